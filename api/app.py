@@ -19,8 +19,10 @@ from api.dashboard.rendering import STATIC, problem_page
 from api.hosts import host_name, is_loopback
 from api.metrics import Metrics
 from api.middleware.body_limit import BodyLimit
+from api.middleware.head import Head
 from api.middleware.rates import Rates
 from api.middleware.request_context import RequestContext
+from api.middleware.root_path import RootPath
 from api.middleware.same_origin import SameOrigin
 from api.middleware.turnstile import Turnstile
 from api.routes import datasets, grasps, hand_corrections, jobs, shards, system, tags, usage, webhooks
@@ -32,6 +34,7 @@ from service.model.errors import InputError, UnavailableError
 from service.model.states import AssetKind
 from service.model.version import PACKAGE_VERSION
 from service.pipeline.backends import Parts
+from service.pipeline.identity import identify_if_redis_answers
 from service.queue.address import redis_url
 from service.settings import Settings
 
@@ -45,6 +48,7 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
     Raises:
         InputError: the address to bind is reachable from elsewhere and no key exists; or what the settings say of a
             proxy cannot be read.
+        BusyError: store, index or Redis belong to another service.
         StoreUnavailable, IndexUnavailable: where the parts cannot be opened.
     """
     proxy = Proxy(settings)
@@ -52,6 +56,8 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
     if not proxy.is_on:
         check_exposure(settings.host, keys)
     opened = parts or Parts.open(settings)
+    if parts is None:
+        identify_if_redis_answers(opened)
     with suppress(UnavailableError):
         complete_if_new(opened.index, opened.store)
     rates = Rates(redis_url(settings))
@@ -104,12 +110,18 @@ def check_exposure(host: str, keys: KeyFile) -> None:
 
 def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile, proxy: Proxy, rates: Rates) -> None:
     """Innermost first: limits on bodies, who asks and how often, foreign web pages, request ids around everything."""
+    app.add_middleware(Head)
     uploads = frozenset({*(f"/v1/{kind.value}s" for kind in AssetKind), "/submit"})
     app.add_middleware(BodyLimit, upload_paths=uploads, upload_bytes=settings.max_upload_bytes)
     app.add_middleware(Turnstile, keys=keys, proxy=proxy, settings=settings, rates=rates)
     allowed = _LOOPBACK_NAMES | {host_name(settings.host)} if keys.is_open else None
     app.add_middleware(SameOrigin, allowed_hosts=allowed)
     app.add_middleware(RequestContext, metrics=app.state.metrics)
+    if prefix := settings.api_root_path:
+        first = prefix.split("/")[1]
+        if first in {str(getattr(route, "path", "/")).split("/")[1] for route in app.routes}:
+            raise InputError(f"GRASPD_API_ROOT_PATH: the service has a path /{first} itself; take another, say /graspd")
+        app.add_middleware(RootPath, prefix=prefix)
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:
@@ -129,6 +141,8 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
                     answers["422"] = problems.responses(422)[422]
                 for status, answer in problems.responses(*_of_everybody(path, method)).items():
                     answers.setdefault(str(status), answer)
+        if app.state.settings.api_root_path:
+            document["servers"] = [{"url": app.state.settings.api_root_path}]
         app.openapi_schema = document
     return app.openapi_schema
 
@@ -139,5 +153,5 @@ def _of_everybody(path: str, method: str) -> list[int]:
     if path.startswith(("/v1/", "/metrics")):
         statuses += [401, 403, 429, 503]
     if method not in ("get", "head"):
-        statuses += [403, 408, 413]
+        statuses += [403, 408, 413, 415]
     return statuses

@@ -77,8 +77,7 @@ class ApiError(Exception):
 
 
 def problem_response(
-    request_path: str,
-    request_id: str | None,
+    request: Request,
     *,
     slug: str,
     title: str,
@@ -89,12 +88,12 @@ def problem_response(
 ) -> JSONResponse:
     """The answer to a request that failed."""
     problem = Problem(
-        type=f"/problems/{slug}",
+        type=f"{_root_path(request)}/problems/{slug}",
         title=title,
         status=status,
         detail=detail,
-        instance=request_path,
-        request_id=request_id,
+        instance=request.url.path,
+        request_id=request_id_of(request),
         errors=errors,
     )
     headers = dict(headers or {})
@@ -103,6 +102,11 @@ def problem_response(
     return JSONResponse(
         problem.model_dump(exclude_none=True), status_code=status, media_type=MEDIA_TYPE, headers=headers
     )
+
+
+def _root_path(request: Request) -> str:
+    settings = getattr(request.app.state, "settings", None) if "app" in request.scope else None
+    return settings.api_root_path if settings is not None else ""
 
 
 def describe(error: Exception) -> tuple[str, str, int, str]:
@@ -141,9 +145,7 @@ def answer(request: Request, error: Exception) -> JSONResponse:
     # The router names the methods of the first route that it met at this path; our own word on it stands.
     if status == 405 and not isinstance(error, ApiError) and (allowed := _allowed_methods(request)):
         headers["Allow"] = ", ".join(allowed)
-    return problem_response(
-        request.url.path, request_id_of(request), slug=slug, title=title, status=status, detail=detail, headers=headers
-    )
+    return problem_response(request, slug=slug, title=title, status=status, detail=detail, headers=headers)
 
 
 def _allowed_methods(request: Request) -> list[str]:
@@ -152,7 +154,10 @@ def _allowed_methods(request: Request) -> list[str]:
     return [
         method
         for method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
-        if any(route.matches(dict(request.scope) | {"method": method})[0] is Match.FULL for route in routes)
+        if any(
+            route.matches(dict(request.scope) | {"method": "GET" if method == "HEAD" else method})[0] is Match.FULL
+            for route in routes
+        )
     ]
 
 
@@ -164,8 +169,7 @@ def validation_answer(request: Request, error: RequestValidationError) -> JSONRe
     where = first.pointer.lstrip("#/").replace("/", ".") or "body"
     detail = f"the body is not JSON: {first.detail}" if is_syntax else f"{where}: {first.detail}"
     return problem_response(
-        request.url.path,
-        request_id_of(request),
+        request,
         slug="bad-request" if is_syntax else InputError.slug,
         title="The body cannot be read" if is_syntax else InputError.title,
         status=400 if is_syntax else InputError.status,

@@ -10,6 +10,7 @@ from typing import Any, Final
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from service.cli import at_the_door
 from service.model.imports import imports, own_process
 from service.model.version import PACKAGE_VERSION
 
@@ -176,4 +177,4 @@ def main() -> None:
     os.environ.setdefault("MUJOCO_GL", "disable")
     # Pydantic would look through all installed packages for plugins of its own. Whoever wants them sets it to nothing.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-    build()()
+    at_the_door(build())

@@ -31,7 +31,7 @@ class Client:
     """
 
     def __init__(self, url: str | None = None, *, key: str | None = None) -> None:
-        self._http = HttpClient(url, key=key) if url is not None and key is not None else open_client(url)
+        self._http = open_client(url, key=key)
 
     def __enter__(self) -> Self:
         return self

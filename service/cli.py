@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
+import io
 import json
 import os
 import stat
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, ParamSpec, TextIO, TypeVar
 
 import typer
 from pydantic import BaseModel, ValidationError
 
 from service.model.errors import GraspdError, InputError
+from service.model.redaction import without_secrets
 
 if TYPE_CHECKING:
     from service.settings import Settings
@@ -38,13 +41,64 @@ def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
         except ValidationError as error:
             fail(validation_line(error), InputError.exit_code)
         except BrokenPipeError:
-            # The reader (head, less) has enough; Python must not complain about it at exit.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _silence(sys.stdout)  # the reader (head, less) has enough
             raise typer.Exit(0) from None
         except KeyboardInterrupt:
             fail("interrupted", 130)
 
     return wrapper
+
+
+def at_the_door(command: Callable[[], object]) -> None:
+    """Run the whole command line: what the system refuses (no room, no right, no reader) is one line, too.
+
+    What is no such thing is a fault of graspd, and keeps its trace.
+    """
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            # The next file that is opened would take its place, and get what is printed.
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        try:
+            command()
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()
+    except BrokenPipeError:
+        _silence(sys.stdout)
+        sys.exit(0)
+    except (OSError, MemoryError) as error:
+        _silence(sys.stdout)
+        with contextlib.suppress(OSError, typer.Exit):
+            fail(_refusal(error), 1)
+        sys.exit(1)
+
+
+def _refusal(error: OSError | MemoryError) -> str:
+    if isinstance(error, MemoryError):
+        return "there is not enough memory; give it more, or ask for less at once"
+    what = ", ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
+    said = f"{what}: {error.strerror}" if what and error.strerror else error.strerror or str(error)
+    mends = {
+        errno.ENOSPC: "make room, or name another place",
+        errno.EDQUOT: "make room, or name another place",
+        errno.EACCES: "name another place, or let this user write there",
+        errno.EROFS: "name another place",
+        errno.ENOENT: "see whether the name is right",
+    }
+    return without_secrets(f"{said}; {mends[error.errno]}" if error.errno in mends else said)
+
+
+def _silence(stream: TextIO | None) -> None:
+    """Have Python complain about it no more at exit."""
+    with contextlib.suppress(OSError, ValueError):
+        if stream is not None:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def fail(message: str, code: int) -> NoReturn:

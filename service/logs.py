@@ -16,6 +16,7 @@ from datetime import UTC, datetime
 from types import MappingProxyType
 from typing import Any, Final
 
+from service.model.redaction import without_secrets
 from service.settings import Settings
 
 #: What a line can be about, in the order in which it is shown.
@@ -76,7 +77,7 @@ class JsonLines(logging.Formatter):
         }
         if record.exc_info:
             line["trace"] = self.formatException(record.exc_info)
-        return json.dumps(line, default=str, ensure_ascii=False)
+        return without_secrets(json.dumps(line, default=str, ensure_ascii=False))
 
 
 class _TextLines(logging.Formatter):
@@ -86,7 +87,7 @@ class _TextLines(logging.Formatter):
         about = " ".join(f"{name}={value}" for name, value in _subjects(record).items())
         trace = f"\n{self.formatException(record.exc_info)}" if record.exc_info else ""
         text = f"{_time(record)[11:23]} {record.levelname} {record.name} {record.getMessage()}"
-        return f"{text} [{about}]{trace}" if about else f"{text}{trace}"
+        return without_secrets(f"{text} [{about}]{trace}" if about else f"{text}{trace}")
 
 
 def _subjects(record: logging.LogRecord) -> dict[str, Any]:

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import re
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from pydantic import Field, SecretStr
+from pydantic import Field, SecretStr, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.model.keeper_shards import MOST_SHARDS
+
+if TYPE_CHECKING:
+    from sqlalchemy import URL
 
 
 class Settings(BaseSettings):
     """Settings of all processes of one graspd. Defaults run everything on one machine inside `data_dir`."""
 
     # Compose and Kubernetes hand on variables that nobody set as empty ones.
-    model_config = SettingsConfigDict(env_prefix="GRASPD_", env_ignore_empty=True, frozen=True)
+    model_config = SettingsConfigDict(
+        env_prefix="GRASPD_", env_ignore_empty=True, frozen=True, hide_input_in_errors=True
+    )
 
     data_dir: Path = Field(Path("graspd-data"), description="folder of everything graspd keeps on this machine")
     redis_url: SecretStr | None = Field(None, description="Redis of the queue; unset: `graspd up` starts one")
@@ -27,6 +33,9 @@ class Settings(BaseSettings):
     index_url: SecretStr | None = Field(None, description="SQLAlchemy URL of the index; unset: SQLite in data_dir")
     host: str = Field("127.0.0.1", description="address the API binds")
     port: int = Field(8000, ge=0, le=65535, description="port the API binds; 0: any free one")
+    api_root_path: str = Field(
+        "", description="path below which a proxy shows the API and the dashboard, such as /graspd; unset: the root"
+    )
     api_url: str = Field(
         "http://127.0.0.1:8000",
         description="where the client commands find the API; unset: the service of data_dir, if it runs",
@@ -124,6 +133,14 @@ class Settings(BaseSettings):
         "auto", description="log lines; auto: text on a terminal, else json"
     )
 
+    @field_validator("api_root_path")
+    @classmethod
+    def _is_path(cls, value: str) -> str:
+        found = f"/{value.strip('/')}".rstrip("/")
+        if not re.fullmatch(r"(/[A-Za-z0-9._~-]+)*", found) or {".", ".."} & set(found.split("/")):
+            raise ValueError("write a path such as /graspd, of letters, digits, dots, dashes and underscores")
+        return found
+
     @cached_property
     def resolved_store_url(self) -> str:
         return self.store_url or (self.data_dir.resolve() / "store").as_uri()
@@ -133,7 +150,14 @@ class Settings(BaseSettings):
         return self.keys_file or self.data_dir.resolve() / "keys.json"
 
     @cached_property
-    def resolved_index_url(self) -> str:
+    def resolved_index_url(self) -> str | URL:
         if self.index_url is not None:
             return self.index_url.get_secret_value()
-        return f"sqlite:///{self.data_dir.resolve() / 'index.sqlite'}"
+        return sqlite_url(self.data_dir.resolve() / "index.sqlite")
+
+
+def sqlite_url(path: Path) -> URL:
+    """SQLAlchemy's URL of a file, whatever its path holds: as a text, it would end at a question mark."""
+    from sqlalchemy import URL  # only API and keeper need it, and it takes long to import
+
+    return URL.create("sqlite", database=str(path))

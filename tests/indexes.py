@@ -9,12 +9,12 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
-from sqlalchemy import Connection, create_engine, text
+from sqlalchemy import URL, Connection, create_engine, make_url, text
 
 from service.index.index import Index
+from service.settings import sqlite_url
 from tests.servers import PostgresServer, schema_of
 
-_PREFIX = "sqlite:///"
 #: Tables of a schema that hold pages, but for the one that names the revision.
 _WRITTEN: Final = text("""
     SELECT c.oid::regclass::text FROM pg_class c JOIN pg_namespace n ON n.oid = c.relnamespace
@@ -22,9 +22,10 @@ _WRITTEN: Final = text("""
 """)
 
 
-def empty_index(url: str) -> Index:
+def empty_index(url: str | URL) -> Index:
     """`Index(url)` where nothing is yet. Tests of how an index comes to be make theirs themselves."""
-    if url.startswith(_PREFIX) and not (file := Path(url.removeprefix(_PREFIX))).exists():
+    parsed = make_url(url)
+    if parsed.get_backend_name() == "sqlite" and not (file := Path(str(parsed.database))).exists():
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(_migrated())
     return Index(url)
@@ -34,7 +35,7 @@ def empty_index(url: str) -> Index:
 def _migrated() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "index.sqlite"
-        Index(f"{_PREFIX}{file}").close()
+        Index(sqlite_url(file)).close()
         return file.read_bytes()
 
 

@@ -47,6 +47,7 @@ class MemoryQueue:
     _streams: dict[int, list[Event]] = field(default_factory=lambda: defaultdict(list))
     _workers: dict[str, WorkerBeat] = field(default_factory=dict)
     _announced: dict[str, float] = field(default_factory=dict)
+    _service: str | None = None
     _leases: dict[int, tuple[str, float]] = field(default_factory=dict)
     _keepers: dict[tuple[int, str], float] = field(default_factory=dict)
     _number: int = 1
@@ -160,6 +161,13 @@ class MemoryQueue:
 
     def announced(self, part: str) -> bool:
         return self._announced.get(part, 0.0) > self.clock()
+
+    def service(self) -> str | None:
+        return self._service
+
+    def set_service(self, identity: str, *, instead: bool = False) -> None:
+        if instead or self._service is None:
+            self._service = identity
 
     def take_share(self, holder: str, seconds: float, *, number: int, before: Collection[int] = ()) -> Share:
         with self._changed:

@@ -22,7 +22,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final, Self
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from service.model.errors import ConflictError, InputError, NotFoundError, UnavailableError
 from service.model.projects import PATTERN, Project
@@ -91,6 +91,8 @@ class Key(BaseModel):
 
 
 class _Document(BaseModel):
+    model_config = ConfigDict(hide_input_in_errors=True)
+
     session_secret: str
     keys: list[Key] = []
     projects: dict[str, ProjectLimits] = {}
@@ -238,14 +240,20 @@ class KeyFile:
         return self._first(lambda key: hmac.compare_digest(key.sha256, digest))
 
     def open_session(self, key: Key) -> str:
-        """Signed cookie value for a browser that showed a key."""
+        """Signed cookie value for a browser that showed a key.
+
+        Raises:
+            UnavailableError: the file of keys has no secret to sign with.
+        """
+        if not self._read().session_secret:
+            raise UnavailableError(f"the key file {self.path} has no session_secret; `graspd keys add` gives it one")
         claim = base64.urlsafe_b64encode(json.dumps([key.sha256, int(time.time()) + SESSION_S]).encode()).decode()
         return f"{claim}.{self._sign(claim)}"
 
     def find_session(self, cookie: str) -> Key | None:
-        """The live key behind a session; revoking the key ends its sessions."""
+        """The live key behind a session; revoking the key ends its sessions. Without a secret there is none."""
         claim, _, signature = cookie.partition(".")
-        if not hmac.compare_digest(signature.encode(), self._sign(claim).encode()):
+        if not self._read().session_secret or not hmac.compare_digest(signature.encode(), self._sign(claim).encode()):
             return None
         digest, expires = json.loads(base64.urlsafe_b64decode(claim))
         if time.time() > expires:

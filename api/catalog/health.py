@@ -8,8 +8,9 @@ from collections.abc import Callable
 from typing import Final
 
 from api.models import Health, Part
-from service.model.errors import GraspdError, UnavailableError
+from service.model.errors import BusyError, GraspdError, StoreUnavailable, UnavailableError
 from service.pipeline.backends import Parts
+from service.pipeline.identity import check_queue
 from service.pipeline.sharing import is_kept
 
 #: The parts are asked anew at most this often [s].
@@ -27,6 +28,8 @@ class Probes:
         self._patience_s = patience_s
         self._known: tuple[float, Health] | None = None
         self._hanging: dict[str, _Probe] = {}
+        self._service: str | None = None
+        """Whose Redis it was when it was last asked."""
         self._lock = threading.Lock()
 
     def health(self) -> Health:
@@ -39,7 +42,7 @@ class Probes:
 
     def _ask(self) -> Health:
         questions: dict[str, Callable[[], Part]] = {
-            "redis": lambda: _answering(self._parts.queue.ping()),
+            "redis": self._redis,
             "index": self._index,
             "store": lambda: _answering(self._parts.store.probe()),
         }
@@ -49,6 +52,19 @@ class Probes:
         self._hanging = {name: probe for name, probe in probes.items() if probe.thread.is_alive()}
         keeper, workers = self._others() if parts["redis"].ok else (False, 0)
         return Health(ok=all(part.ok for part in parts.values()), parts=parts, keeper=keeper, workers=workers)
+
+    def _redis(self) -> Part:
+        """A Redis of another service is not ready: its keeper and workers know nothing of this one's jobs."""
+        part, service = _answering(self._parts.queue.ping()), self._parts.queue.service()
+        if service != self._service:
+            try:
+                check_queue(self._parts.store, self._parts.queue)
+            except BusyError as error:
+                return part.model_copy(update={"ok": False, "detail": str(error)})
+            except StoreUnavailable:
+                return part  # the store's own part tells that
+            self._service = service
+        return part
 
     def _index(self) -> Part:
         """An index that may lack what the store has is not ready: jobs would seem to be gone."""

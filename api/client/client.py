@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
-from urllib.parse import urlsplit
 
 import httpx
 from httpx_sse import EventSource
@@ -18,6 +17,7 @@ from api.models import GraspQuery, Health, Job, JobDetail, Shard
 from service.index.views import AssetView, GraspView, Page
 from service.model.domain import JobRequest
 from service.model.errors import ERRORS, GraspdError, InputError, RateError, UnavailableError
+from service.model.redaction import without_secrets
 from service.model.states import AssetKind, State
 
 _PATIENCE_S: Final = 30.0
@@ -37,17 +37,24 @@ class Client:
         url: where the API answers, e.g. http://127.0.0.1:8000.
         key: Bearer key, if the service asks for one.
         transport: replaces the network in tests.
+
+    Raises:
+        InputError: the address or the key cannot be used.
     """
 
     def __init__(self, url: str, *, key: str | None = None, transport: httpx.BaseTransport | None = None) -> None:
-        headers = {"Authorization": f"Bearer {key}"} if key else {}
-        self.url = url.rstrip("/")
+        address = _address(url.strip().rstrip("/"))
+        self.url = without_secrets(str(address)).rstrip("/")
         # A proxy of the environment cannot reach this machine's own addresses.
-        is_local = is_loopback(urlsplit(self.url).hostname or "")
+        is_local = is_loopback(address.host)
         self._http = httpx.Client(
-            base_url=self.url, headers=headers, timeout=_TIMEOUT, transport=transport, follow_redirects=True,
+            base_url=address,
+            headers=_authorization((key or "").strip()),
+            timeout=_TIMEOUT,
+            transport=transport,
+            follow_redirects=True,
             trust_env=not is_local,
-        )  # fmt: skip
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -219,6 +226,25 @@ class Client:
             time.sleep(min(wait, float(answer.headers.get("retry-after", wait))))
         _raise_for(answer)
         return answer
+
+
+def _address(url: str) -> httpx.URL:
+    mend = "give http://HOST:PORT or https://HOST/PATH, an IPv6 address in brackets: http://[::1]:8000"
+    try:
+        found = httpx.URL(url)
+    except (httpx.InvalidURL, ValueError):
+        found = httpx.URL()
+    if found.scheme not in ("http", "https") or not found.host:
+        raise InputError(f"the address of the API {url!r} cannot be used; {mend}")
+    return found
+
+
+def _authorization(key: str) -> dict[str, str]:
+    if not key:
+        return {}
+    if not (key.isascii() and key.isprintable() and " " not in key):
+        raise InputError("the API key (GRASPD_API_KEY) holds a character that no key has; copy it again")
+    return {"Authorization": f"Bearer {key}"}
 
 
 def _is_too_fast(answer: httpx.Response) -> bool:

@@ -26,10 +26,12 @@ UrlOption = Annotated[
 ]
 
 
-def open_client(url: str | None) -> Client:
-    """A client of the API that the option or the settings name, or else that serves the data folder."""
+def open_client(url: str | None, *, key: str | None = None) -> Client:
+    """A client of the API that the option or the settings name, or else that serves the data folder; with their key,
+    unless one is given."""
     settings = load_settings()
-    key = settings.api_key.get_secret_value() if settings.api_key else None
+    if key is None and settings.api_key:
+        key = settings.api_key.get_secret_value()
     if url is None and "api_url" not in settings.model_fields_set:
         url = recorded_address(settings.data_dir)
     return Client(url or settings.api_url, key=key)

@@ -14,7 +14,7 @@ from api.catalog.tags import Tags
 from api.dashboard import snippets
 from api.dashboard.choice_forms import did
 from api.dashboard.forms import first_message
-from api.dashboard.rendering import render
+from api.dashboard.rendering import base_url, render
 from api.models import GraspDetail, GraspQuery
 from api.routes.dependencies import AssetsOf, GraspsOf, ShardsOf, TagsOf, may_read
 from api.routes.paging import next_address
@@ -110,7 +110,7 @@ def grasp_page(
         type=GraspType(int(grasp.grasp_type or 0)),
         weakest=_WEAKEST.get(grasp.robust_weakest or ""),
         swept=[metric for metric in GRASP_METRICS if metric.name in grasp.sweep],
-        loader=snippets.grasp_loader(grasp, shard, str(request.base_url)),
+        loader=snippets.grasp_loader(grasp, shard, base_url(request)),
     )
 
 

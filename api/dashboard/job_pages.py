@@ -12,7 +12,7 @@ from api.dashboard.choice_forms import did
 from api.dashboard.figures import charts
 from api.dashboard.grasp_pages import COLUMNS, choice_of
 from api.dashboard.pictures import Channel
-from api.dashboard.rendering import render
+from api.dashboard.rendering import base_url, render
 from api.models import GraspQuery, JobDetail, LossCurve
 from api.routes.dependencies import GraspsOf, JobsOf, ShardsOf, TagsOf, may_read
 
@@ -54,8 +54,8 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
         columns=COLUMNS,
         sort="epsilon",
         shards=job.shards,
-        loader=snippets.loader(job, str(request.base_url)),
-        curl=snippets.curl(job, str(request.base_url)),
+        loader=snippets.loader(job, base_url(request)),
+        curl=snippets.curl(job, base_url(request)),
     )
 
 

@@ -79,6 +79,7 @@ _HTTP_PROBLEMS: Final = {
     "unauthorized": (401, "A live key is needed."),
     "forbidden": (403, "The key's scope is too small, or the request comes from a foreign web page."),
     "method-not-allowed": (405, "This address does not take this method."),
+    "unsupported-media-type": (415, "The body is compressed or otherwise encoded; only plain bodies are read."),
     "range-not-satisfiable": (416, "The range of bytes lies behind the end of the file."),
     "misdirected-request": (421, "The service does not answer to this host name while it is open."),
 }

@@ -12,6 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 from api import formatting
 from api.access.auth import is_allowed, may_change
 from api.access.keys import Scope
+from api.middleware.root_path import with_prefix
 from service.model.version import PACKAGE_VERSION
 
 _HERE: Final = Path(__file__).parent
@@ -61,7 +62,13 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
         "may_change": may_change,
     }
     text = request.app.state.templates.get_template(template).render(context)
+    text = with_prefix(text, request.app.state.settings.api_root_path)
     return HTMLResponse(text, status_code=status, headers={"Cache-Control": "no-store"})
+
+
+def base_url(request: Request) -> str:
+    """Where the visitor sees the service, without a slash at the end."""
+    return f"{str(request.base_url).rstrip('/')}{request.app.state.settings.api_root_path}"
 
 
 def problem_page(request: Request, problem: dict[str, Any]) -> Response:

@@ -11,6 +11,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.access.auth import authorize
 from api.access.keys import Scope as KeyScope
+from api.middleware.same_origin import SAFE_METHODS
 from api.problems import ApiError, answer
 from service.model.errors import LimitError
 
@@ -55,6 +56,10 @@ class BodyLimit:
             await _refuse(
                 ApiError(400, "Transfer-Encoding and Content-Length exclude each other"), scope, receive, send
             )
+            return
+        encoding = given.get(b"content-encoding", b"").decode("latin-1").strip().lower()
+        if encoding not in ("", "identity") and scope["method"] not in SAFE_METHODS:
+            await _refuse(_encoded(encoding), scope, receive, send)
             return
         declared = given.get(b"content-length", b"0")
         if not declared.isdigit() or len(declared) > _MOST_DIGITS or int(declared) > limit:
@@ -116,6 +121,14 @@ class BodyLimit:
 
 def _too_large(limit: int) -> LimitError:
     return LimitError(f"the body is larger than {limit} bytes; send a smaller one")
+
+
+def _encoded(encoding: str) -> ApiError:
+    return ApiError(
+        415,
+        f"the body has Content-Encoding {encoding[:40]!r}, and only plain bodies are read; send it as it is",
+        headers={"Accept-Encoding": "identity"},
+    )
 
 
 async def _refuse(error: Exception, scope: Scope, receive: Receive, send: Send) -> None:

@@ -124,7 +124,6 @@ def asset_router(kind: AssetKind) -> APIRouter:
 def _add_model_routes(router: APIRouter, kind: AssetKind) -> None:
     """What viewers show of a hand or an object; a network has no shape."""
 
-    @router.head("/{name}/model", dependencies=[Depends(may_read)], include_in_schema=False)
     @router.get(
         "/{name}/model",
         dependencies=[Depends(may_read)],
@@ -150,8 +149,6 @@ def _add_model_routes(router: APIRouter, kind: AssetKind) -> None:
         headers = {"ETag": f'"{hashlib.sha256(data).hexdigest()}"', "Cache-Control": lasting}
         if is_known(request.headers, headers["ETag"]):
             return Response(status_code=304, headers=headers)
-        if request.method == "HEAD":
-            return Response(media_type=_GLB, headers=headers | {"Content-Length": str(len(data))})
         return Response(data, media_type=_GLB, headers=headers)
 
 

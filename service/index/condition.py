@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from sqlalchemy import make_url, text
-from sqlalchemy.exc import ArgumentError, NoSuchModuleError
+from sqlalchemy import URL, make_url, text
 
-from service.index.database import connect_postgres, mapped, newest_revision
-from service.model.errors import IndexDamaged, IndexUnavailable, InputError
+from service.index.database import UNUSABLE, connect_postgres, mapped, newest_revision, unusable
+from service.model.errors import IndexDamaged, IndexUnavailable
 
 _TIMEOUT_S: Final = 5.0
 
@@ -37,7 +36,7 @@ class IndexCondition:
         return bool(self.revision) and self.revision == self.newest
 
 
-def look(url: str) -> IndexCondition | None:
+def look(url: str | URL) -> IndexCondition | None:
     """None where the file of an SQLite index does not exist yet.
 
     Raises:
@@ -50,10 +49,8 @@ def look(url: str) -> IndexCondition | None:
         if parsed.get_backend_name() == "sqlite":
             return _look_at_file(Path(str(parsed.database)))
         return _look_at_postgres(url)
-    except (ArgumentError, NoSuchModuleError, ModuleNotFoundError) as error:
-        raise InputError(
-            f"the index URL cannot be used ({error}); give sqlite:///PATH or postgresql+psycopg://..."
-        ) from None
+    except UNUSABLE as error:
+        raise unusable(error) from None
 
 
 def _look_at_file(path: Path) -> IndexCondition | None:
@@ -77,7 +74,7 @@ def _look_at_file(path: Path) -> IndexCondition | None:
     return IndexCondition(f"SQLite {sqlite3.sqlite_version}", rows[0][0] if rows else "", newest_revision())
 
 
-def _look_at_postgres(url: str) -> IndexCondition:
+def _look_at_postgres(url: str | URL) -> IndexCondition:
     engine = connect_postgres(url)
     try:
         with mapped(), engine.connect() as connection:

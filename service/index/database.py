@@ -17,7 +17,7 @@ from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from alembic.util import CommandError
-from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
+from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlchemyError
 
 from service.index.metric_columns import add_missing
@@ -33,6 +33,8 @@ MIGRATIONS: Final = Path(__file__).parent / "migrations"
 _BUSY_TIMEOUT_S: Final = 20.0
 #: Key of PostgreSQL's advisory lock that lets one process migrate at a time: the letters "grsp".
 _MIGRATION_LOCK: Final = 0x67727370
+#: What SQLAlchemy raises for a URL.
+UNUSABLE: Final = (ArgumentError, NoSuchModuleError, ModuleNotFoundError, ValueError)
 #: Codes of SQLite for a file whose content makes no sense.
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
@@ -40,7 +42,7 @@ _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 class Database:
     """An engine, with reads and writes as context managers."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str | URL) -> None:
         """Connect and migrate.
 
         Raises:
@@ -156,29 +158,37 @@ def chunks(ids: Sequence[T], size: int = 1000) -> Iterable[Sequence[T]]:
     return (ids[start : start + size] for start in range(0, len(ids), size))
 
 
-def _file_of(url: str) -> SqliteFile | None:
+def _file_of(url: str | URL) -> SqliteFile | None:
     """The file of an SQLite index; None for another database, and for one in memory."""
     try:
         parsed = make_url(url)
-    except ArgumentError:
+    except UNUSABLE:
         return None
     is_file = parsed.get_backend_name() == "sqlite" and parsed.database and parsed.database != ":memory:"
     return SqliteFile(Path(str(parsed.database))) if is_file else None
 
 
-def _engine(url: str) -> Engine:
+def _engine(url: str | URL) -> Engine:
     try:
         parsed = make_url(url)
         if parsed.get_backend_name() == "sqlite":
             return _sqlite_engine(url, parsed.database)
         return connect_postgres(url)
-    except (ArgumentError, NoSuchModuleError, ModuleNotFoundError) as error:
-        raise InputError(
-            f"the index URL cannot be used ({_line(error)}); give sqlite:///PATH or postgresql+psycopg://..."
-        ) from None
+    except UNUSABLE as error:
+        raise unusable(error) from None
 
 
-def connect_postgres(url: str) -> Engine:
+def unusable(error: Exception) -> InputError:
+    """What is told of an index URL that cannot be used. What SQLAlchemy says of how it is written may hold a part of
+    the password."""
+    why = f" ({_line(error)})" if isinstance(error, NoSuchModuleError | ModuleNotFoundError) else ""
+    return InputError(
+        f"GRASPD_INDEX_URL cannot be used{why}; give sqlite:///PATH or postgresql+psycopg://HOST/NAME, and in a "
+        "password %2F for / and %40 for @"
+    )
+
+
+def connect_postgres(url: str | URL) -> Engine:
     """An engine that refuses a database whose encoding is not UTF-8, and migrates nothing."""
     engine = create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10)
 
@@ -195,7 +205,7 @@ def connect_postgres(url: str) -> Engine:
     return engine
 
 
-def _sqlite_engine(url: str, database: str | None) -> Engine:
+def _sqlite_engine(url: str | URL, database: str | None) -> Engine:
     if database and database != ":memory:":
         try:
             Path(database).parent.mkdir(parents=True, exist_ok=True)
@@ -214,7 +224,7 @@ def _sqlite_engine(url: str, database: str | None) -> Engine:
     return engine
 
 
-def downgrade(url: str, revision: str) -> None:
+def downgrade(url: str | URL, revision: str) -> None:
     """Take the schema back to an earlier revision, before an older graspd is installed that knows no later one.
 
     Raises:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from sqlalchemy import URL
+
 from service.index.changes.datasets import DatasetChanges
 from service.index.changes.live import Live
 from service.index.changes.records import Changes
@@ -33,7 +35,7 @@ class Index:
     NotFoundError.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str | URL) -> None:
         """Connect and migrate: see `Database` for errors."""
         self.database = database = Database(url)
         # What is read.

@@ -16,6 +16,7 @@ from service.model.clock import timestamp
 _REBUILT: Final = "rebuilt"
 _SCRUB: Final = "scrub"
 _SCRUB_TURN: Final = "scrub turn"
+_SERVICE: Final = "service"
 #: Names of records that are kept; the count is of all.
 _NAMED: Final = 50
 
@@ -61,6 +62,25 @@ class Notes:
         value = {"at": timestamp(), "left_out": len(left_out), "names": list(left_out[:_NAMED])}
         with self.database.writing(within) as connection:
             upsert(connection, notes, [{"name": _REBUILT, "value": value}])
+
+    def service(self, *, within: Connection | None = None) -> str | None:
+        """Identity of the service that the index belongs to; None in a new one."""
+        query = select(notes.c.value).where(notes.c.name == _SERVICE)
+        if within is not None:
+            value: Any = within.scalar(query)
+        else:
+            with self.database.reading() as connection:
+                value = connection.scalar(query)
+        return None if value is None else str(value["id"])
+
+    def name_service(self, identity: str, *, instead: bool = False) -> str:
+        """Say which service the index belongs to, where nobody said it before or `instead` of that; the one that
+        counts now."""
+        with self.database.writing() as connection:
+            known = None if instead else self.service(within=connection)
+            if known is None:
+                upsert(connection, notes, [{"name": _SERVICE, "value": {"id": identity}}])
+        return known or identity
 
     def scrub_note(self) -> ScrubNote:
         """How far the keeper has read through the store; nothing read yet: a note of defaults."""

@@ -23,6 +23,7 @@ from service.model.records import AttemptRecord, JobEvent, JobRecord, Record
 from service.model.states import State
 from service.model.tags import Tag
 from service.model.webhooks import Webhook
+from service.settings import sqlite_url
 from service.store.deletions import pending
 from service.store.library import load_asset, load_check, stored_assets
 from service.store.manifests import ShardManifest
@@ -212,7 +213,7 @@ def complete_if_new(index: Index, store: Store) -> None:
 def differences(index: Index, store: Store) -> list[str]:
     """Damaged records, then what `rebuild` would change, one line a row; empty if the index is what the store says."""
     with tempfile.TemporaryDirectory(prefix="graspd-index-") as folder:
-        fresh = Index(f"sqlite:///{Path(folder) / 'index.sqlite'}")
+        fresh = Index(sqlite_url(Path(folder) / "index.sqlite"))
         try:
             rebuild(fresh, store)
             made = fresh.notes.completeness()

@@ -32,13 +32,15 @@ import re
 from collections.abc import Mapping
 from typing import Any, ClassVar, Final
 
+from service.model.redaction import without_secrets
+
 #: Line breaks with the space around them, all that `str.splitlines` knows; control characters.
 _BREAK: Final = re.compile(r"\s*[\n\r\v\f\x1c-\x1e\x85\u2028\u2029]\s*")
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
 class GraspdError(Exception):
-    """Base of all errors that graspd reports to its user; its text is one line, whatever it quotes."""
+    """Base of all errors that graspd reports to its user; its text is one line without secrets, whatever it quotes."""
 
     slug: ClassVar[str] = "internal"
     status: ClassVar[int] = 500
@@ -48,7 +50,7 @@ class GraspdError(Exception):
     def __str__(self) -> str:
         # A quoted key, file name or message of a library may carry line breaks and escapes: they would forge lines in
         # logs and terminals. What a printable text holds stays as it is.
-        text = super().__str__()
+        text = without_secrets(super().__str__())
         if text.isprintable():
             return text
         return _CONTROL.sub(lambda found: repr(found[0])[1:-1], _BREAK.sub(" ", text))

@@ -18,6 +18,7 @@ DELETIONS: Final = "deletions"
 RELEASED: Final = "released"
 WEBHOOKS: Final = "webhooks"
 TAGS: Final = "tags"
+SERVICE: Final = "service"
 
 #: Folder under `shards/` and HDF5 kind of what each stage makes.
 SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "scene", Stage.RENDER: "views"}
@@ -151,6 +152,11 @@ def tag_versions(tag: str) -> str:
 def tag_version(tag: str, number: int) -> str:
     """One of `tag_versions`; numbers start at 1, the last one counts, and those before it go."""
     return f"{tag_versions(tag)}/{number:06}.json"
+
+
+def service(number: int) -> str:
+    """Identity of the service that works on the store; numbers start at 1, and the last one counts."""
+    return f"{SERVICE}/{number:06}.json"
 
 
 def deletion(what: str, name: str) -> str:

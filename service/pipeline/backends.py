@@ -23,8 +23,11 @@ class Parts:
     queue: TaskQueue
 
     @classmethod
-    def open(cls, settings: Settings) -> Self:
+    def open(cls, settings: Settings, *, patience: int = 3) -> Self:
         """Open all three: makes the data folder, migrates the index; does not need Redis to answer yet.
+
+        Args:
+            patience: how often Redis is tried before it counts as away.
 
         Raises:
             StoreUnavailable, IndexUnavailable: where they cannot be opened.
@@ -33,7 +36,7 @@ class Parts:
         from service.queue.rq_queue import open_queue
 
         store = open_store(settings.resolved_store_url, public_endpoint=settings.store_public_endpoint)
-        return cls(settings, store, Index(settings.resolved_index_url), open_queue(settings))
+        return cls(settings, store, Index(settings.resolved_index_url), open_queue(settings, patience=patience))
 
     def close(self) -> None:
         """Give all connections back."""

@@ -21,7 +21,7 @@ from service.index.rebuild import complete_if_new, rebuild
 from service.model import names
 from service.model.ability import need_of
 from service.model.clock import timestamp
-from service.model.errors import DamagedError, IndexUnavailable, StoreUnavailable, UnavailableError
+from service.model.errors import BusyError, DamagedError, IndexUnavailable, StoreUnavailable, UnavailableError
 from service.model.keeper_shards import ALL_SHARDS, KeeperShards, shard_of
 from service.model.planning import ingest_id, ingest_message
 from service.model.states import Lane
@@ -30,6 +30,7 @@ from service.model.worker_beat import WorkerBeat
 from service.pipeline.backends import Parts
 from service.pipeline.courier import Courier
 from service.pipeline.datasets.rounds import DatasetRounds
+from service.pipeline.identity import identify
 from service.pipeline.indexer import Indexer
 from service.pipeline.job_actions import HELD_S, queue_tasks
 from service.pipeline.pace import Pace
@@ -55,6 +56,8 @@ _REMEMBERED_S: Final = 60.0
 _REPORTS_EVERY_S: Final = 0.5
 _LONGEST_PAUSE_S: Final = 5.0
 _SWEEP_EVERY_S: Final = 5.0
+#: How often it looks whether store and index are still its service's.
+_IDENTIFY_EVERY_S: Final = 30.0
 #: What a read of the store that is under way has to end, once the keeper stops [s].
 _LAST_READ_S: Final = 3.0
 
@@ -94,7 +97,7 @@ class Keeper:
         self._feeding = Pace(clock, 0.0)
         self._reporting = Pace(clock, min(_REPORTS_EVERY_S, interval_s), share=0.1)
         self._counting = Pace(clock, _WORKERS_EVERY_S, share=0.1)
-        self._plan_again = self._sweep_again = -math.inf
+        self._plan_again = self._sweep_again = self._identify_again = -math.inf
 
     def run(self, stop: threading.Event) -> None:
         """Rounds until told to stop. Where a part is away, waits longer and longer, and loses nothing."""
@@ -128,6 +131,8 @@ class Keeper:
             try:
                 self.round(wait_s=self._parts.settings.keeper_interval_s)
                 pause = 0.0
+            except BusyError:
+                raise  # another service works here: to go on would undo its work
             except UnavailableError as error:
                 pause = min(_LONGEST_PAUSE_S, max(0.25, 2 * pause))
                 log.warning("%s; the keeper tries again in %.2g s", error, pause)
@@ -142,7 +147,11 @@ class Keeper:
 
         Raises:
             UnavailableError: a part is away; the round can be run again.
+            BusyError: another service has taken over the store.
         """
+        if self._clock() >= self._identify_again:
+            identify(self._parts, holds_redis=True)
+            self._identify_again = self._clock() + _IDENTIFY_EVERY_S
         self._see_to_the_index()
         away: list[UnavailableError] = []
         with _noted(away):

@@ -7,6 +7,7 @@ import os
 import tempfile
 from pathlib import Path
 from typing import Final
+from urllib.parse import quote
 
 from service.settings import Settings
 
@@ -19,7 +20,7 @@ def redis_url(settings: Settings) -> str:
     if settings.redis_url is not None:
         return settings.redis_url.get_secret_value()
     secret = password(settings.data_dir)
-    return f"unix://{f':{secret}@' if secret else ''}{socket_path(settings.data_dir)}"
+    return f"unix://{f':{secret}@' if secret else ''}{quote(str(socket_path(settings.data_dir)))}"
 
 
 def password(data_dir: Path) -> str:

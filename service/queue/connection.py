@@ -30,5 +30,9 @@ def connect(url: str, *, patience: int = 3, timeout_s: float = _SOCKET_TIMEOUT_S
             health_check_interval=30,
             retry=Retry(ExponentialBackoff(cap=1.0, base=0.05), patience),
         )
-    except (ValueError, TypeError) as error:
-        raise QueueUnavailable(f"the Redis URL cannot be used: {error}; give redis://, rediss:// or unix://") from None
+    except (ValueError, TypeError):
+        # What the library says may hold a part of the password.
+        raise QueueUnavailable(
+            "GRASPD_REDIS_URL cannot be used; give redis://, rediss:// or unix://, and in a password %2F for /, "
+            "%23 for #, %3F for ? and %40 for @"
+        ) from None

@@ -233,6 +233,12 @@ class Presence(Protocol):
     def announced(self, part: str) -> bool:
         """Whether a part said so."""
 
+    def service(self) -> str | None:
+        """Identity of the service that this queue belongs to; None if none has it yet, or Redis was lost."""
+
+    def set_service(self, identity: str, *, instead: bool = False) -> None:
+        """Say which service the queue belongs to, where nobody said it before or `instead` of that."""
+
     def take_share(self, holder: str, seconds: float, *, number: int, before: Collection[int] = ()) -> Share:
         """Keep the shards of the keepers' work that are held, for that long, and take of the free ones up to a fair
         share. Whoever asks counts as one who shares the work, for as long.

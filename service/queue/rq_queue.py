@@ -35,6 +35,7 @@ from service.settings import Settings
 WORKERS: Final = "graspd:workers"
 #: Sums for Prometheus, a few hundred fields.
 METRICS: Final = "graspd:metrics"
+_SERVICE: Final = "graspd:service"
 _CANCEL_TTL_S: Final = 24 * 3600
 _JOB: Final = b"rq:job:"
 _WORKER: Final = b"graspd:worker:"
@@ -188,6 +189,15 @@ class RqQueue:
         with _mapped():
             return bool(self.connection.exists(_part_key(part)))
 
+    def service(self) -> str | None:
+        with _mapped():
+            found = self.connection.get(_SERVICE)
+        return None if found is None else entries.text(found)
+
+    def set_service(self, identity: str, *, instead: bool = False) -> None:
+        with _mapped():
+            self.connection.set(_SERVICE, identity, nx=not instead)
+
     def take_share(self, holder: str, seconds: float, *, number: int, before: Collection[int] = ()) -> Share:
         with _mapped():
             return shares.take_share(self.connection, holder, seconds, number, before)
@@ -291,6 +301,7 @@ _KINDS: Final = (
     (WORKERS, "set"),
     (METRICS, "hash"),
     (REPORTS, "hash"),
+    (_SERVICE, "string"),
     ("rq:workers", "set"),
     (LISTS, "set"),
 )

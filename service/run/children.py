@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
+import secrets
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Final
 
+from service.run.processes import start_of
+
 log = logging.getLogger(__name__)
+#: Variable of a child by which a later `graspd up` knows it.
+_TOKEN: Final = "GRASPD_CHILD_TOKEN"
 _FIRST_PAUSE_S: Final = 0.2
 _LONGEST_PAUSE_S: Final = 10.0
 #: A child that lived this long was well: the next restart is quick again [s].
@@ -30,6 +36,8 @@ class Child:
     environment: Mapping[str, str]
     folder: Path | None
     """Data folder: pid files go to `run/`, output to `logs/`. None: no such files, and the output is the parent's."""
+    mend: Callable[[Path], None] | None = None
+    """Called with its log after it failed, before it is started again."""
     process: subprocess.Popen[bytes] | None = None
     starts: int = 0
     _started: float = 0.0
@@ -40,20 +48,25 @@ class Child:
     def pid_file(self) -> Path | None:
         return self.folder / "run" / f"{self.name}.pid" if self.folder is not None else None
 
+    @property
+    def _log_file(self) -> Path | None:
+        return self.folder / "logs" / f"{self.name}.log" if self.folder is not None else None
+
     def start(self) -> None:
         """Start the process in a session of its own: Ctrl-C in the terminal is for the parent alone."""
+        token = secrets.token_hex(16)
         with self._output() as output:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "service.run.launch", str(os.getpid()), *self.command],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT if output is not None else None,
-                env={**os.environ, **self.environment},
+                env={**os.environ, **self.environment, _TOKEN: token},
                 start_new_session=True,
             )
         if self.pid_file is not None:
             self.pid_file.parent.mkdir(parents=True, exist_ok=True)
-            self.pid_file.write_text(f"{self.process.pid}\n")
+            self.pid_file.write_text(json.dumps([self.process.pid, start_of(self.process.pid), token]))
         self.starts += 1
         self._started = time.monotonic()
 
@@ -69,6 +82,8 @@ class Child:
             # A worker that has done enough ends by itself, with code 0.
             level = logging.WARNING if code else logging.INFO
             log.log(level, "%s ended (%s); it is started again in %.2g s", self.name, _ended(code), self._pause)
+            if code > 0 and self.mend is not None and self._log_file is not None:
+                self.mend(self._log_file)
             self.process = None
             self._not_before = now + self._pause
             self._pause = min(_LONGEST_PAUSE_S, 2 * self._pause)
@@ -94,36 +109,35 @@ class Child:
             self.pid_file.unlink(missing_ok=True)
 
     def _output(self) -> AbstractContextManager[IO[bytes] | None]:
-        if self.folder is None:
+        if (file := self._log_file) is None:
             return nullcontext()
-        file = self.folder / "logs" / f"{self.name}.log"
         file.parent.mkdir(parents=True, exist_ok=True)
         return file.open("ab")
 
 
 def end_leftovers(folder: Path) -> list[int]:
-    """Kill what the pid files of an earlier `graspd up` name, if it is still ours; returns the pids."""
+    """Kill what the pid files of an earlier `graspd up` name, if it is still that; returns the pids."""
     ended = []
     for file in (folder / "run").glob("*.pid"):
         try:
-            pid = int(file.read_text())
-            if _is_ours(pid, folder):
+            pid, started, token = json.loads(file.read_text())
+            if pid not in (os.getpid(), os.getppid()) and start_of(pid) == started and _has_token(pid, token):
                 os.kill(pid, signal.SIGKILL)
                 ended.append(pid)
-        except (ValueError, OSError):
+        except (ValueError, TypeError, OSError, OverflowError):
             pass
         file.unlink(missing_ok=True)
     return ended
 
 
-def _is_ours(pid: int, folder: Path) -> bool:
-    """A pid may belong to somebody else by now: the data folder must be in the process's environment or command."""
+def _has_token(pid: int, token: str) -> bool:
+    """Whether a process was started with this token in its environment."""
+    wanted = f"{_TOKEN}={token}".encode()
     try:
-        found = [Path(f"/proc/{pid}/{part}").read_bytes() for part in ("environ", "cmdline")]
+        return wanted in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
     except FileNotFoundError:
         listing = subprocess.run(["ps", "-E", "-o", "command=", "-p", str(pid)], capture_output=True, check=False)
-        found = [listing.stdout]
-    return any(os.fsencode(folder) in part for part in found)
+        return wanted in listing.stdout.split()
 
 
 def _ended(code: int) -> str:

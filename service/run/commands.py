@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import threading
@@ -13,9 +14,13 @@ import typer
 from rich.console import Console
 
 from service.cli import JsonFlag, emit, keep_private, load_settings, log_to_stderr, reporting_errors
+from service.heartbeat_file import HeartbeatFile
 from service.model import names
-from service.model.errors import IndexDamaged, UnavailableError
+from service.model.errors import IndexDamaged, QueueUnavailable, UnavailableError
+from service.model.redaction import without_secrets
 from service.settings import Settings
+
+log = logging.getLogger(__name__)
 
 app = typer.Typer(no_args_is_help=True)
 index_app = typer.Typer(no_args_is_help=True, help="Rebuild the index from the store, or export its tables.")
@@ -88,21 +93,19 @@ def keeper(
 
 def _run_keeper(settings: Settings, stop: threading.Event) -> None:
     """Keep the shards of the work that are this keeper's; from the start where they become others."""
-    from service.heartbeat_file import HeartbeatFile
     from service.pipeline.backends import Parts
     from service.pipeline.keeper import Keeper
     from service.pipeline.sharing import Sharing
     from service.queue.rq_queue import open_queue
 
+    alive = HeartbeatFile(settings.heartbeat_file)
     queue = open_queue(settings, patience=0)
     sharing = Sharing(
-        queue,
-        number=settings.keeper_shards,
-        lease_s=settings.lease_s,
-        alive=HeartbeatFile(settings.heartbeat_file),
-        name=settings.keeper_name,
+        queue, number=settings.keeper_shards, lease_s=settings.lease_s, alive=alive, name=settings.keeper_name
     )
     try:
+        # A keeper of another service must not even wait: it would be a standby that all take for their own.
+        _identify(settings, stop, alive)
         while (shards := sharing.wait(stop)) is not None:
             with sharing.held(stop) as over:
                 # What an earlier keeper took in and did not finish comes again to a fresh one.
@@ -115,6 +118,29 @@ def _run_keeper(settings: Settings, stop: threading.Event) -> None:
         queue.close()
 
 
+def _identify(settings: Settings, stop: threading.Event, alive: HeartbeatFile) -> None:
+    """Find out that store, index and Redis are of one service, as soon as Redis answers.
+
+    Raises:
+        BusyError: one of them is another service's.
+    """
+    from service.pipeline.backends import Parts
+    from service.pipeline.identity import identify
+
+    parts = Parts.open(settings, patience=0)
+    try:
+        while not stop.is_set():
+            alive.touch()
+            try:
+                identify(parts)
+                return
+            except QueueUnavailable as error:
+                log.warning("%s", error)
+            stop.wait(settings.lease_s / 3)
+    finally:
+        parts.close()
+
+
 @index_app.command(epilog="graspd index rebuild --check")
 @reporting_errors
 def rebuild(
@@ -122,33 +148,41 @@ def rebuild(
     data_dir: DataDir = None,
     json: JsonFlag = False,
 ) -> None:
-    """Make the rows of the index anew from the store. With --check exit code 1: they differ, or a shard is damaged."""
-    from service.index.index import Index
-    from service.index.rebuild import differences
-    from service.index.rebuild import rebuild as make
-    from service.pipeline.scrub import scan
-    from service.store.store import open_store
+    """Make the rows of the index anew from the store, and be the service that works on it from now on.
 
-    settings = load_settings(data_dir=data_dir)
-    store, index = open_store(settings.resolved_store_url), Index(settings.resolved_index_url)
+    With --check exit code 1: they differ, or a shard is damaged.
+    """
+    from service.index.rebuild import differences
+    from service.index.rebuild import rebuild as fill
+    from service.pipeline.backends import Parts
+    from service.pipeline.identity import identify_if_redis_answers
+    from service.pipeline.scrub import scan
+
+    parts = Parts.open(load_settings(data_dir=data_dir), patience=0)
+    store, index = parts.store, parts.index
+
+    def make() -> dict[str, int]:
+        identify_if_redis_answers(parts, take_over=True)
+        return fill(index, store)
+
     try:
         found = differences(index, store)
         if check:
             found += [
                 f"{wrong.key}: {wrong.what}" for _, wrong in scan(store, names.SHARDS, names.PACKS) if wrong is not None
             ]
-        counts: dict[str, int] = {} if check else make(index, store)
+        counts: dict[str, int] = {} if check else make()
     except IndexDamaged:
         if check:
             raise
-        found, counts = ["the file of the index was damaged; a new one took its place"], make(index, store)
+        found, counts = ["the file of the index was damaged; a new one took its place"], make()
     if json:
         emit({"differences": found, "changed": bool(found) and not check, **counts})
     else:
         for line in found:
             typer.echo(line)
         typer.echo("the index is what the store says" if not found else f"{len(found)} differences", err=True)
-    index.close()
+    parts.close()
     if check and found:
         raise typer.Exit(1)
 
@@ -199,7 +233,8 @@ def path(data_dir: DataDir = None) -> None:
     """Print where the index is; a password in the URL is left out."""
     from sqlalchemy import make_url
 
-    typer.echo(make_url(load_settings(data_dir=data_dir).resolved_index_url).render_as_string(hide_password=True))
+    url = make_url(load_settings(data_dir=data_dir).resolved_index_url)
+    typer.echo(without_secrets(url.render_as_string(hide_password=True)))
 
 
 def _check_rooms(workers: int) -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import importlib.util
+import logging
 import os
+import re
 import shutil
 import stat
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Final
 
@@ -15,6 +19,14 @@ from service.model.errors import BusyError, QueueUnavailable
 from service.queue.address import password_file, socket_path
 from service.run.joining import Joining
 from service.settings import Settings
+
+log = logging.getLogger(__name__)
+#: What an append-only Redis keeps, of version 7 on and before.
+_LOGS: Final = ("appendonlydir", "appendonly.aof")
+_TAIL_BYTES: Final = 1 << 16
+_READY: Final = "Ready to accept connections"
+_OF_LOG: Final = re.compile(r"append.?only|\b(AOF|RDB)\b", re.IGNORECASE)
+_OF_DISK: Final = re.compile(r"No space left|Permission denied|Read-only file system|Too many open files")
 
 
 def find_server() -> tuple[Path, str]:
@@ -84,6 +96,31 @@ def own_redis(settings: Settings) -> IO[str]:
     folder = settings.data_dir.resolve() / "redis"
     _private_folder(folder)
     return lock_file(folder / "lock", f"the Redis of {settings.data_dir}")
+
+
+def give_up_log(settings: Settings, output: Path) -> None:
+    """After a start that failed: move the log of writes aside if Redis says in its `output` that it cannot read it.
+
+    What is in Redis is queued again from the index, so an empty one is better than none.
+    """
+    with contextlib.suppress(OSError), output.open("rb") as file:
+        file.seek(max(0, output.stat().st_size - _TAIL_BYTES))
+        told = file.read().decode(errors="replace").rpartition("just started")[2]
+        # A log that cannot be written is not damaged.
+        if _READY not in told and _OF_LOG.search(told) and not _OF_DISK.search(told):
+            set_log_aside(settings, "Redis cannot read it")
+
+
+def set_log_aside(settings: Settings, why: str) -> None:
+    """Have Redis start empty: move its log of writes into a folder `redis/aside-TIME`, and say so."""
+    folder = settings.data_dir.resolve() / "redis"
+    aside = folder / f"aside-{datetime.now(UTC):%Y%m%dT%H%M%S%f}"
+    if found := [one for name in _LOGS if (one := folder / name).exists()]:
+        _private_folder(aside)
+        for one in found:
+            one.rename(aside / one.name)
+        log.warning("the log of Redis is moved to %s: %s; it starts empty, and what is unfinished is queued again",
+                    aside, why)  # fmt: skip
 
 
 def lock_file(path: Path, what: str) -> IO[str]:

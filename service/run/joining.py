@@ -11,7 +11,7 @@ import secrets
 import shlex
 import socket
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from service.model.errors import InputError, UnavailableError
@@ -28,7 +28,7 @@ class Joining:
     address: str
     """Address of this machine that the name stands for: Redis listens there alone."""
     port: int
-    password: str
+    password: str = field(repr=False)
 
     @property
     def redis_url(self) -> str:

@@ -35,12 +35,15 @@ def verify(
     The keeper's own reading pauses meanwhile; a second call is refused.
     """
     from service.pipeline.backends import Parts
+    from service.pipeline.identity import identify_if_redis_answers
     from service.pipeline.repair import repair as mend
     from service.pipeline.scrub import MISSING, scan
     from service.pipeline.scrubber import Turn
     from service.store.packs import pack_at
 
     parts = Parts.open(load_settings(data_dir=data_dir))
+    if repair:
+        identify_if_redis_answers(parts)
     turn = Turn(parts, is_keeper=False)
     try:
         if not turn.is_mine():

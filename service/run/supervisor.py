@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import logging
 import os
 import secrets
@@ -15,15 +16,18 @@ from pathlib import Path
 from typing import IO, Final, Self
 
 import httpx
+from pydantic import SecretStr
 
 from service.model.errors import BusyError, GraspdError, InputError, UnavailableError
+from service.pipeline.backends import Parts
+from service.pipeline.identity import identify_if_redis_answers, recorded
 from service.pipeline.sharing import is_kept
 from service.queue.address import redis_url
 from service.queue.port import Presence
 from service.queue.rq_queue import open_queue
 from service.run.address import forget_address, record_address
 from service.run.children import Child, end_leftovers
-from service.run.embedded import find_server, lock_file, own_redis, server_command
+from service.run.embedded import find_server, give_up_log, lock_file, own_redis, server_command, set_log_aside
 from service.run.joining import Joining
 from service.settings import Settings
 from service.store.store import open_store
@@ -105,7 +109,7 @@ class Supervisor:
             if leftovers := end_leftovers(folder):
                 log.warning("ended %d processes that an earlier graspd left behind", len(leftovers))
             self._settle()
-            open_store(self.settings.resolved_store_url)
+            self._identify(folder)
             self._children = self._plan()
             self._record(folder)
         except GraspdError:
@@ -203,6 +207,22 @@ class Supervisor:
                 reserved.close()
         self.settings = self._wanted.model_copy(update=update)
 
+    def _identify(self, folder: Path) -> None:
+        """Find out that store, index and Redis are of one service, or that it is told by the children later."""
+        open_store(self.settings.resolved_store_url)
+        before = recorded(folder)
+        try:
+            parts = Parts.open(self.settings, patience=0)
+        except UnavailableError as error:
+            log.warning("%s", error)
+            return
+        try:
+            mine = identify_if_redis_answers(parts, folder=folder)
+        finally:
+            parts.close()
+        if self._wanted.redis_url is None and before not in (None, mine):
+            set_log_aside(self.settings, "it belongs to the service that ran here before")
+
     def _plan(self) -> list[Child]:
         environment = {
             "GRASPD_DATA_DIR": str(self.settings.data_dir),
@@ -220,7 +240,9 @@ class Supervisor:
         if self._wanted.redis_url is None:
             self._locks.append(own_redis(self.settings))
             log.info("Redis: %s, from %s", *find_server())
-            children.append(child("redis", *server_command(self.settings, self._joining)))
+            redis = child("redis", *server_command(self.settings, self._joining))
+            redis.mend = lambda output: give_up_log(self.settings, output)
+            children.append(redis)
         # One that is started again need not wait until its predecessor's lease has run out.
         name = self._wanted.keeper_name or f"{socket.gethostname()}-up-{secrets.token_hex(8)}"
         children.append(child("keeper", *_PROGRAM, "keeper", GRASPD_KEEPER_NAME=name))
@@ -286,13 +308,18 @@ _SETTLED: Final = frozenset({"data_dir", "redis_url", "host", "port", "api_url"}
 
 
 def _stated(settings: Settings) -> dict[str, str]:
-    """Settings that were given in Python, for the environment of the children."""
-    found = {}
-    for name in Settings.model_fields.keys() - _SETTLED:
-        value = getattr(settings, name)
-        if name in settings.model_fields_set and value is not None:
-            found[f"GRASPD_{name.upper()}"] = str(getattr(value, "get_secret_value", lambda v=value: v)())
-    return found
+    """Settings that were given, in Python or otherwise, for the environment of the children."""
+    given = settings.model_fields_set - _SETTLED
+    return {f"GRASPD_{name.upper()}": _as_variable(getattr(settings, name)) for name in given}
+
+
+def _as_variable(value: object) -> str:
+    """A setting as the environment spells it; an empty variable is one that nobody set."""
+    if value is None:
+        return ""
+    if isinstance(value, SecretStr):
+        return value.get_secret_value()
+    return json.dumps(value) if isinstance(value, dict) else str(value)
 
 
 def _reserve(host: str, port: int) -> socket.socket:

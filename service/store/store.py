@@ -194,10 +194,8 @@ def open_store(url: str, *, public_endpoint: str | None = None) -> Store:
     parts = urlsplit(url)
     if parts.scheme == "memory":
         return Store(MemoryStore(), url)
-    if parts.scheme == "file":
-        if parts.netloc or not parts.path.startswith("/"):
-            raise InputError(f"the store URL {url!r} must hold an absolute path: file:///absolute/folder")
-        return _open_local(Path(unquote(parts.path)), url)
+    if (folder := local_folder(url)) is not None:
+        return _open_local(folder, url)
     if parts.scheme not in ("s3", "gs", "az"):
         raise InputError(f"the store URL {url!r} names no known store; use file://, s3://, gs:// or az://")
     with _mapped(url, url):
@@ -209,6 +207,24 @@ def open_store(url: str, *, public_endpoint: str | None = None) -> Store:
         else:
             signer = None if endpoint else backend
         return Store(backend, url, signer=signer)
+
+
+def local_folder(url: str) -> Path | None:
+    """The folder of a store that is one; None for a bucket.
+
+    Raises:
+        InputError: the URL holds no absolute path, or characters that end a path in a URL.
+    """
+    parts = urlsplit(url)
+    if parts.scheme != "file":
+        return None
+    if parts.netloc or not parts.path.startswith("/"):
+        raise InputError(f"the store URL {url!r} must hold an absolute path: file:///absolute/folder")
+    if "?" in url or "#" in url or not url.isprintable():
+        raise InputError(
+            f"the store URL {url!r} holds what ends a path; write %3F for ?, %23 for #, %0A for a line break"
+        )
+    return Path(unquote(parts.path))
 
 
 def check_key(key: str) -> str:

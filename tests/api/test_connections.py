@@ -143,6 +143,13 @@ def test_a_forwarded_address_is_believed_only_where_the_operator_says_so(
     assert rest(connection).endswith(b"\r\n\r\n" + seen)
 
 
+def test_head_of_a_stream_that_never_ends_does(app: FastAPI, connect: Connect) -> None:
+    connection = connect(b"HEAD /events HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n", app=app)
+    head, _, body = rest(connection).partition(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 200")
+    assert body == b""
+
+
 @pytest.mark.parametrize("end", ["revoked", "a first key"])
 @pytest.mark.parametrize("what", ["job", "service"])
 def test_a_stream_of_events_ends_with_its_key(

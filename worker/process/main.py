@@ -29,6 +29,7 @@ from service.model.errors import QueueUnavailable
 from service.model.states import Stage
 from service.model.version import PACKAGE_VERSION
 from service.model.worker_beat import WorkerBeat
+from service.pipeline.identity import check_queue
 from service.queue.address import redis_url
 from service.queue.allowed import AllowedJob, AllowedQueue
 from service.queue.lists import queue_names
@@ -323,6 +324,7 @@ def run_worker(
 
     Raises:
         InputError: there is no such device.
+        BusyError: Redis belongs to another service than the store.
         QueueUnavailable, StoreUnavailable: at the start.
     """
     queue = open_queue(settings, patience=_PATIENCE)
@@ -330,6 +332,7 @@ def run_worker(
     device = Device(settings.device, number=settings.worker_number)
     store = open_store(settings.resolved_store_url)
     queue.ping()
+    check_queue(store, queue)
     heart = Heartbeat(
         redis_url(settings), _first_beat(name, device, stages), lease_s=settings.lease_s, alive=settings.heartbeat_file
     )
@@ -348,6 +351,7 @@ def run_worker(
         device.find_out(lambda: heart.update(device=device.resolve(), device_name=device.name))
         if not _admitted(fitness, heart, stages, limit_s=settings.task_timeout_s, patient=does_all):
             return False
+        check_queue(store, queue)  # an empty Redis may have become somebody's meanwhile
         patient = burst and idle_s > 0
         worker.work(
             burst=burst and not patient,

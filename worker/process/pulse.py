@@ -179,6 +179,8 @@ def _complain(message: str) -> None:
 
 
 def _end(parent: int, why: str) -> None:
+    if os.getppid() != parent:
+        return  # it is gone, and its number may be another's
     _complain(why)
     os.kill(parent, signal.SIGKILL)
 

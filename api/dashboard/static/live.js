@@ -55,7 +55,7 @@
     const lamp = document.getElementById("lamp");
     const onEvent = () => { pending ??= setTimeout(() => refresh().catch(() => {}), document.hidden ? 10000 : pause); };
     // A whole service changes all the time; one job's page is watched closely.
-    const pause = document.body.dataset.events === "/events" ? 1000 : 300;
+    const pause = document.body.dataset.events.includes("/v1/") ? 300 : 1000;
     source.addEventListener("progress", onEvent);
     source.addEventListener("end", () => { onEvent(); source.close(); });
     source.addEventListener("open", () => lamp && lamp.removeAttribute("data-lost"));

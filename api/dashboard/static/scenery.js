@@ -82,7 +82,7 @@ export class Scenery {
   /** Other objects come as their models do; one that has none is left out. */
   async addNeighbours(scene, changed) {
     await Promise.all(scene.neighbours.map(async ({ digest, pose }) => {
-      const model = await loadGlb(`/v1/objects/${digest}/model`).catch(() => null);
+      const model = await loadGlb(new URL(`../v1/objects/${digest}/model`, import.meta.url).href).catch(() => null);
       if (!model) return;
       const thing = new Thing(model);
       thing.look.color.set(COLOURS.neighbour);

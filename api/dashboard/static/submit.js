@@ -5,6 +5,8 @@
   "use strict";
   const POLL_MS = 400;
   const PATIENCE_MS = 60000;
+  // The service may lie below a path of a proxy.
+  const root = new URL("..", document.currentScript.src).pathname;
   const form = document.getElementById("job");
   const button = form.querySelector("button.primary");
   const blocked = document.getElementById("blocked");
@@ -24,11 +26,11 @@
     data.append("file", file);
     if (name) data.append("name", name);
     if (kind === "object" && units && units !== "m") data.append("options", JSON.stringify({ units }));
-    let asset = await document_(await fetch(`/v1/${kind}s`, { method: "POST", body: data }));
+    let asset = await document_(await fetch(`${root}v1/${kind}s`, { method: "POST", body: data }));
     const until = Date.now() + PATIENCE_MS;
     while (asset.verdict === null && Date.now() < until) {
       await pause(POLL_MS);
-      asset = await document_(await fetch(`/v1/${kind}s/${asset.digest}`));
+      asset = await document_(await fetch(`${root}v1/${kind}s/${asset.digest}`));
     }
     if (asset.verdict === "refuse") throw new Error(asset.message);
     return asset;
@@ -82,7 +84,7 @@
         accepted ??= { name: asset.name, unit };
         // It is in the store: the form need not send it a second time.
         input.value = "";
-        show(asset.name, asset.name, `/v1/${kind}s/${asset.digest}/model`);
+        show(asset.name, asset.name, `${root}v1/${kind}s/${asset.digest}/model`);
         say(asset.verdict ? asset.message : "no worker has checked it yet; start one before you submit", "good");
         hold(thing, "");
       } catch (error) {
@@ -105,7 +107,7 @@
       [held, accepted, input.value] = [null, null, ""];
       select.querySelector("option[data-own]:not(:checked)")?.remove();
       figure.querySelector("[data-say]").textContent = "";
-      figure.dataset.model = select.value ? `/v1/${kind}s/${encodeURIComponent(select.value)}/model` : "";
+      figure.dataset.model = select.value ? `${root}v1/${kind}s/${encodeURIComponent(select.value)}/model` : "";
       say("", "");
       hold(thing, "");
     });

@@ -24,6 +24,7 @@ def checks_of(settings: Settings, *, full: bool = False) -> list[Check]:
         Check("redis-persistence", partial(redis_server.persistence, settings)),
         Check("store", partial(object_store.store, settings), limit_s=120.0),
         Check("index", partial(database.index, settings)),
+        Check("identity", partial(database.identity, settings)),
         Check(
             "index-is-store", partial(database.index_is_store, settings, full=full), limit_s=_FULL_S if full else 120.0
         ),

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 from redis.exceptions import RedisError
-from sqlalchemy import make_url, text
+from sqlalchemy import URL, make_url, text
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.index.database import connect_postgres
@@ -72,7 +72,7 @@ def _offsets(settings: Settings) -> Iterator[tuple[str, float]]:
             yield "store", _of_store(settings)
 
 
-def _of_postgres(url: str) -> float:
+def _of_postgres(url: str | URL) -> float:
     engine = connect_postgres(url)
     try:
         with engine.connect() as connected:

@@ -14,9 +14,12 @@ from service.index.index import Index
 from service.index.rebuild import differences
 from service.index.sample import compare, draw
 from service.index.tables import shards
-from service.model.errors import IndexDamaged, InputError, UnavailableError
+from service.model.errors import IndexDamaged, InputError, QueueUnavailable, UnavailableError
 from service.model.finding import Finding, bad, good, skipped, warning
+from service.pipeline.identity import Identity, recorded, services
+from service.queue.rq_queue import open_queue
 from service.run.doctor.machine import existing, local_store
+from service.run.doctor.redis_server import is_there
 from service.settings import Settings
 from service.store.store import open_store
 
@@ -56,7 +59,8 @@ def _absent(name: str, settings: Settings) -> Finding:
 
 
 def _judge(name: str, settings: Settings, found: IndexCondition) -> Finding:
-    url = make_url(settings.resolved_index_url).render_as_string(hide_password=True).partition("?")[0]
+    parsed = make_url(settings.resolved_index_url)
+    url = parsed.set(query={}).render_as_string(hide_password=True)
     line = f"{found.kind} at {url}, revision {found.revision or 'none'}"
     if not found.may_write:
         return bad(name, f"{line}: it cannot be written", "name the primary, and grant CREATE and USAGE on the schema")
@@ -90,6 +94,33 @@ def _openable(settings: Settings) -> str:
         return "the tables of the index are of another version"
     folder = local_store(settings)
     return "" if folder is None or folder.exists() else "there is no store yet"
+
+
+def identity(settings: Settings) -> Finding:
+    """Whether store, index and Redis belong to one service; changes nothing."""
+    name, folder = "identity", local_store(settings)
+    if folder is not None and not folder.exists():
+        return skipped(name, "there is no store yet")
+    store = open_store(settings.resolved_store_url)
+    said, redis = None, None
+    if not _openable(settings):
+        with closing(Index(settings.resolved_index_url)) as opened:
+            said = opened.notes.service()
+    if is_there(settings):
+        try:
+            with closing(open_queue(settings, patience=0)) as queue:
+                redis = queue.service()
+        except QueueUnavailable:
+            if said is None:
+                return skipped(name, "there is no index here, and Redis does not answer")
+    found = Identity(services(store), said, redis, recorded(settings.data_dir.resolve()), settings.store_url is None)
+    if why := found.refusal(store.url):
+        return bad(name, why, "see the message, and GRASPD_STORE_URL, GRASPD_INDEX_URL, GRASPD_REDIS_URL")
+    if not found.chain:
+        return skipped(name, "no service has worked on this store yet")
+    return good(
+        name, "store, index and Redis belong to one service" if said else "store and Redis belong to one service"
+    )
 
 
 def index_is_store(settings: Settings, *, full: bool = False, settles_s: float = _SETTLES_S) -> Finding:

@@ -12,7 +12,6 @@ import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
-from urllib.parse import unquote, urlsplit
 
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
@@ -23,6 +22,7 @@ from service.model.cores import available_cores, memory_limits
 from service.model.finding import Finding, bad, good, warning
 from service.model.version import PACKAGE_VERSION
 from service.settings import Settings
+from service.store.store import local_folder
 
 _GIB: Final = 2**30
 #: Below this a worker's scratch files, a shard and the log of Redis do not fit together with certainty.
@@ -42,8 +42,7 @@ _ROOMS: Final = ("api", "worker", "embedded", "postgres", "otel", "usd", "arm", 
 
 def local_store(settings: Settings) -> Path | None:
     """The folder of a store that is one; None for a bucket."""
-    parts = urlsplit(settings.resolved_store_url)
-    return Path(unquote(parts.path)) if parts.scheme == "file" else None
+    return local_folder(settings.resolved_store_url)
 
 
 def disk(settings: Settings, *, usage: Callable[[Path], tuple[int, int, int]] = shutil.disk_usage) -> Finding:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Final
-from urllib.parse import urlsplit
+from urllib.parse import unquote, urlsplit
 
 from redis import Redis
 from redis.exceptions import RedisError
@@ -143,7 +143,7 @@ def _info(client: Redis) -> dict[str, Any]:
 def _shown(settings: Settings) -> str:
     parts = urlsplit(redis_url(settings))
     if parts.scheme == "unix":
-        return f"unix://{parts.path}"
+        return unquote(parts.path)
     return f"{parts.scheme}://{parts.hostname}{f':{parts.port}' if parts.port else ''}{parts.path}"
 
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import base64
+import hmac
+import json
 from typing import Any
 
 import pytest
 from pydantic import SecretStr
 from starlette.testclient import TestClient
 
+from api.access.auth import SESSION_COOKIE
 from api.access.keys import KeyFile, Scope
 from api.access.proxy import Proxy
 from api.app import create_app
-from service.model.errors import InputError
+from service.model.errors import InputError, UnavailableError
 from service.pipeline.backends import Parts
 from service.settings import Settings
 
@@ -85,6 +88,29 @@ def test_forged_headers_open_nothing(
     http = client(behind, parts, address)
     assert http.get("/v1/jobs", headers=sent).status_code == 401
     assert http.get("/v1/jobs").status_code == 401
+
+
+@pytest.mark.parametrize("claim", ['["x", 9999999999]', "[]", "3", "{", '{"a": 1}', '["x", "y"]', "null"])
+@pytest.mark.parametrize("path", ["/", "/v1/jobs", "/login"])
+def test_a_session_that_is_signed_with_the_empty_secret_opens_nothing(
+    behind: Settings, parts: Parts, claim: str, path: str
+) -> None:
+    assert not behind.resolved_keys_file.exists()
+    packed = base64.urlsafe_b64encode(claim.encode()).decode()
+    cookie = f"{packed}.{hmac.new(b'', packed.encode(), 'sha256').hexdigest()}"
+    http = client(behind, parts, PROXY)
+    forged = {"Cookie": f"{SESSION_COOKIE}={cookie}"}
+    answers = [http.get(path, headers=sent, follow_redirects=False) for sent in (forged, {})]
+    assert answers[0].status_code == answers[1].status_code < 500
+
+
+def test_a_key_file_without_a_secret_opens_no_session(settings: Settings) -> None:
+    keys = KeyFile(settings.resolved_keys_file)
+    keys.add("robot", Scope.ADMIN)
+    file = json.loads(settings.resolved_keys_file.read_text())
+    settings.resolved_keys_file.write_text(json.dumps(file | {"session_secret": ""}))
+    with pytest.raises(UnavailableError, match="session_secret"):
+        keys.open_session(keys.list()[0])
 
 
 def test_headers_that_came_twice_are_not_believed(behind: Settings) -> None:

@@ -142,3 +142,31 @@ def test_a_quota_that_is_used_up_is_reported_at_once() -> None:
 
     with pytest.raises(QuotaError, match="no more jobs today"):
         client_of(handler).jobs()
+
+
+@pytest.mark.parametrize(
+    "url", ["http://::1:8000", "http://[::1", "http://127.0\r.0.1:8000", "localhost:8000", "ftp://host", "http://", "",
+            "http://host:port", "http://me:pass/word@host:8000"]
+)  # fmt: skip
+def test_an_address_that_cannot_be_used_is_one_line_with_the_fix(url: str) -> None:
+    with pytest.raises(InputError, match=r"address of the API .* cannot be used; give http://HOST:PORT") as refused:
+        Client(url)
+    assert "pass" not in str(refused.value)
+
+
+@pytest.mark.parametrize("key", ["gd_abc\u00a0def", "gd_größe", "gd_abc\r\ndef", "gd_abc def", "gd_abc\x00def"])
+def test_a_key_with_a_foreign_character_is_refused_and_not_told(key: str) -> None:
+    with pytest.raises(InputError, match="GRASPD_API_KEY") as refused:
+        Client("http://127.0.0.1:1", key=key)
+    assert "gd_" not in str(refused.value)
+
+
+def test_space_around_an_address_and_a_key_does_not_matter() -> None:
+    with Client(" http://127.0.0.1:1/\r", key="\u00a0gd_abc\n") as client:
+        assert client.url == "http://127.0.0.1:1"
+
+
+def test_a_password_in_the_address_is_not_told() -> None:
+    with Client("http://me:secret@127.0.0.1:1") as client, pytest.raises(UnavailableError) as away:
+        client.health()
+    assert "secret" not in f"{away.value} {client.url}"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pytest
+from fastapi import FastAPI
+from httpx import Response
 from starlette.testclient import TestClient
 
 from service.pipeline.backends import Parts
@@ -80,3 +82,43 @@ def test_a_body_of_two_lengths_is_refused_and_the_connection_ends(http: TestClie
     both = {"Transfer-Encoding": "chunked", "Content-Length": "2"}
     answer = http.post("/v1/jobs", content=b"{}", headers=both)
     assert (answer.status_code, answer.headers["connection"]) == (400, "close")
+
+
+def _kind(answer: Response) -> tuple[int, str | None]:
+    return answer.status_code, answer.headers.get("content-type")
+
+
+def test_head_is_answered_wherever_get_is(app: FastAPI, http: TestClient) -> None:
+    paths = {getattr(route, "path", "{") for route in app.routes if "GET" in (getattr(route, "methods", None) or ())}
+    endless = {path for path in paths if path.endswith(("/events", "/stream"))} - {"/v1/events"}
+    asked = sorted(path for path in paths - endless if "{" not in path)
+    assert {"/", "/healthz", "/readyz", "/metrics", "/v1/jobs", "/openapi.json"} <= set(asked)
+    answers = {path: (http.get(path), http.head(path)) for path in asked}
+    differing = [path for path, (get, head) in answers.items() if head.content or _kind(head) != _kind(get)]
+    assert not differing
+
+
+def test_head_is_logged_and_counted_as_head(app: FastAPI, http: TestClient) -> None:
+    http.head("/healthz")
+    assert 'method="HEAD",route="/healthz"' in app.state.metrics.render(app.state.overview.snapshot()).decode()
+
+
+def test_allow_names_head_beside_get(http: TestClient) -> None:
+    assert http.put("/v1/jobs").headers["allow"] == "GET, HEAD, POST"
+
+
+@pytest.mark.parametrize("encoding", ["gzip", "br", "deflate", "zstd", "x-gzip", "gzip, br"])
+@pytest.mark.parametrize(
+    ("method", "path"), [("POST", "/v1/jobs"), ("POST", "/v1/objects"), ("POST", "/submit"), ("DELETE", "/v1/jobs/x")]
+)
+def test_a_body_that_is_encoded_is_refused_by_the_name_of_its_encoding(
+    http: TestClient, method: str, path: str, encoding: str
+) -> None:
+    answer = http.request(method, path, content=b"x", headers={"Content-Encoding": encoding})
+    assert (answer.status_code, answer.headers["accept-encoding"]) == (415, "identity")
+    assert encoding in answer.text
+
+
+def test_a_plain_body_may_say_so(http: TestClient) -> None:
+    answer = http.post("/v1/jobs", json={}, headers={"Content-Encoding": "identity"})
+    assert answer.status_code == 422

@@ -5,6 +5,8 @@ from __future__ import annotations
 import signal
 import stat
 import subprocess
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -14,9 +16,11 @@ from service.queue.address import redis_url, socket_path
 from service.queue.connection import connect
 from service.queue.rq_queue import RqQueue
 from service.run import embedded
-from service.run.embedded import find_server, own_redis, server_command
+from service.run.children import Child
+from service.run.embedded import find_server, give_up_log, own_redis, server_command
 from service.settings import Settings
 from tests.service.conftest import wait_for_redis
+from tests.waiting import until
 
 
 def executable(path: Path) -> Path:
@@ -99,6 +103,65 @@ def test_what_was_written_survives_kill_9(tmp_path: Path) -> None:
             queue.close()
             process.send_signal(signal.SIGKILL)
     assert kept == 500
+
+
+def answers(queue: RqQueue) -> bool:
+    try:
+        return queue.ping() >= 0
+    except QueueUnavailable:
+        return False
+
+
+def scribble(file: Path) -> None:
+    file.write_bytes(b"no log of Redis " * 20)
+
+
+def make_newer(file: Path) -> None:
+    file.write_bytes(b"REDIS0999" + file.read_bytes()[9:])
+
+
+def cut(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[:20])
+
+
+@pytest.mark.parametrize(
+    ("name", "harm"),
+    [("*.base.rdb", make_newer), ("*.base.rdb", scribble), ("*.base.rdb", cut), ("*.base.rdb", Path.unlink),
+     ("*.incr.aof", scribble), ("*.manifest", scribble)],
+)  # fmt: skip
+def test_a_log_of_writes_that_redis_cannot_read_gives_way_to_an_empty_one(
+    tmp_path: Path, name: str, harm: Callable[[Path], None], caplog: pytest.LogCaptureFixture
+) -> None:
+    settings = Settings(data_dir=tmp_path)
+
+    def serve(service: Child) -> int:
+        """Keys that it holds once it answers."""
+        with closing(RqQueue(connect(redis_url(settings), patience=0))) as queue:
+            until(lambda: service.watch() or answers(queue), "Redis answers")
+            queue.connection.set("kept", "x")
+            return int(queue.connection.dbsize())
+
+    def child() -> Child:
+        made = Child("redis", server_command(settings), {}, tmp_path)
+        made.mend = lambda output: give_up_log(settings, output)
+        return made
+
+    first, second = child(), child()
+    assert serve(first) == 1
+    first.join(0.0)
+    harm(next((tmp_path / "redis" / "appendonlydir").glob(name)))
+    assert serve(second) == 1
+    second.join(0.0)
+    assert len(list((tmp_path / "redis").glob("aside-*/appendonlydir"))) == 1
+    assert "the log of Redis is moved to" in caplog.text
+
+
+def test_a_redis_that_ends_for_want_of_room_keeps_its_log(tmp_path: Path) -> None:
+    settings, output = Settings(data_dir=tmp_path), tmp_path / "redis.log"
+    (tmp_path / "redis" / "appendonlydir").mkdir(parents=True)
+    output.write_text("Redis just started\n# Can't open the append-only file: No space left on device\n")
+    give_up_log(settings, output)
+    assert (tmp_path / "redis" / "appendonlydir").exists()
 
 
 def test_only_one_process_runs_the_redis_of_a_folder(tmp_path: Path) -> None:

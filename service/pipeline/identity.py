@@ -1,0 +1,183 @@
+"""Which service a store, an index and a Redis belong to: two services on one of them would undo each other's work.
+
+The store holds a chain of records, put create-only: the last one is the service that works on it. The index and Redis
+repeat its id. Where one of the two was lost, the other tells that the service is the same; an index and a Redis that
+both know nothing are of a second service, and `graspd index rebuild` says that it takes the first one's place.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from service.model import names
+from service.model.clock import timestamp
+from service.model.errors import BusyError, QueueUnavailable
+from service.model.records import Record
+from service.store.records import put_record, read_record
+
+if TYPE_CHECKING:
+    from service.pipeline.backends import Parts
+    from service.queue.port import Presence
+    from service.store.store import Store
+
+_FILE: Final = "service.id"
+_BYTES: Final = 16
+_REDIS: Final = (
+    "this Redis belongs to another graspd service; give this one a Redis of its own, or another number of database, in "
+    "GRASPD_REDIS_URL; if the other is gone for good, empty it: redis-cli FLUSHDB"
+)
+
+
+class ServiceRecord(Record):
+    """A service that began to work on a store."""
+
+    id: str
+    at: str
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What store, index, Redis and data folder say of whom they belong to."""
+
+    chain: Sequence[str]
+    """Ids in the store; the last one counts."""
+    index: str | None = None
+    redis: str | None = None
+    folder: str | None = None
+    is_own_store: bool = False
+    """Whether the store lies in the data folder."""
+
+    @property
+    def is_same(self) -> bool:
+        """Whether the last service of the store is the one of this index."""
+        if self.index is not None:
+            return self.index == self.chain[-1]
+        others = {self.redis, self.folder} - {None}
+        return self.chain[-1] in others or (self.is_own_store and not others)
+
+    def refusal(self, store: str, *, take_over: bool = False) -> str:
+        """Why a process must not work here, in one line; "" if it may."""
+        if self.redis is not None and self.redis not in (*self.chain, self.index):
+            return _REDIS
+        if not self.chain or self.is_same or take_over:
+            return ""
+        if self.index is not None and self.index not in self.chain:
+            return _others_index(store)
+        known = {self.index, self.redis, self.folder} & set(self.chain)
+        what = "was taken over by" if known else "belongs to"
+        return (
+            f"the store {store} {what} another graspd service, with another index and Redis; give this one a store of "
+            "its own, or if the other is gone for good, run `graspd index rebuild` here"
+        )
+
+
+def identify(
+    parts: Parts,
+    *,
+    folder: Path | None = None,
+    ask_redis: bool = True,
+    take_over: bool = False,
+    holds_redis: bool = False,
+) -> str:
+    """Find out that store, index and Redis belong to one service, and say so in those that know nothing.
+
+    Args:
+        folder: data folder that remembers the service, too.
+        ask_redis: False while Redis is not started.
+        take_over: be the service of the store from now on, whichever it was before.
+        holds_redis: this process has the lease of the keeper, so Redis is its service's whatever it says.
+
+    Returns:
+        id of the service.
+
+    Raises:
+        BusyError: one of them belongs to another service.
+        StoreUnavailable, IndexUnavailable, QueueUnavailable: they cannot be asked.
+    """
+    # Redis first and the store last: of processes that begin a service at once, each finds what the others wrote.
+    redis = parts.queue.service() if ask_redis else None
+    left = _read(folder)
+    chain = services(parts.store)
+    index = parts.index.notes.service()
+    if not chain:
+        # An index that was never filled is left of a start that was killed here.
+        if index is not None and not take_over and parts.index.notes.completeness() is not None:
+            raise BusyError(_others_index(parts.store.url))
+        index = parts.index.notes.name_service(index or secrets.token_hex(_BYTES))
+        if redis not in (None, index) and not holds_redis:
+            raise BusyError(_REDIS)
+        _add(parts.store, 1, index)
+        chain = services(parts.store)
+    found = Identity(
+        chain, index, None if holds_redis and redis not in chain else redis, left, parts.settings.store_url is None
+    )
+    if why := found.refusal(parts.store.url, take_over=take_over):
+        raise BusyError(why)
+    if take_over and not found.is_same:
+        _add(parts.store, len(chain) + 1, secrets.token_hex(_BYTES))
+        chain = services(parts.store)
+    mine = parts.index.notes.name_service(chain[-1], instead=take_over)
+    if ask_redis and redis != mine:
+        parts.queue.set_service(mine, instead=redis is not None)
+        if not holds_redis and parts.queue.service() not in chain:
+            raise BusyError(_REDIS)
+    if folder is not None and left != mine:
+        (folder / _FILE).write_text(mine)
+    return mine
+
+
+def identify_if_redis_answers(parts: Parts, *, folder: Path | None = None, take_over: bool = False) -> str:
+    """`identify`, by what store, index and folder say where Redis is away."""
+    try:
+        return identify(parts, folder=folder, take_over=take_over)
+    except QueueUnavailable:
+        return identify(parts, folder=folder, take_over=take_over, ask_redis=False)
+
+
+def check_queue(store: Store, queue: Presence) -> bool:
+    """For a process without an index: whether Redis says yet that it belongs to the service of the store.
+
+    Raises:
+        BusyError: it belongs to another one.
+    """
+    redis = queue.service()
+    if redis is None:
+        return False
+    chain = services(store)
+    if redis not in chain:
+        raise BusyError(_REDIS)
+    return True
+
+
+def services(store: Store) -> list[str]:
+    """Ids of the services that worked on a store; the last one does now."""
+    keys = sorted(entry.key for entry in store.list(names.SERVICE))
+    return [read_record(ServiceRecord, store, key).id for key in keys]
+
+
+def recorded(folder: Path) -> str | None:
+    """Id of the service that last ran in a data folder."""
+    return _read(folder)
+
+
+def _others_index(store: str) -> str:
+    return (
+        f"the index belongs to another graspd service than the store {store}; name the index of that store, or run "
+        "`graspd index rebuild` to make this one from it"
+    )
+
+
+def _add(store: Store, number: int, identity: str) -> None:
+    put_record(store, names.service(number), ServiceRecord(id=identity, at=timestamp()))
+
+
+def _read(folder: Path | None) -> str | None:
+    if folder is not None:
+        with contextlib.suppress(OSError, UnicodeDecodeError):
+            return (folder / _FILE).read_text().strip() or None
+    return None

@@ -1,0 +1,138 @@
+"""The service below a path of a proxy: every address that leaves has it, whether the proxy takes it off or not."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import pytest
+from pydantic import ValidationError
+from starlette.testclient import TestClient
+
+from api.access.keys import KeyFile, Scope
+from api.app import create_app
+from api.client.client import Client
+from api.middleware.root_path import RootPath, with_prefix
+from service.model.errors import InputError
+from service.pipeline.backends import Parts
+from service.settings import Settings
+from tests.api.conftest import BASE_URL
+from tests.api.factories import add_job, finish_all
+
+PREFIX = "/graspd"
+_FORM = re.compile(r"/(retry|delete|cancel|tag|untag|cells|snapshot)$")
+
+
+@pytest.fixture
+def below(settings: Settings) -> Settings:
+    return settings.model_copy(update={"api_root_path": PREFIX})
+
+
+@pytest.fixture(params=[PREFIX, ""], ids=["kept", "stripped"])
+def http(request: pytest.FixtureRequest, below: Settings, parts: Parts) -> Iterator[TestClient]:
+    """A client behind a proxy that passes the prefix on, and one behind a proxy that takes it off."""
+    app = create_app(below, parts)
+
+    async def proxy(scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] == "http":
+            assert scope["path"].startswith(PREFIX), f"{scope['path']} is not the service's"
+            path = request.param + scope["path"].removeprefix(PREFIX)
+            scope = {**scope, "path": path, "raw_path": path.encode()}
+        await app(scope, receive, send)
+
+    with TestClient(proxy, base_url=BASE_URL, raise_server_exceptions=False) as client:
+        yield client
+
+
+def addresses(page: str) -> set[str]:
+    """Addresses of this host in a page."""
+    return set(re.findall(r'\s(?:href|src|action|formaction|hx-get|data-[a-z]+)="(/[^"#]*)', page))
+
+
+def test_every_address_of_a_page_is_below_the_prefix_and_there(http: TestClient, parts: Parts) -> None:
+    job = add_job(parts, scenes=1, views=1)
+    finish_all(parts, job)
+    seen: set[str] = set()
+    left = {f"{PREFIX}/", f"{PREFIX}/jobs/{job.id}", f"{PREFIX}/login", f"{PREFIX}/none"}
+    while left and len(seen) < 150:
+        path = left.pop()
+        seen.add(path)
+        answer = http.get(path.replace("&amp;", "&")) if "/events" not in path else None
+        if answer is not None and "text/html" in answer.headers["content-type"]:
+            found = addresses(answer.text)
+            assert not [one for one in found if not one.startswith(f"{PREFIX}/")], path
+            left |= {
+                one for one in found if not re.search(r"/(retry|delete|cancel|tag|untag|cells|snapshot)$", one)
+            } - seen
+    assert len(seen) > 40
+
+
+def test_redirects_and_cookies_are_below_the_prefix(http: TestClient, below: Settings) -> None:
+    token = KeyFile(below.resolved_keys_file).add("ann", Scope.ADMIN)
+    sent_away = http.get(f"{PREFIX}/jobs/x", headers={"Accept": "text/html"}, follow_redirects=False)
+    assert sent_away.headers["location"] == f"{PREFIX}/login"
+    answer = http.post(f"{PREFIX}/login", data={"key": token}, follow_redirects=False)
+    assert answer.headers["location"] == f"{PREFIX}/"
+    assert f"Path={PREFIX};" in answer.headers["set-cookie"]
+    assert http.get(f"{PREFIX}/").status_code == 200
+
+
+def test_the_api_tells_where_it_is(http: TestClient) -> None:
+    assert http.get(f"{PREFIX}/openapi.json").json()["servers"] == [{"url": PREFIX}]
+    made = http.post(f"{PREFIX}/v1/jobs", json={"hand": "allegro", "object": "mug", "grasps": 32})
+    assert http.get(made.headers["location"]).json()["id"] == made.json()["id"]
+    problem = http.get(f"{PREFIX}/v1/jobs/none").json()
+    assert http.get(problem["type"]).status_code == 200
+
+
+def test_the_client_works_below_a_prefix(http: TestClient, parts: Parts, tmp_path: Any) -> None:
+    finish_all(parts, job := add_job(parts))
+
+    def forward(request: httpx.Request) -> httpx.Response:
+        answer = http.request(request.method, str(request.url))
+        return httpx.Response(answer.status_code, content=answer.content)
+
+    with Client(f"{BASE_URL}{PREFIX}/", transport=httpx.MockTransport(forward)) as client:
+        (shard,) = client.job(job.id).shards
+        assert client.download(shard, tmp_path / "x.h5").stat().st_size > 0
+
+
+def test_a_snippet_names_the_address_that_the_visitor_sees(http: TestClient, parts: Parts) -> None:
+    job = add_job(parts)
+    finish_all(parts, job)
+    assert f"{BASE_URL}{PREFIX}/v1/shards/" in http.get(f"{PREFIX}/jobs/{job.id}").text
+
+
+def test_what_is_no_address_of_this_host_stays() -> None:
+    same = (
+        '<p title="/x">="/x"</p><a href="//cdn/x"><a href="https://x/"><a href="#x"><a href="?x"><input value="/jobs">'
+    )
+    assert with_prefix(same, PREFIX) == same
+
+
+@pytest.mark.parametrize(
+    ("where", "expected"),
+    [("/x?a=/b#c", "/graspd/x?a=/b#c"), ("http://me/x", "http://me/graspd/x"), ("http://you/x", "http://you/x"),
+     ("x", "x"), ("?x", "?x")],
+)  # fmt: skip
+def test_a_redirect_to_this_host_gets_the_prefix(where: str, expected: str) -> None:
+    assert RootPath(create_app, prefix=PREFIX)._below(where, "me") == expected  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("said", "meant"), [("graspd", PREFIX), ("/graspd/", PREFIX), ("/", ""), ("a/b", "/a/b")])
+def test_slashes_at_the_ends_do_not_matter(said: str, meant: str) -> None:
+    assert Settings(api_root_path=said).api_root_path == meant
+
+
+@pytest.mark.parametrize("said", ["/a b", "/a?b", "/ü", "/../x", "http://x/y", '/"x', "/a//b"])
+def test_what_is_no_path_is_refused(said: str) -> None:
+    with pytest.raises(ValidationError, match="such as /graspd"):
+        Settings(api_root_path=said)
+
+
+@pytest.mark.parametrize("said", ["/v1", "/jobs", "/static/x", "/metrics"])
+def test_a_path_of_the_service_itself_is_refused(settings: Settings, parts: Parts, said: str) -> None:
+    with pytest.raises(InputError, match="GRASPD_API_ROOT_PATH"):
+        create_app(settings.model_copy(update={"api_root_path": said}), parts)

@@ -1,0 +1,117 @@
+"""The dashboard below a path of a reverse proxy, in a real browser: pages, live updates, forms, models in 3D."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import httpx
+import pytest
+import uvicorn
+from fastapi import FastAPI
+
+from api.app import create_app
+from api.server import bind
+from service.model.states import AssetKind
+from service.pipeline.backends import Parts
+from service.settings import Settings
+from service.store.assets import builtin_files
+from tests.api.factories import add_job, finish_all
+from tests.waiting import until
+
+pytestmark = pytest.mark.browser
+
+PREFIX = "/graspd"
+_OF_A_HOP = (b"connection", b"transfer-encoding", b"keep-alive")
+
+
+class ReverseProxy:
+    """What nginx does with `location /graspd/ { proxy_pass http://…/; }`; of other paths it knows nothing."""
+
+    def __init__(self, target: str) -> None:
+        self.target = target
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] != "http":
+            return
+        path = scope["raw_path"].decode()
+        if not path.startswith(f"{PREFIX}/"):
+            await send({"type": "http.response.start", "status": 404, "headers": []})
+            await send({"type": "http.response.body"})
+            return
+        body = b""
+        while (message := await receive()).get("more_body"):
+            body += message["body"]
+        url = f"{self.target}{path.removeprefix(PREFIX)}?{scope['query_string'].decode()}".rstrip("?")
+        headers = [one for one in scope["headers"] if one[0] not in _OF_A_HOP]
+        async with (
+            httpx.AsyncClient(trust_env=False, timeout=None) as client,
+            client.stream(scope["method"], url, headers=headers, content=body + message.get("body", b"")) as answer,
+        ):
+            raw = [one for one in answer.headers.raw if one[0].lower() not in _OF_A_HOP]
+            await send({"type": "http.response.start", "status": answer.status_code, "headers": raw})
+            async for chunk in answer.aiter_raw():
+                await send({"type": "http.response.body", "body": chunk, "more_body": True})
+            await send({"type": "http.response.body"})
+
+
+@contextmanager
+def serving(app: Any) -> Iterator[str]:
+    """Address of an application on loopback."""
+    with bind("127.0.0.1", 0) as listener:
+        server = uvicorn.Server(uvicorn.Config(app, log_level="critical", timeout_graceful_shutdown=1))
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        until(lambda: server.started, "the server listens")
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+        server.should_exit = True
+        thread.join()
+
+
+@pytest.fixture
+def app(settings: Settings, parts: Parts) -> FastAPI:
+    return create_app(settings.model_copy(update={"api_root_path": PREFIX}), parts)
+
+
+@pytest.fixture
+def address(app: FastAPI) -> Iterator[str]:
+    """As the browser sees it; a request to anywhere else fails the test that uses `page`."""
+    with serving(app) as inner, serving(ReverseProxy(inner)) as outer:
+        yield f"{outer}{PREFIX}"
+
+
+def test_every_part_of_the_dashboard_works_below_the_path(page: Any, parts: Parts, address: str) -> None:
+    job = add_job(parts, grasps=6, scenes=1, views=1)
+    page.goto(f"{address}/")
+    page.click(f"a[href='{PREFIX}/jobs/{job.id}'] >> nth=0")
+    page.wait_for_selector("#head .queued")
+    page.evaluate("window.stayed = true")
+    finish_all(parts, job)
+    page.wait_for_selector("#head .succeeded")
+    page.wait_for_selector("#best canvas[data-state=ready]")
+    page.wait_for_selector("#views img")
+    assert page.evaluate("window.stayed && [...document.querySelectorAll('#views img')].every((one) => one.src)")
+    page.click("#best a[href*='/grasps/'] >> nth=0")
+    page.wait_for_selector("figure[data-state=ready]")
+    page.goto(f"{address}/hands/shadow")
+    page.wait_for_selector("figure[data-state=ready]")
+
+    page.goto(f"{address}/submit")
+    page.select_option("#hand", "barrett")
+    page.select_option("#object", "mug")
+    page.wait_for_selector("[data-thing=hand] figure[data-state=ready]")
+    with page.expect_response(f"**{PREFIX}/submit?*"):
+        page.fill("#grasps", "8")
+        page.locator("#grasps").blur()
+    page.click("text=Submit the job")
+    page.wait_for_url(f"**{PREFIX}/jobs/*")
+    page.click("button:has-text('Cancel')")
+    page.wait_for_selector("#head .cancelled")
+
+    page.goto(f"{address}/submit")
+    block = builtin_files(AssetKind.OBJECT, "block")["block.stl"]
+    with page.expect_response(f"**{PREFIX}/v1/objects") as sent:
+        page.set_input_files("#file", {"name": "mine.stl", "mimeType": "model/stl", "buffer": block})
+    assert sent.value.ok
