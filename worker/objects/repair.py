@@ -285,7 +285,7 @@ def _unite(
                 f"the mesh has {len(groups)} separate components; keep the largest: --keep-largest, take them as one "
                 "rigid body: --compound, or upload each alone"
             )
-        best = united ^ solid.union(groups[0])
+        best = united - solid.union([piece for group in groups[1:] for piece in group])
         return mesh.but(*solid.from_manifold(best), f"kept the largest of {len(groups)} components")
     if len(pieces) > 1:
         how = "lie apart" if len(groups) > 1 else f"touch or lie within {1e3 * JOINED_M:g} mm"

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import manifold3d
 import numpy as np
 
-from worker.objects.topology import Floats, Indices
+from worker.objects.topology import Floats, Indices, parts_of_graph
+
+#: A gap exceeds its bound by more than this share of it: coordinates of files are rounded.
+_ROUNDING: Final = 1e-3
 
 
 def to_manifold(vertices: Floats, faces: Indices) -> Any | None:
@@ -28,15 +31,19 @@ def from_manifold(solid: Any) -> tuple[Floats, Indices]:
 
 
 def unite(parts: list[tuple[Floats, Indices]], holes: list[tuple[Floats, Indices]]) -> Any | None:
-    """Union of outward meshes less the holes (outward too); None if one of them is no solid."""
+    """Union of outward meshes less the holes (outward too); None if one of them is no solid.
+
+    A part that lies within a hole is no part of what the hole is in: it stays.
+    """
     solids = [to_manifold(*part) for part in parts]
     cuts = [to_manifold(*hole) for hole in holes]
     if any(solid is None for solid in solids + cuts):
         return None
-    result = union(solids)
+    loose = [solid for solid in solids if any((solid - cut).is_empty() for cut in cuts)]
+    result = union([solid for solid in solids if not any(solid is one for one in loose)])
     for cut in cuts:
         result -= cut
-    return result
+    return union([result, *loose]) if loose else result
 
 
 def union(solids: list[Any]) -> Any:
@@ -46,19 +53,25 @@ def union(solids: list[Any]) -> Any:
 
 def groups(pieces: list[Any], gap: float) -> list[list[Any]]:
     """Solids that hang together over gaps of at most `gap`, the group of the largest volume first."""
-    left, found = list(pieces), []
-    while left:
-        group, waiting = [], [left.pop()]
-        while waiting:
-            group.append(waiting.pop())
-            near = [one for one in left if _apart(group[-1], one) <= gap and group[-1].min_gap(one, 2 * gap) <= gap]
-            left = [one for one in left if not any(one is other for other in near)]
-            waiting += near
-        found.append(group)
-    return sorted(found, key=lambda group: -sum(one.volume() for one in group))
+    low, high = np.moveaxis(np.reshape([piece.bounding_box() for piece in pieces], (-1, 2, 3)), 1, 0)
+    pairs = [
+        (i, j)
+        for i, piece in enumerate(pieces)
+        for j in (i + 1 + np.flatnonzero(_apart(low, high, i) <= gap * (1 + _ROUNDING))).tolist()
+        if piece.min_gap(pieces[j], 2 * gap) <= gap * (1 + _ROUNDING) and not _nested(piece, pieces[j])
+    ]
+    one, other = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    label = parts_of_graph(one, other, len(pieces))
+    found = [[pieces[i] for i in np.flatnonzero(label == k)] for k in range(label.max() + 1)]
+    return sorted(found, key=lambda group: -sum(piece.volume() for piece in group))
 
 
-def _apart(a: Any, b: Any) -> float:
-    """Gap between the boxes around two solids."""
-    (low_a, high_a), (low_b, high_b) = (np.reshape(one.bounding_box(), (2, 3)) for one in (a, b))
-    return float(np.linalg.norm(np.maximum(0, np.maximum(low_a - high_b, low_b - high_a))))
+def _nested(a: Any, b: Any) -> bool:
+    """Whether one of two outer shells holds the other: that one lies loose in a cavity."""
+    small, large = sorted((a, b), key=lambda one: float(one.volume()))
+    return bool((small - large).is_empty())
+
+
+def _apart(low: Floats, high: Floats, i: int) -> Floats:
+    """Gaps between box `i` and those after it."""
+    return np.asarray(np.linalg.norm(np.maximum(0, np.maximum(low[i] - high[i + 1 :], low[i + 1 :] - high[i])), axis=1))

@@ -5,27 +5,73 @@ from __future__ import annotations
 import io
 import re
 import zipfile
+from pathlib import PurePosixPath
 from typing import Final
 
 from service.model.errors import InputError
 
-#: What a file begins with, what it is, and the fix. White space and byte order marks before it are passed over.
-_KNOWN: Final[tuple[tuple[re.Pattern[bytes], str, str], ...]] = (
-    (re.compile(rb"version https://git-lfs\.github\.com/spec/"), "a Git LFS pointer", "git lfs pull"),
-    (re.compile(rb"(\.\./|/)*\.git/annex/objects/|/annex/objects/"), "a git-annex pointer", "git annex get"),
-    (re.compile(rb"<!doctype html|<html", re.I), "a web page", "download the file itself"),
-    (re.compile(rb"(<\?xml[^>]*>\s*)?<Error>\s*<Code>"), "an error message of a storage server", "download it again"),
-    (re.compile(rb'\{\s*"(error|message|errors|detail|status)"\s*:'), "an error message in JSON", "download it again"),
-    (re.compile(rb"\x1f\x8b|BZh|\xfd7zXZ|7z\xbc\xaf|Rar!"), "a compressed archive", "unpack it"),
-    (re.compile(rb"%PDF-"), "a PDF document", "give the file itself"),
+_XML: Final = rb"(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*"
+_MESH: Final = "export a mesh: STL, OBJ, PLY, OFF or GLB"
+_SERVER: Final = (
+    rb"(HTTP/[\d.]+ )?([45]\d\d:? )?((file )?not found|access (is )?denied|forbidden|unauthorized|too many requests|"
+    rb"bad gateway|service unavailable|internal server error)\b"
 )
+_GLTF: Final = rb'\{\s*"(asset|accessors|buffers|bufferViews|scenes?|nodes|meshes|extensions\w*)"'
+#: What a text begins with, what it is, and the fix. White space and byte order marks before it are passed over.
+_TEXTS: Final = (
+    (rb"version https://(git-lfs|hawser)\.github\.com/", "a Git LFS pointer", "git lfs pull"),
+    (rb"(\.\./|/)*\.git/annex/objects/|/annex/objects/", "a git-annex pointer", "git annex get"),
+    (_XML + rb"<(!doctype html|html|head|body|script)\b", "a web page", "download the file itself"),
+    (_XML + rb"<(Error|ListBucketResult)\b", "an error message of a storage server", "download it again"),
+    (_SERVER, "an error message of a server", "download it again"),
+    (_GLTF, "glTF in text", "export one GLB"),
+    (rb'\{\s*"(error|message|errors|detail|status)"\s*:', "an error message in JSON", "download it again"),
+    (rb'\{\s*"', "a JSON document", "download the file itself"),
+    (rb"ISO-10303-21", "a STEP file", _MESH),
+    (rb"#VRML", "a VRML file", _MESH),
+    (rb"#usda", "a USD file", _MESH),
+)
+#: The same of files that are no text.
+_BINARIES: Final = (
+    (rb"\x1f\x8b|BZh|\xfd7zXZ|7z\xbc\xaf|Rar!|\x28\xb5\x2f\xfd|.{257}ustar", "a compressed archive", "unpack it"),
+    (rb"%PDF-", "a PDF document", "give the file itself"),
+    (rb"\x89PNG|\xff\xd8\xff|GIF8", "a picture", "give the file itself"),
+    (rb"Kaydara FBX", "an FBX file", _MESH),
+    (rb"BLENDER[-_v]", "a Blender file", _MESH),
+    (rb"PXR-USDC", "a USD file", _MESH),
+)
+#: What Git writes for a link where the file system has none: a path, without a line's end.
+_LINK: Final = re.compile(rb"[\w.~ /\\-]*[/\\][\w.~ -]+\.\w{1,5}")
+#: How meshes begin, by their suffix.
+_MESHES: Final = {
+    ".ply": re.compile(rb"ply\s"),
+    ".glb": re.compile(rb"glTF"),
+    ".off": re.compile(rb"(ST)?C?N?OFF(?![A-Z])", re.IGNORECASE),
+    ".dae": re.compile(_XML + rb"<COLLADA\b", re.DOTALL),
+    ".stl": re.compile(rb"solid\b.*?\sfacet\s", re.IGNORECASE | re.DOTALL),
+    ".obj": re.compile(rb"(#[^\n]*\s+|(mtllib|o|g)\s[^\n]*\s+)*v\s+[-\d.]"),
+}
 
 
 def refuse_stand_in(name: str, data: bytes, error: type[InputError]) -> None:
     """Raise `error` where a file is known not to be what its name says: the message tells what it is, and the fix."""
     head = data[:1024].removeprefix(b"\xef\xbb\xbf").lstrip()
-    for pattern, what, fix in _KNOWN:
-        if pattern.match(head):
+    # The 80 bytes that a binary STL begins with may be any words.
+    for pattern, what, fix in _BINARIES if b"\0" in head else _TEXTS + _BINARIES:
+        if re.match(pattern, head, re.IGNORECASE | re.DOTALL):
             raise error(f"{name} is {what}, not the file itself: {fix}")
+    if len(data) < 300 and _LINK.fullmatch(data):
+        raise error(f"{name} is the text of a symbolic link, not the file itself: give the file that it names")
+    if not head.strip(b"\0"):
+        raise error(f"{name} holds nothing but spaces or zeros: export or download it again")
     if head.startswith(b"PK\x03\x04") and zipfile.is_zipfile(io.BytesIO(data)):
         raise error(f"{name} is a ZIP archive, not the file itself: unpack it, or name it .zip")
+
+
+def other_format(name: str, data: bytes) -> str | None:
+    """What a file that its reader refuses is instead: a mesh of another format, and the fix."""
+    own, head = PurePosixPath(name).suffix.lower(), data[:4096].lstrip()
+    for suffix, pattern in _MESHES.items():
+        if suffix != own and pattern.match(head):
+            return f"it is a mesh of type {suffix}: name it so"
+    return None

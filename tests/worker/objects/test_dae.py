@@ -84,6 +84,16 @@ BOMB = (
         (dae(SCENE.replace("100 0 0</translate>", "nan 0 0</translate>")), "finite"),
         (dae(SCENE.replace('stride="3"', 'stride="0"')), "points of 0"),
         (dae("<asset/>"), "no faces"),
+        (dae(SCENE.replace("polylist", "tristrips")), "strips are not read"),
+        (dae(SCENE.replace("</polylist>", "</polylist><polygons><ph><p>0</p></ph></polygons>")), "polygons with holes"),
+        (
+            dae(
+                SCENE.replace(
+                    '<instance_geometry url="#g">', '<instance_controller url="#c"/><instance_geometry url="#g">'
+                )
+            ),
+            "skinned",
+        ),
     ],
 )
 def test_a_bad_file_is_refused_and_told(data: bytes, named: str) -> None:

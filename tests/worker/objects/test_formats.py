@@ -7,6 +7,7 @@ import struct
 
 import numpy as np
 import pytest
+import trimesh
 
 from service.model.errors import LimitError, MeshError
 from tests.worker.objects.shapes import Mesh, box
@@ -214,6 +215,8 @@ def test_quantised_positions_of_a_glb_have_their_size(normalized: bool) -> None:
         ({"extensionsRequired": ["ACME_warp"]}, "ACME_warp is not read; export without it"),
         ({"nodes": [{"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {}}}]}, "EXT_mesh_gpu_instancing"),
         ({"meshes": [{"weights": [0.5], "primitives": []}]}, "morph targets"),
+        ({"nodes": [{"mesh": 0, "weights": [0.5]}]}, "morph targets"),
+        ({"nodes": [{"mesh": -1}]}, "meshes has no item -1"),
         ({"buffers": [{"uri": "box.bin", "byteLength": 9}]}, "another file"),
     ],
 )
@@ -225,3 +228,45 @@ def test_a_glb_that_would_be_read_wrongly_is_refused_for_what_it_is(change: dict
 def test_a_glb_with_variants_of_materials_is_read() -> None:
     variants = {"extensionsUsed": ["KHR_materials_variants"]}
     assert len(read_mesh("m.glb", quantised(False, variants)).faces) == 12
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {
+            "extensions": {"ACME_notes": {}},
+            "nodes": [{"mesh": 0, "extensions": {"ACME_notes": {}}, "scale": [1e-4] * 3}],
+        },
+        {
+            "nodes": [{"mesh": 0, "scale": [1e-4] * 3}, {"mesh": 0}],
+            "scenes": [{"nodes": [1]}, {"nodes": [0]}],
+            "scene": 1,
+        },
+        {"nodes": [{"mesh": 0}, {"children": [0], "scale": [1e-4] * 3}], "scenes": []},
+    ],
+    ids=["an extension that is not required", "the scene that is shown", "no scenes: from the nodes above"],
+)
+def test_a_glb_is_read_as_its_scene_shows_it(change: dict[str, object]) -> None:
+    soup = read_mesh("m.glb", quantised(False, change))
+    np.testing.assert_allclose(soup.vertices, box()[0], atol=2e-6)
+
+
+@pytest.mark.parametrize("mode", [5, 6])
+def test_strips_and_fans_of_a_glb_are_wound_as_trimesh_winds_them(mode: int) -> None:
+    order = np.array([0, 1, 2, 3, 5, 4], "<u2")
+    points = np.random.default_rng(0).normal(size=(6, 3)).astype("<f4")
+    document = {
+        "asset": {"version": "2.0"}, "nodes": [{"mesh": 0}], "scenes": [{"nodes": [0]}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": kind} | ({"indices": 1} if kind else {})
+                                   for kind in (0, mode)]}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 6, "type": "VEC3"},
+                      {"bufferView": 1, "componentType": 5123, "count": 6, "type": "SCALAR"}],
+        "bufferViews": [{"buffer": 0, "byteLength": 72}, {"buffer": 0, "byteOffset": 72, "byteLength": 12}],
+        "buffers": [{"byteLength": 84}],
+    }  # fmt: skip
+    faces = read_mesh("m.glb", pack_glb(document, points.tobytes() + order.tobytes())).faces
+    expected = (
+        trimesh.util.triangle_strips_to_faces([order]) if mode == 5 else [[0, 1, 2], [0, 2, 3], [0, 3, 5], [0, 5, 4]]
+    )
+    # A triangle may begin at any of its corners.
+    np.testing.assert_array_equal(*([np.roll(f, -np.argmin(f)).tolist() for f in given] for given in (faces, expected)))

@@ -65,3 +65,22 @@ def test_the_largest_group_is_kept_with_all_its_parts() -> None:
     third.apply_translation((0, 0, 0.3))
     report = check(trimesh.util.concatenate([boxes(0.0005), third]), keep_largest=True)
     assert report["facts"]["volume_m3"] == pytest.approx(0.04 * 0.05 * 0.09)
+
+
+def test_a_gap_of_a_millimetre_joins_whatever_its_rounding() -> None:
+    assert check(boxes(0.001))["verdict"] == "accept"
+
+
+def rattle() -> trimesh.Trimesh:
+    """A hollow box with a loose ball in it."""
+    hollow, ball = trimesh.creation.box((0.04, 0.04, 0.04)), trimesh.creation.icosphere(1, 0.01)
+    cavity = trimesh.creation.box((0.036, 0.036, 0.036))
+    cavity.invert()
+    return trimesh.util.concatenate([hollow, cavity, ball])
+
+
+def test_a_loose_part_in_a_cavity_is_a_part_of_its_own() -> None:
+    assert "2 separate components" in check(rattle())["message"]
+    assert check(rattle(), compound=True)["facts"]["volume_m3"] == pytest.approx(rattle().volume)
+    kept = check(rattle(), keep_largest=True)["facts"]["volume_m3"]
+    assert kept == pytest.approx(0.04**3 - 0.036**3)

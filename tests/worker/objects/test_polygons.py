@@ -85,7 +85,7 @@ def test_corners_on_a_line_stay_corners_so_that_neighbours_fit() -> None:
 
 
 def test_re_entrant_polygons_of_very_many_corners_are_refused() -> None:
-    count = 6000
+    count = 40_000
     angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
     points = (
         np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]) * np.where(np.arange(count) % 2, 1, 0.5)[:, None]

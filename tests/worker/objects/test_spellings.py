@@ -13,6 +13,7 @@ import pytest
 from service.model.errors import MeshError
 from tests.worker.objects.shapes import box
 from tests.worker.objects.test_formats import ascii_stl, obj, off, ply
+from worker.objects.builtin import stl_bytes
 from worker.objects.check import check_object
 from worker.objects.formats import read_mesh
 
@@ -79,7 +80,7 @@ def test_a_word_where_a_number_belongs_is_told_without_pythons_words(name: str) 
     broken = PLAIN[name].replace(b"0.03", b"0,03x", 1)
     with pytest.raises(MeshError) as found:
         read_mesh(name, broken)
-    assert f"not a readable {name[2:].upper()} file" in str(found.value)
+    assert f"not a readable {name[2:].upper()} file: '" in str(found.value) and "0,03x" in str(found.value)
     assert not any(word in str(found.value) for word in ("float", "int()", "literal", "b'"))
 
 
@@ -105,12 +106,57 @@ def archive() -> bytes:
         (b'{"message": "Not Found", "status": "404"}', "an error message in JSON"),
         (archive(), "a ZIP archive"),
         (gzip.compress(b"solid"), "a compressed archive"),
+        (POINTER.decode().encode("utf-16"), "a Git LFS pointer"),
+        (POINTER.replace(b"git-lfs", b"hawser"), "a Git LFS pointer"),
+        (b"../shared/mug.stl", "the text of a symbolic link"),
+        (b"404: Not Found", "an error message of a server"),
+        (b"<?xml version='1.0'?><!-- saved --><!DOCTYPE html PUBLIC 'x'><html>", "a web page"),
+        (b'<?xml version="1.0"?><Error xmlns="http://x"><Code>NoSuchKey</Code></Error>', "storage server"),
+        (b'{"statusCode": 404, "error": "Not Found"}', "a JSON document"),
+        (b'{"asset": {"version": "2.0"}}', "glTF in text"),
+        (b"ISO-10303-21;\nHEADER;\n", "a STEP file"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(90), "a picture"),
     ],
 )
 def test_a_stand_in_is_told_for_what_it_is(suffix: str, data: bytes, told: str) -> None:
     report = check_object({f"mug.{suffix}": data}, "mug")
-    assert report["verdict"] == "refuse" and report["message"].startswith(f"mug.{suffix} is a")
+    assert report["verdict"] == "refuse" and report["message"].startswith(f"mug.{suffix} is ")
     assert told in report["message"]
+
+
+@pytest.mark.parametrize("data", [b" \n\n", bytes(5000)], ids=["spaces", "zeros"])
+def test_a_file_of_nothing_is_told_as_such(data: bytes) -> None:
+    assert "nothing but spaces or zeros" in check_object({"mug.stl": data}, "mug")["message"]
+
+
+@pytest.mark.parametrize("header", [b"404 not found bracket", b'{"made": "by"}', b"OFF-road tyre", b"../parts/a.stl"])
+def test_a_binary_stl_may_begin_with_any_words(header: bytes) -> None:
+    data = header.ljust(80, b" ") + stl_bytes(*box())[80:]
+    assert check_object({"mug.stl": data}, "mug")["verdict"] == "accept"
+
+
+@pytest.mark.parametrize("name", sorted(PLAIN))
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "off", "glb", "dae"])
+def test_a_mesh_under_the_name_of_another_format_is_told(name: str, suffix: str) -> None:
+    report = check_object({f"mug.{suffix}": PLAIN[name]}, "mug")
+    assert (
+        report["verdict"] == "accept" if name[2:] == suffix else f"it is a mesh of type {name[1:]}" in report["message"]
+    )
+
+
+@pytest.mark.parametrize("start", [b"", b"# made by a script\n"], ids=["no word solid", "a comment before it"])
+def test_text_stl_is_known_by_its_facets(start: bytes) -> None:
+    same("m.stl", start + PLAIN["m.stl"].removeprefix(b"solid test\n"))
+
+
+def test_facets_of_four_corners_are_refused_for_what_they_are() -> None:
+    four = b"facet normal 0 0 0\nouter loop\n" + 4 * b"vertex 0 0 0\n" + b"endloop\nendfacet\n"
+    with pytest.raises(MeshError, match="more than three vertices"):
+        read_mesh("m.stl", b"solid\n" + 3 * four + b"endsolid\n")
+
+
+def test_a_comment_may_name_the_end_of_a_ply_header() -> None:
+    same("m.ply", PLAIN["m.ply"].replace(b"element vertex", b"comment no end_header yet\nelement vertex", 1))
 
 
 @pytest.mark.parametrize(

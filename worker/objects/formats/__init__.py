@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import re
 import struct
 from collections.abc import Callable
 from pathlib import PurePosixPath
@@ -14,7 +15,7 @@ from service.model.errors import GraspdError, MeshError
 from worker.objects.formats import dae, glb, obj, off, ply, stl
 from worker.objects.formats.mtl import Nearby, nothing_nearby
 from worker.objects.formats.soup import MAX_FACES, Soup, check_soup
-from worker.objects.stand_ins import refuse_stand_in
+from worker.objects.stand_ins import other_format, refuse_stand_in
 
 __all__ = ["MAX_FACES", "READERS", "Nearby", "Soup", "read_mesh"]
 
@@ -28,6 +29,8 @@ READERS: Final[dict[str, Callable[[bytes], Soup]]] = {
 }
 
 
+#: How Python quotes what it cannot read as a number.
+_NO_NUMBER: Final = re.compile(r": (?:np\.bytes_\()?b?'(.{1,40}?)'")
 #: Those that look at files beside the mesh for its colours.
 _WITH_LOOKS: Final[dict[str, Callable[[bytes, Nearby], Soup]]] = {".obj": obj.read, ".dae": dae.read}
 
@@ -51,22 +54,21 @@ def read_mesh(filename: str, data: bytes, nearby: Nearby = nothing_nearby) -> So
         raise MeshError(f"{filename}: meshes of type {suffix or '(none)'} are not read; convert to one of {known}")
     if not data:
         raise MeshError(f"{filename}: the file is empty; export the mesh again")
-    refuse_stand_in(filename, data, MeshError)
+    text = _marked_text(data)
+    refuse_stand_in(filename, text, MeshError)
     try:
         # Wild numbers are found by the check below, not by NumPy's warnings.
         with np.errstate(all="ignore"):
             looks = _WITH_LOOKS.get(suffix)
-            text = _marked_text(data)
             return check_soup(looks(text, nearby) if looks else reader(text))
     except GraspdError as error:
-        raise type(error)(f"{filename}: {error}") from None
-    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, struct.error):
+        raise type(error)(f"{filename}: {other_format(filename, text) or error}") from None
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, struct.error) as error:
         # Readers lean on NumPy and json for the odd cases: whatever they choke on is the file's fault.
         kind = suffix[1:].upper()
-        raise MeshError(
-            f"{filename}: not a readable {kind} file: a number or word in it is none that {kind} has there; export the "
-            "mesh again"
-        ) from None
+        word = _NO_NUMBER.search(str(error))
+        what = f"{word[1]!r} is no number" if word else f"a number or word in it is none that {kind} has there"
+        raise MeshError(f"{filename}: not a readable {kind} file: {what}; export the mesh again") from None
 
 
 def _marked_text(data: bytes) -> bytes:

@@ -98,6 +98,9 @@ class _Library:
         return self._primitives[geometry]
 
     def _read(self, mesh: Element) -> Iterator[_Primitive]:
+        for path, what in (("tristrips", "strips"), ("trifans", "fans"), ("polygons/ph", "polygons with holes")):
+            if mesh.find(path) is not None:
+                raise MeshError(f"{what} are not read; triangulate the mesh and export it again")
         for kind in ("triangles", "polylist", "polygons"):
             for primitive in mesh.findall(kind):
                 inputs = primitive.findall("input")
@@ -193,6 +196,8 @@ def _instances(root: Element, library: _Library) -> Iterator[tuple[str, np.ndarr
         if depth > _MAX_DEPTH or visited > _MAX_NODES:
             raise MeshError("the node tree is too deep, too large or cyclic; flatten the scene")
         matrix = parent @ _matrix(node)
+        if node.find("instance_controller") is not None:
+            raise MeshError("a skinned mesh is posed by its bones; apply the armature and export it without")
         for instance in node.findall("instance_geometry"):
             bound = {
                 link.get("symbol", ""): link.get("target", "")

@@ -17,6 +17,8 @@ _INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
 #: Positions are floats, or with KHR_mesh_quantization whole numbers that nodes or `normalized` scale.
 _POSITION_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _TRIANGLES, _MAX_DEPTH = 4, 32
+#: Extensions that hold or place vertices: refused by their names wherever they stand.
+_GEOMETRY = ("KHR_draco_", "EXT_meshopt_", "KHR_meshopt_", "EXT_mesh_gpu_instancing")
 #: Extensions that move no vertex; any other one that a file requires is refused by its name.
 _HARMLESS = ("KHR_mesh_quantization", "KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "KHR_xmp_")
 _MAX_INSTANCES = 10_000
@@ -25,18 +27,21 @@ _MAX_INSTANCES = 10_000
 def read(data: bytes) -> Soup:
     """Vertices and triangles; every instance of a mesh in the node tree is its own copy."""
     document, binary = _chunks(data)
-    for name in _list(document, "extensionsRequired"):
-        _refuse_extension(str(name))
+    for name in map(str, _list(document, "extensionsRequired")):
+        if not name.startswith(_HARMLESS):
+            raise _refusal(name)
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     colours: list[np.ndarray] = []
     looks: dict[tuple[int, int], np.ndarray] = {}
     total = 0
     for mesh, matrix in _instances(document):
-        shown = _list(document, "meshes")[mesh]
-        if any(shown.get("weights", [])):
-            raise MeshError("a mesh has morph targets with weights; apply its shape keys and export it without")
+        shown = _item(document, "meshes", mesh)
+        _refuse_morphs(shown)
         for part, primitive in enumerate(shown["primitives"]):
+            # Points and lines have no surface: exporters of CAD put the edges of faces beside them.
+            if 0 <= primitive.get("mode", _TRIANGLES) < _TRIANGLES:
+                continue
             points, triangles = _primitive(document, binary, primitive)
             if np.linalg.det(matrix[:3, :3]) < 0:
                 triangles = triangles[:, ::-1]
@@ -76,7 +81,11 @@ def _instances(document: dict[str, Any]) -> list[tuple[int, np.ndarray]]:
     """(mesh, 4x4 matrix) of every node of the scene that shows a mesh."""
     nodes = _list(document, "nodes")
     scenes = _list(document, "scenes")
-    roots = scenes[int(document.get("scene", 0))].get("nodes", []) if scenes else range(len(nodes))
+    if scenes:
+        roots = _item(document, "scenes", document.get("scene", 0)).get("nodes", [])
+    else:
+        below = {int(child) for node in nodes for child in node.get("children", [])}
+        roots = [root for root in range(len(nodes)) if root not in below]
     stack = [(int(root), np.eye(4), 0) for root in roots]
     found: list[tuple[int, np.ndarray]] = []
     visited = 0
@@ -85,9 +94,10 @@ def _instances(document: dict[str, Any]) -> list[tuple[int, np.ndarray]]:
         visited += 1
         if depth > _MAX_DEPTH or visited > _MAX_INSTANCES or index < 0:
             raise MeshError("the node tree is too deep, too large or cyclic; flatten the scene")
-        node = nodes[index]
+        node = _item(document, "nodes", index)
         matrix = parent @ _matrix(node)
         _refuse_extensions(node)
+        _refuse_morphs(node)
         if "skin" in node:
             raise MeshError("a skinned mesh is posed by its bones; apply the armature and export it without")
         if "mesh" in node:
@@ -108,26 +118,36 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
 
 
 def _primitive(document: dict[str, Any], binary: bytes, primitive: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    if primitive.get("mode", _TRIANGLES) != _TRIANGLES:
-        raise MeshError("only triangles are read; export without points, lines, strips and fans")
     _refuse_extensions(primitive)
     points = _accessor(document, binary, primitive["attributes"]["POSITION"], "VEC3")
     if "indices" in primitive:
         order = _accessor(document, binary, primitive["indices"], "SCALAR").astype(np.int64).reshape(-1)
     else:
         order = np.arange(len(points), dtype=np.int64)
+    match primitive.get("mode", _TRIANGLES):
+        case 5:
+            turned = np.arange(max(len(order) - 2, 0)) % 2
+            at = np.arange(len(turned))
+            order = np.stack([order[at], order[at + 1 + turned], order[at + 2 - turned]], axis=1).reshape(-1)
+        case 6:
+            rim = order[1:]
+            order = np.stack([np.repeat(order[:1], max(len(rim) - 1, 0)), rim[:-1], rim[1:]], axis=1).reshape(-1)
+        case 4:
+            pass
+        case mode:
+            raise MeshError(f"a primitive has the mode {mode}, which glTF does not know; export the mesh again")
     if len(order) % 3 or (len(order) and order.max() >= len(points)):
         raise MeshError("a face has an index outside the vertices, or the last face is not whole")
     return points.astype(float), order.reshape(-1, 3)
 
 
 def _accessor(document: dict[str, Any], binary: bytes, index: Any, shape: str) -> np.ndarray:
-    accessor = _list(document, "accessors")[int(index)]
+    accessor = _item(document, "accessors", index)
     if "sparse" in accessor or accessor.get("type") != shape or "bufferView" not in accessor:
         raise MeshError(f"an accessor is sparse, without data or not {shape}; export plain buffers")
     dtype = np.dtype((_POSITION_TYPES if shape == "VEC3" else _INDEX_TYPES)[accessor["componentType"]])
     width = 3 if shape == "VEC3" else 1
-    view = _list(document, "bufferViews")[int(accessor["bufferView"])]
+    view = _item(document, "bufferViews", accessor["bufferView"])
     _refuse_extensions(view)
     if view.get("buffer", 0) != 0 or "uri" in (_list(document, "buffers") or [{}])[0]:
         raise MeshError("the data lie in another file; export one GLB that holds everything")
@@ -148,14 +168,27 @@ def _accessor(document: dict[str, Any], binary: bytes, index: Any, shape: str) -
 
 
 def _refuse_extensions(part: dict[str, Any]) -> None:
+    """What a file does not require may be passed over, but for what stands in place of the vertices."""
     for name in part.get("extensions", {}):
-        _refuse_extension(name)
+        if name.startswith(_GEOMETRY):
+            raise _refusal(name)
 
 
-def _refuse_extension(name: str) -> None:
-    if not name.startswith(_HARMLESS):
-        how = "without compression" if "draco" in name or "meshopt" in name else "without it"
-        raise MeshError(f"the glTF extension {name[:60]} is not read; export {how}")
+def _refuse_morphs(part: dict[str, Any]) -> None:
+    if any(part.get("weights", [])):
+        raise MeshError("a mesh has morph targets with weights; apply its shape keys and export it without")
+
+
+def _refusal(name: str) -> MeshError:
+    how = "without compression" if "draco" in name or "meshopt" in name else "without it"
+    return MeshError(f"the glTF extension {name[:60]} is not read; export {how}")
+
+
+def _item(document: dict[str, Any], key: str, index: Any) -> Any:
+    items = _list(document, key)
+    if not 0 <= int(index) < len(items):
+        raise MeshError(f"{key} has no item {int(index)}; export the mesh again")
+    return items[int(index)]
 
 
 def _list(document: dict[str, Any], key: str) -> list[Any]:

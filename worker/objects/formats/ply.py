@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -34,10 +35,11 @@ class _Element:
 
 def read(data: bytes) -> Soup:
     """Vertices x y z and the polygons of `vertex_indices`."""
-    end = data.find(b"end_header")
-    if not data.startswith(b"ply") or end < 0 or end > 65536:
+    found = re.search(rb"[\r\n]end_header", data[:65536])
+    if not data.startswith(b"ply") or found is None:
         raise MeshError("a PLY file begins with the word ply and a header of at most 64 KiB")
-    start = data.index(_line_end(data), end) + len(_line_end(data))
+    end, line_end = found.end(), _line_end(data[: found.end()])
+    start = data.index(line_end, end) + len(line_end)
     order, elements = _header(data[:end].decode("ascii", "replace").splitlines()[1:])
     body = _Ascii(data[start:]) if order is None else _Binary(data[start:], order)
     vertices = np.zeros((0, 3))
@@ -54,10 +56,9 @@ def read(data: bytes) -> Soup:
     return Soup(vertices, triangulate(vertices, *polygons))
 
 
-def _line_end(data: bytes) -> bytes:
-    """How lines of the header end: what follows `end_header` may be binary and begin with any byte."""
-    line = data[: data.find(b"end_header")]
-    return next((end for end in (b"\r\n", b"\n", b"\r") if end in line), b"\n")
+def _line_end(header: bytes) -> bytes:
+    """How lines of the header end: what follows it may be binary and begin with any byte."""
+    return next(end for end in (b"\r\n", b"\n", b"\r") if end in header)
 
 
 def _header(lines: list[str]) -> tuple[str | None, list[_Element]]:

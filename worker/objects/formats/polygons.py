@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+import manifold3d
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,8 +14,8 @@ from worker.objects.formats.soup import check_face_count
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-#: Ear clipping takes time with the square of the corners: all squares of a file's re-entrant polygons together.
-MAX_SQUARES: Final = 2 * 10**7
+#: The triangulator takes up to 2 ns times the square of the corners: the squares of a file's re-entrant polygons.
+MAX_SQUARES: Final = 10**9
 #: A triangle against the polygon's winding counts from this share of the polygon's area on.
 _AGAINST: Final = 1e-9
 
@@ -22,8 +23,8 @@ _AGAINST: Final = 1e-9
 def triangulate(vertices: Floats, counts: Ints, corners: Ints) -> Ints:
     """Triangles (F, 3) of polygons with `counts` corners each, laid out one after another in `corners`.
 
-    A polygon is cut as a fan from its first corner, or by ear clipping where the fan would leave it. Faces with fewer
-    than three corners are dropped.
+    A polygon is cut as a fan from its first corner, or by manifold3d's ear clipping where the fan would leave it. Faces
+    with fewer than three corners are dropped.
 
     Raises:
         LimitError: too many faces, or re-entrant polygons of too many corners.
@@ -47,7 +48,10 @@ def triangulate(vertices: Floats, counts: Ints, corners: Ints) -> Ints:
         raise LimitError("its re-entrant polygons have too many corners; triangulate the mesh where it was made")
     for one in wrong:
         ring = corners[starts[one] : starts[one] + counts[one]]
-        triangles[ends[one] - number[one] : ends[one]] = ring[_clip(_flat(vertices[ring], whole[one]))]
+        inside = manifold3d.triangulate([_flat(vertices[ring], whole[one])])
+        # A polygon that crosses itself may come back with fewer: it stays a fan.
+        if len(inside) == number[one]:
+            triangles[ends[one] - number[one] : ends[one]] = ring[inside]
     return triangles
 
 
@@ -57,40 +61,3 @@ def _flat(points: Floats, normal: Floats) -> Floats:
     across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     across /= np.linalg.norm(across)
     return np.stack([points @ across, points @ np.cross(axis, across)], axis=1)
-
-
-def _clip(points: Floats) -> Ints:
-    """(n - 2, 3) corners of the ears of a counter-clockwise polygon (n, 2); corners on a line are kept."""
-    left, found = list(range(len(points))), []
-    while len(left) > 3:
-        at = _ear(points[left])
-        found.append((left[at - 1], left[at], left[(at + 1) % len(left)]))
-        del left[at]
-    return np.array([*found, left], dtype=np.int64)
-
-
-def _ear(ring: Floats) -> int:
-    """Corner whose triangle holds no other corner: of those the one with the widest least angle."""
-    before, after = np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0)
-    area = _cross(ring - before, after - ring)
-    longest = np.maximum(
-        np.linalg.norm(ring - before, axis=1),
-        np.maximum(np.linalg.norm(after - ring, axis=1), np.linalg.norm(after - before, axis=1)),
-    )
-    shape = area / np.maximum(longest, 1e-300) ** 2
-    inward = np.flatnonzero(area <= 0)
-    for at in np.argsort(-shape, kind="stable"):
-        if area[at] <= 0:
-            break
-        a, b, c = before[at], ring[at], after[at]
-        others = ring[inward]
-        corner = (others == a).all(axis=1) | (others == b).all(axis=1) | (others == c).all(axis=1)
-        inside = (_cross(b - a, others - a) >= 0) & (_cross(c - b, others - b) >= 0) & (_cross(a - c, others - c) >= 0)
-        if not (inside & ~corner).any():
-            return int(at)
-    # Only corners on a line, or a polygon that crosses itself, have no ear: the flattest corner changes least.
-    return int(np.argmin(np.abs(shape)))
-
-
-def _cross(u: Floats, v: Floats) -> Floats:
-    return np.asarray(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
