@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
@@ -71,6 +71,10 @@ class Certified:
     """In scenes, of all that were planned: clear_share (free of obstacles at contact, on the way and in the lift),
     lift_share (and lifted), lift_hard_share (and lifted at half the friction)."""
 
+    def moved(self, by: Sequence[float]) -> Certified:
+        """The same with the grasps moved by a vector (3,) [m]."""
+        return replace(self, grasps=self.grasps.moved(by))
+
     def keeping(self, kept: NDArray[np.bool_]) -> Certified:
         """The same without the grasps that are not `kept` (N,): they were too like others."""
         grasps, columns = taken(self.grasps, self.columns, np.flatnonzero(kept))
@@ -109,12 +113,12 @@ def certified_grasps(
         TaskCancelled: when `run.cancelled()` answers True.
     """
     require_opposing(hand)
-    fitting_pairs(hand, obj)
-    work = _Work(hand, obj, request, batch, run)
-    work.scenes = scenes
+    work = _Work(hand, obj.centred, request, batch, run)
+    fitting_pairs(hand, work.obj)
+    work.scenes = None if scenes is None else scenes.centred(obj)
     with ThreadPoolExecutor(1, thread_name_prefix="beside") as work.beside:
-        work.pieces = work.beside.submit(pieces, obj) if request.referee != "none" else None
-        return work.finish(work.until(count), count)
+        work.pieces = work.beside.submit(pieces, work.obj) if request.referee != "none" else None
+        return work.finish(work.until(count), count).moved(obj.centre)
 
 
 def scored(
@@ -135,12 +139,12 @@ def scored(
         MeshError: the object has no usable convex pieces.
         TaskCancelled: when `run.cancelled()` answers True.
     """
-    work = _Work(hand, obj, request.model_copy(update={"want": "raw"}), 0, run)
-    work.scenes = scenes
+    work = _Work(hand, obj.centred, request.model_copy(update={"want": "raw"}), 0, run)
+    work.scenes = None if scenes is None else scenes.centred(obj)
     with ThreadPoolExecutor(1, thread_name_prefix="beside") as work.beside:
-        work.pieces = work.beside.submit(pieces, obj) if request.referee != "none" else None
+        work.pieces = work.beside.submit(pieces, work.obj) if request.referee != "none" else None
         work.tried = len(grasps)
-        return work.finish([work.score(grasps)], len(grasps))
+        return work.finish([work.score(grasps.moved(np.negative(obj.centre)))], len(grasps)).moved(obj.centre)
 
 
 class _Work:
@@ -227,7 +231,9 @@ class _Work:
             self.hand, self.obj, wanted, run.part(0.0, _PARTS[0]), method=request.method, options=request.options
         )  # fmt: skip
         # Verdicts and metrics are many short pieces of work: all cores may take them, whatever other lanes are at.
-        made = self._scored(replace(planned, scene=index), replace(run, lanes=None))
+        # What is judged is what is told: positions are on the grid before.
+        planned = replace(planned, scene=index).moved(np.zeros(3))
+        made = self._scored(planned, replace(run, lanes=None))
         made.seconds["planner"] += planned.seconds
         if number == 0 and rows.start == 0:
             self._begin_audits(made)

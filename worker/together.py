@@ -64,7 +64,7 @@ def certified_batches(
     if join == 1 or len(sizes) == 1:
         return [batch(number, run) for number in range(len(sizes))]
     if request.referee != "none":
-        pieces(obj)  # once, and not by every batch at the same time
+        pieces(obj.centred)  # once, and not by every batch at the same time
     return _together(batch, len(sizes), join, run)
 
 
