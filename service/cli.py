@@ -6,10 +6,12 @@ import contextlib
 import functools
 import json
 import os
+import signal
 import stat
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, ParamSpec, TypeVar
 
 import typer
@@ -45,6 +47,44 @@ def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
             fail("interrupted", 130)
 
     return wrapper
+
+
+def write_output(path: Path, content: bytes) -> None:
+    """Write a file that a user named: whole or not at all, unless it is a device, a pipe or a link."""
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        path.write_bytes(content)
+        return
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_bytes(content)
+        if path.exists():
+            part.chmod(path.stat().st_mode)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def told_to_stop() -> Iterator[list[int]]:
+    """A list that holds the signal, once somebody asks the process to end (Ctrl-C, SIGTERM); a second one ends it."""
+    asked: list[int] = []
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def note(number: int, _: Any) -> None:
+        asked.append(number)
+        for known, handler in before.items():
+            signal.signal(known, handler)
+
+    try:
+        for number in before:
+            signal.signal(number, note)
+    except ValueError:  # not in the main thread: signals are somebody else's
+        before = {}
+    try:
+        yield asked
+    finally:
+        for known, handler in before.items():
+            signal.signal(known, handler)
 
 
 def fail(message: str, code: int) -> NoReturn:
