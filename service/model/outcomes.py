@@ -1,4 +1,4 @@
-"""What became of the candidates of a job, by name, and the sentence that says why fewer grasps were found than asked."""
+"""What became of the candidates of a job, by name, and the sentence that says why it found fewer grasps than asked."""
 
 from __future__ import annotations
 

@@ -17,8 +17,8 @@ from worker.grasps import moved
 
 Floats = NDArray[np.float64]
 
-#: Digits to which coordinates are rounded, of the longest extent: enough that no sliver collapses, and those that a mesh
-#: of decimals is looked for from.
+#: Digits of the longest extent to which coordinates are rounded, so that no sliver collapses; and the fewest of them in
+#: which a mesh of decimals is looked for.
 DIGITS: Final = 9
 LEAST_DIGITS: Final = 5
 

@@ -61,7 +61,14 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         _check_hope(message, found)
     seconds = {f"{name}_seconds": round(value, 4) for name, value in found.seconds.items()}
     shares = {name: round(value, 4) for name, value in found.shares.items()}
-    info = {**seconds, **shares, "rejected": found.rejected, "outcomes": found.outcomes, "planned": found.planned, **_json(found.grasps.info)}
+    info = {
+        **seconds,
+        **shares,
+        "rejected": found.rejected,
+        "outcomes": found.outcomes,
+        "planned": found.planned,
+        **_json(found.grasps.info),
+    }
     said = base_attributes(
         hand, message.request, tried=found.tried, verdict_key=found.verdict_key, outcomes=found.outcomes
     )

@@ -253,9 +253,7 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
             reason = shortfall(found, options.grasps, options.counted, yields["tried"], options.budget, lost)
         views.append(
             CellView(
-                **{
-                    name: row[name] for name in ("position", "hand", "object", "job_id", "state", "planned", "choice")
-                },
+                **{name: row[name] for name in ("position", "hand", "object", "job_id", "state", "planned", "choice")},
                 reason=reason,
                 fidelity=row["fidelity"] or options.knobs.name,
                 asked=options.grasps,

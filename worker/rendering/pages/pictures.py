@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from service.model.colours import hexadecimal
 from service.model.transforms import IDENTITY_POSE, apply, quat_rotate
-from worker.hands.kinematics import body_poses
 from worker.grasps import moved
+from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.objects.model import Floats, ObjectModel
 from worker.rendering.cameras import Cameras, intrinsics, look_at
