@@ -17,9 +17,9 @@ THRESHOLDS: Final = "quality/thresholds_m"
 _IN_SCENES = ("scene_index", "approach", "approach_joint_positions", "lift")
 
 
-#: Step of positions [m]. A double holds multiples of it up to 33,000 km, so grasps that are on the grid go into the
+#: Step of positions [m]. A double holds multiples of it up to 8,388 km, so grasps that are on the grid go into the
 #: frame of a file and come back with the same bits.
-GRID_M: Final = 2.0**-28
+GRID_M: Final = 2.0**-30
 
 
 def on_grid(positions: ArrayLike) -> Floats:
