@@ -89,6 +89,9 @@ class JobDetail(Job):
     object_digest: str
     choice: Choice | None = Field(None, description="how a chart chose its fidelity, where the request said auto")
     note: str | None = Field(None, description="what a reader of the numbers should know")
+    outcomes: dict[str, int] = Field(
+        {}, description="of a job that found fewer grasps than asked: candidates not kept, by what became of them"
+    )
     audited: int = Field(0, description="valid grasps judged again by the letter of the protocol")
     audit_held: int = Field(0, description="of these, grasps that held")
     attempts: list[AttemptView]

@@ -17,7 +17,7 @@ from api.client.reports import job_request, job_summary, means_of, yield_of
 from api.client.watching import JobDisplay
 from api.formatting import count, duration, metric
 from api.models import GraspQuery, JobDetail
-from service.cli import JsonFlag, emit, load_settings, reporting_errors
+from service.cli import JsonFlag, emit, load_settings, reporting_errors, write_output
 from service.index.views import GraspView
 from service.model.domain import JobRequest
 from service.model.errors import TaskError
@@ -187,7 +187,7 @@ def html_page(job: JobDetail, pictures: list[Path], shards: list[Path], out: Pat
 
 
 def _write(path: Path, data: bytes) -> Path:
-    path.write_bytes(data)
+    write_output(path, data)
     return path
 
 

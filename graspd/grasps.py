@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any, Final, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from service.cli import write_output
 from service.model.errors import InputError
 from service.model.metrics import GRASP_METRICS, GraspMetric
 from service.model.transforms import compose
@@ -112,6 +114,17 @@ class Grasps:
     def attributes(self) -> dict[str, Attribute]:
         """What the file says of all of them: method, fidelity, seed, digests (docs/dataset.md)."""
         return dict(self._attributes)
+
+    @property
+    def reason(self) -> str | None:
+        """Why there are fewer of them than were asked for, in a sentence; None where there are not."""
+        said = self._attributes.get("reason")
+        return None if said is None else str(said)
+
+    @property
+    def outcomes(self) -> dict[str, int]:
+        """Tries that were not kept, by what became of them (docs/grasps.md)."""
+        return {name: int(count) for name, count in json.loads(str(self._attributes.get("outcomes", "{}"))).items()}
 
     # Postures.
 
@@ -231,7 +244,7 @@ class Grasps:
         said = {name: value for name, value in self._attributes.items() if name not in ("shard_id", "schema")}
         columns = {name: data for name, data in self._columns.items() if name != "object"}
         try:
-            Path(path).write_bytes(write_shard("base", columns, said))
+            write_output(Path(path), write_shard("base", columns, said))
         except OSError as error:
             raise InputError(f"{path} cannot be written: {error.strerror}") from None
         return Path(path)

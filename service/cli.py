@@ -8,10 +8,12 @@ import functools
 import io
 import json
 import os
+import signal
 import stat
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, ParamSpec, TextIO, TypeVar
 
 import typer
@@ -99,6 +101,44 @@ def _silence(stream: TextIO | None) -> None:
     with contextlib.suppress(OSError, ValueError):
         if stream is not None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def write_output(path: Path, content: bytes) -> None:
+    """Write a file that a user named: whole or not at all, unless it is a device, a pipe or a link."""
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        path.write_bytes(content)
+        return
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_bytes(content)
+        if path.exists():
+            part.chmod(path.stat().st_mode)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def told_to_stop() -> Iterator[list[int]]:
+    """A list that holds the signal, once somebody asks the process to end (Ctrl-C, SIGTERM); a second one ends it."""
+    asked: list[int] = []
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def note(number: int, _: Any) -> None:
+        asked.append(number)
+        for known, handler in before.items():
+            signal.signal(known, handler)
+
+    try:
+        for number in before:
+            signal.signal(number, note)
+    except ValueError:  # not in the main thread: signals are somebody else's
+        before = {}
+    try:
+        yield asked
+    finally:
+        for known, handler in before.items():
+            signal.signal(known, handler)
 
 
 def fail(message: str, code: int) -> NoReturn:

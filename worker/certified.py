@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
@@ -19,20 +20,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.domain import JobOptions
+from service.model.errors import TaskCancelled
+from service.model.outcomes import totals
 from worker.grasps import GraspSet, joined, joined_columns
 from worker.hands.model import HandModel
 from worker.hands.oppositions import require_opposing
 from worker.objects.model import ObjectModel
 from worker.planners import NoPlace, Trial, Wanted, fitting_pairs, method, synthesize
 from worker.quality.diversity import POINTS, distinct, hand_points
-from worker.quality.gate import passes
+from worker.quality.gate import GATES, failed_gate, passes
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.displacement import simulated_displacement_cm
 from worker.quality.referee.first.screening import first_terms
 from worker.quality.referee.judge import judge
 from worker.quality.referee.key import verdict_key
+from worker.quality.referee.lift import LiftOutcome
 from worker.quality.referee.lifting import judge_lifts, lift_key
-from worker.quality.referee.protocol import DIRECTIONS
+from worker.quality.referee.protocol import DIRECTIONS, Outcome
 from worker.quality.referee.robust import reaches, robust
 from worker.quality.referee.robustness import robustness
 from worker.quality.table import measure
@@ -46,6 +50,21 @@ from worker.simulation.surroundings import Scenes
 #: Why a grasp is not kept: its hand is no number, something of its scene is in its way, the referee dropped it, it
 #: failed the geometric gate, holds in too few models around the nominal one, or is as good as the same as one kept.
 REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "fragile", "alike")
+#: Outcomes that are not told by the word of their rejection.
+_REJECTION_OF: Final = {
+    "no_place": "blocked", "diverged": "diverged", "fragile": "fragile", "alike": "alike",
+    **{f"gate_{name}": "gate" for name in GATES},
+}  # fmt: skip
+#: Names of the outcomes of a push and of a lift that drops a grasp.
+_PUSHED: Final = {
+    Outcome.PENETRATION: "penetration", Outcome.LOST_WHILE_CLOSING: "lost_while_closing",
+    Outcome.DISPLACED: "slipped", Outcome.ROTATED: "turned", Outcome.DIVERGED: "unstable",
+}  # fmt: skip
+_LIFTED: Final = {
+    LiftOutcome.PENETRATION: "penetration", LiftOutcome.TOUCHED_ON_THE_WAY: "touched_on_the_way",
+    LiftOutcome.LOST_WHILE_CLOSING: "lost_while_closing", LiftOutcome.NOT_LIFTED: "not_lifted",
+    LiftOutcome.TURNED: "turned", LiftOutcome.DIVERGED: "unstable", LiftOutcome.NEIGHBOUR_MOVED: "neighbour_moved",
+}  # fmt: skip
 #: Shares of a round's progress: planned, judged, measured.
 _PARTS: Final = (0.6, 0.8, 1.0)
 
@@ -61,6 +80,8 @@ class Certified:
     """Grasps planned up to the last one that is kept, or all where fewer were found than wanted."""
     rejected: dict[str, int]
     """Those of them that were not kept, by `REJECTIONS`."""
+    outcomes: dict[str, int]
+    """The same, by `service.model.outcomes.OUTCOMES`: what the referee saw, which gate."""
     verdict_key: str | None
     """Digest of the terms of the verdicts; None: nobody judged."""
     planned: int
@@ -71,11 +92,17 @@ class Certified:
     """In scenes, of all that were planned: clear_share (free of obstacles at contact, on the way and in the lift),
     lift_share (and lifted), lift_hard_share (and lifted at half the friction)."""
 
+    def moved(self, by: Sequence[float]) -> Certified:
+        """The same with the grasps moved by a vector (3,) [m]."""
+        return replace(self, grasps=self.grasps.moved(by))
+
     def keeping(self, kept: NDArray[np.bool_]) -> Certified:
         """The same without the grasps that are not `kept` (N,): they were too like others."""
         grasps, columns = taken(self.grasps, self.columns, np.flatnonzero(kept))
-        rejected = {**self.rejected, "alike": self.rejected.get("alike", 0) + int((~kept).sum())}
-        return replace(self, grasps=grasps, columns=columns, rejected=rejected)
+        alike = {"alike": int((~kept).sum())}
+        rejected = {**self.rejected, "alike": self.rejected.get("alike", 0) + alike["alike"]}
+        outcomes = totals([self.outcomes, alike])
+        return replace(self, grasps=grasps, columns=columns, rejected=rejected, outcomes=outcomes)
 
 
 def certified_grasps(
@@ -88,6 +115,7 @@ def certified_grasps(
     scenes: Scenes | None = None,
     pieces: Callable[[ObjectModel], ConvexPieces] = decompose,
     run: Run = ALONE,
+    partial: bool = False,
 ) -> Certified:
     """A batch of a job: `count` valid grasps (sound ones where nobody judges), or as many as the budget finds; or
     `count` grasps of any kind.
@@ -101,20 +129,28 @@ def certified_grasps(
         scenes: where the grasps are to be used, in turn; valid then means lifted out of its scene. None: free.
         pieces: gives the object's convex pieces; runs beside the first round's planning.
         run: told of the share that is done; asked often whether to stop. Its device is the planner's.
+        partial: if it is stopped, what was judged before is the batch.
 
     Raises:
         HandError: no two digits of the hand oppose each other.
         InputError: the object does not fit into the gripper.
         MeshError: the object has no usable convex pieces.
-        TaskCancelled: when `run.cancelled()` answers True.
+        TaskCancelled: when `run.cancelled()` answers True; with `partial`, before anything was judged.
     """
     require_opposing(hand)
-    fitting_pairs(hand, obj)
-    work = _Work(hand, obj, request, batch, run)
-    work.scenes = scenes
+    work = _Work(hand, obj.centred, request, batch, run)
+    fitting_pairs(hand, work.obj)
+    work.scenes = None if scenes is None else scenes.centred(obj)
     with ThreadPoolExecutor(1, thread_name_prefix="beside") as work.beside:
-        work.pieces = work.beside.submit(pieces, obj) if request.referee != "none" else None
-        return work.finish(work.until(count), count)
+        work.pieces = work.beside.submit(pieces, work.obj) if request.referee != "none" else None
+        rounds: list[Round] = []
+        try:
+            work.until(count, rounds)
+        except TaskCancelled:
+            if not partial or not rounds:
+                raise
+            work.goes_on()
+        return work.finish(rounds, count).moved(obj.centre)
 
 
 def scored(
@@ -135,12 +171,12 @@ def scored(
         MeshError: the object has no usable convex pieces.
         TaskCancelled: when `run.cancelled()` answers True.
     """
-    work = _Work(hand, obj, request.model_copy(update={"want": "raw"}), 0, run)
-    work.scenes = scenes
+    work = _Work(hand, obj.centred, request.model_copy(update={"want": "raw"}), 0, run)
+    work.scenes = None if scenes is None else scenes.centred(obj)
     with ThreadPoolExecutor(1, thread_name_prefix="beside") as work.beside:
-        work.pieces = work.beside.submit(pieces, obj) if request.referee != "none" else None
+        work.pieces = work.beside.submit(pieces, work.obj) if request.referee != "none" else None
         work.tried = len(grasps)
-        return work.finish([work.score(grasps)], len(grasps))
+        return work.finish([work.score(grasps.moved(np.negative(obj.centre)))], len(grasps)).moved(obj.centre)
 
 
 class _Work:
@@ -159,13 +195,17 @@ class _Work:
         self.seconds: dict[str, float] = {"planner": 0.0, "referee": 0.0, "quality": 0.0}
         self._run = run
 
-    def until(self, count: int) -> list[Round]:
-        """Rounds until `count` grasps are there or the budget is used up."""
+    def goes_on(self) -> None:
+        """From here on nobody stops it."""
+        self._run = replace(self._run, cancelled=ALONE.cancelled)
+
+    def until(self, count: int, parts: list[Round]) -> None:
+        """Adds rounds until `count` grasps are there or the budget is used up."""
         wish = self.request
         if wish.want == "raw":
-            return [self._round(0, range(count), self._run)]
+            parts.append(self._round(0, range(count), self._run))
+            return
         budget, number, valid = math.ceil(wish.budget * count), 0, 0
-        parts: list[Round] = []
         while size := next_round(count, valid, self.tried, budget):
             first = 0
             while first < size and valid < count:
@@ -176,7 +216,6 @@ class _Work:
                 parts.append(self._round(number, range(first, first + share), run))
                 first, valid = first + share, valid + len(parts[-1].grasps)
             number += 1
-        return parts
 
     @property
     def _in_parts(self) -> bool:
@@ -227,7 +266,9 @@ class _Work:
             self.hand, self.obj, wanted, run.part(0.0, _PARTS[0]), method=request.method, options=request.options
         )  # fmt: skip
         # Verdicts and metrics are many short pieces of work: all cores may take them, whatever other lanes are at.
-        made = self._scored(replace(planned, scene=index), replace(run, lanes=None))
+        # What is judged is what is told: positions are on the grid before.
+        planned = replace(planned, scene=index).moved(np.zeros(3))
+        made = self._scored(planned, replace(run, lanes=None))
         made.seconds["planner"] += planned.seconds
         if number == 0 and rows.start == 0:
             self._begin_audits(made)
@@ -245,9 +286,14 @@ class _Work:
         absent = {"blocked"} if self.scenes is None else set()
         absent |= set() if self.request.robust else {"fragile"}
         reasons = [name for name in REJECTIONS if name not in absent]
-        rejected = {name: int(np.count_nonzero(fates[:tried] == name)) for name in reasons}
+        outcomes = totals([Counter(fate for fate in fates[:tried].tolist() if fate != "kept")])
+        rejected = dict.fromkeys(reasons, 0)
+        for name, number in outcomes.items():
+            rejected[_REJECTION_OF.get(name, "dropped")] += number
         grasps, columns = taken(grasps, columns, np.arange(min(count, len(grasps))))
-        found = Certified(grasps, columns, tried, rejected, None, len(fates), self.seconds, self._shares(rounds))
+        found = Certified(
+            grasps, columns, tried, rejected, outcomes, None, len(fates), self.seconds, self._shares(rounds)
+        )
         if self.pieces is None:
             return found
         columns |= self._second_opinions(grasps, columns["quality/valid"])
@@ -292,7 +338,8 @@ class _Work:
     def _scored(self, planned: GraspSet, run: Run) -> Round:
         """Judge and measure grasps, and keep those that are wanted or like others; a hand that is no number is never
         one of them."""
-        fates, seconds = np.where(planned.finite, "kept", "diverged"), dict.fromkeys(self.seconds, 0.0)
+        fates = np.where(planned.finite, "kept", "diverged").astype(object)
+        seconds = dict.fromkeys(self.seconds, 0.0)
         finite = np.flatnonzero(fates == "kept")
         planned = planned.take(finite)
         size, every = len(planned), self.request.want == "raw"
@@ -300,7 +347,8 @@ class _Work:
             columns, in_scene = self._judged(planned, run, seconds), dict[str, int]()
         else:
             planned, columns, in_scene = self._judged_in_scenes(planned, self.scenes, run, seconds)
-            fates[finite[columns["quality/success"] < 0]] = "blocked"
+            fates[finite[columns["quality/success"] < 0]] = "no_place"
+        why = _why(columns, size)
         rows = np.arange(size) if every or not columns else np.flatnonzero(columns["quality/success"] == 1)
         grasps = planned.take(rows)
         columns = {path: array[rows] for path, array in columns.items()} | self._measured(grasps, run, seconds)
@@ -312,9 +360,10 @@ class _Work:
             columns |= self._in_models(grasps, held if every else sound & held, run, seconds)
         if not every:
             wanted = sound if self.pieces is None else sound & held
-            lost = np.delete(finite, rows)
-            fates[lost[fates[lost] == "kept"]] = "dropped"
-            fates[finite[rows[~wanted]]] = "gate"
+            lost = np.setdiff1d(np.arange(size), rows)
+            lost = lost[fates[finite[lost]] == "kept"]
+            fates[finite[lost]] = why[lost]
+            fates[finite[rows[~wanted]]] = [f"gate_{name}" for name in np.asarray(failed_gate(columns))[~wanted]]
             if self.request.robust:
                 enough = reaches(columns["quality/robust_share"], self.request.robust)
                 fates[finite[rows[wanted & ~enough]]] = "fragile"
@@ -430,3 +479,18 @@ class _Work:
         assert grasps.scene is not None
         placed = self.scenes.placed(grasps.scene)
         return judge_lifts(self.hand, self.obj, grasps, placed, level="letter", pieces=pieces, run=run).success
+
+
+def _why(columns: Arrays, count: int) -> NDArray[np.object_]:
+    """(N,) what the referee saw of each grasp that it drops."""
+    found = np.full(count, "not_lifted", object)
+    if "quality/lift_outcome" in columns:
+        for code, name in _LIFTED.items():
+            found[np.asarray(columns["quality/lift_outcome"]) == code] = name
+    elif "quality/verdict_outcome" in columns:
+        pushes = np.asarray(columns["quality/verdict_outcome"])
+        bad = (pushes != Outcome.HELD) & (pushes != Outcome.NOT_TRIED)
+        first = pushes[np.arange(count), bad.argmax(axis=1)] if count else np.zeros(0, np.uint8)
+        for code, name in _PUSHED.items():
+            found[first == code] = name
+    return found

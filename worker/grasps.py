@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 Columns = Mapping[str, NDArray[Any]]
@@ -15,6 +15,23 @@ Columns = Mapping[str, NDArray[Any]]
 THRESHOLDS: Final = "quality/thresholds_m"
 #: Columns of grasps in scenes; there are all of them or none.
 _IN_SCENES = ("scene_index", "approach", "approach_joint_positions", "lift")
+
+
+#: Step of positions [m]. A double holds multiples of it up to 8,388 km, so grasps that are on the grid go into the
+#: frame of a file and come back with the same bits.
+GRID_M: Final = 2.0**-30
+
+
+def on_grid(positions: ArrayLike) -> Floats:
+    """Positions rounded to `GRID_M`."""
+    return np.rint(np.asarray(positions, float) / GRID_M) * GRID_M
+
+
+def moved(pose: ArrayLike, by: ArrayLike) -> Floats:
+    """Poses (..., 7) moved by a vector (3,) of their parent's frame, on the grid."""
+    pose = np.array(pose, float)
+    pose[..., :3] = on_grid(pose[..., :3] + np.asarray(by, float))
+    return pose
 
 
 @dataclass
@@ -32,6 +49,10 @@ class Posture:
     def take(self, rows: NDArray[np.intp] | slice) -> Posture:
         """Some of the postures, in the order of `rows`."""
         return Posture(np.asarray(self.hand_pose, float)[rows], np.asarray(self.joint_positions, float)[rows])
+
+    def moved(self, by: ArrayLike) -> Posture:
+        """The postures moved by a vector (3,) [m]."""
+        return Posture(moved(self.hand_pose, by), self.joint_positions)
 
     @classmethod
     def from_columns(cls, columns: Columns, name: str = "grasp") -> Posture:
@@ -80,6 +101,14 @@ class GraspSet:
         scene = None if self.scene is None else self.scene[rows]
         coming = None if self.coming is None else np.asarray(self.coming, float)[rows]
         return GraspSet(grasp, pregrasp, squeeze, loss, self.seconds, self.info, approach, coming, scene, lift)
+
+    def moved(self, by: ArrayLike) -> GraspSet:
+        """The grasps with their ways moved by a vector (3,) [m]: into a frame with its origin elsewhere."""
+        return replace(
+            self, grasp=self.grasp.moved(by), pregrasp=self.pregrasp.moved(by), squeeze=self.squeeze.moved(by),
+            approach=None if self.approach is None else moved(self.approach, by),
+            lift=None if self.lift is None else self.lift.moved(by),
+        )  # fmt: skip
 
     def to_columns(self) -> dict[str, NDArray[Any]]:
         """The posture columns of a base shard; the planner's loss is a column of the quality table."""

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from service.model.domain import BATCH_SIZE, JobOptions
+from service.model.errors import TaskCancelled
 from worker.certified import Certified, certified_grasps
 from worker.engines.joins import PER_LAUNCH
 from worker.hands.model import HandModel
@@ -35,6 +36,7 @@ def certified_batches(
     scenes: Scenes | None = None,
     pieces: Callable[[ObjectModel], ConvexPieces] = decompose,
     run: Run = ALONE,
+    partial: bool = False,
 ) -> list[Certified]:
     """The first batches of a job; see `certified_grasps`, which makes the same of each.
 
@@ -47,6 +49,7 @@ def certified_batches(
         scenes: see `certified_grasps`.
         pieces: gives the object's convex pieces.
         run: told of the grasps that are done.
+        partial: if it is stopped, the batches that were judged before are the result, the last one maybe in part.
 
     Raises:
         Exception: what became of the first batch that failed; the others are stopped.
@@ -56,20 +59,29 @@ def certified_batches(
     def batch(number: int, own: Run) -> Certified:
         own = replace(own, progress=shares.of(number))
         made = certified_grasps(
-            hand, obj, request, count=sizes[number], batch=number, scenes=scenes, pieces=pieces, run=own
-        )
+            hand, obj, request, count=sizes[number], batch=number, scenes=scenes, pieces=pieces, run=own,
+            partial=partial,
+        )  # fmt: skip
         own.progress(1.0, 1.0, "done")
         return made
 
-    if join == 1 or len(sizes) == 1:
-        return [batch(number, run) for number in range(len(sizes))]
-    if request.referee != "none":
-        pieces(obj)  # once, and not by every batch at the same time
-    return _together(batch, len(sizes), join, run)
+    found: dict[int, Certified] = {}
+    try:
+        if join == 1 or len(sizes) == 1:
+            for number in range(len(sizes)):
+                found[number] = batch(number, run)
+        else:
+            if request.referee != "none":
+                pieces(obj.centred)  # once, and not by every batch at the same time
+            _together(batch, len(sizes), join, run, found)
+    except TaskCancelled:
+        if not partial or not found:
+            raise
+    return [found[number] for number in sorted(found)]
 
 
 def distinct_batches(
-    hand: HandModel, request: JobOptions, batches: list[Certified], more: Callable[[int, int], Certified]
+    hand: HandModel, request: JobOptions, batches: list[Certified], more: Callable[[int, int], Certified | None]
 ) -> list[Certified]:
     """The batches without grasps too like one of an earlier batch, and further batches in their place.
 
@@ -79,7 +91,7 @@ def distinct_batches(
         hand: the hand.
         request: `min_distance` says what is too like; raw grasps are all kept.
         batches: the batches of a job, from the first.
-        more: makes a batch of so many grasps, of that number within the job.
+        more: makes a batch of so many grasps, of that number within the job; None: there are to be no more.
     """
     if request.want == "raw" or request.min_distance <= 0:
         return batches
@@ -94,15 +106,19 @@ def distinct_batches(
         kept.append(batch if mine.all() else batch.keeping(mine))
         missing += int((~mine).sum())
         if not waiting and missing and refills < _REFILLS:
-            waiting.append(more(missing, len(batches) + refills))
+            if (another := more(missing, len(batches) + refills)) is None:
+                break
+            waiting.append(another)
             missing, refills = 0, refills + 1
     return kept
 
 
-def _together(work: Callable[[int, Run], Certified], count: int, join: int, run: Run) -> list[Certified]:
+def _together(
+    work: Callable[[int, Run], Certified], count: int, join: int, run: Run, found: dict[int, Certified]
+) -> None:
+    """Puts each batch under its number as soon as it is made."""
     members = min(count, PER_LAUNCH * join)
     stop, left = threading.Event(), iter(range(count))
-    found: dict[int, Certified] = {}
     with Meeting(members, join * BATCH_SIZE) as meeting:
         own = replace(run, meeting=meeting, cancelled=lambda: stop.is_set() or run.cancelled())
 
@@ -114,4 +130,3 @@ def _together(work: Callable[[int, Run], Certified], count: int, join: int, run:
                 meeting.leave()
 
         in_threads([member] * members, stop, "batch")
-    return [found[number] for number in range(count)]

@@ -155,6 +155,7 @@ class Jobs:
             request=job.request,
             choice=job.choice,
             note=job.note,
+            outcomes=job.outcomes,
             audited=job.audited,
             audit_held=job.audit_held,
             hand_digest=job.hand_digest,
@@ -186,7 +187,7 @@ class Jobs:
             owner=job.owner,
             project=job.project,
             finished=job.finished,
-            reason=job.reason,
+            reason=job.reason or job.note,
             stages=stages,
         )
 

@@ -75,6 +75,8 @@ def print_dataset(dataset: DatasetView, console: Console) -> None:
         highlight=False,
         soft_wrap=True,
     )
+    if dataset.reason:
+        console.print(f"reason: {dataset.reason}", markup=False, highlight=False, soft_wrap=True)
 
 
 def print_cells(dataset: DatasetView, cells: Sequence[CellView], console: Console) -> None:

@@ -89,6 +89,7 @@ def job_summary(job: JobDetail) -> dict[str, Any]:
         "note": job.note,
         "progress": job.progress,
         "reason": job.reason,
+        "outcomes": job.outcomes,
         "stages": {stage.stage.value: {"tasks": stage.tasks, "seconds": stage.seconds} for stage in job.stages},
         "mean": {
             name: value
@@ -148,8 +149,8 @@ def _print_job(job: JobDetail, url: str) -> None:
     if job.choice:
         console.print(f"fidelity: {job.fidelity}, {job.choice}", markup=False, soft_wrap=True)
     if job.reason:
-        console.print(f"reason: {job.reason}", markup=False)
-    if job.note:
+        console.print(f"reason: {job.reason}", markup=False, soft_wrap=True)
+    if job.note and job.note != job.reason:
         console.print(f"note: {job.note}", markup=False)
     table = Table("stage", "state", "batches", "progress", "worker time", "left", box=None, header_style="bold")
     for stage in job.stages:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import Field, computed_field
 
 from service.index.views import View
 from service.model.domain import JobOptions
+from service.model.outcomes import shortfall
 from service.model.records import Choice
 from service.model.states import State
 
@@ -38,6 +39,16 @@ class DatasetView(View):
     project: str = Field("", description="project that it belongs to; empty: the one without a name")
     finished: str | None
     cancelled: bool = Field(description="cancelled by its user; `retry` lifts it")
+    outcomes: dict[str, int] = Field({}, description="candidates that were not kept, by what became of them")
+
+    @computed_field(description="why it ended with fewer grasps than asked for")  # type: ignore[prop-decorator]
+    @property
+    def reason(self) -> str | None:
+        """Says so where a dataset ended with fewer grasps than it was asked for."""
+        if not self.state.is_final or self.options.want != "valid":
+            return None
+        options = self.options
+        return shortfall(self.counted, self.asked, options.counted, self.tried, options.budget, self.outcomes)
 
     @property
     def counted(self) -> int:
@@ -67,7 +78,7 @@ class CellView(View):
     attempts_failed: int = Field(description="attempts that failed, those that were repeated with success too")
     progress: float = Field(ge=0, le=1)
     seconds: float = Field(description="time that workers spent on it [s]")
-    reason: str | None = Field(description="why it failed")
+    reason: str | None = Field(description="why it failed, or found fewer grasps than asked for")
 
     def counted(self, options: JobOptions) -> int:
         """Grasps of the standing that its dataset's options can give."""

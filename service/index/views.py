@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, computed_field
 
 from service.model.domain import JobRequest
 from service.model.metric_fields import values, with_fields
+from service.model.outcomes import shortfall
 from service.model.records import Choice
 from service.model.states import AssetKind, Lane, Stage, State
 
@@ -62,6 +63,7 @@ class JobView(View):
     tried: int = Field(0, description="grasps planned for them, kept or not")
     audited: int = Field(0, description="valid grasps judged again by the letter of the protocol")
     audit_held: int = Field(0, description="of these, grasps that held")
+    outcomes: dict[str, int] = Field({}, description="candidates that were not kept, by what became of them")
 
     @computed_field(description="what a reader of the numbers should know")  # type: ignore[prop-decorator]
     @property
@@ -69,12 +71,9 @@ class JobView(View):
         """Says so where a job ended with fewer valid (unjudged: sound) grasps than it was asked for."""
         request = self.request
         found = self.valid if request.counted == "valid" else self.grasps
-        if self.state is not State.SUCCEEDED or request.want != "valid" or found >= request.grasps:
+        if self.state is not State.SUCCEEDED or request.want != "valid":
             return None
-        return (
-            f"found {found} of {request.grasps} {request.counted} grasps in {self.tried} tries: the budget of "
-            f"{request.budget:g} tries for each ended first"
-        )
+        return shortfall(found, request.grasps, request.counted, self.tried, request.budget, self.outcomes)
 
 
 class TaskView(View):

@@ -56,6 +56,9 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
         "text", "valid: valid grasps were asked for (sound ones where nobody judges); raw: of any kind", _BASE
     ),
     "tried": RootAttribute("integer", "grasps tried until the last one kept", _BASE),
+    "outcomes": RootAttribute("text", "JSON: tries that were not kept, by what became of them", _BASE),
+    "reason": RootAttribute("text", "why a command found fewer grasps than asked for; absent: it did not", _BASE),
+    "grasps_wanted": RootAttribute("integer", "grasps asked for, where a command was interrupted before", _BASE),
     "robust": RootAttribute(
         "text",
         "JSON: models around the nominal one in which each valid grasp was judged, and the wanted share; absent: none",

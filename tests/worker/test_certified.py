@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from service.model.diversity import MIN_DISTANCE_M
 from service.model.domain import JobRequest
-from service.model.errors import InputError
+from service.model.errors import InputError, TaskCancelled
 from service.model.robust import Axis
 from worker import certified
 from worker.certified import Certified, certified_grasps
@@ -23,8 +23,10 @@ from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import Wanted
 from worker.quality.diversity import distances, hand_points
+from worker.quality.referee.protocol import Outcome
 from worker.quality.referee.robust import Robustness
-from worker.rounds import next_round
+from worker.rounds import next_round, taken
+from worker.run import Run
 
 COUNT = 6
 
@@ -74,6 +76,50 @@ def test_tries_count_up_to_the_last_grasp_that_is_kept(
     found = certified_grasps(hand, block, wish(audits=0), count=COUNT)
     # Six tries hold at 0, 2, 4; of the seven that promise to be enough the ones at 0, 2, 4 are.
     assert (found.tried, found.planned, found.rejected["dropped"]) == (6 + 5, 6 + 7, 3 + 2)
+
+
+def test_what_the_referee_saw_of_each_try_is_counted(
+    hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = [Outcome.HELD, Outcome.DISPLACED, Outcome.ROTATED, Outcome.LOST_WHILE_CLOSING, Outcome.PENETRATION]
+
+    def each_otherwise(_hand: Any, _obj: Any, grasps: GraspSet, **__: Any) -> SimpleNamespace:
+        outcome = np.full((len(grasps), 6), Outcome.HELD, np.uint8)
+        outcome[:, 2] = [seen[k % len(seen)] for k in range(len(grasps))]
+        held = (outcome[:, 2] == Outcome.HELD).astype(np.int8)
+        return SimpleNamespace(success=held, outcome=outcome, margin=np.zeros(len(grasps)), seconds=0.0)
+
+    monkeypatch.setattr(certified, "judge", each_otherwise)
+    monkeypatch.setattr(certified, "passes", lambda columns: np.zeros(len(columns["quality/success"]), np.uint8))
+    found = certified_grasps(hand, block, wish(audits=0, grasps=5, budget=1), count=5, run=Run(threads=1))
+    gates = {
+        name: found.outcomes.pop(name, 0) for name in ("gate_penetration", "gate_self_penetration", "gate_contacts")
+    }
+    assert sum(gates.values()) == 1
+    assert found.outcomes == {"slipped": 1, "turned": 1, "lost_while_closing": 1, "penetration": 1}
+    assert (found.rejected["dropped"], found.rejected["gate"], found.tried) == (4, 1, 5)
+
+
+@pytest.mark.parametrize("after", [0, 1])
+def test_a_batch_that_is_stopped_is_what_was_judged_before(
+    hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch, after: int
+) -> None:
+    rounds, real = [], certified._Work._round
+
+    def counted(*given: Any) -> Any:
+        if len(rounds) == after:
+            raise TaskCancelled("stopped")
+        rounds.append(real(*given))
+        rounds[-1].grasps, rounds[-1].columns = taken(rounds[-1].grasps, rounds[-1].columns, np.arange(1))
+        return rounds[-1]
+
+    monkeypatch.setattr(certified._Work, "_round", counted)
+    if not after:
+        with pytest.raises(TaskCancelled):
+            certified_grasps(hand, block, wish(audits=0), count=COUNT, partial=True)
+        return
+    found = certified_grasps(hand, block, wish(audits=0), count=COUNT, partial=True)
+    assert len(found.grasps) == 1 and found.verdict_key is not None
 
 
 def test_a_grasp_like_one_that_is_kept_makes_room_for_another(

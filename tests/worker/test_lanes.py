@@ -147,7 +147,8 @@ def test_the_first_valid_grasps_are_audited_whoever_finds_them(pair, one_lane, m
     monkeypatch.setattr(certified._Work, "_audited", lambda work, some: (audited.append(some), audit(work, some))[1])
     found = certified_grasps(*pair, REQUEST, count=COUNT, run=Run(threads=2))
     assert len(begun) == len(audited) == 1
-    np.testing.assert_array_equal(audited[0].grasp.hand_pose, found.grasps.grasp.hand_pose[:2])
+    first = audited[0].moved(pair[1].centre)  # the engine works about the middle of the object
+    np.testing.assert_array_equal(first.grasp.hand_pose, found.grasps.grasp.hand_pose[:2])
     np.testing.assert_array_equal(found.columns["quality/audit"] >= 0, np.arange(COUNT) < 2)
     np.testing.assert_array_equal(found.columns["quality/audit"], one_lane.columns["quality/audit"])
     monkeypatch.setattr(certified._Work, "_begin_audits", lambda work, first: None)

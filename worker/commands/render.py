@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from service.cli import JsonFlag, emit, reporting_errors
+from service.cli import JsonFlag, emit, reporting_errors, write_output
 from service.model.errors import InputError
 from service.model.scene_kinds import supports_in
 from service.model.transforms import compose
@@ -99,11 +99,12 @@ def render(
     inherited = (*INHERITED, "neighbours", "neighbour_digests", "neighbour_sources")
     kept = {key: scene.attributes[key] for key in (*inherited, "scene") if key in scene.attributes}
     kept |= made_of(scene) | {"seed": number, "device": used, "seconds": round(seconds, 4)}
-    output.write_bytes(write_shard("views", result, {**kept, "shard_id": id_of_columns(result)}))
+    write_output(output, write_shard("views", result, {**kept, "shard_id": id_of_columns(result)}))
     count = len(result["image/rgb"])
     if page is not None:
         title = f"Views of {scene.attributes.get('object', 'the object')}"
-        page.write_bytes(views_page(result, title=title, subtitle=f"{count} pictures, {size[0]} x {size[1]} pixels"))
+        subtitle = f"{count} pictures, {size[0]} x {size[1]} pixels"
+        write_output(page, views_page(result, title=title, subtitle=subtitle))
     if json:
         emit({"file": str(output), "pictures": count, "seconds": round(seconds, 2), "device": used})
     else:
@@ -158,7 +159,7 @@ def pictures(
     else:
         sheet = GraspSheet(base, *models, "way" if way else "three sides" if three else "one side", run, size)
         page = sheet.png(subtitle=f"{len(rows)} of {among} {word}{'' if row else ', by epsilon at 5 mm'}")
-    output.write_bytes(with_palette(page) if palette and not animate else page)
+    write_output(output, with_palette(page) if palette and not animate else page)
     if json:
         emit({"file": str(output), "grasps": len(rows), "of": among, "kind": word, "rows": rows.tolist()})
     else:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from service.cli import JsonFlag, emit, reporting_errors
+from service.cli import JsonFlag, emit, reporting_errors, write_output
 from service.store.attributes import Attribute
 from service.store.shards import read_shard, write_shard
 from worker.files.of_shard import (
@@ -60,7 +60,7 @@ def scene(
     attributes: dict[str, Attribute] = {key: base.attributes[key] for key in INHERITED if key in base.attributes}
     attributes |= {"seed": number, "device": "cpu", "seconds": round(seconds, 4)}
     attributes |= beside_attributes(others, with_ or []) | made_of(base) | {"shard_id": id_of_columns(result)}
-    output.write_bytes(write_shard("scene", result, attributes))
+    write_output(output, write_shard("scene", result, attributes))
     clear, total = int(result["grasp/valid"].sum()), len(result["grasp/valid"])
     reasons = count_rejections(result["grasp/rejection"])
     if json:

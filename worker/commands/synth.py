@@ -7,15 +7,24 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, Final, get_args
 
 import typer
 from pydantic import ValidationError
 
-from service.cli import JsonFlag, emit, engine_settings, reporting_errors, validation_line
+from service.cli import (
+    JsonFlag,
+    emit,
+    engine_settings,
+    fail,
+    reporting_errors,
+    told_to_stop,
+    validation_line,
+    write_output,
+)
 from service.model.diversity import CELLS, MIN_DISTANCE_M
 from service.model.domain import JobOptions
-from service.model.errors import InputError
+from service.model.errors import InputError, TaskCancelled
 from service.model.fidelity import FIDELITIES
 from service.model.robust import MODELS
 from service.model.scene_spec import parse_scene
@@ -36,6 +45,8 @@ from worker.quality.referee.key import Level
 from worker.run import Progress as Report
 
 app = typer.Typer()
+#: Exit code of a run that found fewer grasps than it was asked for.
+FEWER: Final = 3
 
 
 @app.command(epilog="graspd synth --hand allegro --object mug -n 32 -o grasps.h5")
@@ -101,6 +112,7 @@ def synth(
     """Make grasps of one hand on one object as a job does, judged and measured, into an HDF5 file.
 
     In a scene a grasp is valid if it comes, closes and lifts without touching anything else and holds what it lifts.
+    Exit code 3: fewer grasps were found than asked. Ctrl-C keeps those that are judged.
     """
     if not out.parent.is_dir():
         raise InputError(f"the folder {out.parent} does not exist; create it or choose another --out")
@@ -116,17 +128,26 @@ def synth(
     )
     place = parse_scene(scene, faces=faces, touch=touch, beside=with_ or [])
     settings = engine_settings()
-    with _bar(quiet=json) as progress:
-        made = synthesized(
-            hand, object_, request, place=place, scenes=scenes, mesh=mesh, device=device, threads=threads,
-            first_judge=settings.first_judge, join=join, processes=settings.processes, progress=progress,
-        )  # fmt: skip
-    out.write_bytes(write_shard("base", made.arrays, {**made.attributes, "shard_id": id_of_columns(made.arrays)}))
+    with told_to_stop() as stop, _bar(quiet=json) as progress:
+        try:
+            made = synthesized(
+                hand, object_, request, place=place, scenes=scenes, mesh=mesh, device=device, threads=threads,
+                first_judge=settings.first_judge, join=join, processes=settings.processes, progress=progress,
+                cancelled=lambda: bool(stop), partial=True,
+            )  # fmt: skip
+        except TaskCancelled:
+            fail(f"interrupted before any grasp was judged: {out} is not written", 128 + stop[0])
+        shard = write_shard("base", made.arrays, {**made.attributes, "shard_id": id_of_columns(made.arrays)})
+        write_output(out, shard)
     found = {"file": str(out), **made.summary()}
     if json:
         emit(found)
     else:
-        typer.echo(_said(found))
+        typer.echo(_said(found | ({"reason": None} if made.interrupted else {})))
+    if made.interrupted:
+        fail(f"interrupted: {out} holds the {found['grasps']} of {grasps} grasps that were there", 128 + stop[0])
+    if made.reason is not None:
+        raise typer.Exit(FEWER)
 
 
 def _request(want: str, budget: float, referee: str, robust: float, models: int) -> JobOptions:
@@ -200,6 +221,6 @@ def _said(found: dict[str, Any]) -> str:
             f"{found['scene']}, {found['scenes']} scenes: {found['clear_share']:.0%} of the tries are clear of what "
             f"stands there, {found['lift_share']:.0%} lift, {found['lift_hard_share']:.0%} at half the friction"
         )
-    if found["want"] == "valid" and found["grasps"] < found["wanted"]:
-        lines.append(f"{found['wanted']} {word} ones were wanted: the budget of tries ended first; see --budget")
+    if found["reason"] is not None:
+        lines.append(found["reason"])
     return "\n".join(lines)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 from service.model.domain import JobOptions
 from service.store.attributes import Attribute
 from service.store.shards import json_attribute
@@ -9,7 +12,12 @@ from worker.hands.model import HandModel
 
 
 def base_attributes(
-    hand: HandModel, request: JobOptions, *, tried: int, verdict_key: str | None
+    hand: HandModel,
+    request: JobOptions,
+    *,
+    tried: int,
+    verdict_key: str | None,
+    outcomes: Mapping[str, int] = MappingProxyType({}),
 ) -> dict[str, Attribute]:
     """The hand's joints, what was asked for, in which scene, how many grasps were tried, and who judged them.
 
@@ -18,6 +26,7 @@ def base_attributes(
         request: friction, want, referee and scene.
         tried: grasps tried until the last one kept.
         verdict_key: digest of the terms of the verdicts; None: nobody judged.
+        outcomes: tries that were not kept, by what became of them.
     """
     said: dict[str, Attribute] = {
         "joint_names": list(hand.joint_names),
@@ -26,6 +35,8 @@ def base_attributes(
         "want": request.want,
         "tried": tried,
     }
+    if outcomes:
+        said["outcomes"] = json_attribute(dict(outcomes))
     if request.in_scene:
         said["scene"] = json_attribute(request.place.told())
     if request.models:

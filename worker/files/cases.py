@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -42,6 +42,14 @@ class Case:
     """(N,) success as published: 1, 0, -1 unknown."""
     placed: Placed | None = None
     """The scenes that the grasps were planned in, if any."""
+
+    @property
+    def centred(self) -> Case:
+        """The same about the middle of the object, where measurements do not depend on the file's origin."""
+        return replace(
+            self, obj=self.obj.centred, grasps=self.grasps.moved(np.negative(self.obj.centre)),
+            placed=None if self.placed is None else self.placed.centred(self.obj),
+        )  # fmt: skip
 
 
 def expand(path: Path) -> list[Path]:

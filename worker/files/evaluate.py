@@ -76,6 +76,7 @@ def evaluate(
     """
     if protocol == "lift" and case.placed is None:
         raise InputError(f"{case.name} has grasps around a free object: `graspd synth --scene` makes some to lift")
+    case = case.centred
     mu = friction or case.friction or DEFAULT_FRICTION
     table = measure(case.hand, case.obj, case.grasps, friction=mu, thresholds_m=[THRESHOLD_M], run=run)
     row: dict[str, Any] = {"n": len(case.grasps), "protocol": protocol, "level": None, "hard": hard, "mu": mu}

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from service.model.diversity import CELLS, GraspType, entropy_bits
 from service.model.domain import BATCH_SIZE, JobOptions
-from service.model.errors import InputError
+from service.model.errors import InputError, TaskCancelled
 from service.model.fidelity import FIDELITIES, Fidelity
+from service.model.outcomes import shortfall, totals
 from service.model.scene_spec import SceneSpec
 from service.store.attributes import Attribute
 from service.store.shards import json_attribute
@@ -54,8 +55,22 @@ class Synthesized:
     batches: list[Certified]
     request: JobOptions
     place: SceneSpec
+    interrupted: bool
+    """Whether it was stopped before the end."""
     seconds: float
     """Wall time, without the reading of the files [s]."""
+
+    @property
+    def reason(self) -> str | None:
+        """Why there are fewer grasps than were asked for; None where there are not."""
+        request = self.request
+        if self.interrupted:
+            return f"interrupted: {len(self.arrays['quality/valid'])} of {request.grasps} grasps were there"
+        return shortfall(
+            len(self.arrays["quality/valid"]), request.grasps, request.counted,
+            sum(batch.tried for batch in self.batches), request.budget,
+            totals(batch.outcomes for batch in self.batches),
+        )  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
         """What a user wants to know first, for JSON."""
@@ -68,6 +83,8 @@ class Synthesized:
             "referee": request.referee,
             "want": request.want,
             "wanted": request.grasps,
+            "reason": self.reason,
+            "outcomes": totals(batch.outcomes for batch in self.batches),
             "seconds": round(self.seconds, 3),
             "grasps_per_second": round(count / self.seconds, 2),
             "mean": {
@@ -130,6 +147,7 @@ def synthesized(
     processes: int = 0,
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
+    partial: bool = False,
 ) -> Synthesized:
     """The grasps of a job in one process, without a queue or a server.
 
@@ -147,10 +165,11 @@ def synthesized(
         processes: that judge and measure; 1: this one; 0: on a GPU one for each core less one, else 1.
         progress: told of the grasps that are done, and of how many.
         cancelled: asked often; True: the work stops.
+        partial: if it is stopped, what was judged before is the result.
 
     Raises:
         InputError: unknown method, option, hand, object or device, or a scene without room.
-        TaskCancelled: `cancelled` answered True.
+        TaskCancelled: `cancelled` answered True; with `partial`, before anything was judged.
     """
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
     wanted = parse_join(str(join))
@@ -170,21 +189,35 @@ def synthesized(
     joined = batches_at_once(chosen, wanted)
     with _pool(processes_at_once(chosen, processes, threads=threads)) as pool:
         run = replace(run, pool=pool)
-        batches = certified_batches(model, thing, request, sizes=sizes, join=joined, scenes=where, run=run)
-        batches = distinct_batches(
-            model, request, batches,
-            lambda count, number: certified_grasps(
-                model, thing, request, count=count, batch=number, scenes=where, run=run.quiet()
-            ),
-        )  # fmt: skip
+        batches = certified_batches(
+            model, thing, request, sizes=sizes, join=joined, scenes=where, run=run, partial=partial
+        )
+
+        def more(count: int, number: int) -> Certified | None:
+            try:
+                return certified_grasps(
+                    model, thing, request, count=count, batch=number, scenes=where, run=run.quiet(), partial=partial
+                )
+            except TaskCancelled:
+                if not partial:
+                    raise
+                return None
+
+        batches = distinct_batches(model, request, batches, more)
+    interrupted = partial and run.cancelled()
     seconds = time.perf_counter() - began
     arrays = joined_columns([{**batch.grasps.to_columns(), **batch.columns} for batch in batches])
     arrays |= {name: poses[name] for name in _KEPT if name in poses}
     attributes = _attributes(model, thing, request, batches, chosen, seconds) | remembered(hand, obj, options)
+    if interrupted:
+        attributes["grasps_wanted"] = request.grasps
     if poses:
         attributes["scene"] = json_attribute(_as_stored(place, others))
         attributes |= beside_attributes(others, [one.object for one in place.neighbours])
-    return Synthesized(arrays, attributes, batches, request, place, seconds)
+    made = Synthesized(arrays, attributes, batches, request, place, interrupted, seconds)
+    if made.reason is not None:
+        attributes["reason"] = made.reason
+    return made
 
 
 @contextmanager
@@ -232,4 +265,7 @@ def _attributes(
         "seed": request.seed, "batch": 0, "device": device, "seconds": round(seconds, 4),
     }  # fmt: skip
     tried = sum(batch.tried for batch in batches)
-    return attributes | base_attributes(hand, request, tried=tried, verdict_key=batches[0].verdict_key)
+    outcomes = totals(batch.outcomes for batch in batches)
+    return attributes | base_attributes(
+        hand, request, tried=tried, verdict_key=batches[0].verdict_key, outcomes=outcomes
+    )

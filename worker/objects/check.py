@@ -14,6 +14,8 @@ from worker.objects.repair import Repaired
 
 #: Bound with which the prepared mesh of the report is simplified [m]: that of the standard fidelity.
 REPORT_ERROR_M = 3e-4
+#: Times its size that an object may lie from its origin without a note.
+FAR = 10
 
 
 def check_object(
@@ -43,7 +45,7 @@ def check_object(
     parts = [
         f"{name}: {size} mm, {facts['faces']} faces, {1e6 * facts['volume_m3']:.1f} cm3",
         *mesh.repairs,
-        *mesh.notes,
+        *facts["notes"],
     ]
     verdict = "repair" if mesh.repairs else "accept"
     return {"verdict": verdict, "message": "; ".join(parts), "repairs": list(mesh.repairs), "facts": facts}
@@ -51,6 +53,10 @@ def check_object(
 
 def _facts(mesh: Repaired, face_error_m: float, options: ObjectOptions) -> dict[str, Any]:
     model = build(mesh, face_error_m)
+    away, extents = float(np.linalg.norm(mesh.centre)), np.ptp(mesh.vertices, axis=0)
+    notes = list(mesh.notes)
+    if away > FAR * extents.max():
+        notes.append(f"its origin lies {away:.4g} m from the middle of the mesh; poses of hands are told from there")
     mass = options.mass
     if mass is None and options.density is not None:
         mass = options.density * model.volume
@@ -60,12 +66,13 @@ def _facts(mesh: Repaired, face_error_m: float, options: ObjectOptions) -> dict[
         "deviation_m": model.deviation_m,
         "repair_deviation_m": mesh.moved_m,
         "self_intersections": mesh.self_intersections,
-        "extents_m": [float(extent) for extent in np.ptp(mesh.vertices, axis=0)],
+        "extents_m": [float(extent) for extent in extents],
         "volume_m3": model.volume,
         "mass_kg": mass,
         "centre_of_mass_m": [float(value) for value in model.centre_of_mass],
+        "origin_distance_m": away,
         "radius_m": model.radius,
         "watertight": model.watertight,
         "units": options.units,
-        "notes": list(mesh.notes),
+        "notes": notes,
     }

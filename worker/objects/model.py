@@ -1,11 +1,12 @@
 """An object as the engine sees it: one closed, outward, simplified triangle mesh with its mass properties.
 
-Everything is in the object frame: the frame of the mesh as uploaded, in metres.
+Everything is in the object frame: the frame of the mesh as uploaded, in metres. `ObjectModel.centred` is the same
+object about its middle, which is what the engine works on; see `worker.objects.frames`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,7 +18,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ObjectModel:
     """A prepared object. Mass scales out: inertia is per unit of mass."""
 
@@ -45,11 +46,37 @@ class ObjectModel:
     deviation_m: float = 0.0
     """Largest distance between the prepared surface and the uploaded one [m]."""
     repairs: tuple[str, ...] = ()
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Middle of the mesh [m]; zero for a model that is `centred`."""
+    about_centre: ObjectModel | None = field(default=None, repr=False)
+    """The object about its middle; None: it is that already."""
 
     @cached_property
     def content(self) -> str:
         """Digest of what was prepared. `digest` is the file's: the same for every fidelity."""
         return content_of(self)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ObjectModel) and other.content == self.content
+
+    def __hash__(self) -> int:
+        return hash(self.content)
+
+    @property
+    def centred(self) -> ObjectModel:
+        """The object in the frame of its middle: the same bits wherever the file's origin lies."""
+        if self.about_centre is None:
+            return self
+        return replace(self.about_centre, name=self.name, digest=self.digest)
+
+    def at(self, centre: tuple[float, float, float]) -> ObjectModel:
+        """An object that is centred, in a frame in which its middle lies at `centre` [m]."""
+        if not any(centre):
+            return self
+        return replace(
+            self, vertices=self.vertices + centre, hull_vertices=self.hull_vertices + centre,
+            centre_of_mass=self.centre_of_mass + centre, centre=centre, about_centre=self,
+        )  # fmt: skip
 
     @property
     def gyration_radius(self) -> float:

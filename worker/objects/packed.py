@@ -20,13 +20,13 @@ _ARRAYS: Final = (
     "hull_vertices",
     "hull_faces",
 )
-_NAMES: Final = ("name", "digest")
+_NAMES: Final = ("name", "digest", "about_centre")
 
 
 def to_bytes(obj: ObjectModel) -> bytes:
     """All of an object but its name and digest, bit for bit."""
     plain = {f.name: getattr(obj, f.name) for f in fields(obj) if f.name not in (*_ARRAYS, *_NAMES)}
-    arrays: dict[str, Any] = {name: getattr(obj, name) for name in _ARRAYS}
+    arrays: dict[str, Any] = {name: getattr(obj.centred, name) for name in _ARRAYS}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays, plain=np.frombuffer(json.dumps(plain).encode(), np.uint8))
     return buffer.getvalue()
@@ -37,4 +37,6 @@ def from_bytes(data: bytes, *, name: str, digest: str) -> ObjectModel:
     with np.load(io.BytesIO(data), allow_pickle=False) as stored:
         plain = json.loads(stored["plain"].tobytes())
         arrays = {field: stored[field] for field in _ARRAYS}
-    return ObjectModel(name=name, digest=digest, **arrays, **plain | {"repairs": tuple(plain["repairs"])})
+    x, y, z = plain.pop("centre")
+    middle = ObjectModel(name=name, digest=digest, **arrays, **plain | {"repairs": tuple(plain["repairs"])})
+    return middle.at((x, y, z))

@@ -95,7 +95,7 @@ def build(mesh: Repaired, face_error_m: float) -> ObjectModel:
     hull_vertices, hull_faces = convex_hull(vertices)
     solid = (vertices, faces.astype(np.int32)) if mesh.watertight else (hull_vertices, hull_faces)
     mass = mass_properties(*solid)
-    return ObjectModel(
+    middle = ObjectModel(
         name="",
         digest="",
         vertices=vertices,
@@ -111,6 +111,7 @@ def build(mesh: Repaired, face_error_m: float) -> ObjectModel:
         deviation_m=error,
         repairs=mesh.repairs,
     )
+    return middle.at(mesh.centre)
 
 
 def convex_hull(points: Floats) -> tuple[Floats, Ints]:

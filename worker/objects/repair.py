@@ -12,9 +12,11 @@ from typing import Final
 import numpy as np
 
 from service.model.errors import MeshError
+from worker.grasps import on_grid
 from worker.objects import solid, topology
 from worker.objects.distance import MeshDistance, surface_points
 from worker.objects.formats import Soup
+from worker.objects.frames import Centred, centred
 from worker.objects.intersections import crossings, untangle
 from worker.objects.mass import signed_volume
 from worker.objects.options import UNITS, ObjectOptions
@@ -35,6 +37,8 @@ WELD: Final = 1e-5
 HOLE: Final = 0.03
 #: Components with less than this share of the largest one's volume are dropped as scan debris.
 DEBRIS: Final = 1e-6
+#: Coordinates that are farther apart than this where the mesh lies are worth a warning [m].
+COARSE_M: Final = 1e-4
 #: A mean wall below this [m] is worth a warning: it can pass between hand points.
 THIN_M: Final = 2.5e-3
 #: Points, besides the vertices, at which the repaired surface is held against the one that was given.
@@ -46,6 +50,7 @@ class Repaired:
     """A mesh in metres with the names of what was changed and of what is odd but right."""
 
     vertices: Floats
+    """(V, 3) about the middle of the mesh."""
     faces: Indices
     watertight: bool = True
     repairs: tuple[str, ...] = ()
@@ -55,6 +60,8 @@ class Repaired:
     """Pairs of faces that still pass through each other; None: not looked for."""
     moved_m: float = 0.0
     """Largest distance of the repaired surface from the one that was given [m]."""
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The middle in the file's frame [m]."""
 
     def but(self, vertices: Floats, faces: Indices, repair: str) -> Repaired:
         return replace(self, vertices=vertices, faces=faces, repairs=(*self.repairs, repair))
@@ -66,8 +73,14 @@ def repair(soup: Soup, options: ObjectOptions) -> Repaired:
     Raises:
         MeshError: wrong units, no volume, holes, several components; the message says the mend.
     """
-    given = _to_metres(soup, options)
-    mesh = _solid(given, options)
+    try:
+        given = _to_metres(soup, options)
+        mesh = _solid(given, options)
+    except MeshError as error:
+        found, unit = centred(soup.vertices[np.unique(soup.faces)]), UNITS[options.units]
+        if found.resolution * unit <= max(COARSE_M, 1e-3 * unit * float(np.ptp(found.points, axis=0).max())):
+            raise
+        raise MeshError(f"{error}; {_coarse(found, unit)}") from None
     if not mesh.repairs:
         return mesh
     moved = MeshDistance(given.vertices, given.faces).furthest(surface_points(mesh.vertices, mesh.faces, _SAMPLES))
@@ -92,21 +105,31 @@ def _solid(mesh: Repaired, options: ObjectOptions) -> Repaired:
 
 def _to_metres(soup: Soup, options: ObjectOptions) -> Repaired:
     used, inverse = np.unique(soup.faces, return_inverse=True)
-    vertices, faces = soup.vertices[used] * UNITS[options.units], inverse.reshape(-1, 3)
-    extent = float(np.ptp(vertices, axis=0).max())
-    if float(np.ptp(vertices, axis=0).min()) <= 1e-7 * extent:
+    given, faces, unit = centred(soup.vertices[used]), inverse.reshape(-1, 3), UNITS[options.units]
+    extents = np.ptp(given.points, axis=0) * unit
+    extent = float(extents.max())
+    if float(extents.min()) <= 1e-7 * extent:
         raise MeshError("the mesh encloses no volume: it is flat; give the surface a thickness")
     if options.scale_to is not None:
-        vertices, extent = vertices * (options.scale_to / extent), options.scale_to
+        unit, extent = unit * (options.scale_to / extent), options.scale_to
     if not MIN_EXTENT_M <= extent <= MAX_EXTENT_M:
         size = f"{extent:.4g} m long, too large" if extent > MAX_EXTENT_M else f"{1e3 * extent:.3g} mm long, too small"
-        fitting = _fitting_units(extent / UNITS[options.units])
-        hints = "; ".join(f"--units {unit} makes it {_length(metres)} long" for unit, metres in fitting.items())
+        fitting = _fitting_units(extent / unit)
+        hints = "; ".join(f"--units {name} makes it {_length(metres)} long" for name, metres in fitting.items())
         raise MeshError(
             f"the mesh is {size} to grasp; {hints or 'check its units'} (or give a size: --scale-to 0.1)",
             facts={"units_suggested": list(fitting)},
         )
-    return Repaired(vertices, faces)
+    notes = (_coarse(given, unit),) if given.resolution * unit > COARSE_M else ()
+    x, y, z = (float(value) for value in on_grid(given.centre * unit))
+    return Repaired(given.points * unit, faces, notes=notes, centre=(x, y, z))
+
+
+def _coarse(given: Centred, unit: float) -> str:
+    return (
+        f"the mesh lies {float(np.linalg.norm(given.centre)) * unit:.4g} m from its origin, where the file's numbers "
+        f"are {1e3 * given.resolution * unit:.2g} mm apart; move it nearer, or write 64-bit numbers (OBJ, PLY)"
+    )
 
 
 def _fitting_units(extent: float) -> dict[str, float]:

@@ -9,6 +9,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from worker.simulation.kernels import balance as kernels
+from worker.simulation.launches import launch
 
 Floats = NDArray[np.float64]
 
@@ -30,7 +31,7 @@ def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
         work.used = wp.empty((batch, columns), dtype=wp.int32)
         x = wp.empty((batch, columns), dtype=wp.float64)
         sound = wp.empty(batch, dtype=wp.int32)
-        wp.launch(
+        launch(
             kernels.nonnegative, batch,
             inputs=[matrix, wp.array(target, dtype=wp.float64), wp.float64(ridge), count], outputs=[work, x, sound],
         )  # fmt: skip

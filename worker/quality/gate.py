@@ -17,6 +17,17 @@ MAX_SELF_PENETRATION_MM: Final = 3.0
 MIN_CONTACT_LINKS: Final = 2
 
 
+#: The gates by name, in their order.
+GATES: Final = ("penetration", "self_penetration", "contacts")
+
+
+def failed_gate(quality: Mapping[str, NDArray[Any]]) -> list[str]:
+    """Of each of N grasps the first gate that it does not pass; of one that passes all, the last."""
+    deep = ~(quality["quality/penetration_depth_mm"] <= MAX_PENETRATION_MM)
+    itself = ~(quality["quality/self_penetration_depth_mm"] <= MAX_SELF_PENETRATION_MM)
+    return [GATES[0 if one else 1 if two else 2] for one, two in zip(deep, itself, strict=True)]
+
+
 def passes(quality: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
     """1 for each of the N grasps that passes, else 0; a grasp with a nan does not."""
     ok = (

@@ -10,6 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from worker.simulation.kernels import hull as kernels
+from worker.simulation.launches import launch
 
 Floats = NDArray[np.float64]
 
@@ -122,7 +123,7 @@ def _grown(
     space = _workspace
     with wp.ScopedDevice("cpu"):
         result = wp.zeros((len(points), 3), dtype=wp.float64)
-        wp.launch(
+        launch(
             kernels.measure_hulls,
             1,
             inputs=[

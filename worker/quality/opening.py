@@ -17,7 +17,7 @@ from worker.hands.model import HandModel
 from worker.quality.contact import finger_of_body
 from worker.quality.posed import Posing
 from worker.simulation.kernels import distance, jamming, opening, optimizers
-from worker.simulation.launches import Launches
+from worker.simulation.launches import Launches, launch
 
 Floats = NDArray[np.float64]
 
@@ -89,12 +89,12 @@ class Openings:
         first, plain = self._sweep(), self._sweep()
         self._leave(grasp, first)
         self._step(first)
-        wp.launch(
+        launch(
             opening.open_plainly, self.count, inputs=[self.fingers, STUCK_M, first], outputs=[plain, self.step],
             device=self.posing.device,
         )  # fmt: skip
         self._step(plain)
-        wp.launch(
+        launch(
             opening.take_opening, (self.count, self.posing.hand.dofs),
             inputs=[self.fingers, self.hands, STUCK_M, first, plain], outputs=[self.open], device=self.posing.device,
         )  # fmt: skip
@@ -108,15 +108,15 @@ class Openings:
         device, jams = self.posing.device, self._jams()
         depth = self._depths(jams)
         depth[0].run()
-        wp.launch(jamming.limit_depth, self.count, inputs=[JAM_M], outputs=[jams], device=device)
+        launch(jamming.limit_depth, self.count, inputs=[JAM_M], outputs=[jams], device=device)
         for look in range(JAM_LOOKS):
             for way in depth[1:]:
                 way.run()
             if blocked is not None:
                 jams.blocked.assign(self._blocked(jams, blocked))
             less = wp.float64(0.5 if look < JAM_LOOKS - 1 else 0.0)
-            wp.launch(jamming.hold_back, self.count, inputs=[less], outputs=[jams], device=device)
-        wp.launch(
+            launch(jamming.hold_back, self.count, inputs=[less], outputs=[jams], device=device)
+        launch(
             jamming.take_way, (self.count, self.posing.hand.dofs), inputs=[self.fingers, self.hands, jams],
             outputs=[self.open], device=device,
         )  # fmt: skip
@@ -135,13 +135,13 @@ class Openings:
             self._place(Launches(device), jams, 1.0).run()
             approach = wp.vec3d(*posing.hand.palm.approach)
             for step, way in enumerate(RETREATS_M):
-                wp.launch(
+                launch(
                     jamming.hand_clearance, (self.count, posing.lanes),
                     inputs=[posing.probe.skin, posing.points, posing.lane, approach, PALM_CLEARANCE_M, wp.float64(way),
                             self.bodies],
                     outputs=[back],
                 )  # fmt: skip
-                wp.launch(jamming.judge_retreat, self.count, inputs=[PALM_CLEARANCE_M, step], outputs=[back])
+                launch(jamming.judge_retreat, self.count, inputs=[PALM_CLEARANCE_M, step], outputs=[back])
         poses = self.hand_pose.copy()
         away = np.array(RETREATS_M)[back.chosen.numpy()]
         poses[:, :3] -= away[:, None] * quat_rotate(poses[:, 3:], posing.hand.palm.approach)
@@ -162,12 +162,12 @@ class Openings:
         bodies, near = posing.touch(grasp, CLEARANCE_M)
         with wp.ScopedDevice(posing.device):
             wrench = [wp.empty((self.count, hand.bodies), dtype=wp.vec3d) for _ in range(2)]
-            wp.launch(
+            launch(
                 opening.body_wrenches, (self.count, hand.bodies),
                 inputs=[posing.points, bodies, near, CLEARANCE_M], outputs=wrench,
             )  # fmt: skip
             away = wp.empty((self.count, hand.dofs), dtype=wp.float64)
-            wp.launch(
+            launch(
                 opening.leave, self.count,
                 inputs=[posing.chain, self.fingers, wp.float64(PLAIN_OPENING), bodies], outputs=[*wrench, away, sweep],
             )  # fmt: skip

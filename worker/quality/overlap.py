@@ -13,6 +13,7 @@ from worker.hands.model import ConvexPiece, HandModel
 from worker.quality.probe import Distances, Probe
 from worker.simulation.device import to_xyzw
 from worker.simulation.kernels import crossing as kernels
+from worker.simulation.launches import launch
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +58,7 @@ class Overlap:
             inputs = [
                 self._probe.mesh.id, self._solids, wp.array(piece, dtype=wp.int32), wp.array(given, dtype=wp.transform)
             ]  # fmt: skip
-            wp.launch(kernels.faces_in_solids, len(piece), inputs=inputs, outputs=[crossed], device="cpu")
+            launch(kernels.faces_in_solids, len(piece), inputs=inputs, outputs=[crossed], device="cpu")
             found: NDArray[np.bool_] = crossed.numpy() != 0
         return found
 

@@ -19,6 +19,7 @@ from worker.quality.contact import LINK_CONTACT_M, contact_links, finger_of_body
 from worker.quality.probe import Probe, probe_of
 from worker.simulation.device import to_xyzw
 from worker.simulation.kernels import balance, jamming, opening, optimizers, touching
+from worker.simulation.launches import launch
 from worker.simulation.posed import PosedBodies, chain_of, room_for_bodies
 
 Floats = NDArray[np.float64]
@@ -107,7 +108,7 @@ class Posing:
         with wp.ScopedDevice(self.device):
             near.distance, near.cosine = wp.empty(shape, dtype=wp.float32), wp.empty(shape, dtype=wp.float64)
             near.closest, near.normal = (wp.empty(shape, dtype=wp.vec3) for _ in range(2))
-            wp.launch(
+            launch(
                 touching.touch, (count, self.lanes), inputs=[self.probe.skin, self.points, self.lane, bodies, reach],
                 outputs=[near],
             )  # fmt: skip

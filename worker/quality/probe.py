@@ -24,6 +24,7 @@ from worker.objects.kept_arrays import arrays_kept_or_made
 from worker.objects.model import ObjectModel
 from worker.simulation.device import DeviceHand, to_xyzw
 from worker.simulation.kernels import distance as kernels
+from worker.simulation.launches import launch
 from worker.simulation.posed import PosedBodies
 from worker.simulation.sampling import object_samples
 
@@ -157,9 +158,7 @@ class Probe:
             distance = wp.empty(count, dtype=wp.float32)
             closest = wp.empty(count, dtype=wp.vec3)
             normal = wp.empty(count, dtype=wp.vec3)
-            wp.launch(
-                kernels.mesh_distance, count, inputs=[self.skin, reach, given], outputs=[distance, closest, normal]
-            )
+            launch(kernels.mesh_distance, count, inputs=[self.skin, reach, given], outputs=[distance, closest, normal])
         place = closest.numpy().astype(float) + self.obj.centre_of_mass
         return distance.numpy().astype(float), place, normal.numpy().astype(float)
 
@@ -173,7 +172,7 @@ class Probe:
         with wp.ScopedDevice(self.device):
             gap = wp.full(shape, np.inf, dtype=wp.float32)
             inputs = [self.skin, self.body_points, self._origin, reach, posed.position, posed.rotation]
-            wp.launch(kernels.body_gaps, shape, inputs=inputs, outputs=[gap])
+            launch(kernels.body_gaps, shape, inputs=inputs, outputs=[gap])
         return gap.numpy().astype(float)
 
     def posed_points(self, bodies: Floats) -> Floats:
@@ -229,7 +228,7 @@ class Probe:
             own = wp.array(points - self.obj.centre_of_mass, dtype=wp.vec3)
             depth = wp.zeros((len(bodies), self.hand.bodies), dtype=wp.float32)
             inputs = [*self._posed_pieces(bodies), self._body, own]
-            wp.launch(kernels.self_distance, points.shape[:2], inputs=inputs, outputs=[depth])
+            launch(kernels.self_distance, points.shape[:2], inputs=inputs, outputs=[depth])
         return depth.numpy().astype(float)
 
     def _piece_distances(self, bodies: Floats) -> Floats:
@@ -237,7 +236,7 @@ class Probe:
             least = wp.full((len(bodies), len(self._piece_body)), REACH_M, dtype=wp.float32)
             inputs = [*self._posed_pieces(bodies), REACH_M, self._samples]
             dim = (len(bodies), len(self.samples))
-            wp.launch(kernels.pieces_distance, dim, inputs=inputs, outputs=[least])
+            launch(kernels.pieces_distance, dim, inputs=inputs, outputs=[least])
         return least.numpy().astype(float)
 
     def _posed_pieces(self, bodies: Floats) -> list[Any]:

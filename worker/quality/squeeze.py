@@ -18,6 +18,7 @@ from worker.quality.balance import solved
 from worker.quality.posed import Posing
 from worker.quality.probe import FACING_COS
 from worker.simulation.kernels import touching
+from worker.simulation.launches import launch
 
 Floats = NDArray[np.float64]
 
@@ -75,26 +76,26 @@ def _balanced(
         scratch = [wp.empty((count, points), dtype=kind) for kind in (wp.int32, wp.float64)]
         touches = wp.empty((count, posing.fingers), dtype=wp.bool)
         chosen, used = wp.empty((count, most), dtype=wp.int32), wp.empty(count, dtype=wp.int32)
-        wp.launch(
+        launch(
             touching.choose, count,
             inputs=[posing.points, posing.finger, near, *reach, wp.float64(FACING_COS), wp.float64(radius)],
             outputs=[touches, *scratch, chosen, used],
         )  # fmt: skip
         matrix = wp.empty((count, most * int(touching.EDGES), rows), dtype=wp.float64)
-        wp.launch(
+        launch(
             touching.columns, chosen.shape,
             inputs=[posing.chain, posing.effort, posing.points, bodies, near, chosen, used, wp.float64(friction),
                     wp.float64(radius), wp.float64(SUM)],
             outputs=[matrix],
         )  # fmt: skip
         unit = wp.empty(count, dtype=wp.float64)
-        wp.launch(touching.scale_torques, count, inputs=[wp.float64(TORQUE)], outputs=[used, matrix, unit])
+        launch(touching.scale_torques, count, inputs=[wp.float64(TORQUE)], outputs=[used, matrix, unit])
         target = np.zeros(rows)
         target[6] = SUM
         share = solved(matrix, target, SPREAD, used)
         residual = wp.empty(count, dtype=wp.float64)
         torque = wp.empty((count, posing.hand.dofs), dtype=wp.float64)
-        wp.launch(
+        launch(
             touching.hold, count, inputs=[posing.effort, matrix, share, used, unit, wp.float64(total)],
             outputs=[residual, torque],
         )  # fmt: skip

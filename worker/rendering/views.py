@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError
 from service.model.transforms import apply
+from worker.objects.frames import to_centre
 from worker.objects.model import Floats, ObjectModel
 from worker.rendering.annotate import box_corners, in_camera, loose_boxes, tight_boxes
 from worker.rendering.camera_file import SAMPLED, GivenCameras
@@ -93,7 +94,8 @@ def render(
             f"rendering needs at least one scene, view and pixel and two samples; "
             f"got {len(poses)} scenes, {views} views, {width} x {height} px, {samples} samples"
         )
-    beside = extras.neighbours or Neighbours((), np.zeros((len(poses), 0, 7)))
+    beside = (extras.neighbours or Neighbours((), np.zeros((len(poses), 0, 7)))).centred
+    obj, poses = obj.centred, to_centre(poses, obj.centre)
     placed = np.concatenate([poses[:, None], beside.poses], axis=1)
     setting = Setting(
         [obj, *beside.objects], placed, plan, seed=seed, samples=samples, supports=extras.supports

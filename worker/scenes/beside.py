@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from service.model.errors import MeshError, SceneError
 from service.model.scene_spec import SceneSpec
 from worker.objects.convex import union_volume
+from worker.objects.frames import to_centre, to_file
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import decompose
 from worker.scenes.kinds import SUNK, check_free, inside, rest_poses, room_in, supports_of
@@ -37,6 +38,10 @@ def neighbour_of(obj: ObjectModel) -> Neighbour:
     Raises:
         MeshError: the object is flat.
     """
+    if any(obj.centre):
+        middle, by = neighbour_of(obj.centred), np.array([*obj.centre, 1.0, 0, 0, 0])
+        pieces = tuple(piece + by[:3] for piece in middle.pieces)
+        return Neighbour(obj, pieces, tuple(solid.moved(by) for solid in middle.solids), middle.error_m, middle)
     if (found := _made.get(obj.content)) is not None:
         return replace(found, obj=obj)  # the same mesh may go by another name
     try:
@@ -91,6 +96,36 @@ def scenes_of(
         SceneError: something stands in something else, or there is no room.
         MeshError: something never comes to rest, or is flat.
     """
+    whole, poses = _scenes_of(
+        _centred_spec(spec, obj, others), obj.centred, [other.centred for other in others], count=count, seed=seed
+    )
+    poses["scene/object_pose"] = to_file(poses["scene/object_pose"], obj.centre)
+    if not others:
+        return replace(whole, object_pose=poses["scene/object_pose"]), poses
+    beside = poses["scene/neighbour_pose"]
+    for number, other in enumerate(others):
+        beside[:, number] = to_file(beside[:, number], other.centre)
+    neighbours = tuple(neighbour_of(other) for other in others)
+    return Scenes(whole.supports, poses["scene/object_pose"], neighbours, beside), poses
+
+
+def _centred_spec(spec: SceneSpec, obj: ObjectModel, others: Sequence[ObjectModel]) -> SceneSpec:
+    """The scene with the poses that it gives told of the middles of the things."""
+
+    def told(pose: Any, thing: ObjectModel) -> Any:
+        return None if pose is None else tuple(to_centre(pose, thing.centre).tolist())
+
+    beside = [
+        one.model_copy(update={"pose": told(one.pose, other)})
+        for one, other in zip(spec.neighbours, others, strict=False)
+    ]
+    return spec.model_copy(update={"target": told(spec.target, obj), "neighbours": tuple(beside)})
+
+
+def _scenes_of(
+    spec: SceneSpec, obj: ObjectModel, others: Sequence[ObjectModel], *, count: int, seed: int
+) -> tuple[Scenes, dict[str, Floats]]:
+    """The scenes of things that are centred; see `scenes_of`."""
     supports = supports_of(spec)
     given = [one.pose for one in spec.neighbours if one.pose is not None]
     if not others:

@@ -12,6 +12,7 @@ from service.model.errors import SceneError
 from service.model.scene_kinds import BIN_SIZE, SHELF_SIZE, supports_in
 from service.model.scene_spec import MOST_TOUCH, Box, SceneSpec
 from service.model.transforms import compose, quat_from_axis_angle, quat_rotate
+from worker.grasps import moved
 from worker.objects.model import ObjectModel
 from worker.scenes.rest import lay_flat, resting_faces
 from worker.scenes.simulate import drop, reference_share, rest_probability
@@ -66,6 +67,7 @@ def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> d
     supports = supports_of(spec)
     if (size := room_in(spec)) is not None:
         poses = np.array([inside(obj, pose, size, np.random.default_rng([seed, i])) for i, pose in enumerate(poses)])
+    poses = poses if spec.target is not None else moved(poses, np.zeros(3))
     check_free(obj, poses, supports)
     return {**found, "scene/object_pose": poses}
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from service.model.errors import SceneError
 from service.model.transforms import compose, quat_from_axis_angle, quat_rotate
+from worker.grasps import moved
 from worker.objects.model import ObjectModel
 from worker.scenes.kinds import GAP, SUNK
 from worker.scenes.neighbours import add_hull
@@ -74,6 +75,7 @@ def lay_beside(
                 f"there is no room for {len(others)} neighbours beside {obj.name} in scene {scene}: none of {_DRAWS} "
                 f"draws left {1e3 * BETWEEN:.0f} mm between all of them; take fewer or smaller ones, or a wider scene"
             )
+    poses = moved(poses, np.zeros(3))
     return poses[:, 0], poses[:, 1:]
 
 

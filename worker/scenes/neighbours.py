@@ -16,9 +16,10 @@ import numpy as np
 from service.model.errors import InputError, MeshError
 from service.model.transforms import compose, quat_rotate
 from worker.engines.mujoco_warnings import void
-from worker.grasps import Posture
+from worker.grasps import Posture, moved
 from worker.hands.kinematics import body_poses
 from worker.hands.model import ConvexPiece, Floats, HandModel
+from worker.objects.frames import to_centre, to_file
 from worker.objects.model import ObjectModel
 from worker.scenes.rest import RestingFaces, lay_flat, resting_faces, settle
 from worker.scenes.simulate import (
@@ -59,6 +60,14 @@ class Neighbours:
     poses: Floats
     """(S, M, 7) in the table frame."""
 
+    @property
+    def centred(self) -> Neighbours:
+        """The same objects about their middles."""
+        poses = np.array(self.poses, float)
+        for number, obj in enumerate(self.objects):
+            poses[:, number] = to_centre(poses[:, number], obj.centre)
+        return Neighbours([obj.centred for obj in self.objects], poses)
+
 
 def drop_together(obj: ObjectModel, neighbours: Sequence[ObjectModel], *, count: int, seed: int) -> dict[str, Floats]:
     """Let an object and its neighbours fall onto a table until all rest, `count` times.
@@ -84,9 +93,11 @@ def drop_together(obj: ObjectModel, neighbours: Sequence[ObjectModel], *, count:
             f"scenes with neighbours need 1 to {MOST_NEIGHBOURS} of them and no negative number; "
             f"got {count} scenes, {len(neighbours)} neighbours, seed {seed}"
         )
-    heap = _Heap([obj, *neighbours])
+    heap = _Heap([one.centred for one in (obj, *neighbours)])
     found = [heap.redo_until_rest((seed, scene)) for scene in range(count)]
-    poses = np.array([poses for poses, _, _ in found]).reshape(count, 1 + len(neighbours), 7)
+    poses = moved(np.array([poses for poses, _, _ in found]).reshape(count, 1 + len(neighbours), 7), np.zeros(3))
+    for number, one in enumerate((obj, *neighbours)):
+        poses[:, number] = to_file(poses[:, number], one.centre)
     return {
         "scene/object_pose": poses[:, 0],
         "scene/neighbour_pose": poses[:, 1:],
@@ -210,6 +221,7 @@ def neighbour_clearance(hand: HandModel, path: Posture, object_pose: Floats, nei
     spec = mujoco.MjSpec()
     for k, piece in enumerate(hand.pieces):
         _add_piece(spec, spec.worldbody.add_body(mocap=True), f"p{k}", piece)
+    neighbours = neighbours.centred
     for k, obj in enumerate(neighbours.objects):
         add_hull(spec, spec.worldbody.add_body(mocap=True), f"n{k}", obj)
     model = spec.compile()

@@ -19,6 +19,8 @@ from service.model.errors import InputError, MeshError
 from service.model.libraries import version_of
 from service.model.transforms import quat_rotate
 from worker.engines.mujoco_warnings import void
+from worker.grasps import moved
+from worker.objects.frames import to_file
 from worker.objects.kept_arrays import arrays_kept_or_made
 from worker.objects.model import Floats, ObjectModel
 from worker.scenes import rest as resting
@@ -101,10 +103,11 @@ def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     """
     if count < 0 or seed < 0:
         raise InputError(f"scenes and seed must not be negative; got {count} scenes, seed {seed}")
-    table = _build(obj)
+    table = _build(obj.centred)
     rests = [_redo_until_rest(table, obj.name, (seed, scene)) for scene in range(count)]
+    poses = moved(np.array([rest.pose for rest in rests]).reshape(count, 7), np.zeros(3))
     return {
-        "scene/object_pose": np.array([rest.pose for rest in rests]).reshape(count, 7),
+        "scene/object_pose": to_file(poses, obj.centre),
         "scene/rest_probability": rest_probability(obj, [rest.face for rest in rests]),
         "scene/drop_seconds": np.array([rest.seconds for rest in rests]),
     }
@@ -119,6 +122,7 @@ def reference_share(obj: ObjectModel, faces: Sequence[int]) -> Floats:
     """(S,) share of `REFERENCE_DROPS` drops of the object alone that rest on each face."""
     if not faces:
         return np.zeros(0)
+    obj = obj.centred
     known, reference = resting_faces(obj), np.array(_reference_faces(_ByContent(obj)))
     return np.array([same_face(known, face, reference).sum() for face in faces]) / REFERENCE_DROPS
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.transforms import IDENTITY_POSE, quat_from_axis_angle, quat_rotate
-from worker.grasps import GraspSet, Posture
+from worker.grasps import GraspSet, Posture, moved
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.postures import wide_open
@@ -96,8 +96,8 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
         lifting[rows] = (
             obstacle_room(hand, Posture(lifted.reshape(-1, 7), joints), [scene]).reshape(len(rows), -1).min(axis=1)
         )
-    lift = Posture(raised, np.array(grasps.squeeze.joint_positions, float))
-    return Way(path, came, lift, contact, closing, coming, lifting, touching)
+    lift = Posture(moved(raised, np.zeros(3)), np.array(grasps.squeeze.joint_positions, float))
+    return Way(moved(path, np.zeros(3)), came, lift, contact, closing, coming, lifting, touching)
 
 
 def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Way:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from contextvars import ContextVar
 from functools import cache, partial
 from typing import Any
 
@@ -35,9 +38,10 @@ class Launches:
     def run(self, times: int = 1) -> None:
         """Launch all, so many times, without waiting for the device."""
         if not wp.get_device(self.device).is_cuda:
-            for _ in range(times):
-                for call in self._calls:
-                    call()
+            with _counted():
+                for _ in range(times):
+                    for call in self._calls:
+                        call()
             return
         if times > 2:
             if self._graph is None:
@@ -53,6 +57,40 @@ class Launches:
     def _launch_all(self) -> None:
         for _, command in self._commands:
             command.launch()
+
+
+def launch(kernel: Any, dim: Any, *, device: Any = None, **given: Any) -> None:
+    """`warp.launch`, with the processor time of a kernel on the CPU counted where somebody wants to know it."""
+    with _counted() if wp.get_device(device).is_cpu else nullcontext():
+        wp.launch(kernel, dim, device=device, **given)
+
+
+#: Processor seconds of kernels on the CPU, while somebody counts them.
+_spent: ContextVar[list[float] | None] = ContextVar("spent", default=None)
+
+
+@contextmanager
+def kernel_seconds() -> Iterator[list[float]]:
+    """Processor seconds of the kernels that this thread runs on the CPU meanwhile."""
+    spent: list[float] = []
+    token = _spent.set(spent)
+    try:
+        yield spent
+    finally:
+        _spent.reset(token)
+
+
+@contextmanager
+def _counted() -> Iterator[None]:
+    spent = _spent.get()
+    if spent is None:
+        yield
+        return
+    began = time.thread_time()
+    try:
+        yield
+    finally:
+        spent.append(time.thread_time() - began)
 
 
 def _packed(command: Any) -> Callable[[], object]:

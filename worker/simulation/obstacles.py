@@ -21,6 +21,7 @@ from worker.simulation.device import DeviceHand, to_xyzw
 from worker.simulation.kernels import chain as chain_kernels
 from worker.simulation.kernels import obstacles as kernels
 from worker.simulation.kernels import solids as solid_kernels
+from worker.simulation.launches import launch
 from worker.simulation.posed import PosedBodies
 from worker.simulation.surroundings import CLEAR_M, Obstacle, Surroundings
 
@@ -81,7 +82,7 @@ def _solid_distances(hand: HandModel, postures: Posture, scene: Surroundings) ->
         position: Any = wp.array(bodies[..., :3], dtype=wp.vec3)
         rotation: Any = wp.array(to_xyzw(bodies[..., 3:]), dtype=wp.quat)
         least = wp.full((len(bodies), hand.bodies), FAR_M, dtype=wp.float32)
-        wp.launch(
+        launch(
             solid_kernels.distances, (len(bodies), len(hand.pieces)),
             inputs=[obstacles.features, device.pieces, obstacles.solids, position, rotation, FAR_M],
             outputs=[least], device="cpu",
@@ -143,7 +144,7 @@ def _half_space_room(
         spaces.more = wp.array([_more(o) for o in flat], dtype=wp.float64)
         room = wp.full((count, hand.bodies), np.inf, dtype=wp.float64)
         inputs = [posed.chain, spaces, wp.array(which, dtype=wp.int32), posed.position, posed.rotation]
-        wp.launch(chain_kernels.rooms, (count, hand.bodies), inputs=inputs, outputs=[room], device="cpu")
+        launch(chain_kernels.rooms, (count, hand.bodies), inputs=inputs, outputs=[room], device="cpu")
     return np.asarray(room.numpy())
 
 

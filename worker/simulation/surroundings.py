@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError
 from service.model.transforms import compose, invert, quat_conjugate, quat_rotate, quat_to_matrix
+from worker.objects.frames import to_centre
 from worker.objects.model import ObjectModel
 
 Floats = NDArray[np.float64]
@@ -114,6 +115,8 @@ class Neighbour:
     """The same pieces, or a little more, with few faces: what a hand stays clear of."""
     error_m: float
     """Farthest that a solid stands out from its piece [m]."""
+    about_centre: Neighbour | None = None
+    """The neighbour about its middle; None: it is that already."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +130,10 @@ class Scenes:
     neighbours: tuple[Neighbour, ...] = ()
     neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))
     """(S, M, 7) of the neighbours in the scene frame."""
+
+    def centred(self, obj: ObjectModel) -> Scenes:
+        """The same scenes with `obj`, which they are of, and the neighbours about their middles."""
+        return Scenes(self.supports, *_centred(obj, self.object_pose, self.neighbours, self.neighbour_pose))
 
     def placed(self, index: NDArray[np.intp]) -> Placed:
         """Grasps in these scenes, by the number of the scene (N,)."""
@@ -175,6 +182,10 @@ class Placed:
         """The scenes, without the grasps."""
         return Scenes(self.supports, self.object_pose, self.neighbours, self.neighbour_pose)
 
+    def centred(self, obj: ObjectModel) -> Placed:
+        """The same grasps' scenes with `obj`, which they are of, and the neighbours about their middles."""
+        return self.everywhere.centred(obj).placed(self.index)
+
     def neighbours_of(self, scene: int) -> Floats:
         """(M, 7) poses of the neighbours in the object frame."""
         if not self.neighbours:
@@ -192,6 +203,15 @@ class Placed:
         taken = replace(self, index=self.index[rows])
         vars(taken)["scenes"] = self.scenes  # they are the same: not to be made anew
         return taken
+
+
+def _centred(
+    obj: ObjectModel, object_pose: Floats, neighbours: tuple[Neighbour, ...], neighbour_pose: Floats
+) -> tuple[Floats, tuple[Neighbour, ...], Floats]:
+    poses = np.array(neighbour_pose, float)
+    for number, one in enumerate(neighbours):
+        poses[:, number] = to_centre(poses[:, number], one.obj.centre)
+    return to_centre(object_pose, obj.centre), tuple(one.about_centre or one for one in neighbours), poses
 
 
 def placed_together(parts: Sequence[Placed]) -> Placed:

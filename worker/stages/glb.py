@@ -64,11 +64,13 @@ def hand_glb(hand: HandModel) -> bytes:
 
 
 def object_glb(obj: ObjectModel) -> bytes:
-    """The prepared mesh in the object's own frame; metres."""
+    """The prepared mesh in the object's own frame; metres. Its node has the middle of the mesh as its translation, for
+    the numbers of a mesh have 32 bits."""
     document = Document()
-    primitive = document.triangles(obj.vertices, obj.faces, obj.corner_normals)
+    primitive = document.triangles(obj.centred.vertices, obj.faces, obj.corner_normals)
     extras = {"kind": "object", "name": obj.name, "centre_of_mass": plain(obj.centre_of_mass)}
-    return document.bytes([{"name": obj.name, "mesh": document.mesh([primitive])}], extras)
+    node = {"name": obj.name, "mesh": document.mesh([primitive]), "translation": list(obj.centre)}
+    return document.bytes([node], extras)
 
 
 def _found(hand: HandModel) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError, SceneError
 from service.model.messages import TaskMessage
+from service.model.outcomes import told
 from service.model.states import Stage
 from service.store.attributes import Attribute
 from worker.certified import Certified, certified_grasps
@@ -60,8 +61,17 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         _check_hope(message, found)
     seconds = {f"{name}_seconds": round(value, 4) for name, value in found.seconds.items()}
     shares = {name: round(value, 4) for name, value in found.shares.items()}
-    info = {**seconds, **shares, "rejected": found.rejected, "planned": found.planned, **_json(found.grasps.info)}
-    said = base_attributes(hand, message.request, tried=found.tried, verdict_key=found.verdict_key)
+    info = {
+        **seconds,
+        **shares,
+        "rejected": found.rejected,
+        "outcomes": found.outcomes,
+        "planned": found.planned,
+        **_json(found.grasps.info),
+    }
+    said = base_attributes(
+        hand, message.request, tried=found.tried, verdict_key=found.verdict_key, outcomes=found.outcomes
+    )
     of_scenes: dict[str, Attribute] = {"scene_shard": message.inputs[0]} if scenes is not None else {}
     said |= of_scenes | beside_attributes(message)
     return Output({**found.grasps.to_columns(), **found.columns, **columns}, said, info)
@@ -95,7 +105,7 @@ def _check_hope(message: TaskMessage, found: Certified) -> None:
     request = message.request
     if request.want == "raw" or len(found.grasps):
         return
-    lost = ", ".join(f"{number} {name}" for name, number in found.rejected.items() if number)
+    lost = told(found.outcomes)
     raise SceneError(
         f"none of {found.planned} grasps tried is {request.counted} in its scene ({request.place.kind}): {lost}; give "
         f"a larger budget than {request.budget:g} tries for each grasp, or another pose, scene, hand or seed"

@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 import warp as wp
-from warp._src import context
 
 from service.model.fidelity import Fidelity
 from worker.hands.model import HandModel
@@ -21,6 +20,7 @@ from worker.planners.fast_graspd.starts import sample_starts
 from worker.planners.port import Wanted
 from worker.run import Run
 from worker.simulation.data import Data
+from worker.simulation.launches import kernel_seconds
 from worker.simulation.model import Model
 from worker.simulation.record import record_iteration
 from worker.simulation.state import HandState, Schedule
@@ -113,32 +113,11 @@ def host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int, d
     """
     run = Run(device, threads=1)
     plan(hand, obj, Wanted(count, fidelity, seed=1), run)
-    with _waiting(device) if wp.get_device(device).is_cuda else _kernel_seconds() as elsewhere:
+    with _waiting(device) if wp.get_device(device).is_cuda else kernel_seconds() as elsewhere:
         began = time.thread_time()
         plan(hand, obj, Wanted(count, fidelity, seed=0), run)
         total = time.thread_time() - began
     return 1e3 * (total - sum(elsewhere)) / count
-
-
-@contextmanager
-def _kernel_seconds() -> Iterator[list[float]]:
-    """Processor seconds of each kernel that this thread runs on the CPU."""
-    spent: list[float] = []
-    original = context.invoke
-
-    def invoke(*arguments: Any) -> Any:
-        began = time.thread_time()
-        try:
-            return original(*arguments)
-        finally:
-            spent.append(time.thread_time() - began)
-
-    # Warp tells the time of kernels on CUDA only.
-    context.invoke = invoke
-    try:
-        yield spent
-    finally:
-        context.invoke = original
 
 
 @contextmanager

@@ -107,7 +107,8 @@ function colourOf(distance, out) {
 export class Contacts {
   constructor(hand, thing) {
     this.hand = hand;
-    this.frame = thing.group;
+    // About the mesh, whose numbers have 32 bits: an object's own frame may lie far away.
+    this.frame = thing.mesh;
     this.field = new DistanceField(thing.geometry);
     let count = 0;
     hand.eachPoint(this.frame, () => { count += 1; });
@@ -115,6 +116,7 @@ export class Contacts {
     this.front = new InstancedMesh(dot, new MeshBasicMaterial(), count);
     this.behind = new InstancedMesh(dot, new MeshBasicMaterial({ transparent: true, opacity: 0.5, depthTest: false }), count);
     this.group = new Group();
+    this.group.position.copy(thing.mesh.position);
     for (const mesh of [this.behind, this.front]) {
       mesh.instanceMatrix.setUsage(DynamicDrawUsage);
       mesh.frustumCulled = false;

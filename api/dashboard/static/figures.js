@@ -104,13 +104,15 @@ export class Hand {
   }
 }
 
-/** The object's mesh; `setWire` shows its triangles. */
+/** The object; `mesh` stands in it where the model says, `setWire` shows its triangles. */
 export class Thing {
   constructor(model) {
     this.geometry = model.nodes[0].solid;
     this.look = material(COLOURS.object);
+    this.mesh = solid(this.geometry, this.look);
+    this.mesh.position.fromArray(model.nodes[0].translation);
     this.group = new Group();
-    this.group.add(solid(this.geometry, this.look));
+    this.group.add(this.mesh);
   }
 
   setWire(on) {

@@ -13,12 +13,14 @@ from service.index.database import Database
 from service.index.dataset_tables import dataset_cells, dataset_snapshots, datasets
 from service.index.dataset_views import CellView, DatasetView, SnapshotView
 from service.index.queries import cursors
+from service.index.queries.outcomes import outcomes_of
 from service.index.reach import seen_datasets
 from service.index.tables import attempts, jobs, shards, tasks
 from service.index.views import Page
 from service.model.dataset_records import SnapshotShard
 from service.model.domain import BATCH_SIZE, JobOptions
 from service.model.errors import NotFoundError
+from service.model.outcomes import shortfall
 from service.model.planning import job_state, stages_of
 from service.model.projects import EVERYTHING, Reach
 from service.model.states import Stage, State
@@ -53,7 +55,11 @@ class Datasets:
     def get(self, name: str, *, reach: Reach = EVERYTHING) -> DatasetView:
         """A dataset; NotFoundError if there is none."""
         with self.database.reading() as connection:
-            return _dataset_view(connection, _dataset_row(connection, name, reach))
+            view = _dataset_view(connection, _dataset_row(connection, name, reach))
+            if view.reason is None:
+                return view
+            cells = select(dataset_cells.c.job_id).where(dataset_cells.c.dataset == name)
+            return view.model_copy(update={"outcomes": outcomes_of(connection, tasks.c.job_id.in_(cells))})
 
     def unfinished(self, names: Collection[str]) -> set[str]:
         """Of these names, those of a dataset that has not ended."""
@@ -240,12 +246,15 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
         count = work[job]
         total = max(count["tasks"], _tasks_of_cell(options))
         yields = made.get(job, {"grasps": 0, "valid": 0, "tried": 0, "seconds": 0.0})
+        found = yields["valid"] if options.counted == "valid" else yields["grasps"]
+        reason = row["reason"]
+        if row["state"] == State.SUCCEEDED.value and options.want == "valid" and found < options.grasps:
+            lost = outcomes_of(connection, tasks.c.job_id == job)
+            reason = shortfall(found, options.grasps, options.counted, yields["tried"], options.budget, lost)
         views.append(
             CellView(
-                **{
-                    name: row[name]
-                    for name in ("position", "hand", "object", "job_id", "state", "planned", "reason", "choice")
-                },
+                **{name: row[name] for name in ("position", "hand", "object", "job_id", "state", "planned", "choice")},
+                reason=reason,
                 fidelity=row["fidelity"] or options.knobs.name,
                 asked=options.grasps,
                 **yields,

@@ -11,6 +11,7 @@ from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, selec
 
 from service.index.database import Database, chunks
 from service.index.queries import cursors
+from service.index.queries.outcomes import outcomes_of
 from service.index.reach import seen_jobs, seen_tasks
 from service.index.tables import attempts, jobs, shards, tasks
 from service.index.views import AttemptView, JobView, Page, StageProgress, TaskView
@@ -55,7 +56,10 @@ class Jobs:
             rows = connection.execute(select(jobs).where(jobs.c.id == job_id, *seen_jobs(reach))).mappings().all()
             if not rows:
                 raise NotFoundError(f"there is no job {job_id!r}")
-            return _job_views(connection, rows)[0]
+            (view,) = _job_views(connection, rows)
+            if view.note is None:
+                return view
+            return view.model_copy(update={"outcomes": outcomes_of(connection, tasks.c.job_id == job_id)})
 
     def unfinished(self, ids: Collection[str]) -> set[str]:
         """Of these job ids, those whose job has not ended."""

@@ -135,6 +135,20 @@ def test_a_job_shows_progress_by_stage(parts: Parts) -> None:
     assert done.finished is not None
 
 
+def test_a_job_that_found_fewer_grasps_says_what_became_of_the_others(parts: Parts) -> None:
+    job, _ = job_actions.submit(parts, request(grasps=64))
+    record = read_record(JobRecord, parts.store, names.job_record(job.id))
+    for task, lost in zip(plan(record), ({"slipped": 3, "turned": 1}, {"slipped": 4}), strict=True):
+        made = make_shard(parts.store, message_of(record, task, attempt=1, max_attempt=3))
+        parts.index.write.add_manifest(made.model_copy(update={"info": {"outcomes": lost}}))
+    done = parts.index.jobs.get(job.id)
+    assert done.valid < 64 and done.outcomes == {"turned": 1, "slipped": 7}
+    assert done.note is not None and f"found {done.valid} of 64 valid grasps" in done.note
+    assert "7 slipped, 1 turned in the hand" in done.note
+    (listed,) = parts.index.jobs.page().items
+    assert listed.note is not None and not listed.outcomes
+
+
 def test_jobs_come_newest_first_page_by_page(parts: Parts) -> None:
     ids = []
     for seed in range(5):

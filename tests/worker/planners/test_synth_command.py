@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,14 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
+import graspd
 from graspd.cli import build
+from service.cli import write_output
 from service.model.errors import ConflictError, NotFoundError
 from service.readers import Grasps, open_shards
 from service.store.shards import Shard, read_shard
+from worker import certified
+from worker.commands import synth as synth_command
 from worker.files.of_shard import object_of_shard
 
 
@@ -183,3 +188,63 @@ def test_every_command_finds_hand_and_object_of_a_file_by_itself(of_own_mesh: Pa
         tmp_path / "v.h5",
     )  # fmt: skip
     assert views.exit_code == 0, views.output
+
+
+def test_fewer_grasps_than_asked_are_told_with_the_reason_and_exit_code_3(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = folder / "few.h5"
+    monkeypatch.setattr(certified, "passes", lambda columns: np.zeros(len(columns["quality/success"]), np.uint8))
+    words = ["--hand", "barrett", "--object", "block", "-n", 2, "--budget", 1, "--json"]
+    done = run("synth", *words, "--fidelity", "draft", "--device", "cpu", "-o", out)  # type: ignore[arg-type]
+    said = json.loads(done.stdout.splitlines()[-1])
+    assert (done.exit_code, said["grasps"], said["valid"], said["wanted"]) == (3, 0, 0, 2), done.output
+    assert sum(said["outcomes"].values()) == said["tried"] == 2
+    assert said["reason"].startswith("found 0 of 2 valid grasps in 2 tries: ")
+    shard = read_shard(out, kind="base")
+    assert shard.attributes["reason"] == said["reason"]
+    assert json.loads(str(shard.attributes["outcomes"])) == said["outcomes"]
+    assert (graspd.load(out).reason, graspd.load(out).outcomes) == (said["reason"], said["outcomes"])
+
+
+def test_all_that_were_asked_need_no_reason(judged: tuple[Path, dict[str, Any]]) -> None:
+    assert judged[1]["reason"] is None and "reason" not in read_shard(judged[0]).attributes
+
+
+@pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGTERM])
+def test_who_stops_it_keeps_what_was_judged(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, asked: signal.Signals
+) -> None:
+    real, out = synth_command.synthesized, folder / f"stopped-{asked}.h5"
+
+    def stopped(*given: Any, progress: Any, **named: Any) -> Any:
+        def tell(done: float, total: float, message: str) -> None:
+            if done >= 32 and signal.getsignal(asked) is not before:
+                signal.raise_signal(asked)
+
+        return real(*given, progress=tell, **named)
+
+    before = signal.getsignal(asked)
+    monkeypatch.setattr(synth_command, "synthesized", stopped)
+    words = ["--hand", "barrett", "--object", "block", "-n", 64, "--budget", 1, "--referee", "none", "--json"]
+    done = run("synth", *words, "--fidelity", "draft", "--device", "cpu", "-o", out)  # type: ignore[arg-type]
+    shard = read_shard(out, kind="base")
+    kept = len(shard["quality/valid"])
+    assert done.exit_code == 128 + asked and 0 < kept <= 32
+    assert f"interrupted: {out} holds the {kept} of 64" in done.stderr
+    assert shard.attributes["grasps_wanted"] == 64 and signal.getsignal(asked) is before
+
+
+def test_a_file_is_written_whole_or_not_at_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = folder / "whole.h5"
+    out.write_bytes(b"before")
+
+    def half(path: Path, content: bytes) -> int:
+        with path.open("wb") as opened:
+            opened.write(content[:2])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "write_bytes", half)
+    with pytest.raises(KeyboardInterrupt):
+        write_output(out, b"after")
+    assert out.read_bytes() == b"before" and not list(folder.glob("*.part")) and not list(folder.glob(".*.part"))

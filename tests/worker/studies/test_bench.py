@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,10 @@ from worker.commands.bench import app
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners.fast_graspd.pairs import pair_of
-from worker.studies.timing import kernel_shares
+from worker.planners.fast_graspd.planner import plan
+from worker.planners.port import Wanted
+from worker.run import Run
+from worker.studies.timing import host_ms, kernel_shares
 
 RUN_KEYS = {
     "fidelity", "batch", "processes", "hand_points", "faces", "iterations", "ms_per_iteration", "grasps_per_second",
@@ -53,6 +57,14 @@ def test_the_host_takes_some_of_the_time_of_a_grasp_and_not_all(result: tuple[di
     host, runs = result[0]["host_ms_per_grasp"], result[0]["runs"]
     assert isinstance(runs, list) and isinstance(host, float)
     assert 0.0 < host < max(1e3 * run["seconds"] / run["grasps"] for run in runs)
+
+
+def test_kernels_on_the_processor_are_no_time_of_the_host() -> None:
+    hand, obj, fidelity, count = hand_from_path("barrett"), object_from_path("block"), FIDELITIES["draft"], 16
+    host = host_ms(hand, obj, fidelity, count, "cpu")
+    began = time.thread_time()
+    plan(hand, obj, Wanted(count, fidelity, seed=0), Run("cpu", threads=1))
+    assert host < 0.5 * 1e3 * (time.thread_time() - began) / count
 
 
 def test_json_table_and_plot_are_written(result: tuple[dict[str, object], Path]) -> None:

@@ -12,7 +12,7 @@ from service.model.errors import LimitError, MeshError
 
 MAX_FACES: Final = 1_000_000
 #: Coordinates beyond this are no length in any unit.
-MAX_COORDINATE: Final = 1e9
+MAX_COORDINATE: Final = 1e11
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.across import ALIKE_M, BESIDE_M, NOISE, ROOM_M, crossings_of, frames
 from worker.simulation.device import to_wxyz, to_xyzw
 from worker.simulation.kernels import reaching as kernels
+from worker.simulation.launches import launch
 from worker.simulation.model import Model
 from worker.simulation.state import HandState
 
@@ -79,7 +80,7 @@ class Reaching:
             number = wp.empty(count, dtype=wp.int32)
             pivot, rotation = wp.zeros(count, dtype=wp.vec3), wp.zeros(count, dtype=wp.quat)
             q = wp.zeros((count, m.dofs), dtype=wp.float32)
-            wp.launch(
+            launch(
                 kernels.reach, count,
                 inputs=[m.obj.surface, self.grips, wp.array(seeds, dtype=wp.int32), wp.array(first, dtype=wp.int32),
                         DRAWS, wp.vec2(*ALIKE_M), wp.vec2(*ROOM_M), wp.array(retreats, dtype=wp.float32)],

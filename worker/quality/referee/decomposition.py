@@ -8,7 +8,7 @@ Excess is what the pieces' union has more of volume, over the object's surface: 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Final
@@ -84,18 +84,20 @@ def decompose(obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
     Raises:
         MeshError: the best pieces stand out more than `MAX_EXCESS_M` from the object.
     """
-    pieces = _load_or_make(_Key(obj), cache or default_cache())
+    pieces = _load_or_make(_Key(obj.centred), cache or default_cache())
     if pieces.excess_m > MAX_EXCESS_M:
         raise MeshError(
             f"{obj.name}: its {len(pieces)} convex pieces have {pieces.volume_ratio:.2f} times its volume and "
             f"stand out {pieces.excess_m * 1e3:.1f} mm (limit {MAX_EXCESS_M * 1e3:g} mm); the referee cannot judge it"
         )
+    if any(obj.centre):
+        pieces = replace(pieces, vertices=tuple(part + obj.centre for part in pieces.vertices))
     return pieces
 
 
 def piece_file(obj: ObjectModel, cache: Path | None = None) -> Path:
     """Where `decompose` keeps the pieces of an object; its stem is a digest of all that they follow from."""
-    return _file(_Key(obj), cache or default_cache())
+    return _file(_Key(obj.centred), cache or default_cache())
 
 
 class _Key:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from service.model.colours import hexadecimal
 from service.model.transforms import IDENTITY_POSE, apply, quat_rotate
+from worker.grasps import moved
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.objects.model import Floats, ObjectModel
@@ -73,7 +74,8 @@ def grasp_pictures(
     Raises:
         TaskCancelled: `run.cancelled()` answered True.
     """
-    hand_pose = np.atleast_2d(np.asarray(hand_pose, float))
+    hand_pose = moved(np.atleast_2d(np.asarray(hand_pose, float)), np.negative(obj.centre))
+    obj = obj.centred
     joints = np.atleast_2d(np.asarray(joint_positions, float))
     solids: list[Solid | Box] = [
         Box(FLOOR_SIZE),

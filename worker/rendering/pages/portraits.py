@@ -139,6 +139,7 @@ def above(first: Image.Image, second: Image.Image) -> Image.Image:
 
 def object_portrait(obj: ObjectModel, *, device: str = "cpu") -> Image.Image:
     """The prepared mesh from three sides, z up."""
+    obj = obj.centred
     solid = Solid(obj.vertices, obj.faces, obj.corner_normals)
     extents = " x ".join(f"{1e3 * extent:.0f}" for extent in np.ptp(obj.vertices, axis=0))
     captions = [f"{obj.name}, {extents} mm", f"{len(obj.faces)} faces", f"within {1e3 * obj.deviation_m:.2f} mm"]

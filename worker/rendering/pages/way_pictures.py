@@ -13,8 +13,10 @@ from service.model.colours import hexadecimal
 from service.model.scene_spec import HalfSpace
 from service.model.transforms import IDENTITY_POSE, apply, compose
 from service.readers.ways import Waypoint
+from worker.grasps import moved
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
+from worker.objects.frames import to_centre
 from worker.objects.model import Floats, ObjectModel
 from worker.rendering.cameras import intrinsics, look_at
 from worker.rendering.hands import drawn_bodies, hand_looks, hand_solids
@@ -67,6 +69,13 @@ class Around:
     """(N,) scene of each grasp; None: all in the first."""
     neighbours: Neighbours | None = None
 
+    def centred(self, obj: ObjectModel) -> Around:
+        """The same with `obj`, which they are of, and the neighbours about their middles."""
+        if not self.supports:
+            return self  # a free object floats wherever the tracer is most exact: about its origin
+        beside = None if self.neighbours is None else self.neighbours.centred
+        return replace(self, object_pose=to_centre(self.object_pose, obj.centre), neighbours=beside)
+
     def scene(self, number: int) -> int:
         """Scene of a grasp."""
         return 0 if self.index is None else int(self.index[number])
@@ -113,7 +122,9 @@ class _Stage:
     """One tracer for all grasps: the frames of one grasp are its worlds."""
 
     def __init__(self, hand: HandModel, obj: ObjectModel, around: Around, frames: int, run: Run, near_m: float) -> None:
-        self.hand, self.obj, self.around, self.frames, self.run = hand, obj, around, frames, run
+        self.hand, self.obj, self.frames, self.run = hand, obj.centred, frames, run
+        self.centre, self.around = np.array(obj.centre), around.centred(obj)
+        around, obj = self.around, self.obj
         self.near_m = near_m
         self.others = around.neighbours.objects if around.neighbours else ()
         self.lamp = TOWARD_LAMP
@@ -130,7 +141,7 @@ class _Stage:
         """(A, F, H, W, 3)"""
         scene = self.around.scene(number)
         rest = np.asarray(self.around.object_pose[scene], float)
-        roots = compose(rest, np.stack([point.hand_pose for point in way]))
+        roots = compose(rest, moved(np.stack([point.hand_pose for point in way]), -self.centre))
         bodies = body_poses(self.hand, roots, np.stack([point.joint_positions for point in way]))
         things = np.stack([compose(rest, np.append(point.carried, IDENTITY_POSE[3:])) for point in way])
         solid = np.stack([apply(pose, self.obj.hull_vertices) for pose in things])

@@ -1,0 +1,144 @@
+"""The results of an object do not depend on where the origin of its mesh lies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+from graspd.cli import build
+from service.model.domain import JobOptions
+from service.model.fidelity import FIDELITIES
+from service.model.scene_spec import SceneSpec, parse_scene
+from service.model.transforms import apply
+from service.store.shards import write_shard
+from worker.files.cases import load_case
+from worker.files.evaluate import evaluate
+from worker.files.synthesis import Synthesized, synthesized
+from worker.objects.prepare import object_from_path
+from worker.rendering.pages.pictures import grasp_pictures
+from worker.stages.glb import object_glb
+
+PLACES = {"origin": (0.0, 0.0, 0.0), "6 m": (5.0, -3.0, 2.0), "UTM": (500_000.0, 4_500_000.0, 300.0)}
+AWAY = pytest.mark.parametrize("place", ["6 m", "UTM"])
+SCENES = pytest.mark.parametrize("scene", ["free", "table"])
+REQUEST = JobOptions(grasps=2, want="raw", audits=0, fidelity=FIDELITIES["draft"], seed=1)
+#: Of positions in the frame of the file [m].
+ROUNDING_M = 1e-6
+
+
+@pytest.fixture(scope="module")
+def boxes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder, box = tmp_path_factory.mktemp("boxes"), trimesh.creation.box((0.06, 0.05, 0.1))
+    found = {name: folder / name.replace(" ", "") / "box.obj" for name in PLACES}
+    for name, path in found.items():
+        path.parent.mkdir()
+        lines = ["v " + " ".join(f"{value:.6f}" for value in vertex) for vertex in box.vertices + PLACES[name]]
+        lines += ["f " + " ".join(str(k + 1) for k in face) for face in box.faces]
+        path.write_text("\n".join(lines))
+    return found
+
+
+@pytest.fixture(scope="module")
+def made(boxes: dict[str, Path]) -> dict[tuple[str, str], Synthesized]:
+    def one(place: str, scene: str) -> Synthesized:
+        where = SceneSpec() if scene == "free" else parse_scene(scene, faces="drawn", touch=None, beside=[])
+        return synthesized("barrett", str(boxes[place]), REQUEST, place=where, scenes=1, device="cpu", threads=1)
+
+    return {(place, scene): one(place, scene) for place in PLACES for scene in ("free", "table")}
+
+
+def file_of(found: Synthesized, path: Path) -> Path:
+    path.write_bytes(write_shard("base", found.arrays, found.attributes))
+    return path
+
+
+@AWAY
+@SCENES
+def test_grasps_are_the_same_in_the_frame_of_the_file(made: Any, place: str, scene: str) -> None:
+    here, there = made["origin", scene].arrays, made[place, scene].arrays
+    ways = [name for name in here if name.endswith("hand_pose") or name in ("grasp/approach", "grasp/lift")]
+    for name in ways:
+        np.testing.assert_allclose(there[name][..., :3] - PLACES[place], here[name][..., :3], rtol=0, atol=ROUNDING_M)
+        np.testing.assert_array_equal(there[name][..., 3:], here[name][..., 3:])
+    for name in set(here) - {*ways, "scene/object_pose"}:
+        np.testing.assert_array_equal(there[name], here[name], err_msg=name)
+
+
+@AWAY
+def test_the_object_stands_in_its_scenes_where_it_would(made: Any, place: str) -> None:
+    here, there = (made[at, "table"].arrays["scene/object_pose"] for at in ("origin", place))
+    np.testing.assert_array_equal(there[:, 3:], here[:, 3:])
+    middle = apply(there, np.array(PLACES[place]))
+    np.testing.assert_allclose(middle, here[:, :3], rtol=0, atol=1e-8)
+
+
+@AWAY
+@SCENES
+def test_an_evaluation_says_the_same(made: Any, tmp_path: Path, place: str, scene: str) -> None:
+    protocol: Any = "lift" if scene == "table" else "dexgraspbench"
+    rows = []
+    for at in ("origin", place):
+        row = evaluate(load_case(file_of(made[at, scene], tmp_path / f"{at}.h5")), protocol=protocol)
+        told = {name: value for name, value in row.items() if "seconds" not in name and not name.startswith("sgs")}
+        rows.append({name: value for name, value in told.items() if name != "verdict_key"})
+    assert rows[0] == rows[1]
+
+
+@AWAY
+def test_pictures_are_the_same(made: Any, boxes: dict[str, Path], tmp_path: Path, place: str) -> None:
+    seen = []
+    for at in ("origin", place):
+        grasp = made[at, "free"].arrays
+        pictures = grasp_pictures(
+            load_case(file_of(made[at, "free"], tmp_path / f"{at}.h5")).hand, object_from_path(boxes[at]),
+            grasp["grasp/hand_pose"][:1], grasp["grasp/joint_positions"][:1], (48, 48), samples=2,
+        )  # fmt: skip
+        seen.append(pictures)
+    np.testing.assert_array_equal(*seen)
+
+
+@AWAY
+def test_views_of_scenes_are_the_same(made: Any, tmp_path: Path, place: str) -> None:
+    from service.store.shards import read_shard
+
+    seen = []
+    for at in ("origin", place):
+        shard, views = file_of(made[at, "table"], tmp_path / f"{at}.h5"), tmp_path / f"{at}-views.h5"
+        words = ["render", shard, "--views", "1", "--width", "48", "--height", "36", "--device", "cpu", "-o", views]
+        done = CliRunner().invoke(build(), [str(word) for word in words])
+        assert done.exit_code == 0, done.output
+        seen.append(read_shard(views, kind="views").arrays)
+    for name in seen[0]:
+        np.testing.assert_array_equal(seen[1][name], seen[0][name], err_msg=name)
+
+
+@AWAY
+def test_a_model_stands_where_its_file_says_in_numbers_about_its_middle(boxes: dict[str, Path], place: str) -> None:
+    import io
+
+    scene = trimesh.load(io.BytesIO(object_glb(object_from_path(boxes[place]))), file_type="glb")
+    (name,) = scene.graph.nodes_geometry
+    np.testing.assert_allclose(scene.graph[name][0][:3, 3], PLACES[place], atol=1e-7)
+    np.testing.assert_allclose(np.abs(next(iter(scene.geometry.values())).bounds), [[0.03, 0.025, 0.05]] * 2, atol=1e-7)
+
+
+@AWAY
+def test_a_neighbour_may_lie_anywhere_in_its_file_as_well(boxes: dict[str, Path], place: str) -> None:
+    from worker.scenes.beside import scenes_of
+
+    spec = SceneSpec(kind="bin", neighbours=[{"object": "box"}])
+    block, other = object_from_path("block"), object_from_path(boxes["origin"])
+    _, here = scenes_of(spec, block, [other], count=1, seed=0)
+    far = object_from_path(boxes[place])
+    scenes, there = scenes_of(spec, block, [far], count=1, seed=0)
+    np.testing.assert_array_equal(there["scene/object_pose"], here["scene/object_pose"])
+    np.testing.assert_allclose(
+        apply(there["scene/neighbour_pose"][0], np.array(far.centre)), here["scene/neighbour_pose"][0, :, :3], atol=1e-8
+    )
+    (room,) = scenes.centred(block).neighbour_pose
+    np.testing.assert_array_equal(room, here["scene/neighbour_pose"][0])
