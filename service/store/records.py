@@ -10,6 +10,7 @@ from service.model import names
 from service.model.clock import timestamp
 from service.model.errors import DamagedError
 from service.model.records import AttemptRecord, JobEvent
+from service.store.seals import is_sealed, put_sealed
 from service.store.store import Store
 
 RecordT = TypeVar("RecordT", bound=BaseModel)
@@ -21,7 +22,8 @@ def read_record(model: type[RecordT], store: Store, key: str) -> RecordT:
 
 
 def parse_record(model: type[RecordT], data: bytes, key: str) -> RecordT:
-    """A record from its bytes."""
+    """A record from its bytes; DamagedError if they are not those that were sealed, or hold no such record."""
+    is_sealed(f"{key}.json", [data], len(data))
     try:
         return model.model_validate_json(data)
     except ValidationError as error:
@@ -34,7 +36,7 @@ def parse_record(model: type[RecordT], data: bytes, key: str) -> RecordT:
 
 def put_record(store: Store, key: str, record: BaseModel) -> bool:
     """Write a record if there is none yet; False if there was."""
-    return store.put(key, record.model_dump_json().encode())
+    return put_sealed(store, key, record.model_dump_json().encode())
 
 
 def job_events(store: Store, job: str) -> list[JobEvent]:
