@@ -44,14 +44,14 @@ def scene_kinds(store: Store) -> list[str]:
 
 
 def publish(store: Store, kind: str, record: Mapping[str, Any]) -> str:
-    """Put a record beside the earlier ones of its kind; its key follows from its `created`, and those of one second
+    """Put a record beside the earlier ones of its kind; its key follows from its `created`, and those of one moment
     are numbered.
 
     Raises:
         ValueError: a number in it that JSON does not know.
     """
     stem = f"{kind}/{re.sub(r'[^0-9A-Za-z]', '', str(record['created']))}"
-    keys = (f"{stem}{number or ''}.json" for number in itertools.count())
+    keys = (f"{stem}{number:03}.json" if number else f"{stem}.json" for number in itertools.count())
     data = json.dumps(record, allow_nan=False).encode()
     return next(key for key in keys if put_sealed(store, key, data))
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from service.model.errors import DamagedError
 from service.model.stability import (
     OUTCOMES,
     MapCell,
@@ -82,7 +83,7 @@ def load(store: Store) -> Stability | None:
     try:
         found = latest(store, STABILITY)
         return None if found is None else from_json(found)
-    except ValueError:
+    except (ValueError, DamagedError):
         return None
 
 
