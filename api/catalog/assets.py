@@ -19,6 +19,7 @@ from service.model.projects import marks_of
 from service.model.states import AssetKind
 from service.pipeline import deletion
 from service.pipeline.backends import Parts
+from service.pipeline.recording import recording
 from service.store import library
 from service.store.assets import ZipFiles, asset_json
 from service.store.descriptions import MAX_BYTES, json_object
@@ -90,9 +91,9 @@ class Assets:
             # Before the record: from then on it counts, and no worker is asked about it.
             put_document(store, names.asset_check(kind, asset.digest), found)
         # Of two uploads at once that want one name, the later one must see the earlier one's record.
-        with index.database.writing() as connection:
+        with recording(self._parts) as (connection, put):
             self._refuse_taken(kind, name, asset.digest)
-            asset = library.record_asset(store, asset)
+            asset = library.record_asset(store, asset, put)
             index.write.add_asset(asset, library.load_check(store, kind, asset.digest), within=connection)
         return self.one(kind, asset.digest)
 

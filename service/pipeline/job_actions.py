@@ -16,7 +16,7 @@ from service.model.ability import need_of
 from service.model.clock import timestamp
 from service.model.digests import job_id
 from service.model.domain import JobRequest
-from service.model.errors import ConflictError, InputError, NotFoundError, UnavailableError
+from service.model.errors import ConflictError, NotFoundError, UnavailableError
 from service.model.messages import Origin, TaskMessage
 from service.model.planning import lane_of, message_of
 from service.model.projects import EVERYTHING, Reach
@@ -24,6 +24,7 @@ from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane, State
 from service.pipeline.backends import Parts
 from service.pipeline.fidelity_choice import Resolver
+from service.pipeline.recording import recording
 from service.pipeline.routes import Routes
 from service.pipeline.scene_check import check_scene
 from service.pipeline.usable import usable, with_neighbours, with_network
@@ -90,7 +91,7 @@ def prepare(
 
 
 def enter(parts: Parts, record: JobRecord, *, keeps_assets: bool = False) -> tuple[JobView, bool]:
-    """Keep a planned job and queue its first tasks.
+    """Keep a planned job and queue its first tasks. The keeper enters those that are too many for one turn.
 
     Args:
         keeps_assets: a dataset keeps hand, object, neighbours and network from being deleted meanwhile.
@@ -103,21 +104,18 @@ def enter(parts: Parts, record: JobRecord, *, keeps_assets: bool = False) -> tup
         ConflictError: the same job was deleted, and its objects are still being removed.
     """
     key = names.job_record(record.id)
-    new = put_record(parts.store, key, record)
-    try:
+    # The dataset wants its jobs whatever breaks off, and its planner holds the turn for no store.
+    new = keeps_assets and put_record(parts.store, key, record)
+    with recording(parts, [key] if new else []) as (connection, put):
+        new = new or (not keeps_assets and put(key, record))
         refuse_pending(parts.store, "job", record.id)
         if not new:
-            record = read_record(JobRecord, parts.store, key)
-        with parts.index.database.writing() as connection:
-            if not new and not parts.store.exists(key):
+            if not parts.store.exists(key):
                 raise ConflictError(f"job {record.id} was deleted just now; submit it again")
-            if not keeps_assets and (missing := parts.index.assets.missing(record.assets, within=connection)):
-                raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
-            parts.index.write.add_job(record, within=connection)
-    except InputError:
-        if new:
-            parts.store.delete(key)
-        raise
+            record = read_record(JobRecord, parts.store, key)
+        if not keeps_assets and (missing := parts.index.assets.missing(record.assets, within=connection)):
+            raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
+        parts.index.write.enter_job(record, within=connection)
     _start(parts, record.id)
     return parts.index.jobs.get(record.id), new
 
@@ -132,12 +130,13 @@ def cancel(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
         NotFoundError: unknown job.
         ConflictError: the job is already finished.
     """
-    job = parts.index.jobs.get(job_id)
-    if job.state.is_final:
-        raise ConflictError(f"job {job_id} has already {_ended(job.state)}; there is nothing to cancel")
-    in_queue = parts.index.feed.unfinished_tasks(job_id)
-    add_job_event(parts.store, job_id, "cancelled", cause=cause)
-    _index_events(parts, job_id)
+    with recording(parts) as (connection, put):
+        job = parts.index.jobs.get(job_id)
+        if job.state.is_final:
+            raise ConflictError(f"job {job_id} has already {_ended(job.state)}; there is nothing to cancel")
+        in_queue = parts.index.feed.unfinished_tasks(job_id)
+        add_job_event(parts.store, job_id, "cancelled", cause=cause, put=put)
+        parts.index.write.set_job_events(job_id, job_events(parts.store, job_id), within=connection)
     try:
         parts.queue.discard(in_queue)
     except UnavailableError as error:
@@ -155,11 +154,12 @@ def retry(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
         NotFoundError: unknown job.
         ConflictError: the job neither failed nor was cancelled.
     """
-    job = parts.index.jobs.get(job_id)
-    if job.state not in (State.FAILED, State.CANCELLED):
-        raise ConflictError(f"job {job_id} is {job.state}; only a failed or cancelled job can be retried")
-    add_job_event(parts.store, job_id, "retried", parts.index.feed.failed_tasks(job_id), cause=cause)
-    _index_events(parts, job_id)
+    with recording(parts) as (connection, put):
+        job = parts.index.jobs.get(job_id)
+        if job.state not in (State.FAILED, State.CANCELLED):
+            raise ConflictError(f"job {job_id} is {job.state}; only a failed or cancelled job can be retried")
+        add_job_event(parts.store, job_id, "retried", parts.index.feed.failed_tasks(job_id), cause=cause, put=put)
+        parts.index.write.set_job_events(job_id, job_events(parts.store, job_id), within=connection)
     _start(parts, job_id)
     return _told(parts, job_id)
 
@@ -206,12 +206,6 @@ def _start(parts: Parts, job_id: str) -> None:
         _told(parts, job_id)
     except UnavailableError as error:
         log.warning("job %s is recorded; its tasks are queued when the queue answers: %s", job_id, error)
-
-
-def _index_events(parts: Parts, job_id: str) -> None:
-    """What users did to a job, read while nobody else writes: of two at once the later one must know of both events."""
-    with parts.index.database.writing() as connection:
-        parts.index.write.set_job_events(job_id, job_events(parts.store, job_id), within=connection)
 
 
 def _told(parts: Parts, job_id: str) -> JobView:

@@ -15,7 +15,7 @@ from service.model.domain import Asset
 from service.model.errors import ConflictError, DamagedError, InputError
 from service.model.states import AssetKind
 from service.store.assets import builtin_asset, builtin_model, builtin_names, describe, pack_into, unpack
-from service.store.records import put_record, read_record
+from service.store.records import Put, put_record, read_record
 from service.store.seals import get_document, is_sealed, seal_archive, sealed
 from service.store.store import Store
 
@@ -87,14 +87,17 @@ def _is_damaged(store: Store, key: str) -> bool:
     return False
 
 
-def record_asset(store: Store, asset: Asset) -> Asset:
+def record_asset(store: Store, asset: Asset, put: Put | None = None) -> Asset:
     """The second half of `publish_asset`: the record, from which on the asset counts.
+
+    Args:
+        put: writes the record; None: into this store.
 
     Raises:
         ConflictError: the same content is known under another name, or is being removed.
     """
     record = names.asset_record(asset.kind, asset.digest)
-    new = put_record(store, record, asset)
+    new = put(record, asset) if put is not None else put_record(store, record, asset)
     if store.exists(names.deletion(asset.kind.value, asset.digest)):
         if new:
             store.delete(record)

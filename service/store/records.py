@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Literal, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -14,6 +16,8 @@ from service.store.seals import is_sealed, put_sealed
 from service.store.store import Store
 
 RecordT = TypeVar("RecordT", bound=BaseModel)
+#: Writes a record under a key if there is none; whether there was none.
+Put = Callable[[str, BaseModel], bool]
 
 
 def read_record(model: type[RecordT], store: Store, key: str) -> RecordT:
@@ -52,13 +56,15 @@ def add_job_event(
     retried: dict[str, int] | None = None,
     *,
     cause: str = "",
+    put: Put | None = None,
 ) -> JobEvent:
     """Append an event after those there are; the state of a job follows from reading them all again, in order."""
+    put = put or partial(put_record, store)
     while True:
         taken = [int(entry.key.rsplit("/", 1)[1].partition("-")[0]) for entry in store.list(names.job_events(job))]
         number = max(taken, default=0) + 1
         event = JobEvent(number=number, what=what, at=timestamp(), retried=retried or {}, cause=cause)
-        if put_record(store, names.job_event(job, event.number, what), event):
+        if put(names.job_event(job, event.number, what), event):
             return event
 
 
