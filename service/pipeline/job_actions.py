@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import time
 from collections import defaultdict
-from collections.abc import Sequence
-from typing import Final
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Final, Literal
 
 from service.index.queries.feed import ReadyTask
 from service.index.views import JobView
@@ -130,13 +131,11 @@ def cancel(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
         NotFoundError: unknown job.
         ConflictError: the job is already finished.
     """
-    with recording(parts) as (connection, put):
-        job = parts.index.jobs.get(job_id)
-        if job.state.is_final:
-            raise ConflictError(f"job {job_id} has already {_ended(job.state)}; there is nothing to cancel")
+    _refuse_ended(parts, job_id)
+    with _changing(parts, job_id) as add:
+        _refuse_ended(parts, job_id)
         in_queue = parts.index.feed.unfinished_tasks(job_id)
-        add_job_event(parts.store, job_id, "cancelled", cause=cause, put=put)
-        parts.index.write.set_job_events(job_id, job_events(parts.store, job_id), within=connection)
+        add("cancelled", cause=cause)
     try:
         parts.queue.discard(in_queue)
     except UnavailableError as error:
@@ -154,12 +153,10 @@ def retry(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
         NotFoundError: unknown job.
         ConflictError: the job neither failed nor was cancelled.
     """
-    with recording(parts) as (connection, put):
-        job = parts.index.jobs.get(job_id)
-        if job.state not in (State.FAILED, State.CANCELLED):
-            raise ConflictError(f"job {job_id} is {job.state}; only a failed or cancelled job can be retried")
-        add_job_event(parts.store, job_id, "retried", parts.index.feed.failed_tasks(job_id), cause=cause, put=put)
-        parts.index.write.set_job_events(job_id, job_events(parts.store, job_id), within=connection)
+    _refuse_unfailed(parts, job_id)
+    with _changing(parts, job_id) as add:
+        _refuse_unfailed(parts, job_id)
+        add("retried", parts.index.feed.failed_tasks(job_id), cause=cause)
     _start(parts, job_id)
     return _told(parts, job_id)
 
@@ -206,6 +203,38 @@ def _start(parts: Parts, job_id: str) -> None:
         _told(parts, job_id)
     except UnavailableError as error:
         log.warning("job %s is recorded; its tasks are queued when the queue answers: %s", job_id, error)
+
+
+@contextmanager
+def _changing(parts: Parts, job_id: str) -> Iterator[Callable[..., None]]:
+    """A turn in which an event may be added to those of a job: of two at once the later one knows of both.
+
+    What there was before is read beforehand: the store may be slow, and others wait for the turn.
+    """
+    before = job_events(parts.store, job_id)
+    with recording(parts) as (connection, put):
+
+        def add(
+            what: Literal["cancelled", "retried"], retried: dict[str, int] | None = None, *, cause: str = ""
+        ) -> None:
+            event = add_job_event(parts.store, job_id, what, retried, cause=cause, put=put)
+            is_next = event.number == max((one.number for one in before), default=0) + 1
+            events = [*before, event] if is_next else job_events(parts.store, job_id)
+            parts.index.write.set_job_events(job_id, events, within=connection)
+
+        yield add
+
+
+def _refuse_ended(parts: Parts, job_id: str) -> None:
+    job = parts.index.jobs.get(job_id)
+    if job.state.is_final:
+        raise ConflictError(f"job {job_id} has already {_ended(job.state)}; there is nothing to cancel")
+
+
+def _refuse_unfailed(parts: Parts, job_id: str) -> None:
+    job = parts.index.jobs.get(job_id)
+    if job.state not in (State.FAILED, State.CANCELLED):
+        raise ConflictError(f"job {job_id} is {job.state}; only a failed or cancelled job can be retried")
 
 
 def _told(parts: Parts, job_id: str) -> JobView:

@@ -39,7 +39,7 @@ def recording(parts: Parts, made: Sequence[str] = ()) -> Iterator[tuple[Connecti
         try:
             yield connection, put
             connection.commit()
-        except BaseException:
+        except Exception:
             for key in keys:
                 try:
                     parts.store.delete(key)

@@ -27,7 +27,7 @@ def read_record(model: type[RecordT], store: Store, key: str) -> RecordT:
 
 def parse_record(model: type[RecordT], data: bytes, key: str) -> RecordT:
     """A record from its bytes; DamagedError if they are not those that were sealed, or hold no such record."""
-    is_sealed(f"{key}.json", [data], len(data))
+    is_sealed(key, [data], len(data))
     try:
         return model.model_validate_json(data)
     except ValidationError as error:
