@@ -25,6 +25,7 @@ from service.store import packs
 from service.store.library import publish_asset
 from service.store.manifests import ShardManifest, publish_shard
 from service.store.packs import find_manifest
+from service.store.seals import put_document
 from service.store.store import Store
 from worker.process.selfcheck import EngineError
 from worker.stages.context import TaskContext
@@ -110,8 +111,8 @@ def add_assets(parts: Parts) -> None:
     """A hand and an object that were found good, named `gripper` and `ball`."""
     for kind, name, files in ((AssetKind.HAND, "gripper", HAND_FILES), (AssetKind.OBJECT, "ball", OBJECT_FILES)):
         asset = publish_asset(parts.store, kind, name, files)
-        check = b'{"verdict": "accept", "message": "fine", "repairs": [], "facts": {}}'
-        parts.store.put(names.asset_check(kind, asset.digest), check)
+        check = {"verdict": "accept", "message": "fine", "repairs": [], "facts": {}}
+        put_document(parts.store, names.asset_check(kind, asset.digest), check)
         parts.index.write.add_asset(asset, {"verdict": "accept", "message": "fine"})
 
 

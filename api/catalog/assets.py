@@ -19,11 +19,13 @@ from service.model.projects import marks_of
 from service.model.states import AssetKind
 from service.pipeline import deletion
 from service.pipeline.backends import Parts
+from service.pipeline.recording import recording
 from service.store import library
 from service.store.assets import ZipFiles, asset_json
 from service.store.descriptions import MAX_BYTES, json_object
 from service.store.hand_corrections import HandCorrections, HandFacts, corrected, facts_of
 from service.store.network_check import network_report
+from service.store.seals import get_sealed, put_document
 
 log = logging.getLogger(__name__)
 _MAX_NAME: Final = 64
@@ -53,8 +55,9 @@ class Assets:
 
         Raises:
             NotFoundError: it has not been checked yet, or was refused.
+            DamagedError: its bytes are not those that were made.
         """
-        return self._parts.store.get(names.asset_model(asset.kind, asset.digest))
+        return get_sealed(self._parts.store, names.asset_model(asset.kind, asset.digest))
 
     def add(
         self,
@@ -86,11 +89,11 @@ class Assets:
         asset = library.store_files(store, kind, name, files, said=said)
         if found is not None:
             # Before the record: from then on it counts, and no worker is asked about it.
-            store.put(names.asset_check(kind, asset.digest), json.dumps(found).encode())
+            put_document(store, names.asset_check(kind, asset.digest), found)
         # Of two uploads at once that want one name, the later one must see the earlier one's record.
-        with index.database.writing() as connection:
+        with recording(self._parts) as (connection, put):
             self._refuse_taken(kind, name, asset.digest)
-            asset = library.record_asset(store, asset)
+            asset = library.record_asset(store, asset, put)
             index.write.add_asset(asset, library.load_check(store, kind, asset.digest), within=connection)
         return self.one(kind, asset.digest)
 

@@ -13,7 +13,7 @@ from service.model.errors import ConflictError, LimitError
 from service.model.projects import Reach
 from service.model.webhooks import MOST_HOOKS, End, Webhook, check_url, secret_of
 from service.pipeline.backends import Parts
-from service.store.records import put_record
+from service.pipeline.recording import recording
 
 log = logging.getLogger(__name__)
 
@@ -40,8 +40,6 @@ class Webhooks:
         if master is None:
             raise ConflictError("webhooks are switched off; the operator sets GRASPD_WEBHOOK_SECRET for API and keeper")
         project = reach().project
-        if len(self._parts.index.outgoing.hooks(reach=Reach(project, everything=False))) >= MOST_HOOKS:
-            raise LimitError(f"there are {MOST_HOOKS} webhooks, which is the most; delete one")
         hook = Webhook(
             id=secrets.token_hex(16),
             url=check_url(url),
@@ -50,8 +48,11 @@ class Webhooks:
             owner=caller_id(),
             project=project,
         )
-        put_record(self._parts.store, names.webhook(hook.id), hook)
-        self._parts.index.outgoing.add(hook)
+        with recording(self._parts) as (connection, put):
+            if len(self._parts.index.outgoing.hooks(reach=Reach(project, everything=False))) >= MOST_HOOKS:
+                raise LimitError(f"there are {MOST_HOOKS} webhooks, which is the most; delete one")
+            put(names.webhook(hook.id), hook)
+            self._parts.index.outgoing.add(hook, within=connection)
         key = caller.get()
         log.info("webhook %s made by %s", hook.id, key.name if key else "this machine")
         return self._parts.index.outgoing.hook(hook.id), secret_of(master.get_secret_value(), hook.id)

@@ -71,10 +71,15 @@ def task_id(job: str, stage: Stage, batch: int) -> str:
     return digest_json({"job": job, "stage": stage, "batch": batch})
 
 
-def plan(job: JobRecord) -> Iterator[PlannedTask]:
-    """All tasks of a job, batch by batch, each batch in the order of its stages."""
+def batches_of(request: JobRequest) -> int:
+    """How many batches a job has."""
+    return -(-request.grasps // BATCH_SIZE)
+
+
+def plan(job: JobRecord, batches: range | None = None) -> Iterator[PlannedTask]:
+    """The tasks of a job, of all batches or some, each batch in the order of its stages."""
     request = job.request
-    for batch in range(-(-request.grasps // BATCH_SIZE)):
+    for batch in batches if batches is not None else range(batches_of(request)):
         count = min(BATCH_SIZE, request.grasps - batch * BATCH_SIZE)
         inputs: tuple[str, ...] = ()
         for stage in stages_of(request):

@@ -15,9 +15,9 @@ from service.model.projects import EVERYTHING, Reach
 from service.model.records import JobRecord
 from service.model.states import AssetKind
 from service.pipeline.backends import Parts
+from service.pipeline.recording import recording
 from service.store.deletions import Deletion
-from service.store.records import put_record, read_record
-from service.store.store import Store
+from service.store.records import Put, read_record
 
 
 def delete_asset(parts: Parts, kind: AssetKind, name: str, *, owner: str = "", reach: Reach = EVERYTHING) -> None:
@@ -34,12 +34,12 @@ def delete_asset(parts: Parts, kind: AssetKind, name: str, *, owner: str = "", r
     asset = parts.index.assets.get(kind, name)
     if asset.builtin:
         raise ConflictError(f"the {kind.value} {asset.name!r} comes with graspd and cannot be deleted")
-    with parts.index.database.writing() as connection:
+    with recording(parts) as (connection, put):
         if user := parts.index.removals.user_of_asset(asset, within=connection):
             if asset.shared and not reach.everything:
                 user = "a job, a dataset or a set of objects"
             raise ConflictError(f"the {kind.value} {asset.name!r} is needed by {user}; delete that first")
-        _record(parts.store, Deletion(what=kind.value, id=asset.digest, at=timestamp(), owner=owner))
+        _record(put, Deletion(what=kind.value, id=asset.digest, at=timestamp(), owner=owner))
         parts.index.removals.remove_asset(kind, asset.digest, within=connection)
 
 
@@ -55,12 +55,12 @@ def delete_job(parts: Parts, job_id: str, *, owner: str = "") -> None:
         record = read_record(JobRecord, parts.store, names.job_record(job_id))
     except (NotFoundError, DamagedError):
         record = None  # then its shards cannot be told, and stay
-    with parts.index.database.writing() as connection:
+    with recording(parts) as (connection, put):
         if user := parts.index.removals.user_of_job(job_id, within=connection):
             raise ConflictError(f"job {job_id} {user}")
         attempts = parts.index.removals.attempts_of(job_id, within=connection)
         deletion = Deletion(what="job", id=job_id, at=timestamp(), owner=owner, job=record, attempts=attempts)
-        _record(parts.store, deletion)
+        _record(put, deletion)
         parts.index.removals.remove_job(job_id, within=connection)
 
 
@@ -74,10 +74,10 @@ def delete_dataset(parts: Parts, name: str, *, owner: str = "") -> None:
     dataset = parts.index.datasets.get(name)
     if not dataset.state.is_final:
         raise ConflictError(f"dataset {name!r} is {dataset.state}; cancel it first: graspd datasets cancel {name}")
-    with parts.index.database.writing() as connection:
-        _record(parts.store, Deletion(what="dataset", id=name, at=timestamp(), owner=owner))
+    with recording(parts) as (connection, put):
+        _record(put, Deletion(what="dataset", id=name, at=timestamp(), owner=owner))
         parts.index.removals.remove_dataset(name, within=connection)
 
 
-def _record(store: Store, deletion: Deletion) -> None:
-    put_record(store, names.deletion(deletion.what, deletion.id), deletion)
+def _record(put: Put, deletion: Deletion) -> None:
+    put(names.deletion(deletion.what, deletion.id), deletion)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,6 +13,7 @@ from service.model.domain import JobRequest
 from service.model.errors import InputError
 from service.model.fidelity import AUTO, OFFERED
 from service.model.records import Choice
+from service.store.seals import get_document
 from service.store.store import Store
 from service.store.study_records import charts_of, latest_key
 
@@ -97,7 +97,7 @@ class Resolver:
             key = latest_key(self._store, charts_of(request.place))
             if not key:
                 raise InputError(_no_chart(request))
-            self._charts[request.scene] = _Chart(key, json.loads(self._store.get(key)))
+            self._charts[request.scene] = _Chart(key, get_document(self._store, key))
         return self._charts[request.scene]
 
 

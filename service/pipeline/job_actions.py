@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import time
 from collections import defaultdict
-from collections.abc import Sequence
-from typing import Final
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Final, Literal
 
 from service.index.queries.feed import ReadyTask
 from service.index.views import JobView
@@ -16,7 +17,7 @@ from service.model.ability import need_of
 from service.model.clock import timestamp
 from service.model.digests import job_id
 from service.model.domain import JobRequest
-from service.model.errors import ConflictError, InputError, NotFoundError, UnavailableError
+from service.model.errors import ConflictError, NotFoundError, UnavailableError
 from service.model.messages import Origin, TaskMessage
 from service.model.planning import lane_of, message_of
 from service.model.projects import EVERYTHING, Reach
@@ -24,6 +25,7 @@ from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane, State
 from service.pipeline.backends import Parts
 from service.pipeline.fidelity_choice import Resolver
+from service.pipeline.recording import recording
 from service.pipeline.routes import Routes
 from service.pipeline.scene_check import check_scene
 from service.pipeline.usable import usable, with_neighbours, with_network
@@ -90,7 +92,7 @@ def prepare(
 
 
 def enter(parts: Parts, record: JobRecord, *, keeps_assets: bool = False) -> tuple[JobView, bool]:
-    """Keep a planned job and queue its first tasks.
+    """Keep a planned job and queue its first tasks. The keeper enters those that are too many for one turn.
 
     Args:
         keeps_assets: a dataset keeps hand, object, neighbours and network from being deleted meanwhile.
@@ -103,21 +105,18 @@ def enter(parts: Parts, record: JobRecord, *, keeps_assets: bool = False) -> tup
         ConflictError: the same job was deleted, and its objects are still being removed.
     """
     key = names.job_record(record.id)
-    new = put_record(parts.store, key, record)
-    try:
+    # The dataset wants its jobs whatever breaks off, and its planner holds the turn for no store.
+    new = keeps_assets and put_record(parts.store, key, record)
+    with recording(parts, [key] if new else []) as (connection, put):
+        new = new or (not keeps_assets and put(key, record))
         refuse_pending(parts.store, "job", record.id)
         if not new:
-            record = read_record(JobRecord, parts.store, key)
-        with parts.index.database.writing() as connection:
-            if not new and not parts.store.exists(key):
+            if not parts.store.exists(key):
                 raise ConflictError(f"job {record.id} was deleted just now; submit it again")
-            if not keeps_assets and (missing := parts.index.assets.missing(record.assets, within=connection)):
-                raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
-            parts.index.write.add_job(record, within=connection)
-    except InputError:
-        if new:
-            parts.store.delete(key)
-        raise
+            record = read_record(JobRecord, parts.store, key)
+        if not keeps_assets and (missing := parts.index.assets.missing(record.assets, within=connection)):
+            raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
+        parts.index.write.enter_job(record, within=connection)
     _start(parts, record.id)
     return parts.index.jobs.get(record.id), new
 
@@ -132,12 +131,11 @@ def cancel(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
         NotFoundError: unknown job.
         ConflictError: the job is already finished.
     """
-    job = parts.index.jobs.get(job_id)
-    if job.state.is_final:
-        raise ConflictError(f"job {job_id} has already {_ended(job.state)}; there is nothing to cancel")
-    in_queue = parts.index.feed.unfinished_tasks(job_id)
-    add_job_event(parts.store, job_id, "cancelled", cause=cause)
-    _index_events(parts, job_id)
+    _refuse_ended(parts, job_id)
+    with _changing(parts, job_id) as add:
+        _refuse_ended(parts, job_id)
+        in_queue = parts.index.feed.unfinished_tasks(job_id)
+        add("cancelled", cause=cause)
     try:
         parts.queue.discard(in_queue)
     except UnavailableError as error:
@@ -155,11 +153,10 @@ def retry(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
         NotFoundError: unknown job.
         ConflictError: the job neither failed nor was cancelled.
     """
-    job = parts.index.jobs.get(job_id)
-    if job.state not in (State.FAILED, State.CANCELLED):
-        raise ConflictError(f"job {job_id} is {job.state}; only a failed or cancelled job can be retried")
-    add_job_event(parts.store, job_id, "retried", parts.index.feed.failed_tasks(job_id), cause=cause)
-    _index_events(parts, job_id)
+    _refuse_unfailed(parts, job_id)
+    with _changing(parts, job_id) as add:
+        _refuse_unfailed(parts, job_id)
+        add("retried", parts.index.feed.failed_tasks(job_id), cause=cause)
     _start(parts, job_id)
     return _told(parts, job_id)
 
@@ -208,10 +205,36 @@ def _start(parts: Parts, job_id: str) -> None:
         log.warning("job %s is recorded; its tasks are queued when the queue answers: %s", job_id, error)
 
 
-def _index_events(parts: Parts, job_id: str) -> None:
-    """What users did to a job, read while nobody else writes: of two at once the later one must know of both events."""
-    with parts.index.database.writing() as connection:
-        parts.index.write.set_job_events(job_id, job_events(parts.store, job_id), within=connection)
+@contextmanager
+def _changing(parts: Parts, job_id: str) -> Iterator[Callable[..., None]]:
+    """A turn in which an event may be added to those of a job: of two at once the later one knows of both.
+
+    What there was before is read beforehand: the store may be slow, and others wait for the turn.
+    """
+    before = job_events(parts.store, job_id)
+    with recording(parts) as (connection, put):
+
+        def add(
+            what: Literal["cancelled", "retried"], retried: dict[str, int] | None = None, *, cause: str = ""
+        ) -> None:
+            event = add_job_event(parts.store, job_id, what, retried, cause=cause, put=put)
+            is_next = event.number == max((one.number for one in before), default=0) + 1
+            events = [*before, event] if is_next else job_events(parts.store, job_id)
+            parts.index.write.set_job_events(job_id, events, within=connection)
+
+        yield add
+
+
+def _refuse_ended(parts: Parts, job_id: str) -> None:
+    job = parts.index.jobs.get(job_id)
+    if job.state.is_final:
+        raise ConflictError(f"job {job_id} has already {_ended(job.state)}; there is nothing to cancel")
+
+
+def _refuse_unfailed(parts: Parts, job_id: str) -> None:
+    job = parts.index.jobs.get(job_id)
+    if job.state not in (State.FAILED, State.CANCELLED):
+        raise ConflictError(f"job {job_id} is {job.state}; only a failed or cancelled job can be retried")
 
 
 def _told(parts: Parts, job_id: str) -> JobView:

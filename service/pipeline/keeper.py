@@ -30,6 +30,7 @@ from service.model.worker_beat import WorkerBeat
 from service.pipeline.backends import Parts
 from service.pipeline.courier import Courier
 from service.pipeline.datasets.rounds import DatasetRounds
+from service.pipeline.entering import Entering
 from service.pipeline.identity import identify
 from service.pipeline.indexer import Indexer
 from service.pipeline.job_actions import HELD_S, queue_tasks
@@ -106,11 +107,12 @@ class Keeper:
 
     @contextmanager
     def _beside(self, stop: threading.Event) -> Iterator[None]:
-        """What goes on beside the rounds: webhooks are told what ended, and the store is read through, where the
-        settings want it."""
+        """What goes on beside the rounds: webhooks are told what ended, large jobs are entered, and the store is read
+        through, where the settings want it."""
         duties: dict[str, Callable[[], None]] = {}
         if self._shards.leads:
             duties["webhooks"] = Courier(self._parts, stop).run
+            duties["entering"] = Entering(self._parts, stop).run
             if self._parts.settings.scrub_mb_per_s:
                 duties["scrub"] = Scrubber(self._parts, stop).run
         threads = [threading.Thread(target=duty, name=name, daemon=True) for name, duty in duties.items()]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import time
@@ -22,6 +21,7 @@ from service.pipeline.indexer import Indexer
 from service.queue.port import Holder, Lease
 from service.store.packs import Finder
 from service.store.records import put_record, read_record, task_attempts
+from service.store.seals import put_document
 
 log = logging.getLogger(__name__)
 #: A task on its way between queue, worker and stream is in none of them for a moment [s].
@@ -189,7 +189,7 @@ class Reaper:
         if message.attempt >= message.max_attempt:
             reason = f"checking this {message.kind.value} ended its worker {message.attempt} times; it is not taken"
             found = {"verdict": "refuse", "message": reason, "repairs": [], "facts": {}}
-            self._parts.store.put(names.asset_check(message.kind, message.digest), json.dumps(found).encode())
+            put_document(self._parts.store, names.asset_check(message.kind, message.digest), found)
             self._indexer.checked(message.kind, message.digest)
         else:
             self._parts.index.live.add_asset_attempt(message.digest, message.attempt, not_before=0.0)

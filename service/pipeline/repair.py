@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import re
 from collections.abc import Sequence
+from typing import Final
 
 from service.index.damage import Damage
 from service.model import names
 from service.model.errors import DamagedError, NotFoundError
 from service.model.planning import PlannedTask, message_of, plan
 from service.model.records import JobRecord
-from service.model.states import Lane, Stage
+from service.model.states import AssetKind, Lane, Stage
 from service.model.version import STAGE_REVISIONS
 from service.pipeline.backends import Parts
 from service.pipeline.scrub import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, STAGES, is_on_its_way
 from service.pipeline.unpacking import unpack
+from service.store.library import builtin_assets, load_asset, publish_builtins
 from service.store.records import read_record, task_attempts
+
+_OF_ASSET: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(.+)")
 
 
 def repair(parts: Parts, found: Sequence[Damage]) -> tuple[list[Damage], list[Damage]]:
@@ -47,6 +53,8 @@ def _mend(parts: Parts, one: Damage, harmed: set[str]) -> str:
         return ""
     if one.key.startswith(f"{names.PACKS}/") and one.key.endswith(".pack"):
         return _take_apart(parts, one.key)
+    if match := _OF_ASSET.fullmatch(one.key):
+        return _asset(parts, one.key, AssetKind(match[1]), match[2], match[3])
     if not one.shard:
         return "put a copy in its place"
     stage = STAGES[one.key.split("/")[1]]
@@ -64,6 +72,28 @@ def _mend(parts: Parts, one: Damage, harmed: set[str]) -> str:
     if one.what != MISSING:
         _clear(parts, one, stage)
     _queue(parts, job, task)
+    return ""
+
+
+def _asset(parts: Parts, key: str, kind: AssetKind, digest: str, file: str) -> str:
+    """Make room for what follows from a hand or an object; a new check makes the rest, and the next task what it needs.
+
+    What comes with graspd is put again from the program.
+    """
+    if (kind, digest) in {(one.kind, one.digest) for one in builtin_assets()}:
+        parts.store.set_aside(key)
+        publish_builtins(parts.store)
+    elif file == "files.zip":
+        return "upload the same files again, or put a copy in its place"
+    elif file == "asset.json":
+        return "put a copy in its place"
+    else:
+        parts.store.set_aside(key)
+    if file in ("model.glb", "check.json") and not parts.store.exists(key):
+        parts.store.set_aside(names.asset_check(kind, digest))
+        with contextlib.suppress(NotFoundError, DamagedError):
+            parts.index.write.add_asset(load_asset(parts.store, kind, digest), None)
+            parts.index.live.set_asset_waiting([digest], queued=False)
     return ""
 
 

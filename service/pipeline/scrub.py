@@ -1,26 +1,33 @@
-"""Looks through a store for what is not what it was: shards, manifests, records. Reads everything, changes nothing."""
+"""Looks through a store for what is not what it was: shards, records, uploads, all that is kept. Changes nothing."""
 
 from __future__ import annotations
 
 import hashlib
 import re
+import tempfile
 from collections.abc import Callable, Iterator
 from typing import Any, Final
-
-from pydantic import ValidationError
 
 from service.index.damage import Damage
 from service.model import names
 from service.model.clock import age_of
 from service.model.dataset_records import DatasetEvent, DatasetRecord, ObjectSet, Snapshot
+from service.model.digests import digest_files
 from service.model.domain import Asset
-from service.model.errors import DamagedError, NotFoundError
+from service.model.errors import DamagedError, InputError, NotFoundError
 from service.model.records import AttemptRecord, JobEvent, JobRecord
-from service.model.states import Stage
+from service.model.states import AssetKind, Stage
+from service.model.tags import Tag
+from service.model.webhooks import Webhook
+from service.store.assets import ZipFiles
+from service.store.deletions import Deletion, Released
+from service.store.library import UNPACKED_LIMIT_BYTES, load_check
 from service.store.manifests import ShardManifest
 from service.store.packs import DeadShards, pack_at, read_manifests
 from service.store.records import parse_record
+from service.store.seals import is_sealed
 from service.store.store import Store
+from service.store.study_records import CHARTS, IN_SCENES, STABILITY
 
 #: What the key of a record looks like, and what it must hold.
 _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
@@ -33,10 +40,18 @@ _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
     (r"datasets/[^/]+/snapshots/[^/]+\.json", Snapshot),
     (r"object_sets/[^/]+/[^/]+\.json", ObjectSet),
     (r"packs/[0-9a-f]{32}/[0-9a-f]{32}\.dead/[0-9a-f]{32}\.json", DeadShards),
+    (r"deletions/[^/]+/[^/]+\.json", Deletion),
+    (r"released/[^/]+\.json", Released),
+    (r"webhooks/[^/]+\.json", Webhook),
+    (r"tags/[^/]+/[^/]+\.json", Tag),
 )
+#: In the order of the keeper's rounds, which remember a place in it.
 FOLDERS: Final = (
-    names.SHARDS, names.ASSETS, names.JOBS, names.TASKS, names.DATASETS, names.OBJECT_SETS, names.PACKS
+    names.SHARDS, names.ASSETS, names.JOBS, names.TASKS, names.DATASETS, names.OBJECT_SETS, names.PACKS,
+    names.DELETIONS, names.RELEASED, names.WEBHOOKS, names.TAGS, CHARTS, IN_SCENES, STABILITY,
 )  # fmt: skip
+_SEALED: Final = (".json", ".zip", ".npz", ".glb")
+_UPLOAD: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(files\.zip|check\.json)")
 _SHARD: Final = re.compile(r"shards/(base|scene|views)/([0-9a-f]{32})\.(h5|json)")
 _PACK: Final = re.compile(r"packs/[0-9a-f]{32}/[0-9a-f]{32}\.pack")
 STAGES: Final[dict[str, Stage]] = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
@@ -49,9 +64,13 @@ FOREIGN: Final = "nothing that graspd put there"
 _ON_ITS_WAY_S: Final = 60.0
 #: Told after each piece that was read: its bytes.
 Read = Callable[[int], None]
+#: Told of each object that was written without a checksum of its own: its key.
+Unsealed = Callable[[str], None]
 
 
-def scan(store: Store, *folders: str, read: Read = lambda size: None) -> Iterator[tuple[str, Damage | None]]:
+def scan(
+    store: Store, *folders: str, read: Read = lambda size: None, unsealed: Unsealed = lambda key: None
+) -> Iterator[tuple[str, Damage | None]]:
     """Every object that can be checked, of all folders or some, with what is wrong with it, None if nothing is.
 
     Raises:
@@ -60,7 +79,7 @@ def scan(store: Store, *folders: str, read: Read = lambda size: None) -> Iterato
     for folder in folders or FOLDERS:
         for entry in store.list(folder):
             if is_checked(entry.key):
-                yield entry.key, examine(store, entry.key, read=read)
+                yield entry.key, examine(store, entry.key, read=read, unsealed=unsealed)
 
 
 def is_on_its_way(store: Store, one: Damage) -> bool:
@@ -73,21 +92,23 @@ def is_on_its_way(store: Store, one: Damage) -> bool:
 
 def is_checked(key: str) -> bool:
     """Whether `examine` knows what an object of this name must hold."""
-    return key.startswith((f"{names.SHARDS}/", f"{names.PACKS}/")) or _model_of(key) is not None
+    return key.startswith((f"{names.SHARDS}/", f"{names.PACKS}/")) or key.endswith(_SEALED)
 
 
-def examine(store: Store, key: str, *, read: Read = lambda size: None) -> Damage | None:
+def examine(
+    store: Store, key: str, *, read: Read = lambda size: None, unsealed: Unsealed = lambda key: None
+) -> Damage | None:
     """What is wrong with one object; of a shard, its file is examined with its manifest."""
     try:
-        if (model := _model_of(key)) is not None:
-            return _record(store, key, model)
+        if not key.startswith((f"{names.SHARDS}/", f"{names.PACKS}/")) or _model_of(key) is not None:
+            return _sealed(store, key, read, unsealed)
         if _PACK.fullmatch(key):
             return _pack(store, key, read)
         if (match := _SHARD.fullmatch(key)) is None:
             return Damage(key, FOREIGN) if store.exists(key) else None
         kind, shard, ending = match.groups()
         if ending == "json":
-            return _manifest(store, key, STAGES[kind], shard, read)
+            return _manifest(store, key, STAGES[kind], shard, read, unsealed)
         manifest = names.shard_manifest(STAGES[kind], shard)
         # A worker puts the manifest last; it may have come since the file was listed.
         orphan = not store.exists(manifest) and store.exists(key) and not store.exists(manifest)
@@ -118,19 +139,49 @@ def _pack(store: Store, key: str, read: Read) -> Damage | None:
     return Damage(key, f"{len(harmed)} of its {len(pack.shards)} shards: {', '.join(harmed)}") if harmed else None
 
 
-def _record(store: Store, key: str, model: type[Any]) -> Damage | None:
+def _sealed(store: Store, key: str, read: Read, unsealed: Unsealed) -> Damage | None:
+    """What carries its own checksum; what has none is looked at as far as its content tells."""
+    match, model = _UPLOAD.fullmatch(key), _model_of(key)
     try:
-        parse_record(model, store.get(key), key)
-    except (DamagedError, ValidationError) as error:
+        if not is_sealed(key, _counted(store.stream(key), read), store.size(key)):
+            unsealed(key)
+            if match is not None and match[3] == "files.zip":
+                _check_upload(store, key, AssetKind(match[1]), match[2])
+        if model is not None:
+            parse_record(model, store.get(key), key)
+        elif match is not None and match[3] == "check.json":
+            load_check(store, AssetKind(match[1]), match[2])
+    except DamagedError as error:
         return Damage(key, str(error))
     return None
 
 
-def _manifest(store: Store, key: str, stage: Stage, shard: str, read: Read) -> Damage | None:
+def _counted(chunks: Iterator[bytes], read: Read) -> Iterator[bytes]:
+    for chunk in chunks:
+        read(len(chunk))
+        yield chunk
+
+
+def _check_upload(store: Store, key: str, kind: AssetKind, digest: str) -> None:
+    """An archive of graspd 0.2: the digest of its files, of which its folder is named, is all that tells."""
+    with tempfile.TemporaryFile() as file:
+        file.writelines(store.stream(key))
+        try:
+            found = digest_files(kind, ZipFiles(file, limit_bytes=UNPACKED_LIMIT_BYTES))
+        except InputError as error:
+            raise DamagedError(f"{key} in the store is damaged: {error}") from None
+    if found != digest:
+        raise DamagedError(f"{key} in the store is damaged: its files are not those of its name; upload it again")
+
+
+def _manifest(store: Store, key: str, stage: Stage, shard: str, read: Read, unsealed: Unsealed) -> Damage | None:
     try:
-        manifest = parse_record(ShardManifest, store.get(key), key)
+        data = store.get(key)
+        manifest = parse_record(ShardManifest, data, key)
     except DamagedError:
         return Damage(key, BAD_MANIFEST, shard)
+    if not is_sealed(key, [data], len(data)):
+        unsealed(key)
     file = names.shard_file(stage, shard)
     if (manifest.shard_id, manifest.key) != (shard, file):
         return Damage(key, BAD_MANIFEST, shard)

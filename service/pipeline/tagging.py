@@ -8,6 +8,7 @@ from service.model.clock import timestamp
 from service.model.errors import LimitError, NotFoundError
 from service.model.tags import MOST_TAGGED, Grasp, Tag, by_shard, tag_id
 from service.pipeline.backends import Parts
+from service.pipeline.recording import recording
 from service.store.tags import drop_older, newest_version, put_version
 
 #: Asked with what is to be changed, None if it is to be made; raises where that is not allowed.
@@ -50,7 +51,7 @@ def _change(
     parts: Parts, tag: str, change: Callable[[Tag], Tag], permit: Permit, *, fresh: Tag | None = None
 ) -> tuple[Tag, Tag]:
     """The tag before and after. Who writes has the index's turn, so that of two changes at once each sees the other."""
-    with parts.index.database.writing() as connection:
+    with recording(parts) as (connection, put):
         found = newest_version(parts.store, tag)
         known = None if found is None or found.gone else found
         if known is None and fresh is None:
@@ -59,8 +60,12 @@ def _change(
         before = known or fresh
         assert before is not None
         after = change(before).model_copy(update={"number": found.number + 1 if found else 1, "changed": timestamp()})
-        if known is None or after.members != before.members or after.gone:
-            put_version(parts.store, after)
+        is_changed = known is None or after.members != before.members or after.gone
+        if is_changed:
+            put_version(put, after)
             parts.index.tags.put(after, within=connection)
+    if is_changed:
+        # Not before the rows are there for good, and not while another one reads the last version.
+        with parts.index.database.writing():
             drop_older(parts.store, after)
     return before, after

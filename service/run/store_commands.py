@@ -30,7 +30,7 @@ def verify(
     data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Folder of everything graspd keeps.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Read every shard and record and say what is damaged or missing. Exit code 1 says that something is.
+    """Read everything that the store keeps and say what is damaged or missing. Exit code 1 says that something is.
 
     The keeper's own reading pauses meanwhile; a second call is refused.
     """
@@ -48,8 +48,8 @@ def verify(
     try:
         if not turn.is_mine():
             raise ConflictError("another `graspd store verify` reads this store; wait until it is done")
-        shards, unused, found = 0, 0, []
-        for key, wrong in scan(parts.store, read=lambda size: turn.keep()):
+        shards, unused, found, unsealed = 0, 0, [], list[str]()
+        for key, wrong in scan(parts.store, read=lambda size: turn.keep(), unsealed=unsealed.append):
             turn.keep()
             shards += key.startswith(f"{names.SHARDS}/") and key.endswith(".json")
             found += [wrong] if wrong is not None else []
@@ -68,6 +68,7 @@ def verify(
             {
                 "shards": shards,
                 "unused_bytes": unused,
+                "without_digest": len(unsealed),
                 "damaged": [one for one in damaged if one["what"] != MISSING],
                 "missing": [one.shard for one in found if one.what == MISSING],
                 "repaired": [one.shard or one.key for one in repaired],
@@ -80,6 +81,8 @@ def verify(
         for one in left:
             typer.echo(f"{one.key}: {one.what}")
         more = f", {unused} bytes in packs that no job needs any more" if unused else ""
+        if unsealed:
+            more += f"; {len(unsealed)} objects that graspd 0.2 wrote have no checksum of their own"
         typer.echo(f"{shards} shards, {len(found)} damaged or missing{more}", err=True)
     if left:
         raise typer.Exit(1)

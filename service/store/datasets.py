@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Literal
 
 from service.model import names
 from service.model.clock import timestamp
 from service.model.dataset_records import DatasetEvent, DatasetRecord, Snapshot
 from service.model.errors import NotFoundError
-from service.store.records import put_record, read_record
+from service.store.records import Put, put_record, read_record
 from service.store.store import Store
 
 
@@ -23,12 +24,15 @@ def dataset_events(store: Store, name: str) -> list[DatasetEvent]:
     return [read_record(DatasetEvent, store, key) for key in keys]
 
 
-def add_dataset_event(store: Store, name: str, what: Literal["cancelled", "retried"]) -> DatasetEvent:
+def add_dataset_event(
+    store: Store, name: str, what: Literal["cancelled", "retried"], *, put: Put | None = None
+) -> DatasetEvent:
     """Append an event after those there are."""
+    put = put or partial(put_record, store)
     while True:
         taken = [event.number for event in dataset_events(store, name)]
         event = DatasetEvent(number=max(taken, default=0) + 1, what=what, at=timestamp())
-        if put_record(store, names.dataset_event(name, event.number, what), event):
+        if put(names.dataset_event(name, event.number, what), event):
             return event
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import contextlib
 import logging
 import tempfile
 from collections.abc import Mapping
@@ -15,7 +15,8 @@ from service.model.domain import Asset
 from service.model.errors import ConflictError, DamagedError, InputError
 from service.model.states import AssetKind
 from service.store.assets import builtin_asset, builtin_model, builtin_names, describe, pack_into, unpack
-from service.store.records import read_record
+from service.store.records import Put, put_record, read_record
+from service.store.seals import get_document, is_sealed, seal_archive, sealed
 from service.store.store import Store
 
 log = logging.getLogger(__name__)
@@ -70,18 +71,33 @@ def store_files(
     asset = asset.model_copy(update=dict(said or {}))
     with tempfile.TemporaryFile() as archive:
         pack_into(files, archive)
-        store.put_file(names.asset_files(kind, asset.digest), archive)
+        seal_archive(archive)
+        key = names.asset_files(kind, asset.digest)
+        if not store.put_file(key, archive) and _is_damaged(store, key):
+            store.set_aside(key)
+            store.put_file(key, archive)
     return asset
 
 
-def record_asset(store: Store, asset: Asset) -> Asset:
+def _is_damaged(store: Store, key: str) -> bool:
+    try:
+        is_sealed(key, store.stream(key), store.size(key))
+    except DamagedError:
+        return True
+    return False
+
+
+def record_asset(store: Store, asset: Asset, put: Put | None = None) -> Asset:
     """The second half of `publish_asset`: the record, from which on the asset counts.
+
+    Args:
+        put: writes the record; None: into this store.
 
     Raises:
         ConflictError: the same content is known under another name, or is being removed.
     """
     record = names.asset_record(asset.kind, asset.digest)
-    new = store.put(record, asset.model_dump_json().encode())
+    new = put(record, asset) if put is not None else put_record(store, record, asset)
     if store.exists(names.deletion(asset.kind.value, asset.digest)):
         if new:
             store.delete(record)
@@ -92,6 +108,11 @@ def record_asset(store: Store, asset: Asset) -> Asset:
     if known.name != asset.name:
         raise ConflictError(f"this {asset.kind.value} is already known as {known.name!r}; use that name")
     return known
+
+
+def builtin_assets() -> list[Asset]:
+    """The hands and objects that come with graspd."""
+    return [builtin_asset(kind, name)[0] for kind in AssetKind for name in builtin_names(kind)]
 
 
 def publish_builtins(store: Store) -> list[Asset]:
@@ -110,6 +131,7 @@ def publish_builtins(store: Store) -> list[Asset]:
 
 def _put_model(store: Store, key: str, model: bytes) -> None:
     """A picture follows from the program as well as from the asset: one of an older version is replaced."""
+    model = sealed(key, model)
     if not store.put(key, model) and store.get(key) != model:
         store.delete(key)
         store.put(key, model)
@@ -151,10 +173,8 @@ def load_check(store: Store, kind: AssetKind, digest: str) -> dict[str, object] 
     key = names.asset_check(kind, digest)
     if not store.exists(key):
         return None
-    try:
-        found: dict[str, object] = json.loads(store.get(key))
-        if found["verdict"] in ("accept", "repair", "refuse"):
+    with contextlib.suppress(DamagedError):
+        found = get_document(store, key)
+        if found.get("verdict") in ("accept", "repair", "refuse"):
             return found
-    except (ValueError, KeyError, TypeError):
-        pass
     raise DamagedError(f"the record {key} in the store is damaged; remove it, and the {kind.value} is checked again")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Literal, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -10,9 +12,12 @@ from service.model import names
 from service.model.clock import timestamp
 from service.model.errors import DamagedError
 from service.model.records import AttemptRecord, JobEvent
+from service.store.seals import is_sealed, put_sealed
 from service.store.store import Store
 
 RecordT = TypeVar("RecordT", bound=BaseModel)
+#: Writes a record under a key if there is none; whether there was none.
+Put = Callable[[str, BaseModel], bool]
 
 
 def read_record(model: type[RecordT], store: Store, key: str) -> RecordT:
@@ -21,7 +26,8 @@ def read_record(model: type[RecordT], store: Store, key: str) -> RecordT:
 
 
 def parse_record(model: type[RecordT], data: bytes, key: str) -> RecordT:
-    """A record from its bytes."""
+    """A record from its bytes; DamagedError if they are not those that were sealed, or hold no such record."""
+    is_sealed(key, [data], len(data))
     try:
         return model.model_validate_json(data)
     except ValidationError as error:
@@ -34,7 +40,7 @@ def parse_record(model: type[RecordT], data: bytes, key: str) -> RecordT:
 
 def put_record(store: Store, key: str, record: BaseModel) -> bool:
     """Write a record if there is none yet; False if there was."""
-    return store.put(key, record.model_dump_json().encode())
+    return put_sealed(store, key, record.model_dump_json().encode())
 
 
 def job_events(store: Store, job: str) -> list[JobEvent]:
@@ -50,13 +56,15 @@ def add_job_event(
     retried: dict[str, int] | None = None,
     *,
     cause: str = "",
+    put: Put | None = None,
 ) -> JobEvent:
     """Append an event after those there are; the state of a job follows from reading them all again, in order."""
+    put = put or partial(put_record, store)
     while True:
         taken = [int(entry.key.rsplit("/", 1)[1].partition("-")[0]) for entry in store.list(names.job_events(job))]
         number = max(taken, default=0) + 1
         event = JobEvent(number=number, what=what, at=timestamp(), retried=retried or {}, cause=cause)
-        if put_record(store, names.job_event(job, event.number, what), event):
+        if put(names.job_event(job, event.number, what), event):
             return event
 
 

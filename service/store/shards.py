@@ -160,7 +160,7 @@ def open_shard(source: bytes | Path | io.RawIOBase, *, name: str = "") -> Iterat
 def _check_contents(file: h5py.File, name: str) -> None:
     """InputError where a file has its values from elsewhere, or says that it has more than can lie in it.
 
-    HDF5 follows links into other files, reads raw bytes of any file as a dataset's, and makes up what was never written.
+    HDF5 follows links into other files, reads raw bytes of any file as values, and makes up what was never written.
     """
     seen, waiting = 0, [(file, "")]
     while waiting:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from service.model import names
 from service.model.errors import ConflictError
 from service.model.tags import Tag
-from service.store.records import put_record, read_record
+from service.store.records import Put, read_record
 from service.store.store import Store
 
 
@@ -19,13 +19,13 @@ def newest_version(store: Store, tag: str) -> Tag | None:
     return read_record(Tag, store, keys[-1]) if keys else None
 
 
-def put_version(store: Store, tag: Tag) -> None:
+def put_version(put: Put, tag: Tag) -> None:
     """Write a tag after a change.
 
     Raises:
         ConflictError: another change came first.
     """
-    if not put_record(store, names.tag_version(tag.id, tag.number), tag):
+    if not put(names.tag_version(tag.id, tag.number), tag):
         raise ConflictError(f"the tag {tag.name!r} was changed a moment ago; try again")
 
 

@@ -96,10 +96,10 @@ def _joined(parts: list[Stability]) -> Stability:
 
 def _publish(found: Stability, data_dir: Path | None) -> str:
     from service.store.store import open_store
-    from service.store.study_records import publish
+    from service.store.study_records import STABILITY, publish
 
     store = open_store(load_settings(data_dir=data_dir).resolved_store_url)
-    key = publish(store, "stability", found.as_json())
+    key = publish(store, STABILITY, found.as_json())
     _say(f"published as {key}")
     return key
 

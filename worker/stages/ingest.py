@@ -22,6 +22,7 @@ from service.model.states import AssetKind
 from service.store.assets import pack, unpack
 from service.store.library import UNPACKED_LIMIT_BYTES, load_asset, load_asset_files
 from service.store.network_check import check_network
+from service.store.seals import put_document, put_sealed
 from worker.stages.context import TaskContext
 
 #: Address space of the child [bytes]: the largest meshes that are taken need about a tenth of it.
@@ -46,8 +47,8 @@ def run(message: IngestMessage, context: TaskContext) -> None:
     if found["verdict"] != "refuse" and load_asset(context.store, message.kind, message.digest).self_test:
         found["facts"]["self_test"] = _self_test(message, files, context)
     if model:
-        context.store.put(names.asset_model(message.kind, message.digest), model)
-    context.store.put(names.asset_check(message.kind, message.digest), json.dumps(found).encode())
+        put_sealed(context.store, names.asset_model(message.kind, message.digest), model)
+    put_document(context.store, names.asset_check(message.kind, message.digest), found)
 
 
 def _files(message: IngestMessage, context: TaskContext) -> dict[str, bytes]:

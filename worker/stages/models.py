@@ -12,6 +12,7 @@ from service.model import names
 from service.model.fidelity import Fidelity
 from service.model.states import AssetKind
 from service.store.assets import builtin_files, builtin_names
+from service.store.seals import put_sealed
 from service.store.store import Store
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
@@ -35,7 +36,7 @@ def publish_model(store: Store, kind: AssetKind, model: HandModel | ObjectModel)
     """Put the glTF of a loaded hand or object into the store if it is not there."""
     key = names.asset_model(kind, model.digest)
     if not store.exists(key):
-        store.put(key, hand_glb(model) if isinstance(model, HandModel) else object_glb(model))
+        put_sealed(store, key, hand_glb(model) if isinstance(model, HandModel) else object_glb(model))
 
 
 def write_builtins(folder: Path = _BUILTIN) -> None:

@@ -7,7 +7,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from service.model import names
-from service.model.errors import NotFoundError
+from service.model.errors import DamagedError, NotFoundError
+from service.store.seals import get_sealed, put_sealed
 from service.store.store import Store
 from service.user_cache import write_whole
 from worker.objects.model import ObjectModel
@@ -30,14 +31,14 @@ def pieces_of(store: Store, obj: ObjectModel, *, cache: Path | None = None) -> C
             _fetch(store, key, file)
         pieces = decompose(obj, cache=cache)
         if file.is_file() and not store.exists(key):
-            store.put(key, file.read_bytes())
+            put_sealed(store, key, file.read_bytes())
         return pieces
 
 
 def _fetch(store: Store, key: str, file: Path) -> None:
     try:
-        data = store.get(key)
-    except NotFoundError:
+        data = get_sealed(store, key)
+    except (NotFoundError, DamagedError):
         return
     # A folder that cannot be written only costs time.
     with suppress(OSError):

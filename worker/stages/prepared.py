@@ -6,10 +6,11 @@ import zipfile
 
 from service.model import names
 from service.model.digests import digest_json
-from service.model.errors import NotFoundError
+from service.model.errors import DamagedError, NotFoundError
 from service.model.states import AssetKind
 from service.model.version import STAGE_REVISIONS
 from service.store.library import load_asset_files
+from service.store.seals import get_sealed, put_sealed
 from service.store.store import Store
 from worker.objects.model import ObjectModel
 from worker.objects.packed import from_bytes, to_bytes
@@ -25,14 +26,14 @@ def prepared_object(store: Store, digest: str, *, name: str, face_error_m: float
     """
     key = names.object_prepared(digest, _address(face_error_m))
     try:
-        return from_bytes(store.get(key), name=name, digest=digest)
+        return from_bytes(get_sealed(store, key), name=name, digest=digest)
     except NotFoundError:
         pass
-    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
+    except (DamagedError, ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
         # What cannot be read is made again; it cannot be replaced, and costs no more than it did without a store.
         return _load(store, digest, name=name, face_error_m=face_error_m)
     obj = _load(store, digest, name=name, face_error_m=face_error_m)
-    store.put(key, to_bytes(obj))
+    put_sealed(store, key, to_bytes(obj))
     return obj
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from service.model.errors import DamagedError
 from service.model.stability import (
     OUTCOMES,
     MapCell,
@@ -18,7 +19,7 @@ from service.model.stability import (
     tick,
 )
 from service.store.store import Store
-from service.store.study_records import latest
+from service.store.study_records import STABILITY, latest
 
 #: Width and height of a cell with its gap, as the style sheet has them [px]: lines are drawn over the cells.
 PITCH: Final = (40, 30)
@@ -80,9 +81,9 @@ class Drawn:
 def load(store: Store) -> Stability | None:
     """The maps that were published last; None where there are none that can be read."""
     try:
-        found = latest(store, "stability")
+        found = latest(store, STABILITY)
         return None if found is None else from_json(found)
-    except ValueError:
+    except (ValueError, DamagedError):
         return None
 
 

@@ -13,6 +13,7 @@ from typing import Any, Final
 from pydantic import BaseModel, ConfigDict
 
 from service.model.charts import FILTERED
+from service.model.errors import DamagedError
 from service.model.scene_spec import SceneSpec
 from service.store.store import Store
 from service.store.study_records import CHARTS, latest, scene_kinds
@@ -179,7 +180,7 @@ def load(store: Store) -> list[Measured]:
         try:
             content = latest(store, kind)
             found += [] if content is None else [Measured.model_validate(content)]
-        except ValueError:
+        except (ValueError, DamagedError):
             continue
     return found
 

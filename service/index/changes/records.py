@@ -6,20 +6,24 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 from sqlalchemy import Connection, delete, select, update
 
 from service.index.bulk import upsert
-from service.index.changes.rows import asset_row, attempt_row, clean, grasp_rows, job_row, shard_row, task_rows
-from service.index.changes.states import settle, settle_batches
+from service.index.changes.rows import Row, asset_row, attempt_row, clean, grasp_rows, job_row, shard_row, task_rows
+from service.index.changes.states import ENTERING, settle, settle_batches
 from service.index.database import Database, chunks
-from service.index.tables import assets, attempts, grasps, jobs, shards, tasks
+from service.index.tables import assets, attempts, grasps, jobs, notes, shards, tasks
 from service.model.domain import Asset
+from service.model.planning import batches_of
 from service.model.records import AttemptRecord, JobEvent, JobRecord
 from service.model.states import State
 from service.store.manifests import ShardManifest
 from service.store.parts import preference
+
+#: Batches that are entered in one turn: some tenths of a second, for which others wait.
+BATCHES_AT_ONCE: Final = 500
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,28 @@ class Changes:
         """A job with all its tasks; those whose shard is there already have succeeded."""
         with self.database.writing(within) as connection:
             return self._add_job(connection, record)
+
+    def enter_job(self, record: JobRecord, *, within: Connection) -> None:
+        """A job with its first tasks; `enter_more` brings the others where they are too many for one turn."""
+        is_new = within.scalar(select(jobs.c.id).where(jobs.c.id == record.id)) is None
+        self._upsert_job(within, record)
+        self._enter(within, record, 0, goes_on=is_new)
+
+    def entering(self) -> list[str]:
+        """Jobs that have tasks yet to be entered."""
+        query = select(notes.c.name).where(notes.c.name.startswith(ENTERING)).order_by(notes.c.name)
+        with self.database.reading() as connection:
+            return [name.removeprefix(ENTERING) for name in connection.scalars(query)]
+
+    def enter_more(self, job_id: str, record: JobRecord | None) -> None:
+        """The next tasks of such a job; None: its record is gone, and no more come."""
+        with self.database.writing() as connection:
+            is_there = connection.scalar(select(jobs.c.id).where(jobs.c.id == job_id)) is not None
+            note: Any = connection.scalar(select(notes.c.value).where(notes.c.name == ENTERING + job_id))
+            if record is None or not is_there:
+                connection.execute(delete(notes).where(notes.c.name == ENTERING + job_id))
+            elif note is not None:
+                self._enter(connection, record, note["batch"], goes_on=True)
 
     def add_manifests(
         self, manifests: Iterable[ShardManifest], *, within: Connection | None = None
@@ -72,13 +98,29 @@ class Changes:
             upsert(connection, assets, [asset_row(asset, check)], keep=("last_attempt", "queued", "not_before"))
 
     def _add_job(self, connection: Connection, record: JobRecord) -> State:
-        rows = list(task_rows(record))
+        self._upsert_job(connection, record)
+        self._upsert_tasks(connection, list(task_rows(record)))
+        return settle(connection, record.id)
+
+    def _upsert_job(self, connection: Connection, record: JobRecord) -> None:
+        upsert(connection, jobs, [job_row(record)], keep=("state", "cancelled", "finished", "reason"))
+
+    def _upsert_tasks(self, connection: Connection, rows: list[Row]) -> None:
         known = self._finished_shards(connection, [row["shard_id"] for row in rows])
         for row in rows:
             row.update(known.get(row["shard_id"], {}))
-        upsert(connection, jobs, [job_row(record)], keep=("state", "cancelled", "finished", "reason"))
         upsert(connection, tasks, rows, keep=[name for name in rows[0] if name != "lane"])
-        return settle(connection, record.id)
+
+    def _enter(self, connection: Connection, record: JobRecord, first: int, *, goes_on: bool) -> None:
+        """Some batches from one on. A note tells where the next ones begin, and that the job cannot have ended."""
+        number = batches_of(record.request)
+        some = range(first, min(number, first + BATCHES_AT_ONCE))
+        self._upsert_tasks(connection, list(task_rows(record, some)))
+        if goes_on and some.stop < number:
+            upsert(connection, notes, [{"name": ENTERING + record.id, "value": {"batch": some.stop}}])
+        elif goes_on:
+            connection.execute(delete(notes).where(notes.c.name == ENTERING + record.id))
+        settle(connection, record.id, some)
 
     def _finished_shards(self, connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, Any]]:
         found: dict[str, dict[str, Any]] = {}

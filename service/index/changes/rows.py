@@ -49,10 +49,10 @@ def beside(options: JobOptions) -> str:
     return " ".join(dict.fromkeys(one.digest or "" for one in options.beside))
 
 
-def task_rows(record: JobRecord) -> Iterator[Row]:
-    """The tasks of a job before anything happened to them."""
+def task_rows(record: JobRecord, batches: range | None = None) -> Iterator[Row]:
+    """The tasks of a job, of all batches or some, before anything happened to them."""
     order = stages_of(record.request)
-    for task in plan(record):
+    for task in plan(record, batches):
         yield {
             "id": task.id,
             "job_id": record.id,

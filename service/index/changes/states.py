@@ -7,11 +7,11 @@ from collections.abc import Collection, Mapping, Sequence
 from itertools import groupby
 from typing import Any, Final
 
-from sqlalchemy import ColumnElement, Connection, exists, func, select, tuple_, update
+from sqlalchemy import ColumnElement, Connection, exists, func, literal, select, tuple_, update
 
 from service.index.database import chunks
 from service.index.outgoing import note_ends
-from service.index.tables import attempts, jobs, tasks
+from service.index.tables import attempts, jobs, notes, tasks
 from service.model.errors import SceneError
 from service.model.planning import TaskFacts, batch_ready, batch_states, job_state
 from service.model.states import State
@@ -33,6 +33,8 @@ _FACTS = (
 
 #: Option of a connection on which nothing that ends is told.
 QUIET: Final = "graspd_quiet"
+#: Beginning of the name of a note: tasks of the job whose id follows are yet to be entered.
+ENTERING: Final = "entering "
 _WHOSE: Final = (jobs.c.project, jobs.c.owner)
 
 
@@ -120,9 +122,10 @@ def _changes(chain: Sequence[Any], *, cancelled: bool) -> list[tuple[str, str, b
 
 
 def _settle_jobs(connection: Connection, ids: Sequence[str]) -> dict[str, State]:
-    # Five probes of an index; to collect the distinct states would read every task of the job.
+    # Six probes of an index; to collect the distinct states would read every task of the job.
     of_job = tasks.c.job_id == jobs.c.id
     probes = [exists().where(of_job, tasks.c.state == state.value).label(state.value) for state in State]
+    probes.append(exists().where(notes.c.name == literal(ENTERING) + jobs.c.id).label("entering"))
     query = select(jobs.c.id, jobs.c.state.label("now"), jobs.c.finished, jobs.c.reason, *_WHOSE, *probes)
     known = {row["id"]: row for row in connection.execute(query.where(jobs.c.id.in_(ids))).mappings()}
     states: dict[str, State] = {}
@@ -130,6 +133,7 @@ def _settle_jobs(connection: Connection, ids: Sequence[str]) -> dict[str, State]
     for job in ids:
         row = known.get(job)
         found = [state for state in State if row is not None and row[state.value]]
+        found += [State.QUEUED] if row is not None and row["entering"] else []
         state = states[job] = job_state(found)
         if row is None:
             continue

@@ -16,6 +16,7 @@ from service.index.reach import seen_jobs, seen_tasks
 from service.index.tables import attempts, jobs, shards, tasks
 from service.index.views import AttemptView, JobView, Page, StageProgress, TaskView
 from service.model.errors import NotFoundError
+from service.model.planning import batches_of
 from service.model.projects import EVERYTHING, Reach
 from service.model.states import Stage, State
 
@@ -128,14 +129,24 @@ def _job_views(connection: Connection, rows: Sequence[Any]) -> list[JobView]:
     ids = [row["id"] for row in rows]
     progress = _progress(connection, ids)
     made = _made(connection, ids)
-    return [
+    views = (
         JobView(
             **{name: row[name] for name in JobView.model_fields if name in row},
             stages=progress[row["id"]],
             **made.get(row["id"], {}),
         )
         for row in rows
+    )
+    return [
+        view.model_copy(update={"stages": [_whole(one, batches_of(view.request)) for one in view.stages]})
+        for view in views
     ]
+
+
+def _whole(stage: StageProgress, tasks: int) -> StageProgress:
+    """With the tasks of a large job that are yet to be entered."""
+    more = max(0, tasks - stage.tasks)
+    return stage.model_copy(update={"tasks": stage.tasks + more, "queued": stage.queued + more}) if more else stage
 
 
 def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[StageProgress]]:

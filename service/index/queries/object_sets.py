@@ -28,6 +28,14 @@ class ObjectSets:
             newest = {row["name"]: ObjectSetView(**row) for row in connection.execute(query).mappings()}
         return list(newest.values())
 
+    def named(self, name: str) -> ObjectSetView | None:
+        """The newest version of a set, of whatever project; None if there is none of that name."""
+        query = select(object_sets).where(object_sets.c.name == name)
+        query = query.order_by(object_sets.c.created.desc(), object_sets.c.digest.desc()).limit(1)
+        with self.database.reading() as connection:
+            row = connection.execute(query).mappings().first()
+        return None if row is None else ObjectSetView(**row)
+
     def get(self, name: str, *, reach: Reach = EVERYTHING) -> ObjectSetView:
         """The newest version of a set of objects; NotFoundError if there is none of that name."""
         found = {view.name: view for view in self.newest(reach=reach)}

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Iterable
 from typing import Literal
+
+from sqlalchemy import Connection
 
 from service.index.dataset_views import DatasetView, ObjectSetView
 from service.model import names
@@ -19,10 +20,11 @@ from service.model.states import AssetKind, State
 from service.pipeline.backends import Parts
 from service.pipeline.datasets.spec import MAX_CELLS, DatasetRequest, Matrix, describe
 from service.pipeline.fidelity_choice import Resolver
+from service.pipeline.recording import recording
 from service.pipeline.usable import usable, with_neighbours, with_network
 from service.store.datasets import add_dataset_event, dataset_events, load_dataset, load_snapshot
 from service.store.deletions import refuse_pending
-from service.store.records import put_record, read_record
+from service.store.records import Put, read_record
 
 
 def create(
@@ -50,36 +52,27 @@ def create(
     shared = with_network(parts, shared, hands, reach)
     parts.queue.ping()
     key = names.dataset_record(request.name)
-    new = False
     # One that is there stays what it is: a later chart changes none of its fidelities.
+    found = None
     if not parts.store.exists(key):
         found = describe(request.name, hands, objects, shared, Resolver(parts.store).choose, owner, reach.project)
-        new = put_record(parts.store, key, found)
-    record = load_dataset(parts.store, request.name)
-    if record.project != reach.project:
-        # Nothing else of it is said: names are of the whole service.
-        raise ConflictError(f"the name {record.name!r} is taken; take another name")
-    if not new:
+    wanted = [(AssetKind.HAND, one.digest) for one in hands]
+    wanted += [(AssetKind.OBJECT, one.digest) for one in objects]
+    wanted += [(AssetKind.OBJECT, one.digest) for one in beside]
+    wanted += [(AssetKind.NETWORK, shared.network)] if shared.network else []
+    with recording(parts) as (connection, put):
+        new = found is not None and put(key, found)
+        record = found if found is not None and new else _present(parts, request.name)
+        if record.project != reach.project:
+            # Nothing else of it is said: names are of the whole service.
+            raise ConflictError(f"the name {record.name!r} is taken; take another name")
         # Not by the digest: a newer graspd knows more options, whose defaults an older one meant as well.
-        other = _difference(record, hands, objects, shared)
-        if other:
+        if not new and (other := _difference(record, hands, objects, shared)):
             raise ConflictError(f"there is another dataset named {record.name!r} ({other}); take another name")
-    try:
         refuse_pending(parts.store, "dataset", record.name)
-        wanted = [(AssetKind.HAND, one.digest) for one in hands]
-        wanted += [(AssetKind.OBJECT, one.digest) for one in objects]
-        wanted += [(AssetKind.OBJECT, one.digest) for one in beside]
-        wanted += [(AssetKind.NETWORK, shared.network)] if shared.network else []
-        with parts.index.database.writing() as connection:
-            if not parts.store.exists(key):
-                raise ConflictError(f"dataset {record.name!r} was deleted just now; create it again")
-            if missing := parts.index.assets.missing(wanted, within=connection):
-                raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
-            parts.index.write_dataset.add(record, within=connection)
-    except InputError:
-        if new:
-            parts.store.delete(key)
-        raise
+        if missing := parts.index.assets.missing(wanted, within=connection):
+            raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
+        parts.index.write_dataset.add(record, within=connection)
     return parts.index.datasets.get(record.name), new
 
 
@@ -92,10 +85,12 @@ def cancel(parts: Parts, name: str) -> DatasetView:
         NotFoundError: unknown dataset.
         ConflictError: it is finished or cancelled already.
     """
-    dataset = parts.index.datasets.get(name)
-    if dataset.cancelled or dataset.state.is_final:
-        raise ConflictError(f"dataset {name!r} is {dataset.state} already; there is nothing to cancel")
-    return _add_event(parts, name, "cancelled")
+    with recording(parts) as (connection, put):
+        dataset = parts.index.datasets.get(name)
+        if dataset.cancelled or dataset.state.is_final:
+            raise ConflictError(f"dataset {name!r} is {dataset.state} already; there is nothing to cancel")
+        _add_event(parts, name, "cancelled", connection, put)
+    return parts.index.datasets.get(name)
 
 
 def retry(parts: Parts, name: str) -> DatasetView:
@@ -105,10 +100,12 @@ def retry(parts: Parts, name: str) -> DatasetView:
         NotFoundError: unknown dataset.
         ConflictError: no cell failed or was cancelled.
     """
-    dataset = parts.index.datasets.get(name)
-    if not dataset.cancelled and not dataset.states[State.FAILED] and not dataset.states[State.CANCELLED]:
-        raise ConflictError(f"dataset {name!r} is {dataset.state}, and no cell failed; there is nothing to retry")
-    return _add_event(parts, name, "retried")
+    with recording(parts) as (connection, put):
+        dataset = parts.index.datasets.get(name)
+        if not dataset.cancelled and not dataset.states[State.FAILED] and not dataset.states[State.CANCELLED]:
+            raise ConflictError(f"dataset {name!r} is {dataset.state}, and no cell failed; there is nothing to retry")
+        _add_event(parts, name, "retried", connection, put)
+    return parts.index.datasets.get(name)
 
 
 def snapshot(parts: Parts, name: str) -> tuple[Snapshot, bool]:
@@ -137,10 +134,13 @@ def snapshot(parts: Parts, name: str) -> tuple[Snapshot, bool]:
         created=timestamp(),
         shards=held,
     )
-    new = put_record(parts.store, names.dataset_snapshot(name, taken.digest), taken)
-    if not new:
-        taken = load_snapshot(parts.store, name, taken.digest)
-    parts.index.write_dataset.add_snapshot(taken)
+    with recording(parts) as (connection, put):
+        if parts.index.datasets.get(name).digest != dataset.digest:
+            raise ConflictError(f"dataset {name!r} was deleted just now, and there is another one; try again")
+        new = put(names.dataset_snapshot(name, taken.digest), taken)
+        if not new:
+            taken = load_snapshot(parts.store, name, taken.digest)
+        parts.index.write_dataset.add_snapshot(taken, within=connection)
     return taken, new
 
 
@@ -169,20 +169,27 @@ def add_object_set(
     wanted = tuple(asset.name for asset in assets)
     if not wanted:
         raise InputError(f"the set {name!r} holds no object; name some")
-    after, project = "", reach.project
-    with contextlib.suppress(NotFoundError):
-        present = parts.index.object_sets.get(name)
-        if not reach.sees(present.project):
-            raise ConflictError(f"the name {name!r} is taken; take another name")
-        if set(present.objects) == set(wanted):
-            return present
-        after = present.digest
-        known = read_record(ObjectSet, parts.store, names.object_set(name, after))
-        owner, project = known.owner, known.project
-        may_follow(owner, project)
-    found = object_set_of(name, wanted, after=after, owner=owner, project=project)
-    put_record(parts.store, names.object_set(name, found.digest), found)
-    parts.index.write_dataset.add_object_set(found)
+    # Of two that want one name at once, the later one must see the earlier one's set.
+    with recording(parts) as (connection, put):
+        after, project = "", reach.project
+        if (present := parts.index.object_sets.named(name)) is not None:
+            if not reach.sees(present.project):
+                raise ConflictError(f"the name {name!r} is taken; take another name")
+            if set(present.objects) == set(wanted):
+                return present
+            after = present.digest
+            known = read_record(ObjectSet, parts.store, names.object_set(name, after))
+            owner, project = known.owner, known.project
+            may_follow(owner, project)
+        if missing := parts.index.assets.missing([(AssetKind.OBJECT, one.digest) for one in assets], within=connection):
+            raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
+        found = object_set_of(name, wanted, after=after, owner=owner, project=project)
+        if not put(key := names.object_set(name, found.digest), found):
+            # It broke off before its row was there.
+            found = read_record(ObjectSet, parts.store, key)
+            if not reach.sees(found.project):
+                raise ConflictError(f"the name {name!r} is taken; take another name")
+        parts.index.write_dataset.add_object_set(found, within=connection)
     return parts.index.object_sets.get(name)
 
 
@@ -203,10 +210,18 @@ def _members(parts: Parts, kind: AssetKind, wanted: Iterable[str], reach: Reach)
     return list(dict.fromkeys(found))
 
 
-def _add_event(parts: Parts, name: str, what: Literal["cancelled", "retried"]) -> DatasetView:
-    add_dataset_event(parts.store, name, what)
-    parts.index.write_dataset.set_events(name, dataset_events(parts.store, name))
-    return parts.index.datasets.get(name)
+def _present(parts: Parts, name: str) -> DatasetRecord:
+    try:
+        return load_dataset(parts.store, name)
+    except NotFoundError:
+        raise ConflictError(f"dataset {name!r} was deleted just now; create it again") from None
+
+
+def _add_event(
+    parts: Parts, name: str, what: Literal["cancelled", "retried"], connection: Connection, put: Put
+) -> None:
+    add_dataset_event(parts.store, name, what, put=put)
+    parts.index.write_dataset.set_events(name, dataset_events(parts.store, name), within=connection)
 
 
 def _difference(known: DatasetRecord, hands: list[Member], objects: list[Member], options: JobOptions) -> str:

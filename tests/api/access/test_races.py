@@ -9,16 +9,21 @@ from threading import Barrier, BrokenBarrierError
 from typing import Any
 
 import pytest
+from httpx import Response
 from pydantic import SecretStr
 from starlette.testclient import TestClient
 
 from api.access.keys import Key, KeyFile, KeyLimits, Scope
 from api.access.quotas import Quotas
 from api.app import create_app
+from service.index.rebuild import differences
 from service.model import names
-from service.model.errors import QuotaError
+from service.model.dataset_records import ObjectSet, object_set_of
+from service.model.errors import ConflictError, QuotaError
 from service.model.records import JobRecord
+from service.model.webhooks import MOST_HOOKS
 from service.pipeline.backends import Parts
+from service.pipeline.datasets.rounds import DatasetRounds
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from service.store import library
@@ -26,6 +31,10 @@ from service.store.records import read_record
 from service.store.store import Store
 from tests.api.factories import finish_all
 
+#: Often enough for two requests to meet.
+ROUNDS = 10
+SETS = "/v1/object-sets"
+MATRIX = {"hands": ["allegro"], "objects": ["mug"], "grasps": 5}
 JOB = {"hand": "allegro", "object": "mug", "grasps": 5}
 KEY = Key(id="1", name="me", scope=Scope.SUBMIT, sha256="", created="", limits=KeyLimits(grasps_in_flight=20))
 Unfinished = Callable[[Collection[str]], Collection[str]]
@@ -36,7 +45,7 @@ def twins(
     settings: Settings, parts: Parts, redis_server: str, rq_queue: RqQueue, noon: None
 ) -> Iterator[list[TestClient]]:
     """Two applications over the same parts, keys and Redis."""
-    wanted = settings.model_copy(update={"redis_url": SecretStr(redis_server)})
+    wanted = settings.model_copy(update={"redis_url": SecretStr(redis_server), "webhook_secret": SecretStr("s" * 16)})
     shared = Parts(wanted, parts.store, parts.index, parts.queue)
     clients = [TestClient(create_app(wanted, shared), base_url="http://127.0.0.1:8000") for _ in range(2)]
     for client in clients:
@@ -190,3 +199,144 @@ def test_of_two_objects_of_one_name_at_once_one_gets_it(
         assert sorted(pool.map(upload, range(2))) == [202, 409]
     stored = [library.load_asset(parts.store, *found).name for found in library.stored_assets(parts.store)]
     assert stored.count("ball") == 1
+
+
+def at_once(twins: list[TestClient], ask: Callable[[TestClient, int], Response]) -> list[Response]:
+    """Two requests of a kind at the same time, each to an API of its own."""
+    start = Barrier(2)
+
+    def asked(number: int) -> Response:
+        start.wait(60)
+        return ask(twins[number], number)
+
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(asked, range(2)))
+
+
+def codes(answers: list[Response]) -> list[int]:
+    return sorted(answer.status_code for answer in answers)
+
+
+def strayed(parts: Parts) -> list[str]:
+    """Rows that are not what the store says, but for those of the assets, which came without a check."""
+    return [line for line in differences(parts.index, parts.store) if not line.startswith("assets ")]
+
+
+@pytest.fixture
+def projects(settings: Settings) -> list[dict[str, str]]:
+    """Headers of a key of each of two projects."""
+    keys = KeyFile(settings.resolved_keys_file)
+    names = ("red", "blue")
+    return [{"Authorization": f"Bearer {keys.add(name, Scope.SUBMIT, project=name)}"} for name in names]
+
+
+def test_of_two_projects_that_want_one_name_of_a_set_at_once_one_gets_it(
+    twins: list[TestClient], projects: list[dict[str, str]], parts: Parts
+) -> None:
+    for number in range(ROUNDS):
+        body = {"name": f"set{number}", "objects": ["mug"]}
+        assert codes(at_once(twins, lambda http, n, body=body: http.post(SETS, json=body, headers=projects[n]))) == [
+            201,
+            409,
+        ]
+    assert strayed(parts) == []
+
+
+def test_of_two_versions_of_a_set_at_once_the_later_follows_the_earlier(
+    twins: list[TestClient], headers: dict[str, str], parts: Parts
+) -> None:
+    objects = (["mug"], ["block"])
+    for number in range(ROUNDS):
+        name = f"set{number}"
+        answers = at_once(
+            twins,
+            lambda http, n, name=name: http.post(SETS, json={"name": name, "objects": objects[n]}, headers=headers),
+        )
+        assert codes(answers) == [201, 201]
+        kept = [read_record(ObjectSet, parts.store, one.key) for one in parts.store.list(f"object_sets/{name}")]
+        first = next(one for one in kept if one.digest == object_set_of(name, one.objects).digest)
+        later = next(one for one in kept if one is not first)
+        assert later.digest == object_set_of(name, later.objects, after=first.digest).digest
+
+
+def test_of_two_datasets_of_one_name_at_once_one_gets_it(
+    twins: list[TestClient], headers: dict[str, str], parts: Parts
+) -> None:
+    def create(http: TestClient, number: int) -> Response:
+        return http.post("/v1/datasets", json=MATRIX | {"name": "all", "seed": number}, headers=headers)
+
+    assert codes(at_once(twins, create)) == [202, 409]
+    assert strayed(parts) == []
+
+
+def test_of_two_last_webhooks_at_once_one_is_made(twins: list[TestClient], projects: list[dict[str, str]]) -> None:
+    def add(http: TestClient, _: int = 0) -> Response:
+        return http.post("/v1/webhooks", json={"url": "https://example.org/"}, headers=projects[0])
+
+    made = [add(twins[0]) for _ in range(MOST_HOOKS - 1)]
+    for _ in range(ROUNDS):
+        answers = at_once(twins, add)
+        assert codes(answers) == [201, 413]
+        made = [answer for answer in answers if answer.status_code == 201]
+        twins[0].delete(f"/v1/webhooks/{made[0].json()['id']}", headers=projects[0])
+
+
+@pytest.mark.parametrize("what", ["job", "dataset"])
+def test_of_two_cancellations_at_once_one_counts(
+    twins: list[TestClient], headers: dict[str, str], parts: Parts, what: str
+) -> None:
+    """Each leaves an event in the store: of two with one number a rebuild would not know which came last."""
+    for number in range(4):
+        if what == "job":
+            name = twins[0].post("/v1/jobs", json=JOB | {"grasps": 1, "seed": number}, headers=headers).json()["id"]
+        else:
+            name = f"all{number}"
+            twins[0].post("/v1/datasets", json=MATRIX | {"name": name, "grasps": 1}, headers=headers)
+        path = f"/v1/{what}s/{name}"
+        assert codes(at_once(twins, lambda http, _, path=path: http.post(f"{path}/cancel", headers=headers))) == [
+            202,
+            409,
+        ]
+        events = list(parts.store.list(f"{what}s/{name}/events"))
+        assert len(events) == 1
+        answers = at_once(twins, lambda http, _, path=path: http.post(f"{path}/retry", headers=headers))
+        assert codes(answers) == [202, 409]
+        assert len(list(parts.store.list(f"{what}s/{name}/events"))) == 2
+
+
+def test_two_snapshots_at_once_are_one(twins: list[TestClient], headers: dict[str, str], parts: Parts) -> None:
+    twins[0].post("/v1/datasets", json=MATRIX | {"name": "all"}, headers=headers)
+    DatasetRounds(parts).advance()
+    job = next(parts.store.list("jobs")).key
+    finish_all(parts, read_record(JobRecord, parts.store, job))
+    answers = at_once(twins, lambda http, _: http.post("/v1/datasets/all/snapshots", headers=headers))
+    assert codes(answers) == [200, 201]
+    assert answers[0].json() == answers[1].json()
+
+
+def test_a_tag_given_twice_at_once_has_the_grasps_of_both(
+    twins: list[TestClient], headers: dict[str, str], parts: Parts
+) -> None:
+    job = twins[0].post("/v1/jobs", json=JOB, headers=headers).json()["id"]
+    shard = finish_all(parts, read_record(JobRecord, parts.store, names.job_record(job)))[0].shard_id
+
+    def give(http: TestClient, number: int) -> Response:
+        chosen = {"name": "good", "grasps": [{"shard_id": shard, "row": number}]}
+        return http.post("/v1/tags", json=chosen, headers=headers)
+
+    assert codes(at_once(twins, give)) == [200, 200]
+    assert [tag["grasps"] for tag in twins[0].get("/v1/tags", headers=headers).json()] == [2]
+    assert strayed(parts) == []
+
+
+def test_of_two_keys_of_one_name_at_once_one_is_made(settings: Settings) -> None:
+    start = Barrier(2)
+
+    def add(_: int) -> bool:
+        start.wait(60)
+        with suppress(ConflictError):
+            return bool(KeyFile(settings.resolved_keys_file).add("same", Scope.READ))
+        return False
+
+    with ThreadPoolExecutor(2) as pool:
+        assert sorted(pool.map(add, range(2))) == [False, True]

@@ -13,6 +13,7 @@ from service.model import names
 from service.model.states import AssetKind
 from service.model.transforms import IDENTITY_POSE, apply
 from service.store.assets import builtin_files, builtin_model, builtin_names
+from service.store.seals import sealed
 from service.store.store import open_store
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
@@ -63,4 +64,4 @@ def test_a_model_is_published_once(tmp_path: Path) -> None:
     key = names.asset_model(AssetKind.OBJECT, obj.digest)
     assert store.get(key)[:4] == b"glTF"
     publish_model(store, AssetKind.OBJECT, obj)
-    assert store.get(key) == object_glb(obj)
+    assert store.get(key) == sealed(key, object_glb(obj))

@@ -1,0 +1,48 @@
+"""Records and rows in one step: what is put into the store during a turn of the index's writers counts as a whole."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from pydantic import BaseModel
+from sqlalchemy import Connection
+
+from service.model.errors import StoreUnavailable
+from service.pipeline.backends import Parts
+from service.store.records import Put, put_record
+
+log = logging.getLogger(__name__)
+
+
+@contextmanager
+def recording(parts: Parts, made: Sequence[str] = ()) -> Iterator[tuple[Connection, Put]]:
+    """A turn of the index's writers, and how records are put in it. They go again where the turn breaks off.
+
+    Nobody else writes meanwhile: what was looked at before a record is put still holds when the rows are there.
+
+    Args:
+        made: keys of records that were put just before, and go as well.
+
+    Raises:
+        IndexUnavailable: the index is away; nothing is recorded.
+    """
+    keys = list(made)
+
+    def put(key: str, record: BaseModel) -> bool:
+        is_new = put_record(parts.store, key, record)
+        keys.extend([key] if is_new else [])
+        return is_new
+
+    with parts.index.database.writing() as connection:
+        try:
+            yield connection, put
+            connection.commit()
+        except Exception:
+            for key in keys:
+                try:
+                    parts.store.delete(key)
+                except StoreUnavailable as error:
+                    log.error("%s stays in the store though its request was refused: %s", key, error)
+            raise

@@ -1,0 +1,102 @@
+"""Large jobs enter the index in pieces: each turn is short, and others have theirs between two of them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from sqlalchemy import func, select
+
+from service.index.changes.records import BATCHES_AT_ONCE
+from service.index.rebuild import differences
+from service.index.tables import tasks
+from service.model import names
+from service.model.errors import ConflictError
+from service.model.states import State
+from service.pipeline import job_actions
+from service.pipeline.backends import Parts
+from service.pipeline.deletion import delete_job
+from service.pipeline.entering import Entering
+from tests.fakes import request
+
+LARGE = 32 * (2 * BATCHES_AT_ONCE + 1)
+
+
+def entered(parts: Parts) -> int:
+    with parts.index.database.reading() as connection:
+        return int(connection.scalar(select(func.count()).select_from(tasks)) or 0)
+
+
+def work_off(parts: Parts) -> list[tuple[str, int]]:
+    """Enter all that is left; the job and the number of rows of each turn."""
+    stop, turns = threading.Event(), list[tuple[str, int]]()
+
+    class Watched(Entering):
+        def enter(self, job: str) -> None:
+            before = entered(parts)
+            super().enter(job)
+            turns.append((job, entered(parts) - before))
+            if not parts.index.write.entering():
+                stop.set()
+
+    Watched(parts, stop).run()
+    return turns
+
+
+def test_turns_are_short_and_alternate(parts: Parts) -> None:
+    jobs = [job_actions.submit(parts, request(grasps=LARGE, seed=seed))[0].id for seed in range(2)]
+    assert entered(parts) == 2 * BATCHES_AT_ONCE
+    turns = work_off(parts)
+    assert [job for job, _ in turns] == 2 * sorted(jobs)
+    assert [rows for _, rows in turns] == [BATCHES_AT_ONCE, BATCHES_AT_ONCE, 1, 1]
+    assert differences(parts.index, parts.store) == []
+
+
+def test_a_job_is_told_whole_before_it_is_entered(parts: Parts) -> None:
+    job, _ = job_actions.submit(parts, request(grasps=LARGE))
+    assert [(stage.tasks, stage.queued) for stage in job.stages] == [(LARGE // 32, LARGE // 32)]
+
+
+def test_a_job_that_is_being_entered_has_not_ended(parts: Parts) -> None:
+    job, _ = job_actions.submit(parts, request(grasps=LARGE))
+    assert not job_actions.cancel(parts, job.id).state.is_final
+    with pytest.raises(ConflictError):
+        delete_job(parts, job.id)
+    work_off(parts)
+    assert parts.index.jobs.get(job.id).state is State.CANCELLED
+    assert differences(parts.index, parts.store) == []
+
+
+def test_the_same_job_again_begins_nothing_anew(parts: Parts) -> None:
+    job, _ = job_actions.submit(parts, request(grasps=LARGE))
+    work_off(parts)
+    again, new = job_actions.submit(parts, request(grasps=LARGE))
+    assert (again.id, new, parts.index.write.entering()) == (job.id, False, [])
+
+
+def test_a_job_whose_record_is_gone_is_given_up(parts: Parts) -> None:
+    job, _ = job_actions.submit(parts, request(grasps=LARGE))
+    parts.store.delete(names.job_record(job.id))
+    assert work_off(parts) == [(job.id, 0)]
+
+
+@pytest.mark.slow
+def test_five_jobs_of_a_million_grasps_delay_a_small_one_by_less_than_three_seconds(parts: Parts) -> None:
+    stop, waits = threading.Event(), list[float]()
+    keeper = threading.Thread(target=Entering(parts, stop).run)
+    keeper.start()
+    with ThreadPoolExecutor(5) as pool:
+        large = [pool.submit(job_actions.submit, parts, request(grasps=10**6, seed=seed)) for seed in range(5)]
+        number = 0
+        while not all(one.done() for one in large) or parts.index.write.entering():
+            number += 1
+            start = time.monotonic()
+            job_actions.submit(parts, request(grasps=1, seed=100 + number))
+            waits.append(time.monotonic() - start)
+    stop.set()
+    keeper.join()
+    print(f"{number} small jobs beside five large ones: longest wait {max(waits):.2f} s")
+    assert entered(parts) == 5 * 31_250 + number
+    assert max(waits) < 3

@@ -1,0 +1,187 @@
+"""One byte that turned, anywhere in anything that the store keeps: found, named, and not believed."""
+
+from __future__ import annotations
+
+import io
+import random
+import re
+from typing import Final
+
+import numpy as np
+import pytest
+
+from service.index.rebuild import rebuild
+from service.model import names
+from service.model.clock import timestamp
+from service.model.dataset_records import ObjectSet
+from service.model.errors import DamagedError
+from service.model.records import AttemptRecord, JobRecord
+from service.model.states import AssetKind, Stage
+from service.model.tags import Tag
+from service.model.webhooks import Webhook
+from service.pipeline import job_actions
+from service.pipeline.backends import Parts
+from service.pipeline.datasets import actions
+from service.pipeline.datasets.spec import DatasetRequest
+from service.pipeline.repair import repair
+from service.pipeline.scrub import FOLDERS, examine, scan
+from service.store.assets import pack as pack_files
+from service.store.deletions import Deletion, Released
+from service.store.library import builtin_assets, load_check, publish_builtins, store_files
+from service.store.manifests import load_manifest
+from service.store.packs import DeadShards, pack_at
+from service.store.records import add_job_event, put_record, read_record
+from service.store.seals import put_document, put_sealed
+from service.store.study_records import latest, publish
+from tests.damage import flipped, overwrite
+from tests.fakes import HAND_FILES, OBJECT_FILES, make_shard, request
+from tests.packing import pack, tasks_of
+
+#: Flips of each object: with some thirty objects more than the 265 that were once tried by hand.
+FLIPS: Final = 15
+#: Kinds of keys: digests and numbers do not count.
+_ID: Final = re.compile(r"[0-9a-f]{32}|[0-9]+|T[0-9]+Z")
+
+
+@pytest.fixture
+def full(parts: Parts) -> Parts:
+    """A store with an object of every kind."""
+    store = parts.store
+    job, _ = job_actions.submit(parts, request(grasps=96))
+    record = read_record(JobRecord, store, names.job_record(job.id))
+    lone, first, second = tasks_of(record)
+    manifest = make_shard(store, lone)
+    parts.index.write.add_manifest(manifest)
+    key = pack(store, [first, second])
+    dead = DeadShards(shards=(pack_at(store, key).shards[0].id,))
+    put_record(store, f"{names.pack_dead(key)}/{'d' * 32}.json", dead)
+    add_job_event(store, job.id, "cancelled")
+    attempt = {"task_id": first.task_id, "job_id": job.id, "stage": Stage.SYNTHESIZE, "number": 1, "kind": "Error"}
+    failed = AttemptRecord(**attempt, reason="broke", worker="w", ended=timestamp(), last=False)
+    put_record(store, names.attempt(first.task_id, 1), failed)
+    actions.create(parts, DatasetRequest(name="all", hands=["gripper"], objects=["ball"], grasps=96))
+    parts.index.write_dataset.set_progress("all", planned=True)
+    actions.cancel(parts, "all")
+    actions.snapshot(parts, "all")
+    actions.add_object_set(parts, "balls", ["ball"])
+    put_record(store, f"{names.DELETIONS}/job/{'e' * 32}.json", Deletion(what="job", id="e" * 32, at=timestamp()))
+    put_record(store, f"{names.RELEASED}/1-{job.id}.json", Released(at=timestamp(), job=record))
+    hook = Webhook(id="f" * 32, url="https://example.org/", states=("succeeded",), created=timestamp())
+    put_record(store, names.webhook(hook.id), hook)
+    tag = Tag(id="a" * 32, name="good", number=1, created=timestamp(), changed=timestamp())
+    put_record(store, names.tag_version(tag.id, 1), tag)
+    for kind in ("charts", "scene_charts/table", "stability"):
+        publish(store, kind, {"created": timestamp(), "runs": [1.0, 2.0]})
+    publish_builtins(store)
+    ball = parts.index.assets.get(AssetKind.OBJECT, "ball").digest
+    file = io.BytesIO()
+    np.savez(file, vertices=np.arange(30.0))
+    put_sealed(store, names.object_prepared(ball, "1" * 32), file.getvalue())
+    put_sealed(store, names.object_pieces(ball, "2" * 32), file.getvalue())
+    return parts
+
+
+def keys_of_each_kind(parts: Parts) -> list[str]:
+    """The longest-named of each kind of object, by key; every kind of hand's or object's file is there."""
+    kinds = {_ID.sub("*", entry.key): entry.key for folder in FOLDERS for entry in parts.store.list(folder)}
+    return sorted(kinds.values())
+
+
+def test_every_flipped_byte_is_found_and_named(full: Parts) -> None:
+    draw, missed, tried = random.Random(45), [], 0
+    keys = keys_of_each_kind(full)
+    packed = next(key for key in keys if key.endswith(".pack"))
+    there = pack_at(full.store, packed)
+    for key in keys:
+        data = full.store.get(key)
+        # The bytes of a shard that is gone are of no use, though they stay until the pack goes.
+        gone = {
+            at
+            for shard in there.shards
+            if key == packed and shard.id in there.dead
+            for start, length in ((shard.start, shard.length), (shard.manifest_start, shard.manifest_length))
+            for at in range(there.body + start, there.body + start + length)
+        }
+        for at in draw.sample(sorted(set(range(len(data))) - gone), FLIPS):
+            overwrite(full.store, key, data[:at] + bytes([data[at] ^ 1 << draw.randrange(8)]) + data[at + 1 :])
+            # The file of a shard is examined with its manifest.
+            wrong = examine(full.store, re.sub(r"\.h5$", ".json", key))
+            tried += 1
+            if wrong is None or wrong.key != key:
+                missed.append((key, at))
+        overwrite(full.store, key, data)
+    assert missed == []
+    assert tried >= 265
+    assert {key.partition("/")[0] for key in keys} == set(FOLDERS)
+    assert [wrong for _, wrong in scan(full.store) if wrong is not None] == []
+
+
+def test_a_damaged_manifest_is_neither_read_nor_indexed(full: Parts) -> None:
+    manifest = next(entry.key for entry in full.store.list(names.SHARDS) if entry.key.endswith(".json"))
+    data = full.store.get(manifest)
+    at = data.index(b'"epsilon":0.') + len(b'"epsilon":0.')
+    overwrite(full.store, manifest, data[:at] + (b"9" if data[at : at + 1] != b"9" else b"1") + data[at + 1 :])
+    with pytest.raises(DamagedError, match=re.escape(manifest)):
+        load_manifest(full.store, Stage.SYNTHESIZE, manifest[-37:-5])
+    assert rebuild(full.index, full.store)["left_out"] == 1
+    made = full.index.notes.completeness()
+    assert made is not None and made.names == (manifest,)
+
+
+def test_what_an_earlier_graspd_wrote_is_read_and_counted(parts: Parts) -> None:
+    found = ObjectSet(name="c" * 64, digest="a" * 32, objects=("ball",), created=timestamp())
+    key, without = names.object_set(found.name, found.digest), list[str]()
+    parts.store.put(key, found.model_dump_json().encode())
+    zipped = names.asset_files(AssetKind.OBJECT, parts.index.assets.get(AssetKind.OBJECT, "ball").digest)
+    overwrite(parts.store, zipped, pack_files(OBJECT_FILES))
+    assert read_record(ObjectSet, parts.store, key) == found
+    assert [wrong for _, wrong in scan(parts.store, unsealed=without.append) if wrong is not None] == []
+    assert {key, zipped} <= set(without)
+
+
+def test_files_of_an_earlier_upload_are_held_against_their_name(parts: Parts) -> None:
+    key = names.asset_files(AssetKind.HAND, parts.index.assets.get(AssetKind.HAND, "gripper").digest)
+    overwrite(parts.store, key, pack_files(HAND_FILES | {"hand.urdf": b"<robot name='other'/>"}))
+    wrong = examine(parts.store, key)
+    assert wrong is not None and "its files are not those of its name" in wrong.what
+
+
+def test_a_damaged_upload_is_replaced_by_the_same_files(parts: Parts) -> None:
+    key = names.asset_files(AssetKind.HAND, parts.index.assets.get(AssetKind.HAND, "gripper").digest)
+    overwrite(parts.store, key, flipped(parts.store.get(key)))
+    store_files(parts.store, AssetKind.HAND, "gripper", HAND_FILES)
+    assert examine(parts.store, key) is None
+
+
+@pytest.mark.parametrize("file", ["model.glb", "check.json"])
+def test_what_a_check_found_is_made_again(parts: Parts, file: str) -> None:
+    ball = parts.index.assets.get(AssetKind.OBJECT, "ball").digest
+    folder = names.asset_check(AssetKind.OBJECT, ball).rpartition("/")[0]
+    put_document(parts.store, f"{folder}/check.json", {"verdict": "accept"})
+    put_sealed(parts.store, f"{folder}/model.glb", b"glTF" + bytes(8) + b"\4\0\0\0JSON{}  ")
+    overwrite(parts.store, f"{folder}/{file}", flipped(parts.store.get(f"{folder}/{file}")))
+    found = [wrong for _, wrong in scan(parts.store) if wrong is not None]
+    repaired, left = repair(parts, found)
+    assert [one.key for one in repaired] == [f"{folder}/{file}"]
+    assert left == []
+    assert load_check(parts.store, AssetKind.OBJECT, ball) is None
+    assert [check.digest for check in parts.index.feed.ready_checks(now=1e12, limit=9)] == [ball]
+
+
+def test_what_comes_with_graspd_is_put_again(parts: Parts) -> None:
+    publish_builtins(parts.store)
+    mug = next(asset for asset in builtin_assets() if asset.kind is AssetKind.OBJECT)
+    folder = names.asset_record(mug.kind, mug.digest).rpartition("/")[0]
+    for file in ("asset.json", "files.zip", "model.glb"):
+        overwrite(parts.store, f"{folder}/{file}", flipped(parts.store.get(f"{folder}/{file}")))
+    _, left = repair(parts, [wrong for _, wrong in scan(parts.store) if wrong is not None])
+    assert left == []
+    assert [wrong for _, wrong in scan(parts.store) if wrong is not None] == []
+
+
+def test_charts_of_one_moment_are_all_kept(parts: Parts) -> None:
+    at = timestamp()
+    keys = [publish(parts.store, "charts", {"created": at, "runs": [number]}) for number in range(12)]
+    assert len(set(keys)) == 12
+    found = latest(parts.store, "charts")
+    assert found is not None and found["runs"] == [11]
