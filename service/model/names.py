@@ -16,6 +16,7 @@ DATASETS: Final = "datasets"
 OBJECT_SETS: Final = "object_sets"
 DELETIONS: Final = "deletions"
 RELEASED: Final = "released"
+REMOVED: Final = "removed"
 WEBHOOKS: Final = "webhooks"
 TAGS: Final = "tags"
 
