@@ -59,6 +59,7 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
         # What the key may not do has no button; the routes refuse it all the same.
         "may_submit": is_allowed(request, Scope.SUBMIT),
         "may_change": may_change,
+        "grace_s": request.app.state.settings.shard_grace_s,
     }
     text = request.app.state.templates.get_template(template).render(context)
     return HTMLResponse(text, status_code=status, headers={"Cache-Control": "no-store"})

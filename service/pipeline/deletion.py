@@ -119,18 +119,26 @@ def put_away(parts: Parts, deletion: Deletion) -> None:
         parts.store.delete(names.deletion(deletion.what, deletion.id))
 
 
-def restore(parts: Parts, what: What, name: str, *, permit: Callable[[Deletion], None]) -> Deletion:
+def restore(
+    parts: Parts,
+    what: What,
+    name: str,
+    *,
+    permit: Callable[[Deletion], None],
+    among: Callable[[Deletion], bool] = lambda _: True,
+) -> Deletion:
     """Bring back what a user took away, as it was; a dataset with the jobs that went with it.
 
     Args:
         name: of the thing, or its id.
         permit: asked with the deletion; raises where it must not be taken back.
+        among: whether a deletion is within reach.
 
     Raises:
         NotFoundError: nothing of that name was deleted within the grace time.
         ConflictError: there is one of that name again, or what it needs is deleted too.
     """
-    known = [one for one in deletions(parts.store, what) if name in (one.id, one.name)]
+    known = [one for one in deletions(parts.store, what) if name in (one.id, one.name) and among(one)]
     if not known:
         raise NotFoundError(f"no {what} {name!r} was deleted in the last {_days(parts.settings.shard_grace_s)}")
     permit(known[0])
