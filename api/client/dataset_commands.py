@@ -174,8 +174,8 @@ def delete(
     """Take away a dataset that has ended, and the jobs that were planned for it alone."""
     with open_client(url) as client:
         found = DatasetClient(client).dataset(name)
-        goes = f"{count(found.cells)} cell{'s' * (found.cells != 1)}, {count(found.grasps)} grasps ({size(found.size_bytes)})"
-        goes += ", its snapshots" * with_snapshots
+        goes = f"{count(found.cells)} cell{'s' * (found.cells != 1)}, {count(found.grasps)} grasps"
+        goes += f" ({size(found.size_bytes)})" + ", its snapshots" * with_snapshots
         confirm(f"Delete dataset {name} with {goes}?", f"dataset {name}", yes=yes)
         client.delete(f"/v1/datasets/{name}", with_snapshots=with_snapshots)
     say_deleted("dataset", name, json=json, undo=f"graspd datasets restore {name}")
