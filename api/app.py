@@ -25,7 +25,7 @@ from api.middleware.request_context import RequestContext
 from api.middleware.root_path import RootPath
 from api.middleware.same_origin import SameOrigin
 from api.middleware.turnstile import Turnstile
-from api.routes import datasets, grasps, hand_corrections, jobs, shards, system, tags, usage, webhooks
+from api.routes import datasets, deletions, grasps, hand_corrections, jobs, shards, system, tags, usage, webhooks
 from api.routes.assets import asset_router
 from api.routes.dependencies import provide
 from api.routes.long_requests import EXPORTS, FORMS, UPLOADS, Turns
@@ -86,7 +86,7 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
     app.state.uploads, app.state.forms = Turns(UPLOADS), Turns(FORMS)
     app.state.exports = Turns(EXPORTS)
     problems.install(app, problem_page)
-    plain = (jobs, grasps, shards, system, hand_corrections, tags, usage, webhooks)
+    plain = (jobs, grasps, shards, system, hand_corrections, tags, usage, webhooks, deletions)
     routers = [*(routes.router for routes in plain), *map(asset_router, AssetKind)]
     pages.install(app, opened)
     for router in (*routers, *datasets.routers, *pages.routers):

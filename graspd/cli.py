@@ -35,6 +35,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("cancel", "api.client.commands", "Jobs", "Stop a job; what is written stays."),
     ("retry", "api.client.commands", "Jobs", "Run again what failed or was cancelled."),
     ("delete", "api.client.commands", "Jobs", "Remove an ended job; its grasps go where no other job has them."),
+    ("restore", "api.client.commands", "Jobs", "Bring back a job that was deleted."),
     ("logs", "api.client.commands", "Jobs", "Failed attempts of a job, with their reasons."),
     ("hands", "api.client.commands", "Jobs", "Check, add, list and show hands."),
     ("objects", "api.client.commands", "Jobs", "Check, add, list and show objects."),

@@ -67,14 +67,14 @@ class Datasets:
         with self._quotas.claim(caller.get(), DATASET_PREFIX + name, grasps, is_new=False):
             return actions.retry(self._parts, name)
 
-    def delete(self, name: str) -> None:
-        """Take a dataset away that has ended.
+    def delete(self, name: str, *, with_snapshots: bool = False) -> None:
+        """Take a dataset away that has ended; one with snapshots only where they may go too.
 
         Raises:
             NotYours: another key submitted it.
         """
         self._owned(name)
-        deletion.delete_dataset(self._parts, name, owner=caller_id())
+        deletion.delete_dataset(self._parts, name, owner=caller_id(), with_snapshots=with_snapshots)
         log.info("dataset %s deleted", name)
 
     def estimate(self, matrix: Matrix) -> Estimate:

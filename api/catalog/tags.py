@@ -90,7 +90,8 @@ class Tags:
         Raises:
             NotYours: another key made it.
         """
-        tagging.remove(self._parts, self._parts.index.tags.named(name, reach=reach()), permit=_permit)
+        tag = self._parts.index.tags.named(name, reach=reach())
+        tagging.remove(self._parts, tag, permit=_permit, owner=caller_id())
         log.info("tag %s removed", name)
 
     def _mine(self, project: str) -> int:

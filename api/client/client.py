@@ -84,9 +84,9 @@ class Client:
     def cancel(self, job_id: str) -> JobDetail:
         return JobDetail.model_validate_json(self.send("POST", f"/v1/jobs/{job_id}/cancel").content)
 
-    def delete(self, path: str) -> None:
+    def delete(self, path: str, **params: Any) -> None:
         """Take away what stands under an address: `/v1/jobs/ID`, `/v1/objects/NAME`."""
-        self.send("DELETE", path)
+        self.send("DELETE", path, params=params)
 
     def retry(self, job_id: str) -> JobDetail:
         return JobDetail.model_validate_json(self.send("POST", f"/v1/jobs/{job_id}/retry").content)

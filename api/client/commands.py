@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -15,9 +16,19 @@ from api.client.add_commands import add_hand, add_network, add_object
 from api.client.client import Client
 from api.client.datasets import DatasetClient
 from api.client.job_options import pairs
-from api.client.reports import UrlOption, job_request, open_client, say_deleted, show_asset, show_job, watch
+from api.client.reports import (
+    UrlOption,
+    YesOption,
+    confirm,
+    job_request,
+    open_client,
+    restore,
+    say_deleted,
+    show_asset,
+    show_job,
+    watch,
+)
 from api.formatting import count, percent, size
-from api.models import Job
 from api.uploads import MAIN_SUFFIXES, name_of_upload
 from service.cli import JsonFlag, emit, reporting_errors
 from service.model.diversity import MIN_DISTANCE_M
@@ -165,12 +176,27 @@ def cancel(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -
 
 @app.command(epilog="graspd delete 3f2a")
 @reporting_errors
-def delete(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+def delete(job_id: JobArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Take away a job that has ended; its shards follow after a grace time, unless another job needs them."""
     with open_client(url) as client:
-        full = _full_id(client, job_id)
-        client.delete(f"/v1/jobs/{full}")
-    say_deleted("job", full, json=json)
+        job = client.job(_full_id(client, job_id))
+        asked = f"Delete job {job.id[:12]}, {job.hand} on {job.object}, with its {count(job.grasps)} grasps?"
+        confirm(asked, f"job {job.id[:12]}", yes=yes)
+        client.delete(f"/v1/jobs/{job.id}")
+    say_deleted("job", job.id, json=json, undo=f"graspd restore {job.id[:12]}")
+
+
+@app.command("restore", epilog="graspd restore 3f2a")
+@reporting_errors
+def restore_job(
+    job_id: Annotated[str, typer.Argument(help="Id of a deleted job, or the beginning of one.")],
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Bring back a job that was deleted, within the grace time."""
+    with open_client(url) as client:
+        gone = [one["id"] for one in client.send("GET", "/v1/deletions").json() if one["what"] == "job"]
+    restore(url, "job", _only_one(gone, job_id), json=json)
 
 
 @app.command(epilog="graspd retry 3f2a --wait")
@@ -251,13 +277,26 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
     @reporting_errors
     def delete_asset(
         name: Annotated[str, typer.Argument(help="Its name or digest.")],
+        yes: YesOption = False,
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
         """Take one away that no job, dataset or set of objects needs."""
         with open_client(url) as client:
+            client.asset(kind, name)
+            confirm(f"Delete the {kind.value} {name}?", f"the {kind.value} {name}", yes=yes)
             client.delete(f"/v1/{kind.value}s/{name}")
-        say_deleted(kind.value, name, json=json)
+        say_deleted(kind.value, name, json=json, undo=f"graspd {kind.value}s restore {name}")
+
+    @group.command("restore", epilog=f"graspd {kind.value}s restore my_{kind.value}")
+    @reporting_errors
+    def restore_asset(
+        name: Annotated[str, typer.Argument(help="Its name or digest.")],
+        url: UrlOption = None,
+        json: JsonFlag = False,
+    ) -> None:
+        """Bring back one that was deleted, within the grace time."""
+        restore(url, kind.value, name, json=json)
 
     return group
 
@@ -312,7 +351,11 @@ def _full_id(client: Client, prefix: str) -> str:
     """The id of the one job that begins so, among the latest."""
     if len(prefix) >= 32:
         return prefix
-    found: list[Job] = [job for job in client.jobs(limit=200).items if job.id.startswith(prefix)]
+    return _only_one([job.id for job in client.jobs(limit=200).items], prefix)
+
+
+def _only_one(ids: Iterable[str], prefix: str) -> str:
+    found = {id for id in ids if id.startswith(prefix)}
     if len(found) > 1:
         raise InputError(f"{len(found)} jobs begin with {prefix!r}; give more letters")
-    return found[0].id if found else prefix
+    return found.pop() if found else prefix

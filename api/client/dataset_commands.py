@@ -17,7 +17,7 @@ from api.client.dataset_reports import print_cells, print_dataset, print_estimat
 from api.client.dataset_specs import SpecOption, Wanted, wanted
 from api.client.datasets import DatasetClient
 from api.client.job_options import validated, with_job_options
-from api.client.reports import UrlOption, open_client, say_deleted
+from api.client.reports import UrlOption, YesOption, confirm, open_client, restore, say_deleted
 from api.formatting import count, percent, size
 from service.cli import JsonFlag, emit, reporting_errors
 from service.index.dataset_views import DatasetView
@@ -162,11 +162,30 @@ def cancel(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) ->
 
 @group.command(epilog="graspd datasets delete kitchen")
 @reporting_errors
-def delete(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Take away a dataset that has ended, its snapshots, and the jobs that were planned for it alone."""
+def delete(
+    name: NameArgument,
+    yes: YesOption = False,
+    with_snapshots: Annotated[
+        bool, typer.Option("--with-snapshots", help="Its snapshots may go too; else they protect it.")
+    ] = False,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Take away a dataset that has ended, and the jobs that were planned for it alone."""
     with open_client(url) as client:
-        client.delete(f"/v1/datasets/{name}")
-    say_deleted("dataset", name, json=json)
+        found = DatasetClient(client).dataset(name)
+        goes = f"{count(found.cells)} cell{'s' * (found.cells != 1)}, {count(found.grasps)} grasps"
+        goes += f" ({size(found.size_bytes)})" + ", its snapshots" * with_snapshots
+        confirm(f"Delete dataset {name} with {goes}?", f"dataset {name}", yes=yes)
+        client.delete(f"/v1/datasets/{name}", with_snapshots=with_snapshots)
+    say_deleted("dataset", name, json=json, undo=f"graspd datasets restore {name}")
+
+
+@group.command("restore", epilog="graspd datasets restore kitchen")
+@reporting_errors
+def restore_dataset(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Bring back a dataset that was deleted, with its jobs and snapshots, within the grace time."""
+    restore(url, "dataset", name, json=json)
 
 
 @group.command(epilog="graspd datasets retry kitchen --wait")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Annotated, Any
+from urllib.parse import quote
 
 import typer
 from pydantic import ValidationError
@@ -37,12 +39,37 @@ def open_client(url: str | None, *, key: str | None = None) -> Client:
     return Client(url or settings.api_url, key=key)
 
 
-def say_deleted(what: str, name: str, *, json: bool) -> None:
-    """Tell that a thing is gone."""
+YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Delete it without asking.")]
+
+
+def confirm(question: str, what: str, *, yes: bool) -> None:
+    """Ask before something is destroyed; InputError where the answer is no, or nobody is there to answer."""
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise InputError(f"{what} is not deleted: there is no terminal to ask at; --yes deletes it without asking")
+    if not typer.confirm(question):
+        raise InputError("nothing was deleted")
+
+
+def say_deleted(what: str, name: str, *, json: bool, undo: str = "") -> None:
+    """Tell that a thing is gone, and the command that brings it back."""
     if json:
         emit({"deleted": name, "kind": what})
+        return
+    typer.echo(f"{what} {name} is deleted")
+    if undo:
+        typer.echo(f"`{undo}` brings it back for a while (GRASPD_SHARD_GRACE_S)", err=True)
+
+
+def restore(url: str | None, what: str, name: str, *, json: bool) -> None:
+    """Bring back what was deleted, and say so."""
+    with open_client(url) as client:
+        found = client.send("POST", f"/v1/{what}s/{quote(name, safe='')}/restore").json()
+    if json:
+        emit({"restored": found["id"], "kind": what})
     else:
-        typer.echo(f"{what} {name} is deleted")
+        typer.echo(f"{what} {name} is restored")
 
 
 def job_request(values: dict[str, Any]) -> JobRequest:

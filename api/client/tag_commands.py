@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated, Any, Final
+from urllib.parse import quote
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from api.client.reports import UrlOption, open_client, say_deleted
+from api.client.reports import UrlOption, YesOption, confirm, open_client, restore, say_deleted
 from api.formatting import count
 from service.cli import JsonFlag, emit, reporting_errors
 from service.model.errors import InputError
@@ -79,16 +80,26 @@ def remove_tag(
     if "filter" in body:
         body["filter"]["tag"] = tag
     with open_client(url) as client:
-        _tell(client.send("POST", f"/v1/tags/{tag}/remove", json=body).json(), "fewer with", json=json)
+        _tell(client.send("POST", f"/v1/tags/{quote(tag, safe='')}/remove", json=body).json(), "fewer with", json=json)
 
 
 @app.command("delete", epilog="graspd tags delete good")
 @reporting_errors
-def delete_tag(tag: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+def delete_tag(tag: NameArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Take a tag away; its grasps stay."""
+    path = f"/v1/tags/{quote(tag, safe='')}"
     with open_client(url) as client:
-        client.delete(f"/v1/tags/{tag}")
-    say_deleted("tag", tag, json=json)
+        has = client.send("GET", path).json()["grasps"]
+        confirm(f"Delete the tag {tag}, which {count(has)} grasps have?", f"the tag {tag}", yes=yes)
+        client.delete(path)
+    say_deleted("tag", tag, json=json, undo=f"graspd tags restore {tag}")
+
+
+@app.command("restore", epilog="graspd tags restore good")
+@reporting_errors
+def restore_tag(tag: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Bring back a tag that was deleted, on its grasps, within the grace time."""
+    restore(url, "tag", tag, json=json)
 
 
 @app.command("export", epilog="graspd tags export good -o good.zip")

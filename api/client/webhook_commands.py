@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from api.client.reports import UrlOption, open_client, say_deleted
+from api.client.reports import UrlOption, YesOption, confirm, open_client, say_deleted
 from service.cli import JsonFlag, emit, reporting_errors
 
 app = typer.Typer(no_args_is_help=True, help="Addresses that are told when jobs and datasets end.")
@@ -69,8 +69,9 @@ def show_log(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False)
 
 @app.command("delete", epilog="graspd webhooks delete 1a2b3c")
 @reporting_errors
-def delete_webhook(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Tell it nothing any more."""
+def delete_webhook(webhook: IdArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Tell it nothing any more. Its secret is gone for good."""
     with open_client(url) as client:
+        confirm(f"Delete the webhook {webhook} and its secret for good?", f"the webhook {webhook}", yes=yes)
         client.delete(f"/v1/webhooks/{webhook}")
     say_deleted("webhook", webhook, json=json)

@@ -59,13 +59,6 @@ async def export(request: Request, tags: TagsOf, exports: ExportsOf) -> Streamin
         return await exported(request, tags, exports, _selection(fields), wanted)
 
 
-@router.post("/tags/{name}/delete", dependencies=[Depends(may_submit)])
-def delete(name: str, tags: TagsOf) -> RedirectResponse:
-    """Take a tag away and show all grasps."""
-    tags.remove(name)
-    return RedirectResponse("/grasps", status_code=303)
-
-
 def did(given: dict[str, str]) -> str:
     """What the last action did, in words; takes its parameters out of those of the address."""
     what, done, name = (given.pop(key, "") for key in ("did", "done", "named"))

@@ -118,18 +118,15 @@ async def act_on_cells(request: Request, name: str, jobs: JobsOf) -> RedirectRes
 
 @router.post("/{name}/{action}", dependencies=[Depends(may_submit)], response_model=None)
 def act(request: Request, name: str, action: str, datasets: DatasetsOf) -> RedirectResponse | HTMLResponse:
-    """Cancel, retry or delete a whole dataset, or take a snapshot of it."""
+    """Cancel or retry a whole dataset, or take a snapshot of it."""
     do: dict[str, Callable[[], Any]] = {
         "cancel": lambda: datasets.cancel(name),
         "retry": lambda: datasets.retry(name),
         "snapshot": lambda: datasets.take_snapshot(name),
-        "delete": lambda: datasets.delete(name),
     }
     if action not in do:
         raise InputError(f"a dataset has no action {action!r}; there are: {', '.join(do)}")
     do[action]()
-    if action == "delete":
-        return RedirectResponse("/datasets", status_code=303)
     return _redirect(f"/datasets/{name}", action, done=1)
 
 

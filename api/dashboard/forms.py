@@ -62,13 +62,6 @@ def retry(job_id: str, jobs: JobsOf) -> RedirectResponse:
     return RedirectResponse(f"/jobs/{job_id}", status_code=303)
 
 
-@router.post("/jobs/{job_id}/delete", dependencies=[Depends(may_submit)])
-def delete(job_id: str, jobs: JobsOf) -> RedirectResponse:
-    """Take a job away that has ended, and show the others."""
-    jobs.delete(job_id)
-    return RedirectResponse("/", status_code=303)
-
-
 def first_message(error: ValueError) -> str:
     """The first mistake of a validation, in one line."""
     if isinstance(error, ValidationError):

@@ -60,6 +60,7 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
         # What the key may not do has no button; the routes refuse it all the same.
         "may_submit": is_allowed(request, Scope.SUBMIT),
         "may_change": may_change,
+        "grace_s": request.app.state.settings.shard_grace_s,
     }
     text = request.app.state.templates.get_template(template).render(context)
     text = with_prefix(text, request.app.state.settings.api_root_path)

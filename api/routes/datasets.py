@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Path, Request, Response
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from api.problems import ApiError, responses
@@ -120,11 +120,18 @@ def retry_dataset(name: DatasetName, response: Response, datasets: DatasetsOf) -
     "/{name}",
     status_code=204,
     dependencies=[Depends(may_submit)],
-    responses=responses(401, 403, 404, 409, 503),
+    responses=responses(401, 403, 404, 409, 422, 503),
 )
-def delete_dataset(name: DatasetName, datasets: DatasetsOf) -> None:
-    """Take away a dataset that has ended, its snapshots, and those of its jobs that were planned for it alone."""
-    datasets.delete(name)
+def delete_dataset(
+    name: DatasetName,
+    datasets: DatasetsOf,
+    with_snapshots: Annotated[
+        bool, Query(description="whether its snapshots may go too; else they protect it")
+    ] = False,
+) -> None:
+    """Take away a dataset that has ended, and those of its jobs that were planned for it alone. `POST .../restore`
+    brings all of it back within the grace time."""
+    datasets.delete(name, with_snapshots=with_snapshots)
 
 
 @router.post(

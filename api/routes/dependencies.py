@@ -15,6 +15,7 @@ from api.access.unfinished import unfinished
 from api.catalog.assets import Assets
 from api.catalog.comparison import Comparisons
 from api.catalog.datasets import Datasets
+from api.catalog.deletions import Deletions
 from api.catalog.grasp_exports import GraspExports
 from api.catalog.grasps import Grasps
 from api.catalog.jobs import Jobs
@@ -49,6 +50,7 @@ def provide(app: FastAPI, parts: Parts) -> None:
     state.comparisons = Comparisons(parts, state.datasets)
     state.overview, state.usage = Overview(parts, state.jobs), Usage(parts, state.keys)
     state.webhooks, state.tags = Webhooks(parts), Tags(parts, state.grasps)
+    state.deletions = Deletions(parts)
     state.grasp_exports = GraspExports(parts, state.grasps, state.tags)
 
 
@@ -84,6 +86,7 @@ StoreOf = Annotated[Store, Depends(_provided("store"))]
 UsageOf = Annotated[Usage, Depends(_provided("usage"))]
 TagsOf = Annotated[Tags, Depends(_provided("tags"))]
 ExportsOf = Annotated[GraspExports, Depends(_provided("grasp_exports"))]
+DeletionsOf = Annotated[Deletions, Depends(_provided("deletions"))]
 WebhooksOf = Annotated[Webhooks, Depends(_provided("webhooks"))]
 OverviewOf = Annotated[Overview, Depends(_provided("overview"))]
 Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="items on a page")]

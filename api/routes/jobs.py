@@ -101,7 +101,8 @@ def retry(job_id: str, jobs: JobsOf) -> JobDetail:
     responses=responses(401, 403, 404, 409, 503),
 )
 def delete(job_id: str, jobs: JobsOf) -> None:
-    """Take away a job that has ended. Its shards, where no other job needs them, follow after a grace time."""
+    """Take away a job that has ended. Its shards, where no other job needs them, follow after a grace time; until then
+    `POST .../restore` brings it back."""
     jobs.delete(job_id)
 
 

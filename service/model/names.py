@@ -16,6 +16,7 @@ DATASETS: Final = "datasets"
 OBJECT_SETS: Final = "object_sets"
 DELETIONS: Final = "deletions"
 RELEASED: Final = "released"
+REMOVED: Final = "removed"
 WEBHOOKS: Final = "webhooks"
 TAGS: Final = "tags"
 SERVICE: Final = "service"
@@ -41,7 +42,7 @@ def asset_check(kind: AssetKind, digest: str) -> str:
 
 def hand_expanded(digest: str) -> str:
     """The URDF that a hand's xacro file expanded to when it was first read."""
-    return f"{ASSETS}/{AssetKind.HAND.value}/{digest}/expanded.urdf"
+    return f"{ASSETS}/{AssetKind.HAND.value}/{digest}/expanded.json"
 
 
 def asset_model(kind: AssetKind, digest: str) -> str:

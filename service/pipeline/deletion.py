@@ -8,16 +8,28 @@ again.
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable, Collection, Iterable
+
+from sqlalchemy import Connection
+
+from service.index.changes.states import QUIET
 from service.model import names
 from service.model.clock import timestamp
+from service.model.dataset_records import Snapshot
 from service.model.errors import ConflictError, DamagedError, NotFoundError
 from service.model.projects import EVERYTHING, Reach
-from service.model.records import JobRecord
+from service.model.records import AttemptRecord, JobRecord
 from service.model.states import AssetKind
+from service.model.tags import Tag
+from service.pipeline import tagging
 from service.pipeline.backends import Parts
 from service.pipeline.recording import recording
-from service.store.deletions import Deletion
-from service.store.records import Put, read_record
+from service.store.datasets import dataset_events, load_dataset
+from service.store.deletions import Deletion, Released, What, deletions, released_key, removed_folder
+from service.store.library import load_asset, load_check
+from service.store.records import Put, job_events, put_record, read_record
+from service.store.store import Store
 
 
 def delete_asset(parts: Parts, kind: AssetKind, name: str, *, owner: str = "", reach: Reach = EVERYTHING) -> None:
@@ -39,7 +51,8 @@ def delete_asset(parts: Parts, kind: AssetKind, name: str, *, owner: str = "", r
             if asset.shared and not reach.everything:
                 user = "a job, a dataset or a set of objects"
             raise ConflictError(f"the {kind.value} {asset.name!r} is needed by {user}; delete that first")
-        _record(put, Deletion(what=kind.value, id=asset.digest, at=timestamp(), owner=owner))
+        said = {"name": asset.name, "submitter": asset.owner, "project": asset.project}
+        _record(put, Deletion(what=kind.value, id=asset.digest, at=timestamp(), owner=owner, **said))
         parts.index.removals.remove_asset(kind, asset.digest, within=connection)
 
 
@@ -50,7 +63,7 @@ def delete_job(parts: Parts, job_id: str, *, owner: str = "") -> None:
         NotFoundError: there is no such job.
         ConflictError: it has not ended, or a dataset holds it.
     """
-    parts.index.jobs.get(job_id)
+    job = parts.index.jobs.get(job_id)
     try:
         record = read_record(JobRecord, parts.store, names.job_record(job_id))
     except (NotFoundError, DamagedError):
@@ -59,24 +72,187 @@ def delete_job(parts: Parts, job_id: str, *, owner: str = "") -> None:
         if user := parts.index.removals.user_of_job(job_id, within=connection):
             raise ConflictError(f"job {job_id} {user}")
         attempts = parts.index.removals.attempts_of(job_id, within=connection)
-        deletion = Deletion(what="job", id=job_id, at=timestamp(), owner=owner, job=record, attempts=attempts)
+        said = {"name": f"{job.request.hand} on {job.request.object}", "submitter": job.owner, "project": job.project}
+        deletion = Deletion(what="job", id=job_id, at=timestamp(), owner=owner, job=record, attempts=attempts, **said)
         _record(put, deletion)
         parts.index.removals.remove_job(job_id, within=connection)
 
 
-def delete_dataset(parts: Parts, name: str, *, owner: str = "") -> None:
-    """Take a dataset away with its snapshots; those of its jobs follow that were planned for it alone.
+def delete_dataset(parts: Parts, name: str, *, owner: str = "", with_snapshots: bool = False) -> None:
+    """Take a dataset away; those of its jobs follow that were planned for it alone.
+
+    Args:
+        with_snapshots: whether its snapshots may go with it.
 
     Raises:
         NotFoundError: there is no such dataset.
-        ConflictError: it has not ended.
+        ConflictError: it has not ended, or has snapshots that are to stay.
     """
     dataset = parts.index.datasets.get(name)
     if not dataset.state.is_final:
         raise ConflictError(f"dataset {name!r} is {dataset.state}; cancel it first: graspd datasets cancel {name}")
     with recording(parts) as (connection, put):
-        _record(put, Deletion(what="dataset", id=name, at=timestamp(), owner=owner))
+        taken = parts.index.removals.snapshots_of(name, within=connection)
+        if taken and not with_snapshots:
+            raise ConflictError(
+                f"dataset {name!r} has {taken} snapshot{'s' * (taken > 1)}, which papers and training runs may name; "
+                f"to delete them too: graspd datasets delete {name} --with-snapshots"
+            )
+        said = {"submitter": dataset.owner, "project": dataset.project}
+        _record(put, Deletion(what="dataset", id=name, at=timestamp(), owner=owner, **said))
         parts.index.removals.remove_dataset(name, within=connection)
+
+
+def put_away(parts: Parts, deletion: Deletion) -> None:
+    """Move the objects of what is gone below `removed/`, its own record last; then the deletion's record goes. Nothing
+    happens to what was restored meanwhile."""
+    record = _record_of(deletion)
+    with parts.index.database.writing():
+        if not parts.store.exists(names.deletion(deletion.what, deletion.id)):
+            return
+        folder = removed_folder(deletion)
+        put_record(parts.store, f"{folder}/deletion.json", deletion)
+        if deletion.job is not None:
+            put_record(parts.store, released_key(deletion), Released(at=deletion.at, job=deletion.job))
+        attempts = [names.attempt(task, number) for task, number in deletion.attempts]
+        for key in [*attempts, *_last(_below(parts.store, record.rpartition("/")[0]), record)]:
+            parts.store.move(key, f"{folder}/{key}")
+        parts.store.delete(names.deletion(deletion.what, deletion.id))
+
+
+def restore(
+    parts: Parts,
+    what: What,
+    name: str,
+    *,
+    permit: Callable[[Deletion], None],
+    among: Callable[[Deletion], bool] = lambda _: True,
+) -> Deletion:
+    """Bring back what a user took away, as it was; a dataset with the jobs that went with it.
+
+    Args:
+        name: of the thing, or its id.
+        permit: asked with the deletion; raises where it must not be taken back.
+        among: whether a deletion is within reach.
+
+    Raises:
+        NotFoundError: nothing of that name was deleted within the grace time.
+        ConflictError: there is one of that name again, or what it needs is deleted too.
+    """
+    known = [one for one in deletions(parts.store, what) if name in (one.id, one.name) and among(one)]
+    if not known:
+        raise NotFoundError(f"no {what} {name!r} was deleted in the last {_days(parts.settings.shard_grace_s)}")
+    permit(known[0])
+    if what == "tag":
+        _restore_tag(parts, known[0])
+        return known[0]
+    with parts.index.database.writing() as connection:
+        connection.execution_options(**{QUIET: True})
+        if what == "dataset":
+            _restore(parts, known[0], connection, before=lambda: _restore_jobs(parts, known[0], connection))
+        else:
+            _restore(parts, known[0], connection)
+    return known[0]
+
+
+def _restore(
+    parts: Parts, deletion: Deletion, connection: Connection, *, before: Callable[[], None] = lambda: None
+) -> None:
+    """Objects, then rows, then the deletion is forgotten. Called in the turn of the index's writers."""
+    store, record, folder = parts.store, _record_of(deletion), removed_folder(deletion)
+    waiting = names.deletion(deletion.what, deletion.id)
+    if not store.exists(waiting) and store.exists(record):
+        called = deletion.id if deletion.what in ("job", "dataset") else deletion.name
+        raise ConflictError(f"there is a {deletion.what} {called!r} again; delete that first")
+    moved = [key.removeprefix(f"{folder}/") for key in _below(store, folder)]
+    for key in _last([key for key in moved if key != "deletion.json"], record):
+        store.move(f"{folder}/{key}", key)
+    try:
+        before()
+        _enter(parts, deletion, connection)
+    except ConflictError:
+        if not store.exists(waiting):
+            put_record(store, waiting, deletion)  # the keeper puts it away again
+        raise
+    store.delete(waiting)
+    store.delete(f"{folder}/deletion.json")
+
+
+def _enter(parts: Parts, deletion: Deletion, connection: Connection) -> None:
+    """The rows that follow from the records of a job, a dataset, a hand, an object or a network."""
+    store, index = parts.store, parts.index
+    if deletion.what == "job":
+        record = read_record(JobRecord, store, names.job_record(deletion.id))
+        _require(parts, record.assets, connection)
+        index.write.add_job(record, within=connection)
+        tried = [read_record(AttemptRecord, store, names.attempt(*one)) for one in deletion.attempts]
+        for attempt in sorted(tried, key=lambda one: one.number):
+            index.write.add_attempt(attempt, within=connection)
+        if events := job_events(store, record.id):
+            index.write.set_job_events(record.id, events, within=connection)
+    elif deletion.what == "dataset":
+        dataset = load_dataset(store, deletion.id)
+        members = [(AssetKind.HAND, one.digest) for one in dataset.hands]
+        _require(parts, [*members, *((AssetKind.OBJECT, one.digest) for one in dataset.objects)], connection)
+        index.write_dataset.add(dataset, within=connection)
+        index.write_dataset.set_events(dataset.name, dataset_events(store, dataset.name), within=connection)
+        for key in _below(store, names.dataset_snapshots(dataset.name)):
+            index.write_dataset.add_snapshot(read_record(Snapshot, store, key), within=connection)
+    else:
+        kind = AssetKind(deletion.what)
+        asset = load_asset(store, kind, deletion.id)
+        with contextlib.suppress(NotFoundError):
+            other = index.assets.get(kind, asset.name, reach=Reach(asset.project, everything=False))
+            if other.verdict != "refuse" and other.digest != asset.digest:
+                raise ConflictError(f"there is another {kind.value} named {asset.name!r} now; delete that first")
+        index.write.add_asset(asset, load_check(store, kind, asset.digest), within=connection)
+
+
+def _restore_jobs(parts: Parts, deletion: Deletion, connection: Connection) -> None:
+    """The jobs of a dataset that were deleted with it, or after it."""
+    wanted = set(load_dataset(parts.store, deletion.id).jobs)
+    newest: dict[str, Deletion] = {}
+    for one in deletions(parts.store, "job"):
+        if one.id in wanted and one.at >= deletion.at:
+            newest.setdefault(one.id, one)
+    for one in newest.values():
+        if parts.store.exists(names.deletion("job", one.id)) or not parts.store.exists(names.job_record(one.id)):
+            _restore(parts, one, connection)
+
+
+def _restore_tag(parts: Parts, deletion: Deletion) -> None:
+    folder = removed_folder(deletion)
+    key = next(key for key in _below(parts.store, folder) if not key.endswith("/deletion.json"))
+    tagging.bring_back(parts, read_record(Tag, parts.store, key))
+    for done in (key, f"{folder}/deletion.json"):
+        parts.store.delete(done)
+
+
+def _require(parts: Parts, wanted: Collection[tuple[AssetKind, str]], connection: Connection) -> None:
+    if missing := parts.index.assets.missing(wanted, within=connection):
+        kind = missing[0].partition(" ")[0]
+        raise ConflictError(f"it needs the {missing[0]}, which was deleted too: graspd {kind}s restore first")
+
+
+def _record_of(deletion: Deletion) -> str:
+    """The object that says that the thing is there."""
+    if deletion.what == "job":
+        return names.job_record(deletion.id)
+    if deletion.what == "dataset":
+        return names.dataset_record(deletion.id)
+    return names.asset_record(AssetKind(deletion.what), deletion.id)
+
+
+def _below(store: Store, folder: str) -> list[str]:
+    return sorted(entry.key for entry in store.list(folder))
+
+
+def _last(keys: Iterable[str], record: str) -> list[str]:
+    return sorted(keys, key=lambda key: (key == record, key))
+
+
+def _days(seconds: float) -> str:
+    return f"{seconds / 86400:.3g} days"
 
 
 def _record(put: Put, deletion: Deletion) -> None:

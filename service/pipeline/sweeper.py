@@ -1,5 +1,5 @@
-"""Removes the objects of what users deleted, a little in each round of the keeper, and after a grace time the shards
-that no job needs any more."""
+"""Puts away what users deleted, a little in each round of the keeper; after a grace time it goes for good, with the
+shards that no job needs any more."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from service.model.errors import ConflictError, DamagedError, NotFoundError
 from service.model.planning import plan
 from service.model.states import AssetKind, Stage
 from service.pipeline.backends import Parts
-from service.pipeline.deletion import delete_job
+from service.pipeline.deletion import delete_job, put_away
 from service.pipeline.pack_removal import remove_packed
 from service.store.datasets import load_dataset
-from service.store.deletions import Deletion, Released, released_key
-from service.store.records import put_record, read_record
+from service.store.deletions import Deletion, Released, removed_before
+from service.store.records import read_record
 
 log = logging.getLogger(__name__)
 #: Time for deletions in one round of the keeper [s].
@@ -50,17 +50,23 @@ class Sweeper:
                 continue
             if not self._carry_out(deletion, deadline):
                 return True
-            self._parts.store.delete(entry.key)
             log.info("the objects of %s %s are removed", deletion.what, deletion.id)
         return False
 
     def collect(self, budget_s: float = BUDGET_S) -> bool:
-        """Remove shards that have not been needed for the grace time. Returns whether something is left to do."""
+        """Remove what was deleted before the grace time, and shards that have not been needed since. Returns whether
+        something is left to do."""
+        deadline = self._clock() + budget_s
+        before = timestamp(self._parts.settings.shard_grace_s)
+        # What tells of the deletion sorts first and goes last.
+        for entry in sorted(self._parts.store.list(names.REMOVED), key=lambda one: one.key.endswith("/deletion.json")):
+            if self._clock() > deadline:
+                return True
+            if removed_before(entry.key, before):
+                self._parts.store.delete(entry.key)
         known = self._parts.index.notes.completeness()
         if known is not None and known.left_out:
             return False  # a job whose record cannot be read may need one of them
-        deadline = self._clock() + budget_s
-        before = timestamp(self._parts.settings.shard_grace_s)
         for entry in sorted(self._parts.store.list(names.RELEASED), key=lambda one: one.key):
             try:
                 released = read_record(Released, self._parts.store, entry.key)
@@ -80,28 +86,20 @@ class Sweeper:
 
     def _carry_out(self, deletion: Deletion, deadline: float) -> bool:
         """Rows once more, in case the process ended between record and rows; then the objects. Whether all is done."""
-        if deletion.what == "job":
-            self._parts.index.removals.remove_job(deletion.id)
-            self._remove_job(deletion)
-        elif deletion.what == "dataset":
-            self._parts.index.removals.remove_dataset(deletion.id)
-            if not self._remove_jobs_of(deletion.id, deadline):
-                return False
-            self._remove_below(f"{names.DATASETS}/{deletion.id}", last=names.dataset_record(deletion.id))
-        else:
-            kind = AssetKind(deletion.what)
-            self._parts.index.removals.remove_asset(kind, deletion.id)
-            record = names.asset_record(kind, deletion.id)
-            self._remove_below(record.rpartition("/")[0], last=record)
+        with self._parts.index.database.writing() as connection:
+            if not self._parts.store.exists(names.deletion(deletion.what, deletion.id)):
+                return True  # restored since it was listed
+            removals = self._parts.index.removals
+            if deletion.what == "job":
+                removals.remove_job(deletion.id, within=connection)
+            elif deletion.what == "dataset":
+                removals.remove_dataset(deletion.id, within=connection)
+            else:
+                removals.remove_asset(AssetKind(deletion.what), deletion.id, within=connection)
+        if deletion.what == "dataset" and not self._remove_jobs_of(deletion.id, deadline):
+            return False
+        put_away(self._parts, deletion)
         return True
-
-    def _remove_job(self, deletion: Deletion) -> None:
-        if deletion.job is not None:
-            put_record(self._parts.store, released_key(deletion), Released(at=deletion.at, job=deletion.job))
-        for task, number in deletion.attempts:
-            self._parts.store.delete(names.attempt(task, number))
-        record = names.job_record(deletion.id)
-        self._remove_below(record.rpartition("/")[0], last=record)
 
     def _remove_jobs_of(self, dataset: str, deadline: float) -> bool:
         """Delete the jobs that the planner made for a dataset and that no other one holds; whether all are gone."""
@@ -118,12 +116,6 @@ class Sweeper:
                 except (ConflictError, NotFoundError) as error:
                     log.info("job %s of the deleted dataset %s stays: %s", job, dataset, error)
         return True
-
-    def _remove_below(self, folder: str, *, last: str) -> None:
-        for key in [entry.key for entry in self._parts.store.list(folder)]:
-            if key != last:
-                self._parts.store.delete(key)
-        self._parts.store.delete(last)
 
     def _unneeded(self, released: Released) -> Iterator[tuple[Stage, str]]:
         planned = [(task.stage, task.output) for task in plan(released.job)]

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 
+from service.model import names
 from service.model.clock import timestamp
-from service.model.errors import LimitError, NotFoundError
+from service.model.errors import ConflictError, LimitError, NotFoundError
 from service.model.tags import MOST_TAGGED, Grasp, Tag, by_shard, tag_id
 from service.pipeline.backends import Parts
 from service.pipeline.recording import recording
+from service.store.deletions import Deletion, removed_folder
+from service.store.records import put_record
 from service.store.tags import drop_older, newest_version, put_version
 
 #: Asked with what is to be changed, None if it is to be made; raises where that is not allowed.
@@ -42,9 +45,32 @@ def take_off(parts: Parts, tag: str, grasps: Collection[Grasp], *, permit: Permi
     return len(before.members) - len(after.members)
 
 
-def remove(parts: Parts, tag: str, *, permit: Permit) -> None:
-    """Take a tag away, by its id; the grasps stay."""
-    _change(parts, tag, lambda one: one.model_copy(update={"grasps": {}, "gone": True}), permit)
+def remove(parts: Parts, tag: str, *, permit: Permit, owner: str = "") -> None:
+    """Take a tag away, by its id; the grasps stay, and which they were is kept for the grace time."""
+
+    def gone(one: Tag) -> Tag:
+        said = {"name": one.name, "submitter": one.owner, "project": one.project}
+        deletion = Deletion(what="tag", id=one.id, at=timestamp(), owner=owner, **said)
+        folder = removed_folder(deletion)
+        put_record(parts.store, f"{folder}/{names.tag_version(one.id, one.number)}", one)
+        put_record(parts.store, f"{folder}/deletion.json", deletion)
+        return one.model_copy(update={"grasps": {}, "gone": True})
+
+    _change(parts, tag, gone, permit)
+
+
+def bring_back(parts: Parts, tag: Tag) -> None:
+    """A tag that was taken away, with its grasps.
+
+    Raises:
+        ConflictError: there is one of that name again.
+    """
+
+    def permit(known: Tag | None) -> None:
+        if known is not None:
+            raise ConflictError(f"there is a tag {tag.name!r} again; delete that first")
+
+    _change(parts, tag.id, lambda one: one, permit, fresh=tag)
 
 
 def _change(

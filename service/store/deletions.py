@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from typing import Final, Literal
 
 from pydantic import Field
 
 from service.model import names
-from service.model.errors import ConflictError
+from service.model.errors import ConflictError, DamagedError, NotFoundError
 from service.model.records import JobRecord, Record
+from service.store.records import read_record
 from service.store.store import Store
 
 _DIGITS: Final = re.compile(r"\D")
-What = Literal["hand", "object", "network", "job", "dataset"]
+What = Literal["hand", "object", "network", "job", "dataset", "tag"]
 
 
 class Deletion(Record):
@@ -24,6 +26,9 @@ class Deletion(Record):
     id: str
     at: str
     owner: str = Field("", description="id of the API key that deleted it")
+    name: str = Field("", description="what its users call it, where that is not its id")
+    submitter: str = Field("", description="id of the API key that it was submitted with")
+    project: str = ""
     job: JobRecord | None = None
     attempts: tuple[tuple[str, int], ...] = ()
 
@@ -46,6 +51,33 @@ def refuse_pending(store: Store, what: str, name: str) -> None:
     """ConflictError while a thing of this id is being removed: what is new would be removed with it."""
     if store.exists(names.deletion(what, name)):
         raise ConflictError(f"the {what} {name} of before is still being removed; try again in a moment")
+
+
+def removed_folder(deletion: Deletion) -> str:
+    """Where the objects of a deleted thing lie until the grace time ends; the same deletion has the same."""
+    return f"{names.REMOVED}/{_DIGITS.sub('', deletion.at)}-{deletion.what}-{deletion.id}"
+
+
+def removed_before(key: str, at: str) -> bool:
+    """Whether an object below `removed/` belongs to a deletion from before a time."""
+    return key.split("/")[1].partition("-")[0] < _DIGITS.sub("", at)
+
+
+def deletions(store: Store, what: str = "") -> list[Deletion]:
+    """Deletions that can be taken back, the newest first; of one kind of thing or of all."""
+    keys = [entry.key for entry in store.list(names.DELETIONS) if entry.key.count("/") == 2]
+    keys = [key for key in keys if not what or key.split("/")[1] == what]
+    keys += [
+        entry.key
+        for entry in store.list(names.REMOVED)
+        if entry.key.count("/") == 2 and (not what or entry.key.split("-")[1] == what)
+    ]
+    found: dict[str, Deletion] = {}
+    for key in keys:
+        with contextlib.suppress(NotFoundError, DamagedError):
+            deletion = read_record(Deletion, store, key)
+            found[removed_folder(deletion)] = deletion
+    return sorted(found.values(), key=lambda one: one.at, reverse=True)
 
 
 def released_key(deletion: Deletion) -> str:

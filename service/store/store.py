@@ -129,9 +129,13 @@ class Store:
 
     def set_aside(self, key: str) -> None:
         """Move a damaged object below `damaged/`, so that its name is free; one that is gone is no error."""
+        self.move(key, f"damaged/{key}")
+
+    def move(self, key: str, to: str) -> None:
+        """Give an object another name; nothing happens if there is none."""
         try:
             with _mapped(key, self.url):
-                obstore.rename(self._backend, check_key(key), f"damaged/{key}", overwrite=True)
+                obstore.rename(self._backend, check_key(key), check_key(to), overwrite=True)
         except NotFoundError:
             return
 

@@ -9,13 +9,17 @@ from typing import Any
 
 import pytest
 
+from service.model import names
 from service.model.planning import plan
+from service.model.records import JobRecord
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
+from service.store.records import read_record
 from service.store.study_records import publish
 from tests.api.dashboard.test_stability_page import a_record
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
+from tests.planning import plan_all
 from tests.waiting import until
 
 pytestmark = pytest.mark.browser
@@ -51,7 +55,7 @@ def places(parts: Parts) -> list[str]:
         "/", "/datasets", "/datasets/kitchen", "/datasets/kitchen?state=queued", f"/jobs/{record.id}",
         "/compare?one=kitchen&other=kitchen",
         f"/jobs/{waiting.id}", "/grasps", "/grasps?view=table", "/grasps?min_epsilon=99", f"/grasps/{shard}/0",
-        "/hands", "/hands/shadow", "/workers", "/chart", "/stability", "/submit", "/problems", "/login",
+        "/hands", "/hands/shadow", "/workers", "/chart", "/stability", "/submit", "/problems", "/login", "/deleted",
     ]  # fmt: skip
 
 
@@ -201,6 +205,33 @@ def test_every_page_reads_without_javascript(address: str, page: Any, places: li
     assert "Save as a hand of its own" in of("/hands/")
     assert "standard" in of("/chart")
     assert "hands sink in" in of("/stability")
+
+
+def test_a_dataset_is_deleted_by_its_name_and_comes_back(page: Any, parts: Parts) -> None:
+    """One press asks; what protects it is said; the press after that can be taken back."""
+    wanted = DatasetRequest.model_validate({"name": "kitchen", "hands": ["allegro"], "objects": ["mug"]})
+    actions.create(parts, wanted)
+    plan_all(parts)
+    finish_all(parts, read_record(JobRecord, parts.store, names.job_record(parts.index.jobs.page().items[0].id)))
+    actions.snapshot(parts, "kitchen")
+    page.goto("/datasets/kitchen")
+    page.click("button:has-text('Delete')")
+    dialog = page.get_by_role("dialog")
+    assert "32 grasps" in dialog.inner_text() and "Its snapshots go too" in dialog.inner_text()
+    dialog.get_by_role("button", name="Delete").click()
+    assert dialog.is_visible(), "the browser asks for the name and the snapshots"
+    dialog.get_by_role("button", name="Keep it").click()
+    assert dialog.is_hidden()
+    page.click("button:has-text('Delete')")
+    dialog.get_by_role("textbox").fill("kitchen")
+    dialog.get_by_role("checkbox").check()
+    dialog.get_by_role("button", name="Delete").click()
+    page.wait_for_selector("text=The dataset kitchen is deleted.")
+    assert parts.index.datasets.page().items == []
+    page.click("button:has-text('Undo')")
+    page.wait_for_url("**/datasets/kitchen")
+    assert "Snapshots" in page.inner_text("main")
+    assert parts.index.datasets.get("kitchen").grasps == 32
 
 
 def test_an_error_is_a_page_of_its_own(page: Any) -> None:

@@ -6,6 +6,7 @@ from service.model import names
 from service.model.states import AssetKind
 from service.store.hand_main import format_of
 from service.store.library import load_asset_files
+from service.store.seals import get_document, put_document
 from service.store.store import Store
 from worker.hands.load import main_file
 from worker.hands.options import parse_options
@@ -26,5 +27,5 @@ def load_hand_files(store: Store, digest: str) -> dict[str, bytes]:
         return files
     key = names.hand_expanded(digest)
     if not store.exists(key):
-        store.put(key, expand(files, main, settings.xacro))
-    return {**files, main: store.get(key)}
+        put_document(store, key, {"urdf": expand(files, main, settings.xacro).decode()})
+    return {**files, main: str(get_document(store, key)["urdf"]).encode()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import Connection, delete, exists, insert, or_, select, update
+from sqlalchemy import Connection, delete, exists, func, insert, or_, select, update
 
 from service.index.database import Database, chunks
 from service.index.dataset_tables import dataset_cells, dataset_snapshots, datasets, object_sets
@@ -56,6 +56,11 @@ class Removals:
         """Task and number of each failed attempt of a job."""
         query = select(attempts.c.task_id, attempts.c.number).where(attempts.c.job_id == job_id)
         return tuple((task, number) for task, number in within.execute(query))
+
+    def snapshots_of(self, dataset: str, *, within: Connection) -> int:
+        """How many snapshots a dataset has."""
+        query = select(func.count()).where(dataset_snapshots.c.dataset == dataset)
+        return int(within.scalar(query) or 0)
 
     def planned_only(self, ids: Sequence[str]) -> list[str]:
         """Of these jobs, those that only a dataset's planner made: nobody submitted them by themselves."""

@@ -244,6 +244,19 @@ def test_a_dataset_is_deleted_by_its_key_or_an_admin(
     assert client.delete("/v1/datasets/d", headers=people[who]).status_code == status
 
 
+@pytest.mark.parametrize(("who", "status"), [("ann", 200), ("bob", 403), ("eve", 403), ("root", 200)])
+def test_a_dataset_is_restored_by_its_key_or_an_admin(
+    client: TestClient, people: dict[str, Headers], parts: Parts, who: str, status: int
+) -> None:
+    client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
+    client.post("/v1/datasets/d/cancel", headers=people["ann"])
+    plan_all(parts)
+    assert client.delete("/v1/datasets/d", headers=people["root"]).status_code == 204
+    assert [one["name"] for one in client.get("/v1/deletions", headers=people["ann"]).json()] == ["d"]
+    assert client.post("/v1/datasets/d/restore", headers=people[who]).status_code == status
+    assert client.get("/v1/datasets/d", headers=people["eve"]).status_code == (200 if status == 200 else 404)
+
+
 @pytest.mark.parametrize(("who", "status"), [("ann", 201), ("bob", 403), ("eve", 403), ("root", 201)])
 def test_a_set_of_objects_gets_a_new_version_from_its_key_or_an_admin(
     client: TestClient, people: dict[str, Headers], who: str, status: int

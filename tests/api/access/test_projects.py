@@ -87,6 +87,9 @@ class World:
             added = self.post(f"/v1/{kind}", ann, data={"name": name}, files={"file": file})
             assert added.status_code == 202, added.text
             self.said[f"{kind}_digest"] = added.json()["digest"]
+        file = ("gone.stl", _BALL + b" ")
+        self.post("/v1/objects", ann, data={"name": "red-secret-gone"}, files={"file": file})
+        assert self.client.delete("/v1/objects/red-secret-gone", headers=ann).status_code == 204
         digest = self.client.get("/v1/hands/allegro", headers=ann).json()["digest"]
         file = ("net.npz", to_bytes(random_network(hand="allegro", digest=digest)))
         added = self.post("/v1/networks", ann, data={"name": "red-secret-net"}, files={"file": file})
@@ -112,7 +115,7 @@ class World:
     @property
     def secrets(self) -> list[str]:
         """What none but the project and an admin may read."""
-        named = [f"red-secret-{what}" for what in ("hand", "ball", "net", "data", "set", "tag")]
+        named = [f"red-secret-{what}" for what in ("hand", "ball", "gone", "net", "data", "set", "tag")]
         return [*named, "red-secret broke", *self.said.values()]
 
 
@@ -131,10 +134,13 @@ _VALUES = {
     "slug": ("not-found",),
     "webhook_id": ("webhook",),
     "action": ("cancel", "retry", "snapshot", "delete"),
+    "what": ("object",),
 }
 _NAMES = {
     "hands": ("red-secret-hand", "hands_digest"),
-    "objects": ("red-secret-ball", "objects_digest"),
+    "objects": ("red-secret-ball", "red-secret-gone", "objects_digest"),
+    "deleted": ("red-secret-gone",),
+    "jobs": ("job_id", "failed"),
     "networks": ("red-secret-net", "networks_digest"),
     "datasets": ("red-secret-data",),
     "object-sets": ("red-secret-set",),
@@ -196,6 +202,7 @@ def _bodies(world: World, method: str, address: str) -> list[dict[str, Any]]:
         {"data": options | {"hand": "red-secret-hand", "object": "red-secret-ball"}},
         {"data": options | {"hand": "allegro", "object_held": world.said["objects_digest"], "held_units": "mm"}},
         {"data": options | {"name": "mine", "hands": "red-secret-hand", "objects": "red-secret-ball"}},
+        {"data": {"typed": "red-secret-data"}},
         {"data": {"tag": "mine", "grasp": f"{world.said['shard_id']}:0", "format": "csv"}},
         {"data": {"tag": "red-secret-tag", "all": "true", "filter": f"job={world.said['job_id']}", "format": "csv"}},
         *({"data": options | {"action": action, "cell": cells}} for action in ("submit", "retry", "cancel")),
@@ -241,7 +248,8 @@ def _state(world: World) -> Any:
     get = lambda path: world.client.get(path, headers=root).json()  # noqa: E731
     jobs = {job["id"]: job["state"] for job in get("/v1/jobs?limit=200")["items"] if job["project"] == "red"}
     data = get("/v1/datasets/red-secret-data")
-    return jobs, data["cancelled"], data["state"], get("/v1/object-sets/red-secret-set")["objects"]
+    gone = [one["name"] for one in get("/v1/deletions")]
+    return gone, jobs, data["cancelled"], data["state"], get("/v1/object-sets/red-secret-set")["objects"]
 
 
 def test_the_streams_of_another_project_are_not_there(world: World) -> None:

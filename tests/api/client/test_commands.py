@@ -7,6 +7,7 @@ import os
 import socket
 import subprocess
 import sys
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -130,7 +131,7 @@ def test_a_network_is_added_named_by_a_job_and_deleted(graspd: Shell, tmp_path: 
     pair = ("--hand", "barrett", "--object", "mug", "--scene", "table", "--method", "learned")
     job = graspd.json("submit", *pair, "--option", "network=net", "--option", "starts=2")
     assert graspd.json("submit", *pair, "--option", f"network={made['digest']}", "--option", "starts=2") == job
-    assert f"needed by job {job['job']}" in said(graspd("networks", "delete", "net"))
+    assert f"needed by job {job['job']}" in said(graspd("networks", "delete", "net", "--yes"))
     assert graspd.json("submit", *pair, "--option", f"network={tmp_path / 'other.npz'}")["job"] != job["job"]
     assert {one["name"] for one in graspd.json("networks", "list")["networks"]} == {"net", "other"}
     few = ("--hands", "barrett", "--objects", "mug", "--grasps", "64", "--yes")
@@ -139,9 +140,66 @@ def test_a_network_is_added_named_by_a_job_and_deleted(graspd: Shell, tmp_path: 
         graspd.json("datasets", "create", "proposed", *few, *rest)["dataset"]["options"]["options"]["network"]
         != "other"
     )
-    for command in ("cancel", "delete"):
-        assert graspd(command, job["job"]).returncode == 0
-    assert graspd("networks", "delete", "net").stdout == "network net is deleted\n"
+    for command in (("cancel",), ("delete", "--yes")):
+        assert graspd(*command, job["job"]).returncode == 0
+    assert graspd("networks", "delete", "net", "--yes").stdout == "network net is deleted\n"
+
+
+@pytest.mark.parametrize("kind", ["delete", "objects delete", "datasets delete"])
+def test_nothing_is_deleted_unasked(graspd: Shell, kind: str) -> None:
+    """Without a terminal to ask at it takes a word."""
+    name, _ = _deletable(graspd, kind)
+    done = graspd(*kind.split(), name)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "--yes deletes it without asking" in said(done)
+    assert graspd(*kind.split(), name, "--yes").returncode == 0, "it was still there"
+
+
+@pytest.mark.parametrize(("answer", "code"), [("n", 2), ("y", 0)])
+def test_at_a_terminal_the_question_is_answered(graspd: Shell, answer: str, code: int) -> None:
+    name, words = _deletable(graspd, "datasets delete")
+    ours, theirs = os.openpty()
+    os.write(ours, f"{answer}\n".encode())
+    command = [sys.executable, "-m", "graspd", "datasets", "delete", name]
+    done = subprocess.run(
+        command, stdin=theirs, capture_output=True, text=True, env=graspd.environment, timeout=60, check=False
+    )
+    for end in (ours, theirs):
+        os.close(end)
+    assert done.returncode == code, done.stderr
+    assert words in done.stdout
+    assert graspd("datasets", "status", name).returncode == 2 - code
+
+
+@pytest.mark.parametrize("kind", ["delete", "objects delete", "datasets delete"])
+def test_what_was_deleted_is_restored(graspd: Shell, kind: str) -> None:
+    name, _ = _deletable(graspd, kind)
+    group = kind.split()[:-1]
+    graspd(*kind.split(), name, "--yes")
+    done = graspd(*group, "restore", name)
+    assert done.returncode == 0 and f"{name[:8]}" in done.stdout and "is restored" in done.stdout
+    assert graspd(*group, "restore", name).returncode == 2, "it is not deleted any more"
+
+
+def _deletable(graspd: Shell, kind: str) -> tuple[str, str]:
+    """Name of a thing that may be deleted, and words of the question."""
+    pair = ("--hand", "allegro", "--object", "mug", "--seed", str(zlib.crc32(os.urandom(8)) >> 2))
+    thing = f"t{os.urandom(4).hex()}"
+    if kind == "delete":
+        job = graspd.json("submit", *pair)["job"]
+        graspd("cancel", job)
+        return job, "allegro on mug"
+    if kind == "datasets delete":
+        few = ("--hands", "allegro", "--objects", "mug", "--grasps", "32", "--yes")
+        graspd.json("datasets", "create", thing, *few)
+        graspd("datasets", "cancel", thing)
+        return thing, f"Delete dataset {thing} with 1 cell,"
+    if kind == "objects delete":
+        path = Path(graspd.environment["GRASPD_DATA_DIR"]) / f"{thing}.stl"
+        path.write_bytes(STL + thing.encode())
+        graspd("objects", "add", str(path), "--no-wait")
+        return thing, thing
+    raise AssertionError(kind)
 
 
 def test_the_licence_of_an_object_is_kept_with_its_files(graspd: Shell, tmp_path: Path) -> None:

@@ -157,7 +157,10 @@ def test_forms_tag_chosen_grasps_and_lead_back_to_the_list(http: TestClient, par
     assert does("tag") == does("tag", all="true", filter="job=none") == does("export", grasp="../../x:1") == "422"
     assert http.post("/grasps/tag", data=filters, headers={"Origin": "https://example.org"}).status_code == 403
     assert http.post("/grasps/export", data={"grasp": f"{shard}:1", "format": "csv"}).text.count("\r\n") == 2
-    assert http.post("/tags/good/delete", follow_redirects=False).headers["location"] == "/grasps"
+    assert http.post("/tags/good/delete").status_code == 422, "its name was not typed"
+    gone = http.post("/tags/good/delete", data={"typed": "good"})
+    assert gone.url.path == "/deleted" and "The tag good is deleted." in gone.text
+    assert http.post("/deleted/tag/good/restore").url.path == "/grasps"
     assert "<script>" not in http.get("/grasps?did=tagged&done=1&named=<script>").text
 
 

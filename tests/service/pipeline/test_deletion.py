@@ -12,16 +12,18 @@ from service.index.rebuild import differences
 from service.model import names
 from service.model.errors import ConflictError, NotFoundError
 from service.model.states import AssetKind, State
-from service.pipeline import job_actions
+from service.model.tags import tag_id
+from service.pipeline import job_actions, tagging
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
-from service.pipeline.deletion import delete_asset, delete_dataset, delete_job
+from service.pipeline.deletion import delete_asset, delete_dataset, delete_job, restore
 from service.pipeline.sweeper import Sweeper
-from service.store.deletions import pending
+from service.store.deletions import deletions, pending
 from service.store.library import publish_asset
 from tests.fakes import OBJECT_FILES, make_shard, request
 from tests.planning import plan_all
+from tests.service.pipeline.datasets.makers import fail
 
 
 def finished(parts: Parts, **changes: Any) -> str:
@@ -126,7 +128,7 @@ def test_a_deleted_dataset_takes_its_own_jobs_with_it(parts: Parts) -> None:
     dataset(parts)
     dataset(parts, "other", grasps=64)
     actions.snapshot(parts, "d")
-    delete_dataset(parts, "d")
+    delete_dataset(parts, "d", with_snapshots=True)
     assert differences(parts.index, parts.store) == []
     with pytest.raises(ConflictError, match="still being removed"):
         dataset(parts)
@@ -211,6 +213,111 @@ def test_a_deletion_that_broke_off_is_carried_out_by_the_next_keeper(
     assert (
         keys(parts, *{"job": ("jobs",), "dataset": ("datasets", "jobs"), "object": ("assets/object",)}[what]) == set()
     )
+
+
+def test_a_dataset_with_a_snapshot_is_deleted_only_by_a_further_word(parts: Parts) -> None:
+    dataset(parts)
+    actions.snapshot(parts, "d")
+    with pytest.raises(ConflictError, match=r"has 1 snapshot.*--with-snapshots"):
+        delete_dataset(parts, "d")
+    assert parts.index.datasets.get("d").name == "d"
+    assert not pending(parts.store)
+
+
+SWEPT = pytest.mark.parametrize("swept", [False, True], ids=["at once", "after the keeper"])
+
+
+def sweep(parts: Parts) -> None:
+    while Sweeper(parts).advance():
+        pass
+    Sweeper(parts).advance()
+
+
+@SWEPT
+def test_a_deleted_job_is_restored_as_it_was(parts: Parts, swept: bool) -> None:
+    """One that had failed, with its attempts: it is not run again."""
+    job, _ = job_actions.submit(parts, request())
+    fail(parts, job.id)
+    before = parts.index.jobs.get(job.id), parts.index.jobs.attempts(job=job.id)
+    delete_job(parts, job.id)
+    if swept:
+        sweep(parts)
+    restore(parts, "job", job.id, permit=lambda _: None)
+    assert (parts.index.jobs.get(job.id), parts.index.jobs.attempts(job=job.id)) == before
+    assert not deletions(parts.store)
+    assert not Sweeper(parts).advance()
+    assert differences(parts.index, parts.store) == []
+
+
+@SWEPT
+def test_a_deleted_dataset_is_restored_with_its_jobs_and_snapshots(parts: Parts, swept: bool) -> None:
+    dataset(parts)
+    actions.snapshot(parts, "d")
+    before = parts.index.datasets.get("d"), parts.index.datasets.snapshots("d").items, _jobs(parts)
+    delete_dataset(parts, "d", with_snapshots=True)
+    if swept:
+        sweep(parts)
+        assert _jobs(parts) == []
+    restore(parts, "dataset", "d", permit=lambda _: None)
+    sweep(parts)
+    assert (parts.index.datasets.get("d"), parts.index.datasets.snapshots("d").items, _jobs(parts)) == before
+    assert not deletions(parts.store)
+    assert differences(parts.index, parts.store) == []
+
+
+@SWEPT
+def test_a_deleted_object_is_restored_under_its_name(parts: Parts, swept: bool) -> None:
+    before = parts.index.assets.get(AssetKind.OBJECT, "ball")
+    delete_asset(parts, AssetKind.OBJECT, "ball")
+    if swept:
+        sweep(parts)
+    restore(parts, "object", "ball", permit=lambda _: None)
+    assert parts.index.assets.get(AssetKind.OBJECT, "ball") == before
+    assert differences(parts.index, parts.store) == []
+
+
+def test_what_was_made_again_is_not_written_over(parts: Parts) -> None:
+    dataset(parts)
+    delete_dataset(parts, "d")
+    sweep(parts)
+    dataset(parts, "d", grasps=64)
+    with pytest.raises(ConflictError, match="there is a dataset 'd' again"):
+        restore(parts, "dataset", "d", permit=lambda _: None)
+    assert parts.index.datasets.get("d").asked == 64
+
+
+def test_a_job_is_not_restored_without_its_object(parts: Parts) -> None:
+    job = finished(parts)
+    delete_job(parts, job)
+    delete_asset(parts, AssetKind.OBJECT, "ball")
+    sweep(parts)
+    with pytest.raises(ConflictError, match="graspd objects restore first"):
+        restore(parts, "job", job, permit=lambda _: None)
+    sweep(parts)
+    assert differences(parts.index, parts.store) == []
+    restore(parts, "object", "ball", permit=lambda _: None)
+    restore(parts, "job", job, permit=lambda _: None)
+    assert parts.index.jobs.get(job).state is State.SUCCEEDED
+
+
+def test_a_deleted_tag_is_restored_with_its_grasps(parts: Parts) -> None:
+    job = finished(parts)
+    shard = next(shard.id for shard in parts.index.shards.page(job=job).items if shard.kind == "base")
+    tagging.give(parts, "good", [(shard, 0), (shard, 3)], project="", owner="", permit=lambda _: None)
+    tagging.remove(parts, tag_id("good", ""), permit=lambda _: None)
+    restore(parts, "tag", "good", permit=lambda _: None)
+    assert [(tag.name, tag.grasps) for tag in parts.index.tags.all()] == [("good", 2)]
+    assert not deletions(parts.store)
+
+
+def test_after_the_grace_time_nothing_comes_back(parts: Parts) -> None:
+    job = finished(parts)
+    delete_job(parts, job)
+    sweep(parts)
+    assert not graceless(parts).collect(budget_s=60)
+    assert keys(parts, "removed") == set()
+    with pytest.raises(NotFoundError, match="was deleted in the last 7 days"):
+        restore(parts, "job", job, permit=lambda _: None)
 
 
 def _jobs(parts: Parts) -> list[str]:

@@ -1,0 +1,64 @@
+"""What was deleted and can still be brought back."""
+
+from __future__ import annotations
+
+import logging
+from datetime import datetime, timedelta
+
+from pydantic import Field
+
+from api.access.auth import must_own, reach
+from service.index.views import View
+from service.pipeline import deletion
+from service.pipeline.backends import Parts
+from service.store.deletions import Deletion, What, deletions
+
+log = logging.getLogger(__name__)
+
+
+class DeletionView(View):
+    """A thing that was deleted within the grace time."""
+
+    what: What
+    id: str = Field(description="of the job, tag, hand, object or network; name of the dataset")
+    name: str
+    at: str = Field(description="when it was deleted")
+    until: str = Field(description="until then it can be restored")
+    owner: str = Field(description="id of the key that it was submitted with")
+    project: str
+
+
+class Deletions:
+    """Deletions within the caller's reach; who may delete a thing may restore it."""
+
+    def __init__(self, parts: Parts) -> None:
+        self._parts = parts
+
+    def recent(self) -> list[DeletionView]:
+        """What can be restored, the newest first."""
+        return [self._view(one) for one in deletions(self._parts.store) if self._is_seen(one)]
+
+    def restore(self, what: What, name: str) -> DeletionView:
+        """Bring a thing back, by its name or id.
+
+        Raises:
+            NotFoundError: nothing of that name was deleted within the grace time.
+            NotYours: another key submitted it.
+            ConflictError: there is one of that name again, or what it needs is deleted too.
+        """
+
+        def permit(one: Deletion) -> None:
+            must_own(one.submitter, f"{what} {name!r}", one.project)
+
+        found = deletion.restore(self._parts, what, name, permit=permit, among=self._is_seen)
+        log.info("%s %s restored", what, found.name or found.id)
+        return self._view(found)
+
+    def _is_seen(self, one: Deletion) -> bool:
+        return reach().everything or one.project == reach().project
+
+    def _view(self, one: Deletion) -> DeletionView:
+        ends = datetime.fromisoformat(one.at) + timedelta(seconds=self._parts.settings.shard_grace_s)
+        until = ends.isoformat(timespec="seconds").replace("+00:00", "Z")
+        said = {"name": one.name or one.id, "owner": one.submitter}
+        return DeletionView(what=one.what, id=one.id, at=one.at, until=until, project=one.project, **said)
