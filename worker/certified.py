@@ -491,6 +491,6 @@ def _why(columns: Arrays, count: int) -> NDArray[np.object_]:
         pushes = np.asarray(columns["quality/verdict_outcome"])
         bad = (pushes != Outcome.HELD) & (pushes != Outcome.NOT_TRIED)
         first = pushes[np.arange(count), bad.argmax(axis=1)] if count else np.zeros(0, np.uint8)
-        for code, name in _PUSHED.items():
-            found[first == code] = name
+        for push, name in _PUSHED.items():
+            found[first == push] = name
     return found

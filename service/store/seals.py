@@ -12,7 +12,8 @@ import json
 import re
 import struct
 from collections.abc import Iterable, Mapping
-from typing import IO, Any, Final
+from io import BufferedRandom
+from typing import Any, Final
 
 from service.model.errors import DamagedError
 from service.store.store import Store
@@ -79,7 +80,7 @@ def sealed(key: str, data: bytes) -> bytes:
     return data[:at] + hashlib.sha256(data).hexdigest().encode() + data[at + len(_ZEROS) :]
 
 
-def seal_archive(file: IO[bytes]) -> None:
+def seal_archive(file: BufferedRandom) -> None:
     """Seal a ZIP in a file that is open for reading and writing."""
     comment = _ZIP + _ZEROS
     file.seek(-2, 2)

@@ -35,8 +35,8 @@ def unite(parts: list[tuple[Floats, Indices]], holes: list[tuple[Floats, Indices
 
     A part that lies within a hole is no part of what the hole is in: it stays.
     """
-    solids = [to_manifold(*part) for part in parts]
-    cuts = [to_manifold(*hole) for hole in holes]
+    solids: list[Any] = [to_manifold(*part) for part in parts]
+    cuts: list[Any] = [to_manifold(*hole) for hole in holes]
     if any(solid is None for solid in solids + cuts):
         return None
     loose = [solid for solid in solids if any((solid - cut).is_empty() for cut in cuts)]
