@@ -106,7 +106,7 @@ def problem_response(
 
 def _root_path(request: Request) -> str:
     settings = getattr(request.app.state, "settings", None) if "app" in request.scope else None
-    return settings.api_root_path if settings is not None else ""
+    return (settings.api_root_path or "") if settings is not None else ""
 
 
 def describe(error: Exception) -> tuple[str, str, int, str]:

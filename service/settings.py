@@ -33,8 +33,8 @@ class Settings(BaseSettings):
     index_url: SecretStr | None = Field(None, description="SQLAlchemy URL of the index; unset: SQLite in data_dir")
     host: str = Field("127.0.0.1", description="address the API binds")
     port: int = Field(8000, ge=0, le=65535, description="port the API binds; 0: any free one")
-    api_root_path: str = Field(
-        "", description="path below which a proxy shows the API and the dashboard, such as /graspd; unset: the root"
+    api_root_path: str | None = Field(
+        None, description="path below which a proxy shows the API and the dashboard, such as /graspd; unset: the root"
     )
     api_url: str = Field(
         "http://127.0.0.1:8000",
@@ -135,11 +135,13 @@ class Settings(BaseSettings):
 
     @field_validator("api_root_path")
     @classmethod
-    def _is_path(cls, value: str) -> str:
+    def _is_path(cls, value: str | None) -> str | None:
+        if value is None:
+            return None
         found = f"/{value.strip('/')}".rstrip("/")
         if not re.fullmatch(r"(/[A-Za-z0-9._~-]+)*", found) or {".", ".."} & set(found.split("/")):
             raise ValueError("write a path such as /graspd, of letters, digits, dots, dashes and underscores")
-        return found
+        return found or None
 
     @cached_property
     def resolved_store_url(self) -> str:

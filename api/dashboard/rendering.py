@@ -63,13 +63,13 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
         "grace_s": request.app.state.settings.shard_grace_s,
     }
     text = request.app.state.templates.get_template(template).render(context)
-    text = with_prefix(text, request.app.state.settings.api_root_path)
+    text = with_prefix(text, request.app.state.settings.api_root_path or "")
     return HTMLResponse(text, status_code=status, headers={"Cache-Control": "no-store"})
 
 
 def base_url(request: Request) -> str:
     """Where the visitor sees the service, without a slash at the end."""
-    return f"{str(request.base_url).rstrip('/')}{request.app.state.settings.api_root_path}"
+    return f"{str(request.base_url).rstrip('/')}{request.app.state.settings.api_root_path or ''}"
 
 
 def problem_page(request: Request, problem: dict[str, Any]) -> Response:
