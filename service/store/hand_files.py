@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import posixpath
 import re
-from collections.abc import Iterable, Mapping
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from html import unescape
+from pathlib import Path, PurePosixPath
 from typing import Final
 
 from service.model.errors import InputError, LimitError
 from service.store.assets import MAX_FILES
-from service.store.hand_main import SUFFIXES, format_of
+from service.store.hand_main import SUFFIXES, format_of, text_of
 from service.store.mesh_looks import HEAD_BYTES, MESHES, beside, named_by
+from service.store.mesh_names import one_like, read_reference
 
 #: What says more of a hand than its URDF does; the first goes over the second.
 DESCRIPTIONS: Final = ("asset.json", "hand.json")
 #: Of a folder only these are taken, beside its descriptions.
 _TAKEN: Final = (*SUFFIXES, ".yaml", ".yml", ".stl", ".obj", ".ply", ".off", ".glb", ".dae", ".msh")
-_REFERENCE: Final = re.compile(rb"""file(?:name)?\s*=\s*["']([^"']+)["']""")
-_FOLDER: Final = re.compile(rb"""(?:mesh|asset)dir\s*=\s*["']([^"']*)["']""")
+_REFERENCE: Final = re.compile(r"""file(?:name)?\s*=\s*["']([^"']+)["']""")
+_FOLDER: Final = re.compile(r"""(?:mesh|asset)dir\s*=\s*["']([^"']*)["']""")
+_MAX_INCLUDED: Final = 32
 #: Folders of a ROS package in which descriptions lie: their meshes lie beside them, not below.
 _OF_PACKAGES: Final = ("urdf", "robots", "xacro", "mjcf")
 _ABOVE: Final = 4
@@ -86,7 +90,7 @@ def _of_description(path: Path) -> tuple[dict[str, Path], str]:
         # What it includes is only known when it is expanded.
         files = _below(root if (root / "package.xml").is_file() else path.parent, root)
     else:
-        files = {name: root / name for name in sorted(_named_by(path, root)) if _inside(root / name, root)}
+        files = {name: root / name for name in sorted(_named_by(path, root))}
     for note in DESCRIPTIONS:
         for folder in (root, path.parent):
             if _inside(folder / note, root):
@@ -102,34 +106,64 @@ def _package(path: Path) -> Path:
     return path.parents[1] if path.parent.name in _OF_PACKAGES else path.parent
 
 
-def _named_by(path: Path, root: Path, seen: frozenset[Path] = frozenset()) -> set[str]:
-    """Names below the root that a description, and what it includes, may mean."""
-    text = path.read_bytes()
-    base = path.parent.relative_to(root).as_posix()
-    folders = {"", *(match.decode(errors="replace") for match in _FOLDER.findall(text))}
-    names: set[str] = set()
-    for match in _REFERENCE.findall(text):
-        for name in _names(match.decode(errors="replace"), base, folders):
-            names.add(name)
-            inner = root / name
-            if inner.suffix.lower() in SUFFIXES and inner not in seen and len(seen) < 32 and _inside(inner, root):
-                names |= _named_by(inner.resolve(), root, seen | {path, inner})
-    return names
+def _named_by(path: Path, root: Path) -> set[str]:
+    """Names of the files below the root that a description, and what it includes, may mean.
 
-
-def _names(reference: str, base: str, folders: Iterable[str]) -> set[str]:
-    """Names that a reference may mean: the folders of a ROS package, and those above it, may be there or not.
-
-    `worker.hands.references.find_mesh` chooses among them.
+    `worker.hands.references.find_mesh` and `worker.hands.mjcf_source` choose among them.
     """
-    scheme, separator, rest = reference.replace("\\", "/").partition("://")
-    inside = (rest.lstrip("/") if scheme == "file" else rest) if separator else scheme
-    if not inside or inside.startswith("/") or "\0" in inside:
-        return set()
-    parts = inside.split("/")
-    tails = ["/".join(parts[start:]) for start in range(len(parts) if separator else 1)]
-    names = {posixpath.normpath(posixpath.join(base, folder, tail)) for tail in tails for folder in folders}
-    return {name for name in names | set(map(posixpath.normpath, tails)) if not name.startswith("..")}
+    seen, waiting = {path}, [path]
+    bases, folders, references = set(), {""}, set()
+    found: set[str] = set()
+    while waiting:
+        file = waiting.pop()
+        text = text_of(file.read_bytes())
+        bases.add(file.parent.relative_to(root).as_posix())
+        folders |= {unescape(folder) for folder in _FOLDER.findall(text)}
+        references |= {unescape(reference) for reference in _REFERENCE.findall(text)}
+        # Names in an included file count from its folder or from that of the description, as the reader pleases.
+        found = {
+            name
+            for reference in references
+            for base in bases
+            for folder in folders
+            for name in _names(reference, base, folder, root)
+        }
+        for name in sorted(found):
+            inner = (root / name).resolve()
+            if inner.suffix.lower() in SUFFIXES and inner not in seen and len(seen) < _MAX_INCLUDED:
+                seen.add(inner)
+                waiting.append(inner)
+    return found
+
+
+def _names(written: str, base: str, folder: str, root: Path) -> Iterator[str]:
+    """Names of files below the root that a reference may mean."""
+    with suppress(InputError):
+        reference = read_reference(posixpath.join(folder, written), base)
+        if not reference.scheme or not folder:
+            for name in reference.names:
+                if there := _on_disk(name, root):
+                    yield there
+
+
+def _on_disk(name: str, root: Path) -> str:
+    """The name of a file below the root, in its own capitals; empty where there is none."""
+    if _inside(root / name, root):
+        return posixpath.normpath(name)
+    at = root
+    for part in PurePosixPath(name).parts:
+        like = part if (at / part).exists() else one_like(part, (e.name for e in _entries(at)))
+        if not like:
+            return ""
+        at /= like
+    return at.relative_to(root).as_posix() if _inside(at, root) else ""
+
+
+def _entries(folder: Path) -> Iterable[Path]:
+    try:
+        return list(folder.iterdir()) if folder.is_dir() else []
+    except OSError:
+        return []
 
 
 def _inside(file: Path, root: Path) -> bool:

@@ -16,11 +16,20 @@ Format = Literal["urdf", "xacro", "mjcf"]
 SUFFIXES: Final = (".urdf", ".xacro", ".xml", ".mjcf")
 #: A root element that begins later than this is none that a tool wrote [bytes].
 _HEAD_BYTES: Final = 1 << 16
-_PROLOG: Final = re.compile(rb"\s*(?:<\?.*?\?>|<!--.*?-->|<!DOCTYPE(?:[^\[>]|\[.*?\])*>)", re.DOTALL)
-_ROOT: Final = re.compile(rb"\s*<([A-Za-z_][\w:.-]*)")
-_COMMENT: Final = re.compile(rb"<!--.*?-->", re.DOTALL)
-_MACROS: Final = (b"<xacro:", b"${", b"$(")
-_FORMATS_OF: Final[dict[bytes, Format]] = {b"robot": "urdf", b"mujoco": "mjcf"}
+_PROLOG: Final = re.compile(r"\s*(?:<\?.*?\?>|<!--.*?-->|<!DOCTYPE(?:[^\[>]|\[.*?\])*>)", re.DOTALL)
+_ROOT: Final = re.compile(r"\s*<([A-Za-z_][\w:.-]*)")
+_COMMENT: Final = re.compile(r"<!--.*?-->", re.DOTALL)
+_MACROS: Final = ("<xacro:", "${", "$(")
+_FORMATS_OF: Final[dict[str, Format]] = {"robot": "urdf", "mujoco": "mjcf"}
+#: What a file in an encoding begins with, its mark of byte order or that of `<`; a longer one goes first.
+_MARKS: Final = (
+    (b"\xff\xfe\0\0", "utf-32"), (b"\0\0\xfe\xff", "utf-32"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"),
+    (b"<\0\0\0", "utf-32-le"), (b"\0\0\0<", "utf-32-be"), (b"<\0", "utf-16-le"), (b"\0<", "utf-16-be"),
+)  # fmt: skip
+_DECLARED: Final = re.compile(rb"""\s*<\?xml[^>]{0,100}encoding\s*=\s*["']([\w.:-]{1,40})""")
+_DECLARATION: Final = re.compile(r"<\?xml\s[^>]{0,200}\?>")
+#: Encodings that a file may name; all else is UTF-8, whatever it says.
+_NAMED: Final = re.compile(r"iso-?8859|latin|windows-12|cp12|gb|big5|shift|euc|koi8", re.IGNORECASE)
 
 
 def format_of(name: str, data: bytes) -> Format | None:
@@ -28,11 +37,28 @@ def format_of(name: str, data: bytes) -> Format | None:
     suffix = PurePosixPath(name).suffix.lower()
     if suffix not in SUFFIXES:
         return None
-    found = _FORMATS_OF.get(_root_element(data[:_HEAD_BYTES]))
-    if found == "urdf" and any(sign in _COMMENT.sub(b"", data) for sign in _MACROS):
+    text = text_of(data)
+    found = _FORMATS_OF.get(_root_element(text[:_HEAD_BYTES]))
+    if found == "urdf" and any(sign in _COMMENT.sub("", text) for sign in _MACROS):
         return "xacro"
     # A file that calls itself a URDF is taken at its word, so that its reader says what is wrong with it.
     return found or {".urdf": "urdf", ".xacro": "xacro", ".mjcf": "mjcf"}.get(suffix)  # type: ignore[return-value]
+
+
+def text_of(data: bytes) -> str:
+    """The text of an XML or YAML file in the encoding that its byte order or its declaration says, without the
+    declaration and white space around it; what claims to be UTF-8 and is not, is read as Latin 1."""
+    coding = next((name for mark, name in _MARKS if data.startswith(mark)), "")
+    if not coding:
+        declared = _DECLARED.match(data)
+        said = declared[1].decode() if declared else ""
+        coding = said if _NAMED.match(said) else "utf-8-sig"
+    try:
+        text = data.decode(coding)
+    except (UnicodeError, LookupError):
+        text = data.decode("latin-1")
+    # It may only stand at the very beginning, and a licence often does.
+    return _DECLARATION.sub("", text, count=1).strip("\ufeff\0 \t\r\n")
 
 
 def main_of(files: Mapping[str, bytes], wanted: str = "", *, where: str = "the hand") -> str:
@@ -49,11 +75,13 @@ def main_of(files: Mapping[str, bytes], wanted: str = "", *, where: str = "the h
     known = {name: kind for name in sorted(files) if (kind := format_of(name, _head(files, name)))}
     if wanted:
         return _named(wanted, [name for name in sorted(files) if name in known or name == wanted], where)
-    for kinds in (("urdf",), ("xacro",), ("mjcf",)):
-        found = [name for name, kind in known.items() if kind in kinds]
-        if found and kinds == ("urdf",) and any(name.lower().endswith(".urdf") for name in found):
+    # A part of a xacro file may hold no macro itself.
+    kinds_of = {name: "xacro" if name.lower().endswith(".xacro") else kind for name, kind in known.items()}
+    for chosen in ("urdf", "xacro", "mjcf"):
+        found = [name for name, kind in kinds_of.items() if kind == chosen]
+        if chosen == "urdf" and any(name.lower().endswith(".urdf") for name in found):
             found = [name for name in found if name.lower().endswith(".urdf")]
-        if len(found) > 1 and kinds != ("urdf",):
+        if len(found) > 1 and chosen != "urdf":
             found = _outermost(files, found) or found
         if len(found) == 1:
             return found[0]
@@ -80,11 +108,11 @@ def _named(wanted: str, known: list[str], where: str) -> str:
 
 def _outermost(files: Mapping[str, bytes], found: list[str]) -> list[str]:
     """Those that no other includes."""
-    contents = {name: files[name] for name in found}
+    contents = {name: text_of(files[name]).lower() for name in found}
     return [
         name
         for name in found
-        if not any(PurePosixPath(name).name.encode() in text for other, text in contents.items() if other != name)
+        if not any(PurePosixPath(name).name.lower() in text for other, text in contents.items() if other != name)
     ]
 
 
@@ -116,11 +144,9 @@ def _head(files: Mapping[str, bytes], name: str) -> bytes:
     return files[name]
 
 
-def _root_element(head: bytes) -> bytes:
-    if head.startswith((b"\xff\xfe", b"\xfe\xff")):
-        head = head.decode("utf-16", errors="replace").encode()
-    at, head = 0, head.removeprefix(b"\xef\xbb\xbf")
+def _root_element(head: str) -> str:
+    at = 0
     while prolog := _PROLOG.match(head, at):
         at = prolog.end()
     root = _ROOT.match(head, at)
-    return root[1] if root else b""
+    return root[1] if root else ""

@@ -13,10 +13,10 @@ from collections.abc import Mapping
 from pathlib import PurePosixPath
 from typing import Final
 
-from defusedxml import ElementTree as SafeTree
-from defusedxml.common import DefusedXmlException
-
 from service.model.errors import HandError, LimitError
+from service.store.mesh_names import one_like
+from worker.hands.xml_tree import parse_xml
+from worker.objects.stand_ins import refuse_stand_in
 
 MAX_BYTES: Final = 8 * 2**20
 _MAX_INCLUDES: Final = 64
@@ -45,9 +45,7 @@ def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str
             would load another model; the message names it.
         LimitError: larger than the limits of this module.
     """
-    root = _parse(files[main], main)
-    if root.tag != "mujoco":
-        raise HandError(f"{main}: the XML root is <{root.tag[:40]}>, an MJCF model begins with <mujoco>")
+    root = parse_xml(files[main], main, "an MJCF model", "mujoco", limit_bytes=MAX_BYTES)
     _put_in_includes(root, files, main, main, [0, 0])
     folder = _mesh_folder(root)
     assets: dict[str, bytes] = {}
@@ -112,18 +110,6 @@ def _numbers(text: str) -> list[float]:
         return []
 
 
-def _parse(data: bytes, name: str) -> Element:
-    if len(data) > MAX_BYTES:
-        raise LimitError(f"{name}: {len(data)} bytes of XML; at most {MAX_BYTES} are taken")
-    try:
-        root: Element = SafeTree.fromstring(data)
-    except DefusedXmlException:
-        raise HandError(f"{name}: XML entities are refused; write the text out") from None
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise HandError(f"{name}: not well-formed XML ({error}); export the model again") from None
-    return root
-
-
 def _put_in_includes(root: Element, files: Mapping[str, bytes], main: str, here: str, counts: list[int]) -> None:
     """Replace each include by what stands in its file; `counts` are the includes and elements so far."""
     counts[1] += sum(1 for _ in root.iter())
@@ -138,7 +124,8 @@ def _put_in_includes(root: Element, files: Mapping[str, bytes], main: str, here:
                 raise HandError(f"{main}: more than {_MAX_INCLUDES} includes, or a file that includes itself")
             wanted = child.get("file", "")
             name = _find(wanted, files, [posixpath.dirname(main), posixpath.dirname(here)], main, "includes")
-            part = _parse(files[name], name)
+            refuse_stand_in(name, files[name], HandError)
+            part = parse_xml(files[name], name, limit_bytes=MAX_BYTES)
             _put_in_includes(part, files, main, name, counts)
             parent[at : at + 1] = list(part)
 
@@ -146,7 +133,7 @@ def _put_in_includes(root: Element, files: Mapping[str, bytes], main: str, here:
 def _find(wanted: str, files: Mapping[str, bytes], folders: list[str], main: str, does: str) -> str:
     """Name of a file that a model names, sought from several folders."""
     path = wanted.replace("\\", "/")
-    inside = False
+    inside, like = False, []
     for folder in dict.fromkeys(folders):
         name = posixpath.normpath(posixpath.join(folder, path))
         if path.startswith("/") or name.startswith(("..", "/")) or ":" in path:
@@ -154,11 +141,14 @@ def _find(wanted: str, files: Mapping[str, bytes], folders: list[str], main: str
         inside = True
         if name in files:
             return name
+        like.append(one_like(name, files))
     if not inside:
         raise HandError(f"{main}: {does} {wanted[:80]!r}, which lies outside the hand's folder; put it inside")
     below = [name for name in files if name.endswith("/" + posixpath.normpath(path).removeprefix("../"))]
     if len(below) == 1:
         return below[0]
+    if found := next(filter(None, like), ""):
+        return found
     raise HandError(f"{main}: {does} {wanted[:80]!r}, which is not there; add the file")
 
 
@@ -184,6 +174,7 @@ def _take_mesh(
         raise HandError(f"{main}: the mesh {name!r} is none of {', '.join(_MESHES)}, which MJCF takes; convert it")
     # MuJoCo calls a mesh by its file where the model does not name it.
     element.set("name", element.get("name", PurePosixPath(file.replace("\\", "/")).stem))
+    refuse_stand_in(name, files[name], HandError)
     given = f"{len(assets)}{suffix}"
     assets[given] = files[name]
     element.set("file", given)

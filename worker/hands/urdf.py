@@ -7,25 +7,21 @@ wrongly; this reader refuses each by name. It knows only what a hand needs: link
 from __future__ import annotations
 
 import math
-import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from defusedxml import ElementTree as SafeTree
-from defusedxml.common import DefusedXmlException
 
-from service.model.errors import HandError, LimitError
+from service.model.errors import HandError
 from service.model.transforms import Floats, quat_from_axis_angle, quat_multiply
 from worker.hands.robot import MAX_LENGTH_M, MOVING, UNLIMITED_M, Joint, Link, Mimic, Robot, Shape, build_robot
+from worker.hands.xml_tree import parse_xml
 
 MAX_BYTES: Final = 4 * 2**20
 #: Visual elements beyond this many are not drawn.
 MAX_VISUALS: Final = 1024
 Colour = tuple[float, float, float]
-_PREFIX: Final = re.compile(rb"[<\s/]([A-Za-z_][\w.-]{0,40}):[A-Za-z_]")
-_MAX_PREFIXES: Final = 100
 
 
 def read_urdf(data: bytes, filename: str = "the URDF") -> Robot:
@@ -35,39 +31,12 @@ def read_urdf(data: bytes, filename: str = "the URDF") -> Robot:
         HandError: not XML, not a robot, or a value that no hand can have; the message names it.
         LimitError: larger than the limits of this module.
     """
-    robot = _parse_xml(data, filename)
+    robot = parse_xml(data, filename, "a URDF", "robot", limit_bytes=MAX_BYTES)
     notes: list[str] = []
     materials = {element.get("name", ""): _colour(element) for element in robot.findall("material")}
     links = [_read_link(element, materials) for element in robot.findall("link")]
     joints = [_read_joint(element, notes) for element in robot.findall("joint")]
     return build_robot(robot.get("name", ""), links, joints, notes, filename)
-
-
-def _parse_xml(data: bytes, filename: str) -> ElementTree.Element:
-    if len(data) > MAX_BYTES:
-        raise LimitError(f"{filename}: {len(data)} bytes of XML; at most {MAX_BYTES} are taken")
-    try:
-        root = _with_prefixes(data)
-    except DefusedXmlException:
-        raise HandError(f"{filename}: XML entities are refused; write the text out") from None
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise HandError(f"{filename}: not well-formed XML ({error}); export the URDF again") from None
-    if root.tag != "robot":
-        raise HandError(f"{filename}: the XML root is <{root.tag[:40]}>, a URDF begins with <robot>")
-    return root
-
-
-def _with_prefixes(data: bytes) -> ElementTree.Element:
-    """The tree of an XML text; prefixes of foreign elements (`drake:...`) that nobody declared are declared here."""
-    try:
-        root: ElementTree.Element = SafeTree.fromstring(data)
-    except ElementTree.ParseError as error:
-        if "unbound prefix" not in str(error):
-            raise
-        prefixes = sorted(set(_PREFIX.findall(data)) - {b"xml", b"xmlns"})
-        declared = b"".join(b' xmlns:%s="urn:%s"' % (prefix, prefix) for prefix in prefixes[:_MAX_PREFIXES])
-        root = SafeTree.fromstring(data.replace(b"<robot", b"<robot" + declared, 1))
-    return root
 
 
 def _read_link(element: ElementTree.Element, materials: dict[str, Colour | None]) -> Link:

@@ -16,6 +16,7 @@ from pathlib import PurePosixPath
 from typing import Final
 
 from service.model.errors import HandError
+from service.store.hand_main import text_of
 from worker.hands.urdf import MAX_BYTES
 
 #: Largest hands on arms take a tenth of it [s].
@@ -43,7 +44,7 @@ def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) 
         "main": main, "arguments": dict(arguments), "names": sorted(files), "memory": MEMORY_LIMIT_BYTES,
         "cpu": CPU_LIMIT_S, "limit": MAX_BYTES,
         "texts": {
-            name: files[name].decode(errors="replace")
+            name: text_of(files[name])
             for name in sorted(files) if PurePosixPath(name).suffix.lower() in _READ
         },
     }  # fmt: skip

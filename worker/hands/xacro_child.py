@@ -61,12 +61,14 @@ def _expand(given: dict[str, Any]) -> str:
     from defusedxml import minidom as safe
     from xacro import substitution_args
 
+    from service.store.mesh_names import one_like
+
     texts: dict[str, str] = given["texts"]
     names: list[str] = given["names"]
 
     def named(path: str) -> str:
         """Name of a file of the hand; Refused where the path leads out of its folder."""
-        inside = posixpath.normpath(posixpath.join(_TOP, path))
+        inside = posixpath.normpath(posixpath.join(_TOP, path.replace("\\", "/")))
         if not inside.startswith(_TOP + "/"):
             said = path.removeprefix(_TOP + "/")
             raise Refused(f"{said!r} lies outside the hand's folder; put it inside, or give the folder that holds both")
@@ -74,6 +76,9 @@ def _expand(given: dict[str, Any]) -> str:
 
     def text_of(path: str) -> str:
         name = named(path)
+        name = name if name in texts else one_like(name, texts) or name
+        if name in texts and texts[name].startswith("version https://git-lfs."):
+            raise Refused(f"includes {name!r}, which is a Git LFS pointer, not the file itself: git lfs pull")
         if name not in texts:
             raise Refused(f"includes {name!r}, which is not there; add the file, or give the folder that holds it")
         return texts[name]
@@ -111,7 +116,13 @@ def _expand(given: dict[str, Any]) -> str:
     xacro.verbosity = 0
     del encodings, yaml
     _close_doors(given["cpu"], given["memory"])
-    document = xacro.process_file(f"{_TOP}/{given['main']}", mappings=dict(given["arguments"]), verbosity=0)
+    document: minidom.Document = xacro.process_file(
+        f"{_TOP}/{given['main']}", mappings=dict(given["arguments"]), verbosity=0
+    )
+    for mesh in document.getElementsByTagName("mesh"):
+        if (filename := mesh.getAttribute("filename")).startswith(_TOP + "/"):
+            # As `$(find PACKAGE)` makes it: a place of this process, and no file of anybody's.
+            mesh.setAttribute("filename", f"file://{filename.removeprefix(_TOP)}")
     text = document.toxml()
     if len(text) > given["limit"]:
         raise Refused(f"it expands to {len(text)} characters; at most {given['limit']} are taken")

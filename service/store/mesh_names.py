@@ -1,0 +1,80 @@
+"""Names of files as descriptions of hands write them: one rule for those on a disk and for those of an upload."""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import Final
+from urllib.parse import unquote
+
+from service.model.errors import InputError
+from service.store.assets import check_path
+
+_SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(/*)")
+#: Of them the rest is a path; what comes first in it, a package or folders of another machine, may be left out.
+_OURS: Final = frozenset({"package", "model", "file"})
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What a description means by a name."""
+
+    names: tuple[str, ...]
+    """Names in the upload that it may be, the first one goes first."""
+    scheme: str = ""
+    """Of `package://...`, `model://...` and `file://...`."""
+    tails: tuple[str, ...] = ()
+    """With a scheme, what may lie below any folder: all of them but a bare file name."""
+
+
+def read_reference(written: str, base: str) -> Reference:
+    """What a name may mean, in either spelling of slashes, with spaces or `%20`.
+
+    The folder of a ROS package may be packed with or without its name and those above it, and beside other packages:
+    `package://NAME/a/b.stl` is NAME/a/b.stl, a/b.stl or b.stl, from the description's folder or from the top.
+
+    Args:
+        written: the name.
+        base: folder of the description.
+
+    Raises:
+        InputError: it leads out of the upload, or names no file; the message goes on from the name.
+    """
+    text = written.strip().replace("\\", "/")
+    found = _SCHEME.match(text)
+    scheme = found[1].lower() if found else ""
+    if found and scheme not in _OURS:
+        raise InputError("is no file of this hand; put it beside the URDF")
+    rest = text[found.end() :] if found else text
+    # A package is no folder of the description's: dots in its path count from the package.
+    paths = [_inside(rest, "" if scheme else base)]
+    with suppress(InputError):
+        paths += [_inside(unquote(rest), "" if scheme else base)]
+    tails = [tail for path in dict.fromkeys(paths) for tail in (_tails(path) if scheme else [path])]
+    names = [str(PurePosixPath(folder) / tail) for tail in tails for folder in (base, "")]
+    return Reference(tuple(dict.fromkeys(names)), scheme, tuple(tail for tail in tails if scheme and "/" in tail))
+
+
+def one_like(name: str, files: Iterable[str]) -> str:
+    """The only file that is called so but for capitals, else nothing."""
+    wanted = name.lower()
+    like = [file for file in files if file.lower() == wanted]
+    return like[0] if len(like) == 1 else ""
+
+
+def _tails(path: str) -> list[str]:
+    parts = PurePosixPath(path).parts
+    return [str(PurePosixPath(*parts[start:])) for start in range(len(parts))]
+
+
+def _inside(path: str, base: str) -> str:
+    """`../meshes/x` resolved against a folder, if that stays inside the upload."""
+    dots = ".." in path and not path.startswith("/")
+    try:
+        return check_path(posixpath.normpath(posixpath.join(base, path)) if dots else path)
+    except InputError:
+        raise InputError("lies outside the hand's folder; put it inside") from None
