@@ -183,8 +183,8 @@ def unusable(error: Exception) -> InputError:
     the password."""
     why = f" ({_line(error)})" if isinstance(error, NoSuchModuleError | ModuleNotFoundError) else ""
     return InputError(
-        f"the index URL (GRASPD_INDEX_URL) cannot be used{why}; give sqlite:///PATH or postgresql+psycopg://HOST/NAME, and in a "
-        "password %2F for / and %40 for @"
+        f"the index URL (GRASPD_INDEX_URL) cannot be used{why}; give sqlite:///PATH or "
+        "postgresql+psycopg://HOST/NAME, and in a password %2F for / and %40 for @"
     )
 
 

@@ -15,6 +15,7 @@ from service.index.rebuild import differences, rebuild
 from service.model.states import State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
+from service.pipeline.identity import identify
 from service.settings import Settings
 from service.store.library import publish_builtins
 from service.store.store import open_store
@@ -31,6 +32,7 @@ def kept(tmp_path: Path) -> Iterator[Parts]:
     settings = Settings(data_dir=tmp_path / "data")
     index = Index(settings.resolved_index_url)
     parts = Parts(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
+    identify(parts)
     add_assets(parts)
     publish_builtins(parts.store)
     run_all(parts, job_actions.submit(parts, request(grasps=64, scenes=1))[0].id)
