@@ -18,6 +18,7 @@ DELETIONS: Final = "deletions"
 RELEASED: Final = "released"
 WEBHOOKS: Final = "webhooks"
 TAGS: Final = "tags"
+MARKS: Final = "marks"
 
 #: Folder under `shards/` and HDF5 kind of what each stage makes.
 SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "scene", Stage.RENDER: "views"}
@@ -146,6 +147,11 @@ def tag_versions(tag: str) -> str:
 def tag_version(tag: str, number: int) -> str:
     """One of `tag_versions`; numbers start at 1, the last one counts, and those before it go."""
     return f"{tag_versions(tag)}/{number:06}.json"
+
+
+def mark(mark: str) -> str:
+    """What tells whether the index is as old as the store."""
+    return f"{MARKS}/{mark}.json"
 
 
 def deletion(what: str, name: str) -> str:
