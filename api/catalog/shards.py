@@ -53,8 +53,12 @@ class Shards:
         return self._parts.store.size(shard.key)
 
     def stream(self, shard: Shard, start: int, length: int) -> Iterator[bytes]:
-        """Bytes of the file, in chunks."""
-        return self._parts.store.stream(shard.key, start, length)
+        """Bytes of the file, in chunks that are what they were when it was found intact.
+
+        Raises:
+            DamagedShard: they are not; from the iterator as well, which then ends before its end.
+        """
+        return self._checked.stream(shard.key, shard.sha256, start, length)
 
     def job_of(self, shard_id: str) -> str | None:
         """A job that a shard belongs to; None where it is gone."""

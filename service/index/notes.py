@@ -15,6 +15,8 @@ from service.model.clock import timestamp
 
 _REBUILT: Final = "rebuilt"
 _SCRUB: Final = "scrub"
+_CHANGES: Final = "changes"
+_MARK: Final = "mark"
 _SCRUB_TURN: Final = "scrub turn"
 _SERVICE: Final = "service"
 #: Names of records that are kept; the count is of all.
@@ -30,6 +32,18 @@ class Completeness:
     """Damaged records of the store that are not in the index."""
     names: tuple[str, ...] = ()
     """The first of them."""
+
+
+@dataclass(frozen=True)
+class Marked:
+    """What tells whether the index is as old as the store."""
+
+    mark: str = ""
+    """Mark that both have; empty: none yet."""
+    before: str = ""
+    """The store's mark while it gets that one; then the same."""
+    changes: int = 0
+    """Changes that there were then."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +95,32 @@ class Notes:
             if known is None:
                 upsert(connection, notes, [{"name": _SERVICE, "value": {"id": identity}}])
         return known or identity
+
+    def set_incomplete(self) -> None:
+        """The index may lack what the store has; the keeper makes it anew."""
+        with self.database.writing() as connection:
+            connection.execute(delete(notes).where(notes.c.name == _REBUILT))
+
+    def count_change(self, *, within: Connection) -> None:
+        """A user's record was put: the index is another one than before."""
+        number = int(within.scalar(select(notes.c.value).where(notes.c.name == _CHANGES)) or 0)  # type: ignore[call-overload]
+        upsert(within, notes, [{"name": _CHANGES, "value": number + 1}])
+
+    def changes(self) -> int:
+        """How many of these there were."""
+        with self.database.reading() as connection:
+            value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _CHANGES))
+        return int(value or 0)
+
+    def marked(self) -> Marked:
+        """The mark of the index."""
+        with self.database.reading() as connection:
+            value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _MARK))
+        return Marked(**value) if value else Marked()
+
+    def set_marked(self, marked: Marked, *, within: Connection | None = None) -> None:
+        with self.database.writing(within) as connection:
+            upsert(connection, notes, [{"name": _MARK, "value": asdict(marked)}])
 
     def scrub_note(self) -> ScrubNote:
         """How far the keeper has read through the store; nothing read yet: a note of defaults."""

@@ -15,6 +15,7 @@ from sqlalchemy.exc import DataError
 
 from service.index.changes.states import QUIET
 from service.index.index import Index
+from service.index.notes import Marked
 from service.index.tables import LIVE_COLUMNS, LIVE_TABLES, metadata
 from service.model import names
 from service.model.dataset_records import DatasetEvent, DatasetRecord, ObjectSet, Snapshot
@@ -27,6 +28,7 @@ from service.settings import sqlite_url
 from service.store.deletions import pending
 from service.store.library import load_asset, load_check, stored_assets
 from service.store.manifests import ShardManifest
+from service.store.marks import newest_mark
 from service.store.packs import Pack, packs_below, read_manifests
 from service.store.records import parse_record
 from service.store.store import Store
@@ -57,6 +59,7 @@ def rebuild(index: Index, store: Store, *, progress: Callable[[str, int], None] 
         for table in metadata.tables.values():
             if table.name not in LIVE_TABLES:
                 connection.execute(delete(table))
+        index.notes.set_marked(Marked(mark := newest_mark(store), mark), within=connection)
         made.assets()
         made.jobs()
         made.shards()

@@ -20,6 +20,7 @@ REMOVED: Final = "removed"
 WEBHOOKS: Final = "webhooks"
 TAGS: Final = "tags"
 SERVICE: Final = "service"
+MARKS: Final = "marks"
 
 #: Folder under `shards/` and HDF5 kind of what each stage makes.
 SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "scene", Stage.RENDER: "views"}
@@ -158,6 +159,11 @@ def tag_version(tag: str, number: int) -> str:
 def service(number: int) -> str:
     """Identity of the service that works on the store; numbers start at 1, and the last one counts."""
     return f"{SERVICE}/{number:06}.json"
+
+
+def mark(mark: str) -> str:
+    """What tells whether the index is as old as the store."""
+    return f"{MARKS}/{mark}.json"
 
 
 def deletion(what: str, name: str) -> str:

@@ -34,6 +34,7 @@ from service.pipeline.entering import Entering
 from service.pipeline.identity import identify
 from service.pipeline.indexer import Indexer
 from service.pipeline.job_actions import HELD_S, queue_tasks
+from service.pipeline.marking import Marking
 from service.pipeline.pace import Pace
 from service.pipeline.reaper import Reaper
 from service.pipeline.reports import Reports
@@ -77,6 +78,7 @@ class Keeper:
         self._reaper = Reaper(parts, self._indexer, shards, clock=clock)
         self._planner = DatasetRounds(parts, clock=clock)
         self._sweeper = Sweeper(parts, clock=clock)
+        self._marking = Marking(parts)
         self._has_plans = False
         self._turns = Turns()
         self._backlog: list[tuple[str, Event]] = []
@@ -86,6 +88,8 @@ class Keeper:
         """Why tasks were held back when the queue was last filled."""
         self._news = False
         """Whether anything came in since the queue was filled."""
+        self._made = False
+        """Whether anything came in since store and index got their mark."""
         self._started = False
         self._alive = HeartbeatFile(parts.settings.heartbeat_file)
         self._workers = 0
@@ -143,6 +147,9 @@ class Keeper:
                 pause = min(_LONGEST_PAUSE_S, max(1.0, 2 * pause))
                 log.exception("a round broke off; the keeper goes on in %.2g s", pause)
                 stop.wait(pause)
+        if self._shards.leads and self._started:
+            with _noted([]):
+                self._marking.advance(news=self._made)
 
     def round(self, *, wait_s: float = 0.0) -> None:
         """Index what came in, then look after queue, leases and workers.
@@ -163,6 +170,9 @@ class Keeper:
             if self._shards.leads:
                 with _noted(away):
                     self._parts.queue.tidy()
+                with _noted(away):
+                    self._marking.advance(news=self._made)
+                    self._made = False
             with _noted(away):
                 self._indexer.flush()
                 self._counting.run(self._look_after_workers)
@@ -221,7 +231,7 @@ class Keeper:
                 raise IndexUnavailable("the keeper of the first shard makes the index from the store")
         elif not self._started:
             self._start()
-        elif self._parts.index.notes.completeness() is None:
+        elif self._parts.index.notes.completeness() is None or self._is_stale():
             self._make_whole()
 
     def _start(self) -> None:
@@ -229,11 +239,19 @@ class Keeper:
         complete_if_new(self._parts.index, self._parts.store)
         made = self._parts.index.notes.completeness()
         # What was left out may have been mended since.
-        if made is None or made.left_out:
+        if made is None or made.left_out or self._is_stale():
             self._make_whole()
         else:
             self._index_assets()
         self._started = True
+
+    def _is_stale(self) -> bool:
+        """Whether the index, or the store, was exchanged for an older copy."""
+        if self._marking.agrees():
+            return False
+        log.warning("index and store have different marks: one of them is an older copy")
+        self._parts.index.notes.set_incomplete()
+        return True
 
     def _make_whole(self) -> None:
         log.warning("the index may lack what the store has: it is made from the store")
@@ -257,7 +275,8 @@ class Keeper:
         done = [entry for place, entry in enumerate(self._backlog) if place not in waiting]
         self._backlog = [entry for place, entry in enumerate(self._backlog) if place in waiting]
         self._parts.queue.acknowledge([event_id for event_id, _ in done])
-        self._news |= any(event.kind is not EventKind.JOB for _, event in done)
+        self._news |= (made := any(event.kind is not EventKind.JOB for _, event in done))
+        self._made |= made
         if waiting:
             raise StoreUnavailable(f"the store does not answer, and {len(waiting)} events wait for it")
 

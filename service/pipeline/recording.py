@@ -38,6 +38,7 @@ def recording(parts: Parts, made: Sequence[str] = ()) -> Iterator[tuple[Connecti
     with parts.index.database.writing() as connection:
         try:
             yield connection, put
+            parts.index.notes.count_change(within=connection)
             connection.commit()
         except Exception:
             for key in keys:

@@ -8,12 +8,15 @@ import re
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
 from service.model.errors import DamagedShard, NotFoundError
-from service.store.store import Stamp, Store
+from service.store.store import STREAM_BYTES, Stamp, Store
 
 #: Lists of checksums that exports and cards write, looked for in the folder of a shard and in the two above it.
 CHECKSUM_LISTS: Final = ("SHA256SUMS", "checksums.sha256")
@@ -51,12 +54,23 @@ def gone(key: str) -> DamagedShard:
     return DamagedShard(f"{key} is gone from the store, and its manifest is there; {MEND}")
 
 
+@dataclass(frozen=True)
+class _Intact:
+    """What is known of an object that was read through."""
+
+    stamp: Stamp
+    until: float
+    size: int
+    blocks: tuple[bytes, ...]
+    """A digest of each `STREAM_BYTES` of it."""
+
+
 class Checked:
     """Remembers which objects were found intact while their size, tag and time of change stay. Safe between threads."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._known: OrderedDict[tuple[str, str], tuple[Stamp, float]] = OrderedDict()
+        self._known: OrderedDict[tuple[str, str], _Intact] = OrderedDict()
         self._lock = threading.Lock()
 
     def check(self, key: str, sha256: str) -> None:
@@ -66,22 +80,57 @@ class Checked:
             DamagedShard: it is gone, or has another checksum.
             StoreUnavailable: the store does not answer.
         """
+        self._intact(key, sha256)
+
+    def stream(self, key: str, sha256: str, start: int, length: int) -> Iterator[bytes]:
+        """Bytes of an object, each block read anew and held against what it was before any of it is given.
+
+        The time of change does not tell of bytes that rotted. The first block is looked at when this is called.
+
+        Raises:
+            DamagedShard: it is not what its checksum says; from the iterator as well, which then ends before its end.
+            StoreUnavailable: the store does not answer.
+        """
+        known = self._intact(key, sha256)
+        end = min(known.size, start + length)
+        chunks = self._blocks(key, sha256, known, start, end)
+        return chain([first], chunks) if (first := next(chunks, None)) is not None else chunks
+
+    def _blocks(self, key: str, sha256: str, known: _Intact, start: int, end: int) -> Iterator[bytes]:
+        for number in range(start // STREAM_BYTES, -(-end // STREAM_BYTES)):
+            at = number * STREAM_BYTES
+            block = self._store.get_range(key, at, min(STREAM_BYTES, known.size - at))
+            if _of_block(block) != known.blocks[number]:
+                with self._lock:
+                    self._known.pop((key, sha256), None)
+                raise DamagedShard(f"{key} is damaged: some of its bytes turned since it was read; {MEND}")
+            yield block[max(0, start - at) : end - at]
+
+    def _intact(self, key: str, sha256: str) -> _Intact:
         try:
             stamp = self._store.stamp(key)
             with self._lock:
-                known, until = self._known.get((key, sha256), (None, 0.0))
-            if known == stamp and time.monotonic() < until:
-                return
-            digest = hashlib.sha256()
+                known = self._known.get((key, sha256))
+            if known is not None and known.stamp == stamp and time.monotonic() < known.until:
+                return known
+            digest, blocks, size = hashlib.sha256(), list[bytes](), 0
             for chunk in self._store.stream(key):
                 digest.update(chunk)
+                blocks.append(_of_block(chunk))
+                size += len(chunk)
         except NotFoundError:
             raise gone(key) from None
         check_digest(key, digest.hexdigest(), sha256)
+        known = _Intact(stamp, time.monotonic() + _BELIEVED_S, size, tuple(blocks))
         with self._lock:
-            self._known[key, sha256] = (stamp, time.monotonic() + _BELIEVED_S)
+            self._known[key, sha256] = known
             if len(self._known) > _REMEMBERED:
                 self._known.popitem(last=False)
+        return known
+
+
+def _of_block(data: bytes) -> bytes:
+    return hashlib.blake2b(data, digest_size=16).digest()
 
 
 def check_file(path: Path) -> None:

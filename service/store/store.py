@@ -30,7 +30,8 @@ from service.store.parts import part_of
 
 _KEY: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]*(/[A-Za-z0-9][A-Za-z0-9._=-]*)*")
 _PROBE: Final = "health/probe"
-_STREAM_BYTES: Final = 1 << 20
+#: Of one piece of a stream.
+STREAM_BYTES: Final = 1 << 20
 #: A request that fails is tried again this often by the client; the task's own back-off takes over after that.
 _REMOTE: Final[dict[str, Any]] = {
     "client_options": {"timeout": timedelta(seconds=120), "connect_timeout": timedelta(seconds=5)},
@@ -115,7 +116,7 @@ class Store:
         """Chunks of an object from `start` on; never holds more than one chunk."""
         end = self.size(key) if length is None else start + length
         while start < end:
-            if not (chunk := self.get_range(key, start, min(_STREAM_BYTES, end - start))):
+            if not (chunk := self.get_range(key, start, min(STREAM_BYTES, end - start))):
                 return
             start += len(chunk)
             yield chunk
@@ -271,7 +272,7 @@ def _put_local(root: Path, key: str, data: IO[bytes]) -> bool:
     staged = path.with_name(f"{path.name}#{random.SystemRandom().randrange(10**12)}")
     try:
         with staged.open("wb") as file:
-            shutil.copyfileobj(data, file, _STREAM_BYTES)
+            shutil.copyfileobj(data, file, STREAM_BYTES)
             file.flush()
             os.fsync(file.fileno())
         os.link(staged, path)

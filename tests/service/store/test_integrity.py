@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from pathlib import Path
 
 import pytest
@@ -100,3 +101,34 @@ def test_a_file_that_cannot_be_read_is_refused_in_one_line(tmp_path: Path, store
         except Exception as error:
             assert type(error).__module__ == "service.model.errors", (at, error)
             assert "\n" not in str(error), at
+
+
+def turn_in_secret(tmp_path: Path, key: str, at: int) -> None:
+    """Another byte, and the time of change kept."""
+    path = tmp_path / "store" / key
+    facts = path.stat()
+    path.write_bytes(flipped(path.read_bytes(), at))
+    os.utime(path, ns=(facts.st_atime_ns, facts.st_mtime_ns))
+
+
+def test_bytes_that_turned_in_secret_are_not_given(tmp_path: Path, store: Store, shard: ShardManifest) -> None:
+    checked = Checked(store)
+    checked.check(shard.key, shard.sha256)
+    turn_in_secret(tmp_path, shard.key, 100)
+    with pytest.raises(DamagedShard, match=shard.shard_id):
+        checked.stream(shard.key, shard.sha256, 50, 10)
+    with pytest.raises(DamagedShard):
+        checked.check(shard.key, shard.sha256)
+
+
+def test_a_large_file_is_cut_off_before_what_turned(tmp_path: Path, store: Store) -> None:
+    data = bytes(range(256)) * 10_000
+    store.put("large.bin", data)
+    digest, checked = hashlib.sha256(data).hexdigest(), Checked(store)
+    assert b"".join(checked.stream("large.bin", digest, 0, len(data))) == data
+    assert b"".join(checked.stream("large.bin", digest, 1_000_000, 100_000)) == data[1_000_000:1_100_000]
+    turn_in_secret(tmp_path, "large.bin", 2_200_000)
+    got = list[bytes]()
+    with pytest.raises(DamagedShard):
+        got.extend(checked.stream("large.bin", digest, 0, len(data)))
+    assert b"".join(got) == data[: 2 << 20]

@@ -1,0 +1,146 @@
+"""An index or a store that was exchanged for an older copy is not believed."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from service.index import rebuild as rebuilding
+from service.index.index import Index
+from service.index.notes import Notes
+from service.index.rebuild import differences
+from service.pipeline import job_actions, keeper
+from service.pipeline.backends import Parts
+from service.pipeline.datasets import actions
+from service.settings import Settings
+from service.store.store import open_store
+from tests.fakes import add_assets, request
+from tests.memory_queue import MemoryQueue
+
+
+@pytest.fixture
+def rebuilt(monkeypatch: pytest.MonkeyPatch) -> list[object]:
+    """Stores from which an index was made."""
+    made = list[object]()
+
+    def noted(index: Index, store: object, **more: object) -> object:
+        made.append(store)
+        return rebuilding.rebuild(index, store, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(keeper, "rebuild", noted)
+    return made
+
+
+def in_service(folder: Path, act: Callable[[Parts], object] = lambda parts: None) -> list[str]:
+    """A keeper starts, a user does something, the keeper stops; how the index then differs from the store."""
+    settings = Settings(data_dir=folder)
+    store = open_store(settings.resolved_store_url)
+    parts = Parts(settings, store, Index(settings.resolved_index_url), MemoryQueue())
+    try:
+        working = keeper.Keeper(parts)
+        working.round()
+        add_assets(parts)
+        act(parts)
+        stop = threading.Event()
+        stop.set()
+        working.run(stop)
+        return [line for line in differences(parts.index, store) if not line.startswith("assets ")]
+    finally:
+        parts.close()
+
+
+def submit(seed: int) -> Callable[[Parts], object]:
+    return lambda parts: job_actions.submit(parts, request(seed=seed))
+
+
+def copy_index(folder: Path, target: Path) -> None:
+    """As a backup of the stopped service: the file with what belongs to it."""
+    target.mkdir(exist_ok=True)
+    for old in target.glob("index.sqlite*"):
+        old.unlink()
+    for file in folder.glob("index.sqlite*"):
+        shutil.copy2(file, target)
+
+
+def test_an_older_copy_of_the_index_is_made_anew(tmp_path: Path, rebuilt: list[object]) -> None:
+    data, backup = tmp_path / "data", tmp_path / "backup"
+    in_service(data, submit(1))
+    copy_index(data, backup)
+    in_service(data, submit(2))
+    in_service(data, lambda parts: actions.add_object_set(parts, "balls", ["ball"]))
+    copy_index(backup, data)
+    assert rebuilt == []
+    assert in_service(data) == []
+    assert len(rebuilt) == 1
+    assert in_service(data, submit(3)) == []
+    assert len(rebuilt) == 1
+
+
+def test_an_older_copy_of_the_store_is_believed_and_the_index_made_anew(tmp_path: Path, rebuilt: list[object]) -> None:
+    data, backup = tmp_path / "data", tmp_path / "backup"
+    in_service(data, submit(1))
+    shutil.copytree(data / "store", backup)
+    in_service(data, submit(2))
+    shutil.rmtree(data / "store")
+    shutil.copytree(backup, data / "store")
+    assert in_service(data) == []
+    assert len(rebuilt) == 1
+
+
+def test_an_index_that_is_lost_is_made_once(tmp_path: Path, rebuilt: list[object]) -> None:
+    data = tmp_path / "data"
+    in_service(data, submit(1))
+    for file in data.glob("index.sqlite*"):
+        file.unlink()
+    assert in_service(data) == []
+    assert in_service(data) == []
+    assert len(rebuilt) == 1
+
+
+def test_a_copy_that_is_as_new_as_the_store_is_kept(tmp_path: Path, rebuilt: list[object]) -> None:
+    data, backup = tmp_path / "data", tmp_path / "backup"
+    in_service(data, submit(1))
+    copy_index(data, backup)
+    in_service(data)
+    copy_index(backup, data)
+    assert in_service(data) == []
+    assert rebuilt == []
+
+
+def test_an_index_exchanged_while_the_keeper_runs_is_made_anew(tmp_path: Path, rebuilt: list[object]) -> None:
+    data, backup = tmp_path / "data", tmp_path / "backup"
+    in_service(data, submit(1))
+    copy_index(data, backup)
+    in_service(data, submit(2))
+    settings = Settings(data_dir=data)
+    store = open_store(settings.resolved_store_url)
+    parts = Parts(settings, store, Index(settings.resolved_index_url), MemoryQueue())
+    working = keeper.Keeper(parts)
+    working.round()
+    for file in data.glob("index.sqlite*"):
+        file.unlink()
+    copy_index(backup, data)
+    working.round()
+    assert len(parts.index.jobs.page().items) == 2
+    parts.close()
+
+
+def test_a_keeper_killed_between_index_and_store_leaves_nothing_to_mend(
+    tmp_path: Path, rebuilt: list[object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, real = tmp_path / "data", Notes.set_marked
+
+    def killed(notes: Notes, *args: object, **more: object) -> None:
+        real(notes, *args, **more)  # type: ignore[arg-type]
+        raise KeyboardInterrupt
+
+    in_service(data, submit(1))
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Notes, "set_marked", killed)
+        in_service(data, submit(2))
+    assert in_service(data) == []
+    assert rebuilt == []
