@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from datetime import UTC, date, datetime
-from typing import Annotated
+from datetime import UTC, datetime
 
-from fastapi import APIRouter, Depends, Query, Request
+from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse
 
 from api.dashboard.rendering import render
 from api.routes.dependencies import UsageOf, may_read
+from api.routes.usage import Since, Until
 
 router = APIRouter(include_in_schema=False)
 _SUMMED = ("grasps", "valid", "tasks", "gpu_seconds", "cpu_seconds")
@@ -20,8 +20,8 @@ _SUMMED = ("grasps", "valid", "tasks", "gpu_seconds", "cpu_seconds")
 def usage_page(
     request: Request,
     usage: UsageOf,
-    since: Annotated[date | None, Query()] = None,
-    until: Annotated[date | None, Query()] = None,
+    since: Since = None,
+    until: Until = None,
 ) -> HTMLResponse:
     """Use of each project: in sum, against its quotas, and day by day."""
     days = usage.days(since, until)

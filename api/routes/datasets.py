@@ -6,6 +6,8 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
+from starlette.routing import Route
+from starlette.types import Receive, Scope, Send
 
 from api.problems import ApiError, responses
 from api.routes.dependencies import Cursor, DatasetsOf, Limit, may_read, may_submit
@@ -56,10 +58,15 @@ def estimate_dataset(body: Matrix, datasets: DatasetsOf) -> Estimate:
     return datasets.estimate(body)
 
 
-@router.api_route("/estimate", methods=["GET", "HEAD", "PUT", "PATCH", "DELETE"], include_in_schema=False)
-def no_dataset() -> None:
-    """`estimate` is the name of no dataset, so only POST has a meaning here."""
-    raise ApiError(405, "an estimate is asked for with POST", headers={"Allow": "POST"})
+class _NoDataset:
+    """`estimate` is the name of no dataset, so only POST has a meaning there."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        raise ApiError(405, "an estimate is asked for with POST", headers={"Allow": "POST"})
+
+
+# A class takes every method; a function would have to name those that there are.
+router.routes.append(Route("/v1/datasets/estimate", _NoDataset(), include_in_schema=False))
 
 
 @router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 422, 503))

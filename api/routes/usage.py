@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from datetime import date
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Response
+from pydantic import BeforeValidator
 
 from api.catalog.usage import as_csv
 from api.problems import responses
@@ -14,8 +16,17 @@ from service.index.views import UsageDay
 
 router = APIRouter(tags=["usage"])
 
-Since = Annotated[date | None, Query(description="first day (UTC); default: a month before the last")]
-Until = Annotated[date | None, Query(description="last day (UTC); default: today")]
+
+def _day(said: object) -> object:
+    """A number would be read as seconds since 1970, and of a time its day would be taken."""
+    if isinstance(said, str) and not re.fullmatch(r"[0-9]{4}-[0-9]{2}-[0-9]{2}", said):
+        raise ValueError("a day is written as 2026-01-31")
+    return said
+
+
+Day = Annotated[date, BeforeValidator(_day)]
+Since = Annotated[Day | None, Query(description="first day (UTC); default: a month before the last")]
+Until = Annotated[Day | None, Query(description="last day (UTC); default: today")]
 
 
 @router.get("/v1/usage", dependencies=[Depends(may_read)], responses=responses(400, 401, 403, 422, 503))

@@ -12,7 +12,8 @@ import ipaddress
 import socket
 import ssl
 import threading
-from collections.abc import Iterable, Mapping
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 from urllib.parse import urlsplit
@@ -32,6 +33,12 @@ _NAT64: Final = ipaddress.ip_network("64:ff9b::/96")
 _LOCAL_NAT64: Final = ipaddress.ip_network("64:ff9b:1::/48")
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 Networks = tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]
+#: Addresses that the library takes for global and that only machines inside reach: of clouds (Azure's host, IBM's
+#: services), of protocols (RFC 6890, RFC 7526), of documentation (RFC 9637).
+_INSIDE: Final = tuple(
+    ipaddress.ip_network(one)
+    for one in ("168.63.129.16/32", "161.26.0.0/16", "166.8.0.0/14", "192.0.0.0/24", "192.88.99.0/24", "3fff::/20")
+)
 
 
 class Refused(InputError):
@@ -64,6 +71,8 @@ def networks(text: str) -> Networks:
 def is_public(address: Address) -> bool:
     """Whether an address is one of the internet: not loopback, private, link-local, shared, multicast or reserved, nor
     an IPv6 address that stands for such an IPv4 one."""
+    if any(address in network for network in _INSIDE):
+        return False
     if isinstance(address, ipaddress.IPv6Address):
         inner = address.ipv4_mapped or address.sixtofour or (address.teredo[1] if address.teredo else None)
         if address in _NAT64:
@@ -122,13 +131,13 @@ def post(
     path = parts.path or "/"
     try:
         addresses = reachable(host, port, allowed)
-        connection = _connection(parts.scheme, host, port, addresses, patience_s)
+        connection = _Connection(parts.scheme, host, port, addresses, patience_s)
     except Refused as error:
         return Answer(None, str(error), is_final=True)
     except (OSError, ValueError):
         return Answer(None, "the host of the address cannot be looked up")
     # The time-out of a socket begins anew with each byte; this ends the whole.
-    end = threading.Timer(patience_s, _cut, [connection])
+    end = threading.Timer(patience_s, connection.cut)
     end.daemon = True
     end.start()
     try:
@@ -144,31 +153,37 @@ def post(
         connection.close()
 
 
-def _cut(connection: http.client.HTTPConnection) -> None:
-    with contextlib.suppress(OSError):
-        if connection.sock is not None:
-            connection.sock.shutdown(socket.SHUT_RDWR)
+class _Connection(http.client.HTTPConnection):
+    """A connection to one of the addresses that were looked at, where the library would look the name up again.
 
+    Args:
+        patience_s: for all addresses together, and the handshake [s].
+    """
 
-def _connection(
-    scheme: str, host: str, port: int, addresses: Iterable[str], patience_s: float
-) -> http.client.HTTPConnection:
-    if scheme == "https":
-        made: http.client.HTTPConnection = http.client.HTTPSConnection(
-            host, port, timeout=patience_s, context=ssl.create_default_context()
-        )
-    else:
-        made = http.client.HTTPConnection(host, port, timeout=patience_s)
-    # Where the library would resolve the name again, the addresses that were looked at.
-    made._create_connection = lambda *_, **__: _dial(addresses, port, patience_s)  # type: ignore[attr-defined]
-    return made
+    def __init__(self, scheme: str, host: str, port: int, addresses: Sequence[str], patience_s: float) -> None:
+        super().__init__(host, port)
+        self.default_port = 443 if scheme == "https" else 80
+        self._context = ssl.create_default_context() if scheme == "https" else None
+        self._addresses = addresses
+        self._end = time.monotonic() + patience_s
 
+    def connect(self) -> None:
+        dialled = self._dial()
+        self.sock = self._context.wrap_socket(dialled, server_hostname=self.host) if self._context else dialled
 
-def _dial(addresses: Iterable[str], port: int, patience_s: float) -> socket.socket:
-    last: OSError = OSError("no address")
-    for address in addresses:
-        try:
-            return socket.create_connection((address, port), timeout=patience_s)
-        except OSError as error:
-            last = error
-    raise last
+    def cut(self) -> None:
+        """End it from another thread, whatever it waits for."""
+        with contextlib.suppress(OSError):
+            if self.sock is not None:
+                self.sock.shutdown(socket.SHUT_RDWR)
+
+    def _dial(self) -> socket.socket:
+        last: OSError = OSError("no address")
+        for address in self._addresses:
+            if (left_s := self._end - time.monotonic()) <= 0:
+                break
+            try:
+                return socket.create_connection((address, self.port), timeout=left_s)
+            except OSError as error:
+                last = error
+        raise last

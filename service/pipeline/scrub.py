@@ -49,7 +49,7 @@ _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
 FOLDERS: Final = (
     names.SHARDS, names.ASSETS, names.JOBS, names.TASKS, names.DATASETS, names.OBJECT_SETS, names.PACKS,
     names.DELETIONS, names.RELEASED, names.WEBHOOKS, names.TAGS, CHARTS, IN_SCENES, STABILITY,
-    names.MARKS,
+    names.MARKS, names.SERVICE, names.REMOVED,
 )  # fmt: skip
 _SEALED: Final = (".json", ".zip", ".npz", ".glb")
 _UPLOAD: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(files\.zip|check\.json)")

@@ -89,6 +89,21 @@ def test_a_key_opens_a_session_and_its_end_ends_it(closed: tuple[TestClient, dic
     assert client.get("/v1/jobs").status_code == 401
 
 
+def test_a_session_ends_where_its_visitor_signs_out(closed: tuple[TestClient, dict[Scope, str]]) -> None:
+    client, tokens = closed
+    assert "Sign out" not in client.get("/login").text
+    client.post("/login", data={"key": tokens[Scope.READ]})
+    page = client.get("/login").text
+    assert "Sign out" in page and "read" in page
+    answer = client.post("/logout", follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"]) == (303, "/login")
+    assert client.get("/v1/jobs").status_code == 401
+
+
+def test_another_web_site_signs_nobody_out(closed: tuple[TestClient, dict[Scope, str]]) -> None:
+    assert closed[0].post("/logout", headers={"Origin": "https://evil.example"}).status_code == 403
+
+
 def test_a_forged_session_is_refused(closed: tuple[TestClient, dict[Scope, str]], keys: KeyFile) -> None:
     client, _ = closed
     claim, _, _ = keys.open_session(keys.list()[2]).partition(".")

@@ -58,6 +58,8 @@ def ear() -> Iterator[tuple[str, list[Any]]]:
         ("127.0.0.1", False), ("127.9.9.9", False), ("0.0.0.0", False), ("10.0.0.1", False), ("172.16.3.4", False),
         ("192.168.1.1", False), ("169.254.169.254", False), ("100.64.0.1", False), ("224.0.0.1", False),
         ("255.255.255.255", False), ("192.0.2.1", False), ("240.0.0.1", False),
+        ("192.0.0.10", False), ("192.88.99.1", False), ("161.26.0.10", False), ("166.9.0.1", False),
+        ("64:ff9b::a83f:8110", False), ("2002:a83f:8110::", False), ("3fff::1", False),
         ("::1", False), ("::", False), ("fe80::1", False), ("fd00::1", False), ("fec0::1", False), ("ff02::1", False),
         ("::ffff:127.0.0.1", False), ("::ffff:169.254.169.254", False), ("2002:7f00:1::", False),
         ("64:ff9b::a9fe:a9fe", False), ("64:ff9b:1::808:808", False),
@@ -158,3 +160,18 @@ def test_a_look_up_that_does_not_end_is_given_up(monkeypatch: pytest.MonkeyPatch
         assert post("http://slow.example/", b"{}", {}).status is None
     finally:
         let_go.set()
+
+
+def test_all_addresses_of_a_name_together_get_the_time_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [(socket.AF_INET, 1, 6, "", (f"93.184.216.{number}", 80)) for number in range(50)]
+    clock = [100.0]
+
+    def silent(_: Any, timeout: float) -> Any:
+        clock[0] += min(timeout, 4.0)
+        raise TimeoutError
+
+    monkeypatch.setattr(posting.socket, "getaddrinfo", lambda *_, **__: found)
+    monkeypatch.setattr(posting.socket, "create_connection", silent)
+    monkeypatch.setattr(posting.time, "monotonic", lambda: clock[0])
+    assert post("http://many.example/", b"{}", {}, patience_s=10).status is None
+    assert clock[0] == 110.0
