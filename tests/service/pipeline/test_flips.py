@@ -23,10 +23,11 @@ from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
+from service.pipeline.identity import ServiceRecord
 from service.pipeline.repair import repair
 from service.pipeline.scrub import FOLDERS, examine, scan
 from service.store.assets import pack as pack_files
-from service.store.deletions import Deletion, Released
+from service.store.deletions import Deletion, Released, removed_folder
 from service.store.library import builtin_assets, load_check, publish_builtins, store_files
 from service.store.manifests import load_manifest
 from service.store.packs import DeadShards, pack_at
@@ -66,6 +67,13 @@ def full(parts: Parts) -> Parts:
     actions.add_object_set(parts, "balls", ["ball"])
     put_record(store, f"{names.DELETIONS}/job/{'e' * 32}.json", Deletion(what="job", id="e" * 32, at=timestamp()))
     put_record(store, f"{names.RELEASED}/1-{job.id}.json", Released(at=timestamp(), job=record))
+    gone = Deletion(what="job", id="b" * 32, at=timestamp())
+    put_record(store, f"{removed_folder(gone)}/deletion.json", gone)
+    put_record(store, f"{removed_folder(gone)}/{names.job_record(gone.id)}", record)
+    put_record(store, names.service(1), ServiceRecord(id="c" * 32, at=timestamp()))
+    put_document(store, names.mark("d" * 32), {"at": timestamp()})
+    hand = parts.index.assets.get(AssetKind.HAND, "gripper").digest
+    put_document(store, names.hand_expanded(hand), {"urdf": "<robot name='claw'/>"})
     hook = Webhook(id="f" * 32, url="https://example.org/", states=("succeeded",), created=timestamp())
     put_record(store, names.webhook(hook.id), hook)
     tag = Tag(id="a" * 32, name="good", number=1, created=timestamp(), changed=timestamp())

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 
 import pytest
-from sqlalchemy import Connection
+from sqlalchemy import Connection, make_url
 from sqlalchemy.exc import OperationalError
 
 from service.index import database
@@ -71,7 +71,7 @@ def locked(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> Iterator[Parts]:
     index = Index(parts.settings.resolved_index_url)
     with (
         closing(index),
-        closing(sqlite3.connect(parts.settings.resolved_index_url.removeprefix("sqlite:///"))) as other,
+        closing(sqlite3.connect(str(make_url(parts.settings.resolved_index_url).database))) as other,
     ):
         other.execute("BEGIN IMMEDIATE")
         yield Parts(parts.settings, parts.store, index, parts.queue)
