@@ -18,7 +18,7 @@ began=$(date +%s.%N)
 # Clock time and processor time of each step: on a busy machine the second tells more.
 step() { # name command ...
     local name=$1 took; shift
-    took=$({ time "$@" > "$work/said" 2>&1; } 2>&1) || { cat "$work/said" >&2; exit 1; }
+    took=$({ time "$@" > "$work/said" 2>&1; } 2>&1) || [ $? = 3 ] || { cat "$work/said" >&2; exit 1; }
     read -r real user system <<< "$took"
     printf '%-30s %7.1f s  %7.1f s of CPU   %s\n' "$name" "$real" "$(echo "$user + $system" | bc)" \
         "$(grep -m1 "${pattern:-.}" "$work/said" || true)"

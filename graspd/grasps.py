@@ -123,7 +123,7 @@ class Grasps:
 
     @property
     def outcomes(self) -> dict[str, int]:
-        """Tries that were not kept, by what became of them (docs/grasps.md)."""
+        """Tries that were not kept, by what became of them (docs/quality.md)."""
         return {name: int(count) for name, count in json.loads(str(self._attributes.get("outcomes", "{}"))).items()}
 
     # Postures.

@@ -485,8 +485,8 @@ def _why(columns: Arrays, count: int) -> NDArray[np.object_]:
     """(N,) what the referee saw of each grasp that it drops."""
     found = np.full(count, "not_lifted", object)
     if "quality/lift_outcome" in columns:
-        for code, name in _LIFTED.items():
-            found[np.asarray(columns["quality/lift_outcome"]) == code] = name
+        for lift, name in _LIFTED.items():
+            found[np.asarray(columns["quality/lift_outcome"]) == lift] = name
     elif "quality/verdict_outcome" in columns:
         pushes = np.asarray(columns["quality/verdict_outcome"])
         bad = (pushes != Outcome.HELD) & (pushes != Outcome.NOT_TRIED)

@@ -204,7 +204,8 @@ def test_fewer_grasps_than_asked_are_told_with_the_reason_and_exit_code_3(
     shard = read_shard(out, kind="base")
     assert shard.attributes["reason"] == said["reason"]
     assert json.loads(str(shard.attributes["outcomes"])) == said["outcomes"]
-    assert (graspd.load(out).reason, graspd.load(out).outcomes) == (said["reason"], said["outcomes"])
+    again = graspd.open(out)
+    assert (again.reason, again.outcomes) == (said["reason"], said["outcomes"])
 
 
 def test_all_that_were_asked_need_no_reason(judged: tuple[Path, dict[str, Any]]) -> None:
