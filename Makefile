@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 # Tests wait for processes a fifth of their time: three at once keep two cores busy.
 JOBS ?= 3
 
-.PHONY: clusters results docs-commands dist gpu-check help install demo test test-slow test-containers check format browser screenshots docs pins audit clean
+.PHONY: clusters results docs-commands dist gpu-check help install demo test test-slow test-containers check format browser screenshots docs pins licences audit clean
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-15s %s\n", $$1, $$2}'
 
@@ -74,6 +74,10 @@ clusters: ## files for clusters read by SkyPilot, Ray and spython, in an environ
 pins: $(STAMP) ## versions that the images install: those of .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,postgres,otel,gpu]'
 	$(BIN)/python docker/pin.py > docker/constraints.txt.new && mv docker/constraints.txt.new docker/constraints.txt
+
+licences: $(STAMP) ## licences of what graspd runs with, into docs/licences.md
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,arm]'
+	$(BIN)/python docker/licences.py
 
 audit: $(STAMP) ## known vulnerabilities of what .venv and the images install (asks PyPI)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,audit]'

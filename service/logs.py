@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import logging
 import os
@@ -84,10 +85,25 @@ class _TextLines(logging.Formatter):
     """Time, level, module, message, and in brackets what it is about."""
 
     def format(self, record: logging.LogRecord) -> str:
+        record = _plain(record)
         about = " ".join(f"{name}={value}" for name, value in _subjects(record).items())
         trace = f"\n{self.formatException(record.exc_info)}" if record.exc_info else ""
         text = f"{_time(record)[11:23]} {record.levelname} {record.name} {record.getMessage()}"
         return without_secrets(f"{text} [{about}]{trace}" if about else f"{text}{trace}")
+
+
+#: What ends a line, or what a terminal obeys.
+_OBEYED: Final = {
+    code: repr(chr(code))[1:-1]
+    for code in (*range(0x20), *range(0x7F, 0xA0), 0x2028, 0x2029, *range(0x202A, 0x202F), *range(0x2066, 0x206A))
+}
+
+
+def _plain(record: logging.LogRecord) -> logging.LogRecord:
+    """The same record with a message of one line: a path or a name of a stranger writes no line of its own."""
+    made = copy.copy(record)
+    made.msg, made.args = record.getMessage().translate(_OBEYED), ()
+    return made
 
 
 def _subjects(record: logging.LogRecord) -> dict[str, Any]:

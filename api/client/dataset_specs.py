@@ -101,7 +101,7 @@ def read_spec(file: Path) -> dict[str, Any]:
         raise InputError(f"{file} cannot be read: {getattr(error, 'strerror', None) or error}") from None
     try:
         found = json.loads(text) if file.suffix == ".json" else tomllib.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{file} is no {'JSON' if file.suffix == '.json' else 'TOML'}: {error}") from None
     if not isinstance(found, dict):
         raise InputError(f"{file} must hold the keys of a dataset: hands, objects, grasps, ...")

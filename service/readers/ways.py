@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic_core import from_json
 
 from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
@@ -90,6 +90,6 @@ def scene_spec_of(shard: Shard) -> SceneSpec | None:
     if said is None:
         return None
     try:
-        return SceneSpec(**json.loads(str(said)))
+        return SceneSpec(**from_json(str(said)))
     except (ValueError, TypeError):
         raise InputError("the shard's attribute scene says no scene") from None

@@ -72,6 +72,13 @@ def test_an_error_brings_its_trace_in_the_same_line(written: Callable[[], str]) 
     assert line["trace"].endswith("ValueError: no")
 
 
+def test_on_a_terminal_a_message_writes_no_line_of_its_own(written: Callable[[], str]) -> None:
+    logs.set_up(Settings(log_format="text"))
+    log.info("GET %s", "/a\r\n12:00:00 ERROR forged\x1b[2J\x9b0m\u2028\u202e")
+    (line,) = written().splitlines()
+    assert line.endswith(r"GET /a\r\n12:00:00 ERROR forged\x1b[2J\x9b0m\u2028\u202e")
+
+
 def test_on_a_terminal_a_line_is_text(written: Callable[[], str]) -> None:
     logs.set_up(Settings(log_format="text"))
     with logs.bind(job="j1"):

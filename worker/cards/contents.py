@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from pydantic_core import from_json
 
 from service.model.dataset_records import DatasetRecord, Snapshot, job_of
 from service.model.errors import InputError, NotFoundError
@@ -112,7 +113,7 @@ def with_provenance(contents: Contents, file: Path) -> Contents:
         InputError: no such JSON, or it names what the dataset does not hold.
     """
     try:
-        said = json.loads(file.read_text())
+        said = from_json(file.read_bytes())
         groups = {kind: {str(k): dict(v) for k, v in said.get(kind, {}).items()} for kind in ("hands", "objects")}
     except OSError as error:
         raise InputError(f"{file} cannot be read: {error.strerror}") from None

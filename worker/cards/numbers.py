@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic_core import from_json
 
 from service.model.clock import timestamp
 from service.model.diversity import CELLS, GraspType, entropy_bits, evenness
@@ -142,7 +142,7 @@ def _said(tally: Tally, name: str) -> list[Any]:
 
 def _knobs(text: str) -> Any:
     try:
-        return json.loads(text)
+        return from_json(text)
     except ValueError:
         return {"name": text}
 

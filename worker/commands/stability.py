@@ -83,7 +83,7 @@ def _read(path: Path) -> Stability:
         return from_json(loads(path.read_text()))
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
-    except ValueError:
+    except (ValueError, RecursionError):
         raise InputError(f"{path} is no stability.json; `graspd stability --out FOLDER` writes one") from None
 
 

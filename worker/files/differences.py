@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
+from pydantic_core import from_json
 
 from service.readers import Shards
 from service.store import standing
@@ -55,7 +55,7 @@ class _Side:
 def _short(name: str, value: object) -> str:
     if name == "fidelity":
         try:
-            return str(json.loads(str(value))["name"])
+            return str(from_json(str(value))["name"])
         except (ValueError, KeyError, TypeError):
             return str(value)
     return str(value)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import zip_longest
@@ -58,8 +57,9 @@ def hand_files_of_shard(shard: Shard, given: str | None) -> Found:
 
 def object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
     """The object named by `given`, simplified as in the shard; see `hand_of_shard`."""
-    knobs = json.loads(str(shard.attributes.get("fidelity") or "{}"))
-    error = float(knobs["face_error_m"]) if isinstance(knobs, dict) and "face_error_m" in knobs else 3e-4
+    knobs = options_of(shard.attributes.get("fidelity"))
+    stated = knobs.get("face_error_m")
+    error = float(stated) if isinstance(stated, int | float) else 3e-4
     wanted = _wanted(shard, AssetKind.OBJECT)
     if not given:
         return _loaded(wanted, find(wanted), error)

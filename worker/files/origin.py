@@ -5,12 +5,13 @@ They are known by their digests, so a file that was changed or is another one is
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import unquote, urlsplit
+
+from pydantic_core import from_json
 
 from service.model.digests import digest_files, digest_variant
 from service.model.errors import GraspdError, NotFoundError
@@ -138,7 +139,7 @@ def at(sought: Sought, path: Path) -> Found | None:
 def options_of(attribute: object) -> dict[str, Any]:
     """Options from a shard's attribute; none where it has none."""
     try:
-        said = json.loads(str(attribute or "{}"))
+        said = from_json(str(attribute or "{}"))
     except ValueError:
         return {}
     return said if isinstance(said, dict) else {}

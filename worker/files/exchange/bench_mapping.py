@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic_core import from_json
 
 from service.model.errors import InputError
 from service.model.transforms import IDENTITY_POSE, compose, invert
@@ -86,7 +87,7 @@ def _read(path: Path) -> HandMapping | None:
     if not path.is_file():
         return None
     try:
-        said: dict[str, Any] = json.loads(path.read_bytes())
+        said: dict[str, Any] = from_json(path.read_bytes())
         pose = tuple(float(value) for value in said["root_in_model"])
         joints, links = (tuple((str(a), str(b)) for a, b in said[key]) for key in ("joints", "links"))
         hand, root, config, model = (str(said[key]) for key in ("hand", "root_link", "config", "model"))

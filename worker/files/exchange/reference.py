@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic_core import from_json
 
 from service.model.errors import InputError
 from service.model.transforms import pose_from_matrix
@@ -47,7 +47,7 @@ def friction(path: Path) -> float | None:
 
 def _stored(path: Path) -> dict[str, Any]:
     try:
-        found = json.loads(path.read_text())
+        found = from_json(path.read_bytes())
     except (OSError, ValueError) as error:
         raise InputError(f"{path} is no JSON file: {error}") from None
     if not isinstance(found, dict):

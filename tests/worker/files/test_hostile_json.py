@@ -1,0 +1,49 @@
+"""JSON and TOML that is nested a hundred thousand deep, wherever a stranger's file or shard may hold some."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from api.client.dataset_specs import read_spec
+from service.model.errors import InputError
+from service.readers.ways import scene_spec_of
+from service.store.shards import Shard
+from worker.cards.contents import Contents, with_provenance
+from worker.commands.stability import _read as read_stability
+from worker.files.differences import _short
+from worker.files.exchange.bench_mapping import _read as read_mapping
+from worker.files.exchange.reference import friction
+from worker.files.origin import options_of
+
+DEEP = "[" * 100_000 + "]" * 100_000
+
+
+@pytest.mark.parametrize(
+    ("name", "reader"),
+    [
+        ("spec.json", read_spec),
+        ("spec.toml", read_spec),
+        ("reference.json", friction),
+        ("hand_mapping.json", read_mapping),
+        ("stability.json", read_stability),
+        ("provenance.json", lambda path: with_provenance(Contents.__new__(Contents), path)),
+    ],
+)
+def test_a_file_that_is_nested_deep_is_refused_in_one_line(
+    name: str, reader: Callable[[Path], object], tmp_path: Path
+) -> None:
+    file = tmp_path / name
+    file.write_text(f"hands = {DEEP}" if name.endswith("toml") else f'{{"hands": {DEEP}}}')
+    with pytest.raises(InputError, match=name) as refused:
+        reader(file)
+    assert "\n" not in str(refused.value)
+
+
+def test_an_attribute_that_is_nested_deep_says_nothing() -> None:
+    assert options_of(DEEP) == {} and _short("fidelity", DEEP) == DEEP
+    shard = Shard("base", {"scene": DEEP}, {})
+    with pytest.raises(InputError, match="says no scene"):
+        scene_spec_of(shard)
