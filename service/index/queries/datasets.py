@@ -239,7 +239,7 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
         job = row["job_id"]
         count = work[job]
         total = max(count["tasks"], _tasks_of_cell(options))
-        yields = made.get(job, {"grasps": 0, "valid": 0, "tried": 0, "seconds": 0.0})
+        yields = made.get(job, {"seconds": 0.0})
         views.append(
             CellView(
                 **{
@@ -249,7 +249,6 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
                 fidelity=row["fidelity"] or options.knobs.name,
                 asked=options.grasps,
                 **yields,
-                valid_yield=yields["valid"] / yields["tried"] if yields["tried"] else None,
                 tasks=total,
                 tasks_done=count[State.SUCCEEDED],
                 tasks_failed=count[State.FAILED],
@@ -275,7 +274,7 @@ def _work_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[s
 
 
 def _made_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, Any]]:
-    wanted = [column for column in _MADE if column.name in ("grasps", "valid", "tried", "seconds")]
+    wanted = [column for column in _MADE if column.name in ("grasps", "valid", "tried", "judged", "seconds")]
     query = (
         select(tasks.c.job_id, *wanted)
         .join(shards, shards.c.id == tasks.c.shard_id)
@@ -300,4 +299,5 @@ _MADE: Final = (
     _base(shards.c.count).label("grasps"),
     _base(shards.c.valid).label("valid"),
     _base(shards.c.tried).label("tried"),
+    _base(shards.c.judged).label("judged"),
 )
