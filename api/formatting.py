@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from datetime import datetime
-from typing import Final
+from typing import Any, Final
 
 NONE: Final = "–"
 
@@ -33,6 +33,13 @@ def percent(value: float | None) -> str:
     if value is None:
         return NONE
     return f"{int(100 * value + 1e-9)} %" if value > 0.1 else f"{100 * value:.1f} %".replace(".0 %", " %")
+
+
+def valid_yield(made: Any) -> str:
+    """Share of the judged grasps that are valid, of whatever counts them; words where nobody judged."""
+    if made.valid_yield is None:
+        return "not judged" if made.tried else NONE
+    return percent(made.valid_yield)
 
 
 def duration(seconds: float | None) -> str:
@@ -81,6 +88,7 @@ FILTERS: Final[Mapping[str, Callable[..., str]]] = {
     "metric": metric,
     "count": count,
     "percent": percent,
+    "valid_yield": valid_yield,
     "place": place,
     "duration": duration,
     "bytes": size,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from service.index.views import AttemptView, GraspView, ShardView, StageProgress, TagView, WorkerView
+from service.index.views import AttemptView, GraspView, Judged, ShardView, StageProgress, TagView, WorkerView
 from service.model.diversity import CELLS
 from service.model.domain import Digest, JobRequest
 from service.model.labels import Name
@@ -28,7 +28,7 @@ class StageStatus(StageProgress):
     eta_s: float | None = Field(None, description="expected time until the stage ends [s]")
 
 
-class Job(BaseModel):
+class Job(Judged):
     """A job as the list shows it."""
 
     id: str
@@ -38,9 +38,6 @@ class Job(BaseModel):
     method: str
     fidelity: str
     requested: int = Field(description="grasps asked for")
-    grasps: int = Field(description="grasps kept so far")
-    valid: int = Field(description="of these, past the geometric gate and judged to hold; 0 where nobody judges")
-    tried: int = Field(0, description="grasps planned for them, kept or not")
     standing: Literal["valid", "sound", "kept"] = Field(
         "valid", description="what its kept grasps can be: sound where nobody judges, or merely kept if raw were wanted"
     )

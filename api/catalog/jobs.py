@@ -180,6 +180,7 @@ class Jobs:
             grasps=job.grasps,
             valid=job.valid,
             tried=job.tried,
+            judged=job.judged,
             standing=job.request.standing,
             progress=progress_of_job(job),
             eta_s=eta_of_job(job, stages),

@@ -151,10 +151,13 @@ def jobs(
     if json:
         emit({"jobs": [job.model_dump(mode="json") for job in page.items], "next": page.next})
         return
-    table = Table("job", "state", "hand", "object", "progress", "valid", "created", box=None, header_style="bold")
+    table = Table("job", "state", "hand", "object", "progress", "grasps", box=None, header_style="bold")
+    table.add_column("created", no_wrap=True)
     for job in page.items:
-        done = f"{count(job.valid)} of {count(job.requested)}"
-        table.add_row(job.id[:12], job.state, job.hand, job.object, percent(job.progress), done, job.created)
+        made = job.valid if job.standing == "valid" else job.grasps
+        done = f"{count(made)} of {count(job.requested)} {job.standing}"
+        created = job.created[:16].replace("T", " ")
+        table.add_row(job.id[:12], job.state, job.hand, job.object, percent(job.progress), done, created)
     Console().print(table if page.items else "no job yet; `graspd submit --hand allegro --object mug` makes one")
 
 

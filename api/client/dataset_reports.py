@@ -10,8 +10,9 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from api.client.datasets import DatasetClient
-from api.formatting import count, duration, metric, percent, size
+from api.formatting import count, duration, metric, percent, size, valid_yield
 from service.index.dataset_views import CellView, DatasetView
+from service.index.views import Judged
 from service.model.domain import JobOptions
 from service.model.states import State
 from service.pipeline.datasets.estimate import Estimate
@@ -67,7 +68,7 @@ def print_dataset(dataset: DatasetView, console: Console) -> None:
         f"{dataset.name}  {dataset.state.value}  {percent(dataset.progress)}{left}", markup=False, highlight=False
     )
     console.print(f"cells: {states}", markup=False, highlight=False)
-    tried = f" of {count(dataset.tried)} tried" if dataset.tried else ""
+    tried = f" of {count(dataset.tried)} tried ({_yield(dataset)})" if dataset.tried else ""
     console.print(
         f"grasps: {count(dataset.counted)} {dataset.options.standing}{tried}, {count(dataset.asked)} asked for; "
         f"{count(dataset.shards)} shards, {size(dataset.size_bytes)}; worker time {duration(dataset.seconds)}",
@@ -118,6 +119,11 @@ def watch_dataset(client: DatasetClient, name: str, console: Console) -> Dataset
     return dataset
 
 
+def _yield(made: Judged) -> str:
+    """`at 94 % of the judged`, in short."""
+    return f"at {valid_yield(made)}" if made.judged else "not judged"
+
+
 def _styled(cell: CellView, options: JobOptions) -> str:
     return f"[{_STYLES[cell.state]}]{_words(cell, options)}[/]"
 
@@ -128,7 +134,7 @@ def _words(cell: CellView, options: JobOptions) -> str:
         words.append(percent(cell.progress))
     if cell.tried:
         made = cell.counted(options)
-        words.append(f"{count(made)}/{count(cell.asked)} at {percent(made / cell.tried)}")
+        words.append(f"{count(made)}/{count(cell.asked)} {_yield(cell)}")
     if cell.tasks_failed:
         words.append(f"{cell.tasks_failed} failed")
     return " ".join(words)

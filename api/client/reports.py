@@ -111,6 +111,8 @@ def job_summary(job: JobDetail) -> dict[str, Any]:
         "grasps": job.grasps,
         "valid": job.valid,
         "tried": job.tried,
+        "judged": job.judged,
+        "valid_yield": job.valid_yield,
         "audited": job.audited,
         "audit_held": job.audit_held,
         "note": job.note,

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pydantic import Field, computed_field
 
-from service.index.views import View
+from service.index.views import Judged, View
 from service.model.domain import JobOptions
 from service.model.outcomes import shortfall
 from service.model.records import Choice
 from service.model.states import State
 
 
-class DatasetView(View):
+class DatasetView(Judged):
     """A dataset in numbers. `grasps`, `valid` and `tried` count what base shards hold so far."""
 
     name: str
@@ -23,9 +23,6 @@ class DatasetView(View):
     cells: int
     states: dict[State, int] = Field(description="cells by state; a cell whose job is not planned yet is queued")
     asked: int = Field(description="grasps asked for, over all cells")
-    grasps: int
-    valid: int
-    tried: int = Field(description="grasps that were computed to get these")
     tasks: int
     tasks_done: int
     tasks_failed: int
@@ -56,7 +53,7 @@ class DatasetView(View):
         return self.valid if self.options.standing == "valid" else self.grasps
 
 
-class CellView(View):
+class CellView(Judged):
     """One hand x object of a dataset: an ordinary job, or one that is still to be planned."""
 
     position: int = Field(description="hand by hand, and in each hand object by object, from 0")
@@ -68,10 +65,6 @@ class CellView(View):
     planned: bool = Field(description="whether the job exists yet")
     state: State
     asked: int = Field(description="grasps asked for")
-    grasps: int
-    valid: int
-    tried: int
-    valid_yield: float | None = Field(description="valid grasps per grasp tried; None while none was tried")
     tasks: int
     tasks_done: int
     tasks_failed: int

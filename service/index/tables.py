@@ -126,6 +126,7 @@ shards: Final = Table(
     Column("tried", Integer, nullable=False, server_default="0"),
     Column("audited", Integer, nullable=False, server_default="0"),
     Column("audit_held", Integer, nullable=False, server_default="0"),
+    Column("judged", Integer, nullable=False, server_default="0"),
     Column("hand", String(64), nullable=False),
     Column("object", String(64), nullable=False),
     Column("hand_digest", String(32), nullable=False),
@@ -143,8 +144,8 @@ shards: Final = Table(
     Index("shards_newest", "created", "id"),
     Index("shards_by_kind", "kind", "created", "id"),
     # These hold all that sums over shards need: a row itself is as long as its manifest.
-    Index("shards_sums", "kind", "hand", "object", "count", "valid", "tried", "size_bytes"),
-    Index("shards_of_task", "id", "count", "valid", "tried", "audited", "audit_held"),
+    Index("shards_sums", "kind", "hand", "object", "count", "valid", "tried", "size_bytes", "judged"),
+    Index("shards_of_task", "id", "count", "valid", "tried", "audited", "audit_held", "judged"),
     Index("shards_made", "created", "kind", "count", "valid", "seconds"),
     Index("shards_charged", "created", "charged", "kind", "device", "count", "valid", "seconds", "size_bytes"),
 )

@@ -28,6 +28,23 @@ class Page(View, Generic[T]):
     next: str | None = None
 
 
+class Judged(View):
+    """What was made, and how much of it is valid. Grasps that nobody judged are no failures: they are left out."""
+
+    grasps: int = Field(0, description="grasps kept so far")
+    valid: int = Field(
+        0, description="of these, valid: past the geometric gate and judged to hold; 0 where nobody judges"
+    )
+    tried: int = Field(0, description="grasps planned for them, kept or not")
+    judged: int = Field(0, description="of these, judged by the geometric gate and a referee; 0 where nobody judges")
+
+    @computed_field(description="valid grasps per grasp judged; null: nobody judged")  # type: ignore[prop-decorator]
+    @property
+    def valid_yield(self) -> float | None:
+        """Share of the judged ones that are valid."""
+        return self.valid / self.judged if self.judged else None
+
+
 class StageProgress(View):
     """Tasks of one stage of a job, by state. `done` counts finished tasks plus the shares of the running ones."""
 
@@ -42,7 +59,7 @@ class StageProgress(View):
     seconds: float = Field(0.0, description="sum over the finished tasks")
 
 
-class JobView(View):
+class JobView(Judged):
     id: str
     state: State
     lane: Lane
@@ -56,11 +73,6 @@ class JobView(View):
     choice: Choice | None = Field(None, description="how a chart chose its fidelity, where the request said auto")
     reason: str | None = Field(None, description="why the job failed: the first failed task's last attempt")
     stages: list[StageProgress] = []
-    grasps: int = Field(0, description="grasps kept so far")
-    valid: int = Field(
-        0, description="of these, valid: past the geometric gate and judged to hold; 0 where nobody judges"
-    )
-    tried: int = Field(0, description="grasps planned for them, kept or not")
     audited: int = Field(0, description="valid grasps judged again by the letter of the protocol")
     audit_held: int = Field(0, description="of these, grasps that held")
     outcomes: dict[str, int] = Field({}, description="candidates that were not kept, by what became of them")
@@ -206,14 +218,11 @@ class FailureGroup(View):
     last_seen: str
 
 
-class Stats(View):
+class Stats(Judged):
     """The whole service in a few numbers."""
 
     jobs: dict[State, int]
     tasks: dict[State, int]
-    grasps: int
-    valid: int
-    tried: int = Field(0, description="grasps planned for them, kept or not")
     shards: int
     bytes: int
     workers: int
@@ -291,7 +300,7 @@ class UsageDay(View):
     cpu_seconds: float = Field(description="time that CPU workers spent on them [s]")
 
 
-class MatrixCell(View):
+class MatrixCell(Judged):
     """One hand x object of the matrix."""
 
     hand: str
@@ -300,6 +309,3 @@ class MatrixCell(View):
     queued: int
     running: int
     failed: int
-    grasps: int
-    valid: int
-    tried: int

@@ -40,6 +40,7 @@ class Tally:
             if manifest.kind == "base":
                 self._add("graspd_grasps_total", "all", amount=manifest.count)
                 self._add("graspd_grasps_total", "valid", amount=manifest.valid)
+                self._add("graspd_grasps_total", "judged", amount=manifest.judged)
 
     def failed(self, stage: str, kind: str) -> None:
         """An attempt of a task failed."""

@@ -98,6 +98,13 @@ class ShardManifest(BaseModel):
         return self
 
     @property
+    def judged(self) -> int:
+        """Tries that were judged, by the geometric gate and the referee: those of a base shard with a referee, or
+        none. What is valid is a share of these; of what nobody judged it is not known."""
+        has_verdicts = any(grasp.success is not None for grasp in self.grasps)
+        return self.tried if has_verdicts or (not self.grasps and self.request.referee != "none") else 0
+
+    @property
     def count(self) -> int:
         """Rows that matter to a reader: grasps; transferred grasps, or scenes to plan grasps in; pictures."""
         scenes = "S" if self.request.in_scene else "K"

@@ -61,16 +61,16 @@ def _gaps(card: Row) -> list[str]:
 
 
 def _yields(card: Row) -> str:
-    rows = [cell for cell in card["cells"] if cell["of_tries"] is not None]
+    rows = [cell for cell in card["cells"] if cell["of_judged"] is not None]
     low: list[Row] = []
     for hand in dict.fromkeys(cell["hand"] for cell in rows):
         own = [cell for cell in rows if cell["hand"] == hand]
-        middle = sorted(cell["of_tries"] for cell in own)[len(own) // 2]
-        low += [cell for cell in own if cell["of_tries"] < _LITTLE * middle]
+        middle = sorted(cell["of_judged"] for cell in own)[len(own) // 2]
+        low += [cell for cell in own if cell["of_judged"] < _LITTLE * middle]
     if not low:
         return ""
-    low.sort(key=lambda cell: cell["of_tries"])
-    each = _listed([f"{_pair(cell)} ({_percent(cell['of_tries'])})" for cell in low])
+    low.sort(key=lambda cell: cell["of_judged"])
+    each = _listed([f"{_pair(cell)} ({_percent(cell['of_judged'])})" for cell in low])
     return (
         f"**Hard pairs**, where under half as many tries are valid as usual for the hand: {each}. What they hold is a "
         "selection of what was easy."

@@ -150,6 +150,7 @@ def _knobs(text: str) -> Any:
 def _validity(cells: Iterable[CellTally]) -> Row:
     cells = list(cells)
     tried, valid = sum(cell.tried for cell in cells), sum(cell.valid for cell in cells)
+    judged = sum(cell.judged for cell in cells)
     audited, held = sum(cell.audited for cell in cells), sum(cell.audit_held for cell in cells)
     rejected: Counter[str] = Counter()
     for cell in cells:
@@ -157,7 +158,8 @@ def _validity(cells: Iterable[CellTally]) -> Row:
     return {
         "tried": tried,
         "valid": valid,
-        "of_tries": share(min(valid, tried), tried),
+        "judged": judged,
+        "of_judged": share(min(valid, judged), judged),
         "rejected": dict(rejected) or None,
         "audited": audited,
         "audit_dropped": audited - held,
@@ -234,8 +236,10 @@ def _cells(contents: Contents, tally: Tally) -> list[Row]:
         cell, gap = tally.cells.get(pair, CellTally()), contents.gaps.get(pair)
         valid = _validity([cell])
         row: Row = {"hand": pair[0], "object": pair[1], "asked": asked, "grasps": cell.grasps}
-        row |= {key: valid[key] for key in ("tried", "valid", "rejected", "audited", "audit_dropped", "seconds")}
-        row["of_tries"] = valid["of_tries"] and valid["of_tries"]["share"]
+        row |= {
+            key: valid[key] for key in ("tried", "judged", "valid", "rejected", "audited", "audit_dropped", "seconds")
+        }
+        row["of_judged"] = valid["of_judged"] and valid["of_judged"]["share"]
         row |= {"missing_tasks": gap.tasks if gap else 0, "missing_because": gap.reason if gap else None}
         row["median"] = {name: found["median"] for name, found in _quality([cell]).items()}
         row["clear_of_table"] = (_table([cell])["of_grasps"] or {}).get("share")

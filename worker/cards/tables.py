@@ -48,14 +48,15 @@ def validity_table(card: Row) -> str:
     found = {**card["validity"]["by_hand"], "**all**": card["validity"]}
     rows = []
     for name, row in found.items():
+        of_judged = interval(row["of_judged"]) if row["judged"] or not row["tried"] else "not judged"
         each = 1000 * row["seconds"] / row["valid"] if row["valid"] and row["seconds"] else None
         rows.append(
-            [name, f"{row['tried']:,}", f"{row['valid']:,}", interval(row["of_tries"]), _rejected(row["rejected"]),
+            [name, f"{row['tried']:,}", f"{row['valid']:,}", of_judged, _rejected(row["rejected"]),
              f"{row['audited']:,}", str(row["audit_dropped"]) if row["audited"] else "-",
              interval(row["false_valid"]), "not recorded" if each is None else f"{each:,.0f}"]
         )  # fmt: skip
-    head = ("hand", "tried", "valid", "valid of tried (95 %)", "why not", "audited", "overturned", "false valid (95 %)",
-            "worker s per 1,000")  # fmt: skip
+    head = ("hand", "tried", "valid", "valid of judged (95 %)", "why not", "audited", "overturned",
+            "false valid (95 %)", "worker s per 1,000")  # fmt: skip
     return markdown(head, rows)
 
 
@@ -81,14 +82,14 @@ def cells_table(card: Row) -> str:
         median = cell["median"]
         rows.append(
             [cell["hand"], cell["object"], "-" if cell["asked"] is None else f"{cell['asked']:,}",
-             f"{cell['tried']:,}", f"{cell['valid']:,}", percent(cell["of_tries"]),
+             f"{cell['tried']:,}", f"{cell['valid']:,}", percent(cell["of_judged"]),
              *(_fixed(median.get(name), QUALITY_NAMES[name][1]) for name in _SHOWN),
              percent(cell["clear_of_table"]), _fixed(cell["diversity"], 2),
              percent(1 - cell["directions"]["empty"] / card["directions"]["cells"]) if cell["directions"] else "-",
              _bits(cell["directions"]), _bits(cell.get("types")),
              cell["missing_because"] or ""]
         )  # fmt: skip
-    head = ["hand", "object", "asked", "tried", "valid", "of tries", *(QUALITY_NAMES[name][0] for name in _SHOWN),
+    head = ["hand", "object", "asked", "tried", "valid", "of judged", *(QUALITY_NAMES[name][0] for name in _SHOWN),
             "clear of table", "D", "directions used", "entropy of directions, bit", "of types, bit",
             "missing because"]  # fmt: skip
     if not any(row[-1] for row in rows):

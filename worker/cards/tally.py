@@ -38,6 +38,8 @@ class CellTally:
     grasps: int = 0
     valid: int = 0
     tried: int = 0
+    judged: int = 0
+    """Tries of shards that a referee judged."""
     audited: int = 0
     audit_held: int = 0
     scenes: int = 0
@@ -158,7 +160,10 @@ def _add_base(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts) -> 
     valid = standing.valid(columns)
     cell.grasps += piece.rows
     cell.valid += int(valid.sum())
-    cell.tried += int(piece.said.get("tried", piece.rows))
+    tried = int(piece.said.get("tried", piece.rows))
+    cell.tried += tried
+    if standing.judged(columns).any() or (not piece.rows and piece.said.get("verdict_level", "none") != "none"):
+        cell.judged += tried
     cell.rejected.update({str(why): int(count) for why, count in dict(piece.info.get("rejected", {})).items()})
     if (audit := columns.get("quality/audit")) is not None:
         cell.audited += int(np.count_nonzero(audit[valid] >= 0))

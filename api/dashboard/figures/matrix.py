@@ -18,8 +18,8 @@ _ROWS: Final = 60
 
 @dataclass(frozen=True)
 class Tile:
-    """One hand on one object. `made` counts grasps of its `standing`; `value` is what its checkbox sends, `href` where
-    it leads."""
+    """One hand on one object. `made` counts grasps of its `standing`; `share` is the valid part of the judged; `value`
+    is what its checkbox sends, `href` where it leads."""
 
     hand: str
     object: str
@@ -28,16 +28,13 @@ class Tile:
     state: str
     made: int
     tried: int
+    share: float | None
     standing: str = "valid"
     jobs: int = 0
     progress: float | None = None
     note: str = ""
     scene: str = "free"
     """Kind of the scene in which its grasps are valid."""
-
-    @property
-    def share(self) -> float | None:
-        return self.made / self.tried if self.tried else None
 
     @property
     def shade(self) -> str:
@@ -65,6 +62,7 @@ def of_dataset(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
             state=cell.state.value,
             made=cell.counted(dataset.options),
             tried=cell.tried,
+            share=cell.valid_yield,
             standing=dataset.options.standing,
             progress=cell.progress if cell.state is State.RUNNING else None,
             note=cell.reason or "",
@@ -84,8 +82,10 @@ def of_service(cells: Iterable[MatrixCell], hands: Sequence[str], objects: Seque
             value=f"{cell.hand}|{cell.object}",
             href=f"/grasps?hand={cell.hand}&object={cell.object}",
             state=_state(cell),
-            made=cell.valid,
+            made=cell.valid if cell.judged else cell.grasps,
             tried=cell.tried,
+            share=cell.valid_yield,
+            standing="valid" if cell.judged else "kept",
             jobs=cell.jobs,
         )
         for cell in cells
@@ -96,7 +96,7 @@ def of_service(cells: Iterable[MatrixCell], hands: Sequence[str], objects: Seque
     ordered = sorted(names, key=lambda name: (name not in worked, name))
     for hand in columns:
         for obj in ordered[:_ROWS]:
-            found.setdefault((hand, obj), Tile(hand, obj, f"{hand}|{obj}", "", "blank", 0, 0))
+            found.setdefault((hand, obj), Tile(hand, obj, f"{hand}|{obj}", "", "blank", 0, 0, None))
     return _grid(columns, ordered[:_ROWS], found, hidden=max(0, len(ordered) - _ROWS))
 
 

@@ -119,6 +119,7 @@ def shard_row(manifest: ShardManifest) -> Row:
         "tried": manifest.tried,
         "audited": manifest.audited,
         "audit_held": manifest.audit_held,
+        "judged": manifest.judged,
         "hand": manifest.hand,
         "object": manifest.object,
         "hand_digest": manifest.hand_digest,

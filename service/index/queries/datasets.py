@@ -245,12 +245,12 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
         job = row["job_id"]
         count = work[job]
         total = max(count["tasks"], _tasks_of_cell(options))
-        yields = made.get(job, {"grasps": 0, "valid": 0, "tried": 0, "seconds": 0.0})
-        found = yields["valid"] if options.counted == "valid" else yields["grasps"]
+        yields = made.get(job, {"seconds": 0.0})
+        found = yields.get("valid" if options.counted == "valid" else "grasps", 0)
         reason = row["reason"]
         if row["state"] == State.SUCCEEDED.value and options.want == "valid" and found < options.grasps:
             lost = outcomes_of(connection, tasks.c.job_id == job)
-            reason = shortfall(found, options.grasps, options.counted, yields["tried"], options.budget, lost)
+            reason = shortfall(found, options.grasps, options.counted, yields.get("tried", 0), options.budget, lost)
         views.append(
             CellView(
                 **{name: row[name] for name in ("position", "hand", "object", "job_id", "state", "planned", "choice")},
@@ -258,7 +258,6 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
                 fidelity=row["fidelity"] or options.knobs.name,
                 asked=options.grasps,
                 **yields,
-                valid_yield=yields["valid"] / yields["tried"] if yields["tried"] else None,
                 tasks=total,
                 tasks_done=count[State.SUCCEEDED],
                 tasks_failed=count[State.FAILED],
@@ -284,7 +283,7 @@ def _work_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[s
 
 
 def _made_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, Any]]:
-    wanted = [column for column in _MADE if column.name in ("grasps", "valid", "tried", "seconds")]
+    wanted = [column for column in _MADE if column.name in ("grasps", "valid", "tried", "judged", "seconds")]
     query = (
         select(tasks.c.job_id, *wanted)
         .join(shards, shards.c.id == tasks.c.shard_id)
@@ -309,4 +308,5 @@ _MADE: Final = (
     _base(shards.c.count).label("grasps"),
     _base(shards.c.valid).label("valid"),
     _base(shards.c.tried).label("tried"),
+    _base(shards.c.judged).label("judged"),
 )

@@ -180,7 +180,8 @@ def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[Stag
 
 
 def _made(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, int]]:
-    columns = {"grasps": "count", "valid": "valid", "tried": "tried", "audited": "audited", "audit_held": "audit_held"}
+    same = ("valid", "tried", "judged", "audited", "audit_held")
+    columns = {"grasps": "count", **{name: name for name in same}}
     query = (
         select(tasks.c.job_id, *(func.sum(shards.c[column]).label(name) for name, column in columns.items()))
         .join(shards, shards.c.id == tasks.c.shard_id)

@@ -23,10 +23,11 @@ def cell(**fields: object) -> MatrixCell:
 @pytest.mark.parametrize(
     ("counts", "state", "shade"),
     [
-        ({"valid": 30, "tried": 40}, "succeeded", "y8"),
+        ({"valid": 30, "tried": 40, "judged": 40}, "succeeded", "y8"),
         ({"running": 1, "failed": 1}, "running", "none"),
         ({"queued": 1, "failed": 1}, "queued", "none"),
-        ({"failed": 1, "valid": 0, "tried": 10}, "failed", "y0"),
+        ({"failed": 1, "valid": 0, "tried": 10, "judged": 10}, "failed", "y0"),
+        ({"grasps": 10, "tried": 10}, "succeeded", "none"),
     ],
 )
 def test_a_cell_tells_its_state_and_yield(counts: dict[str, int], state: str, shade: str) -> None:

@@ -1,0 +1,61 @@
+"""Valid yield is of what somebody judged: grasps that nobody judged are no failures, in no number and on no page."""
+
+from __future__ import annotations
+
+import pytest
+from starlette.testclient import TestClient
+
+from service.model import names
+from service.model.records import JobRecord
+from service.pipeline.backends import Parts
+from service.pipeline.datasets import actions
+from service.pipeline.datasets.spec import DatasetRequest
+from service.store.records import read_record
+from tests.api.factories import add_job, finish_all
+from tests.planning import plan_all
+
+
+@pytest.fixture
+def jobs(http: TestClient, parts: Parts) -> dict[str, str]:
+    """One job that was judged, and a larger one on the same pair that was not."""
+    judged, unjudged = add_job(parts, want="raw"), add_job(parts, grasps=320, referee="none", want="raw")
+    for record in (judged, unjudged):
+        finish_all(parts, record)
+    return {"judged": judged.id, "unjudged": unjudged.id}
+
+
+def share(http: TestClient, job: str) -> float:
+    rows = http.get("/v1/grasps", params={"job": job, "limit": 200}).json()["items"]
+    return sum(row["valid"] for row in rows) / len(rows)
+
+
+def test_the_service_counts_as_tries_only_what_was_judged(http: TestClient, jobs: dict[str, str]) -> None:
+    stats = http.get("/v1/stats").json()
+    assert (stats["tried"], stats["judged"]) == (352, 32)
+    assert stats["valid_yield"] == share(http, jobs["judged"])
+
+
+def test_a_job_tells_its_yield_or_that_nobody_judged(http: TestClient, jobs: dict[str, str]) -> None:
+    told = {name: http.get(f"/v1/jobs/{job}").json() for name, job in jobs.items()}
+    assert told["judged"]["valid_yield"] == share(http, jobs["judged"])
+    assert (told["unjudged"]["judged"], told["unjudged"]["valid_yield"]) == (0, None)
+
+
+def test_a_dataset_of_unjudged_grasps_has_no_yield(http: TestClient, parts: Parts) -> None:
+    wanted = {"name": "d", "hands": ["allegro"], "objects": ["mug"], "referee": "none"}
+    actions.create(parts, DatasetRequest.model_validate(wanted))
+    plan_all(parts)
+    (job,) = parts.index.jobs.page().items
+    finish_all(parts, read_record(JobRecord, parts.store, names.job_record(job.id)))
+    (cell,) = http.get("/v1/datasets/d/cells").json()["items"]
+    assert (cell["tried"], cell["judged"], cell["valid_yield"]) == (32, 0, None)
+    assert http.get("/v1/datasets/d").json()["valid_yield"] is None
+    for page in ("/datasets/d", "/datasets", "/compare?one=d&other=d", f"/jobs/{job.id}", "/"):
+        assert "not judged" in http.get(page).text, page
+
+
+def test_pages_show_the_share_of_the_judged(http: TestClient, jobs: dict[str, str]) -> None:
+    words = f"{int(100 * share(http, jobs['judged']) + 1e-9)} %"
+    home = http.get("/").text
+    assert words in home and "320 more are not judged" in home
+    assert words in http.get("/datasets").text
