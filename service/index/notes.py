@@ -103,7 +103,7 @@ class Notes:
 
     def count_change(self, *, within: Connection) -> None:
         """A user's record was put: the index is another one than before."""
-        number = int(within.scalar(select(notes.c.value).where(notes.c.name == _CHANGES)) or 0)  # type: ignore[call-overload]
+        number = int(within.scalar(select(notes.c.value).where(notes.c.name == _CHANGES)) or 0)
         upsert(within, notes, [{"name": _CHANGES, "value": number + 1}])
 
     def changes(self) -> int:

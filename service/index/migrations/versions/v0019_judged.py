@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import sqlalchemy as sa
 from alembic import op
 
@@ -37,7 +39,7 @@ def downgrade() -> None:
         changed.drop_column("judged")
 
 
-def _index(columns_of):  # type: ignore[no-untyped-def]
+def _index(columns_of: Callable[[list[str]], list[str]]) -> None:
     for name, columns in _INDEXES.items():
         op.drop_index(name, table_name="shards")
         op.create_index(name, "shards", columns_of(columns), unique=False)
