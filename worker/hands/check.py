@@ -15,9 +15,9 @@ from worker.hands.model import HandModel
 from worker.hands.oppositions import require_opposing
 from worker.hands.options import HandOptions, parse_options
 from worker.hands.read import read_robot
-from worker.hands.robot import Robot
+from worker.hands.robot import Robot, chain_to
 from worker.hands.surface import sample_surface
-from worker.hands.tree import build_tree, joints_above, passed_limits
+from worker.hands.tree import build_tree, cut_drives, joints_above, passed_limits
 
 #: Points with which the outer surface is measured.
 _SURFACE_POINTS = 512
@@ -86,13 +86,17 @@ def _limits(robot: Robot, settings: HandOptions) -> list[str]:
     tree = build_tree(robot, settings)
     passed = passed_limits(robot, tree, settings)
     notes = [f"limits of {', '.join(passed)} are not used, as in ROS: they follow other joints"] if passed else []
+    notes += cut_drives(robot, tree)
     return notes + ([f"{', '.join(tree.still)} cannot move: the limits leave one value"] if tree.still else [])
 
 
 def _left_out(robot: Robot, hand: HandModel, settings: HandOptions) -> list[str]:
     """What a user must know of a hand that was cut off its arm without having said so."""
     above = joints_above(robot, hand.root_link)
-    if settings.root or not above:
+    if settings.root:
+        faulty = [joint for joint in chain_to(robot, hand.root_link) if joint.fault]
+        return [f"{joint.name} ({joint.type}) above the palm taken as fixed" for joint in faulty]
+    if not above:
         return []
     return [f"{', '.join(above)} above the palm left out, poses are those of {hand.root_link!r} (--root {robot.root})"]
 

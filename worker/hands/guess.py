@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import HandError
+from service.model.suggestions import did_you_mean
 from service.model.transforms import IDENTITY_POSE, apply, compose, quat_rotate
 from worker.hands.jaws import MAX_DOFS, Jaws, closing_by_geometry, find_jaws, slides
 from worker.hands.kinematics import body_poses
@@ -93,7 +94,7 @@ def _closing_seen(hand: HandModel, stated: Mapping[int, float]) -> Floats:
     if not seen.any() and not stated and slides(hand).all():
         raise HandError(
             f"no two surfaces of the hand come together when {', '.join(hand.dof_names[:4])} moves: its fingers are "
-            "missing or have no collision shapes; add them"
+            "missing or have no collision shapes (add them), or do not move towards each other (correct axes or limits)"
         )
     closing = np.where((seen == 0) & ~slides(hand), hand.closing, seen)
     for dof, direction in stated.items():
@@ -105,7 +106,7 @@ def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int,
     """Bodies of the stated links, else the leaves of the tree."""
     for name in options.fingertips:
         if name not in tree.known:
-            raise HandError(f"asset.json names the fingertip link {name!r}, which the hand does not have")
+            raise HandError(f"the hand has no link {name!r} to be a fingertip{did_you_mean(name, tree.links)}")
     kept = [tree.links[name][0] for name in options.fingertips if name in tree.links]
     if kept:
         return tuple(dict.fromkeys(kept))
@@ -272,7 +273,8 @@ def _palm_link(tree: Tree, options: HandOptions) -> tuple[int, Floats]:
     if options.palm is None:
         return 0, IDENTITY_POSE
     if options.palm.link not in tree.links:
-        raise HandError(f"asset.json names the palm link {options.palm.link!r}, which the hand does not have")
+        link = options.palm.link
+        raise HandError(f"the hand has no link {link!r} to be its palm{did_you_mean(link, tree.links)}")
     return tree.links[options.palm.link]
 
 
@@ -341,6 +343,6 @@ def _by_dof(hand: HandModel, tree: Tree, values: Mapping[str, float]) -> list[tu
     """(dof, value) of named joints; those that were frozen, coupled or dropped have no say any more."""
     for name in values:
         if name not in tree.known:
-            known = ", ".join(hand.dof_names[:8])
-            raise HandError(f"asset.json names {name!r}, which is no joint of the hand ({known}, ...)")
+            known = ", ".join(hand.dof_names[:8]) + (", ..." if hand.dofs > 8 else "")
+            raise HandError(f"{name!r} is no joint of the hand ({known}){did_you_mean(name, hand.dof_names)}")
     return [(hand.dof_names.index(name), value) for name, value in values.items() if name in hand.dof_names]

@@ -20,7 +20,7 @@ from worker.hands.mjcf_couplings import couplings
 from worker.hands.mjcf_servos import Servo, commanded, servos
 from worker.hands.mjcf_source import self_contained
 from worker.hands.primitives import hull
-from worker.hands.robot import UNLIMITED_M, Joint, Link, Mimic, Robot, Shape, build_robot
+from worker.hands.robot import UNLIMITED_M, Joint, Link, Robot, Shape, build_robot
 
 _FREE, _HINGE, _SLIDE = (
     int(kind) for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
@@ -73,19 +73,18 @@ class _Reader:
 
     def __post_init__(self) -> None:
         self.name = ""
-        self._mimics: dict[int, Mimic | float] = {}
-        self._servos: dict[int, Servo] = {}
-        self._commanded: dict[int, tuple[float, float]] = {}
         self._bare = not self.model.ngeom or not any(
             self.model.geom_contype[g] or self.model.geom_conaffinity[g] for g in range(self.model.ngeom)
         )
-        self._mimics, notes, tendons = couplings(self.model, self.joint_name)
-        self._servos = servos(self.model, self._mimics, {joint for pulls in tendons.values() for joint in pulls})
+        coupled = couplings(self.model, self.joint_name)
+        self._mimics, self._faults = coupled.follows, coupled.faults
+        self._servos = servos(self.model, self._mimics, {j for pulls in coupled.tendons.values() for j in pulls})
         self.tendons = {
-            name: {self.joint_name(joint): pull for joint, pull in pulls.items()} for name, pulls in tendons.items()
+            name: {self.joint_name(joint): pull for joint, pull in pulls.items()}
+            for name, pulls in coupled.tendons.items()
         }
         self._commanded = commanded(self.model)
-        self.notes += notes
+        self.notes += coupled.notes
 
     def roots(self) -> list[int]:
         """Bodies on the world below which something moves: the others are furniture or objects."""
@@ -96,6 +95,10 @@ class _Reader:
         found = sorted(moving)
         if not found:
             raise HandError(f"{self.main}: no moving joint; a hand needs at least one hinge or slide joint")
+        free = [j for j in range(model.njnt) if int(model.jnt_type[j]) == _FREE and int(model.jnt_bodyid[j]) in moving]
+        self.notes += [
+            f"{self.body_name(int(model.jnt_bodyid[j]))!r} is free to float, and taken as fixed" for j in free
+        ]
         return found
 
     def _top(self, body: int) -> int:
@@ -144,8 +147,10 @@ class _Reader:
         model, name = self.model, self.joint_name(joint)
         what = f"{self.main}: joint {name!r}"
         kind = int(model.jnt_type[joint])
+        still = _fixed(name, parent, child, origin)
         if kind not in (_HINGE, _SLIDE):
-            raise HandError(f"{what} is a ball joint; write it as three hinge joints")
+            fault = f"{what} is a ball joint; write it as three hinge joints"
+            return replace(still, type="ball", fault=fault)
         slides = kind == _SLIDE
         axis = np.asarray(model.jnt_axis[joint], float)
         # A joint value counts from `ref`, at which the body stands as it is written.
@@ -157,8 +162,9 @@ class _Reader:
         limited = bool(model.jnt_limited[joint])
         most = UNLIMITED_M if slides else math.pi
         lower, upper = map(float, model.jnt_range[joint]) if limited else (-most, most)
+        fault = self._faults.get(joint, "")
         if not -4 * math.pi <= lower <= upper <= 4 * math.pi:
-            raise HandError(f"{what}: range {lower:g} .. {upper:g} is reversed or too large")
+            fault = f"{what}: range {lower:g} .. {upper:g} is reversed or too large"
         servo = self._servos.get(joint, Servo())
         least, largest = self._commanded.get(joint, (lower, upper))
         if max(lower, least) < min(upper, largest):
@@ -167,7 +173,7 @@ class _Reader:
         return Joint(
             name, kind_name, parent, child, origin, axis, lower, upper, servo.effort, follows,
             stiffness=servo.stiffness, armature=float(model.dof_armature[model.jnt_dofadr[joint]]),
-            dry_friction=float(model.dof_frictionloss[model.jnt_dofadr[joint]]),
+            dry_friction=float(model.dof_frictionloss[model.jnt_dofadr[joint]]), fault=fault,
         )  # fmt: skip
 
     def _link(self, body: int, name: str) -> Link:

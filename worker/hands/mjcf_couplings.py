@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Final
 
 import mujoco
@@ -18,13 +19,21 @@ _RANGE_POINTS: Final = 41
 Tendons = dict[str, dict[int, float]]
 
 
-def couplings(model: Any, name: Callable[[int], str]) -> tuple[dict[int, Mimic | float], list[str], Tendons]:
-    """What each dependent joint follows, or the value at which an equality holds it; notes for the user; and tendons.
+@dataclass(frozen=True)
+class Couplings:
+    """How the joints of a model hang together."""
 
-    Args:
-        model: the compiled model.
-        name: name of a joint.
-    """
+    follows: dict[int, Mimic | float]
+    """What each dependent joint follows, or the value at which an equality holds it."""
+    notes: list[str]
+    """What a user must know."""
+    tendons: Tendons
+    faults: dict[int, str]
+    """Joints whose loop is not solved, and why."""
+
+
+def couplings(model: Any, name: Callable[[int], str]) -> Couplings:
+    """Those of a compiled model; `name` tells the name of a joint."""
     found: dict[int, Mimic | float] = {}
     notes: list[str] = []
     for equality in range(model.neq):
@@ -44,9 +53,9 @@ def couplings(model: Any, name: Callable[[int], str]) -> tuple[dict[int, Mimic |
         elif kind == int(mujoco.mjtEq.mjEQ_JOINT):
             _note(notes, _couple(model, first, second, np.asarray(model.eq_data[equality, :5]), found, name))
     more, tendons = _couple_by_tendons(model, found, name)
-    notes += more + follow_loops(model, found, name)
+    said, faults = follow_loops(model, found, name)
     _hold_followers(model, found, name)
-    return found, notes, tendons
+    return Couplings(found, notes + more + said, tendons, faults)
 
 
 def _hold_followers(model: Any, found: dict[int, Mimic | float], name: Callable[[int], str]) -> None:
@@ -71,7 +80,7 @@ def _couple(
     if second < 0:
         found[first] = rest[0] + float(polynomial[0])
         return ""
-    if first in found or first == second:
+    if first in found or first == second or _leads_to(second, first, found, name):
         return f"a second equality of {name(first)!r} was left out"
     constant, slope, note = float(polynomial[0]), float(polynomial[1]), ""
     if np.abs(polynomial[2:]).max() > 1e-9:
@@ -83,6 +92,16 @@ def _couple(
         note = f"{name(first)!r} follows {name(second)!r} by a line within {error:.2g}"
     found[first] = Mimic(name(second), slope, rest[0] + constant - slope * rest[1])
     return note
+
+
+def _leads_to(joint: int, first: int, found: dict[int, Mimic | float], name: Callable[[int], str]) -> bool:
+    """Whether a joint follows another one, at the end of whatever chain."""
+    number = {name(j): j for j in found}
+    while isinstance(follows := found.get(joint), Mimic):
+        if follows.joint == name(first):
+            return True
+        joint = number.get(follows.joint, -1)
+    return False
 
 
 def _couple_tendons(

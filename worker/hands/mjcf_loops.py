@@ -21,53 +21,79 @@ _STEPS: Final = 33
 _ROUNDS: Final = 60
 #: Ends of a loop that stay further apart than this do not meet [m].
 _OPEN_M: Final = 2e-4
+_ONE_VALUE: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 #: A passive joint that leaves its line by more than this does not follow it [rad].
 MAX_ERROR_RAD: Final = 0.08
 
 
-def follow_loops(model: Any, found: dict[int, Mimic | float], name: Callable[[int], str]) -> list[str]:
-    """Add to `found` the joints that close the loops of a model; notes for the user.
+def follow_loops(
+    model: Any, found: dict[int, Mimic | float], name: Callable[[int], str]
+) -> tuple[list[str], dict[int, str]]:
+    """Add to `found` the joints that close the loops of a model.
 
-    Raises:
-        HandError: a loop does not close over the range of its driver, or its joints follow no line.
+    Returns:
+        notes for the user; and joints whose loop is not solved, with the refusal of a hand that moves by them.
     """
     loops = [e for e in range(model.neq) if model.eq_type[e] == int(mujoco.mjtEq.mjEQ_CONNECT) and model.eq_active0[e]]
-    if not loops:
-        return []
     actuated = {joint for actuator in range(model.nu) for joint, _ in driven(model, actuator)}
-    notes = []
+    notes: list[str] = []
+    faults: dict[int, str] = {}
     for group in _groups(model, loops):
         joints = sorted({j for e in group for j in _on_loop(model, e)})
-        drivers = [j for j in joints if j in actuated and j not in found]
         passive = [j for j in joints if j not in actuated and j not in found]
         if not passive:
             continue
-        if not drivers:
-            # Those that follow others move as these do.
-            drivers = [j for j in joints if j in found and not isinstance(found[j], float)]
-        if len(drivers) != 1:
-            held = ", ".join(name(j) for j in joints)
-            if not drivers:
-                raise HandError(f"the loop of {held} has no driver; give one of its joints an actuator")
-            many = " and ".join(name(j) for j in drivers)
+        try:
+            notes.append(_follow(model, group, joints, passive, actuated, found, name))
+        except HandError as error:
+            # It only matters where the hand moves by it.
+            faults |= dict.fromkeys(passive, str(error))
+    return notes, faults
+
+
+def _follow(
+    model: Any, group: list[int], joints: list[int], passive: list[int], actuated: set[int],
+    found: dict[int, Mimic | float], name: Callable[[int], str],
+) -> str:  # fmt: skip
+    """Add to `found` what the passive joints of a group of loops follow; a note.
+
+    Raises:
+        HandError: it has no driver or several, does not close over the range of its driver, or its joints follow no
+            line.
+    """
+    held = ", ".join(map(name, joints))
+    if round_ones := [j for j in joints if int(model.jnt_type[j]) not in _ONE_VALUE]:
+        raise HandError(
+            f"the loop of {held} turns on {name(round_ones[0])}, which is no hinge or slide joint, and is not solved; "
+            "write equalities of joints instead of the loop"
+        )
+    drivers = [j for j in joints if j in actuated and j not in found]
+    if not drivers:
+        # Those that follow others move as these do.
+        drivers = [j for j in joints if j in found and not isinstance(found[j], float)]
+    if not drivers:
+        raise HandError(f"the loop of {held} has no driver; give one of its joints an actuator")
+    if len(drivers) > 1:
+        many = " and ".join(map(name, drivers))
+        raise HandError(
+            f"the loop of {held} has {len(drivers)} drivers ({many}), and only loops of one are solved; leave one "
+            "actuator in it, or write equalities of joints instead of the loop"
+        )
+    values, followers = _solve(model, group, drivers[0], passive, name)
+    worst = 0.0
+    lines: dict[int, Mimic | float] = {}
+    for joint, follower in zip(passive, followers.T, strict=True):
+        slope, constant = map(float, np.polyfit(values, follower, 1))
+        error = float(np.abs(follower - constant - slope * values).max())
+        if error > MAX_ERROR_RAD:
             raise HandError(
-                f"the loop of {held} has {len(drivers)} drivers ({many}), and only loops of one are solved; leave one "
-                "actuator in it, or write equalities of joints instead of the loop"
+                f"the loop of {name(drivers[0])!r} moves {name(joint)!r} by no line (off by {error:.2f}); "
+                "write an equality of the two joints instead"
             )
-        values, followers = _solve(model, group, drivers[0], passive, name)
-        worst = 0.0
-        for joint, follower in zip(passive, followers.T, strict=True):
-            slope, constant = map(float, np.polyfit(values, follower, 1))
-            error = float(np.abs(follower - constant - slope * values).max())
-            if error > MAX_ERROR_RAD:
-                raise HandError(
-                    f"the loop of {name(drivers[0])!r} moves {name(joint)!r} by no line (off by {error:.2f}); "
-                    "write an equality of the two joints instead"
-                )
-            worst = max(worst, error)
-            found[joint] = Mimic(name(drivers[0]), slope, constant)
-        notes.append(f"{', '.join(map(name, passive))} follow {name(drivers[0])} within {worst:.2g} rad")
-    return notes
+        worst = max(worst, error)
+        lines[joint] = Mimic(name(drivers[0]), slope, constant)
+    found |= lines
+    return f"{', '.join(map(name, passive))} follow {name(drivers[0])} within {worst:.2g} rad"
 
 
 def _groups(model: Any, loops: list[int]) -> list[list[int]]:

@@ -25,6 +25,8 @@ MAX_LENGTH_M: Final = 10.0
 #: Limit of a prismatic joint that has none, to either side [m]: such a joint may stand in a scene, not in a hand.
 UNLIMITED_M: Final = 10.0
 MOVING: Final = ("revolute", "continuous", "prismatic")
+#: Joints of a URDF that let a base float.
+FREE: Final = ("floating", "planar")
 
 
 @dataclass(frozen=True)

@@ -45,14 +45,20 @@ def make_pieces(
     if shape.kind != "mesh":
         vertices, faces = tessellate(shape.kind, shape.size)
         return [ConvexPiece(body, shape.kind, shape.size, pose, apply(pose, vertices), faces, link)]
-    if shape.mesh is not None:
-        found = _hulls(*shape.mesh)
-    else:
-        name = find_mesh(shape.filename, files, base, link)
-        key = (name, shape.size)
-        if key not in hulls:
-            hulls[key] = _mesh_hulls(name, shape.size, files[name], link)
-        found = hulls[key]
+    name = ""
+    try:
+        if shape.mesh is not None:
+            found = _hulls(*shape.mesh)
+        else:
+            name = find_mesh(shape.filename, files, base, link)
+            key = (name, shape.size)
+            if key not in hulls:
+                hulls[key] = _mesh_hulls(name, shape.size, files[name], link)
+            found = hulls[key]
+    except HandError as error:
+        if repr(link) in str(error):
+            raise
+        raise HandError(f"collision mesh {f'{name!r} ' if name else ''}of link {link!r}: {error}") from None
     return [
         ConvexPiece(body, "hull", (), IDENTITY_POSE.copy(), apply(pose, vertices), faces, link)
         for vertices, faces in found

@@ -77,7 +77,10 @@ def _sample(hand: HandModel, count: int, seed: int) -> SurfacePoints:
         more = max(OVERSAMPLING * count, MIN_CANDIDATES) * count * OVERSAMPLING // max(len(candidates), 1)
         candidates = _candidates(hand, min(more, 5_000_000), seed)
     if len(candidates) < count:
-        raise HandError(f"the hand's outer surface gives {len(candidates)} points of {count}; ask for fewer")
+        raise HandError(
+            f"the outer surface of the hand gives {len(candidates)} points where {count} are needed: its pieces lie "
+            "inside one another; correct its collision shapes"
+        )
     area_of_body = np.bincount(candidates.body, candidates.area, minlength=hand.bodies).astype(float)
     available = np.bincount(candidates.body, minlength=hand.bodies)
     quota = apportion(area_of_body, count, available)

@@ -103,9 +103,9 @@ def check_tendons(robot: Robot, stated: Mapping[str, Mapping[str, float]]) -> No
     for name, pulls in stated.items():
         for joint in pulls:
             if joint not in robot.joints or robot.joints[joint].type == "fixed":
-                raise HandError(f"asset.json: tendon {name!r} pulls {joint!r}, which is no moving joint of the hand")
+                raise HandError(f"tendon {name!r} pulls {joint!r}, which is no moving joint of the hand")
             if joint in seen:
-                raise HandError(f"asset.json: joint {joint!r} is on two tendons; one drive can move it")
+                raise HandError(f"joint {joint!r} is on two tendons; one drive can move it")
             seen.add(joint)
         if sum(abs(c) > LEAST_PULL for c in pulls.values()) < 2:
-            raise HandError(f"asset.json: tendon {name!r} pulls fewer than two joints; leave it out")
+            raise HandError(f"tendon {name!r} pulls fewer than two joints; leave it out")

@@ -10,13 +10,18 @@ from typing import Final
 import numpy as np
 
 from service.model.errors import HandError
+from service.model.suggestions import did_you_mean
 from service.model.transforms import IDENTITY_POSE, compose, quat_from_axis_angle
 from worker.hands.model import Floats, JointType
 from worker.hands.options import HandOptions
-from worker.hands.robot import UNLIMITED_M, Joint, Mimic, Robot, chain_to
+from worker.hands.robot import MAX_LENGTH_M, UNLIMITED_M, Joint, Mimic, Robot, chain_to
 from worker.hands.roots import pick_root
 from worker.hands.tendons import check_tendons
 
+#: Share of its range that a drive may lose without a word.
+_TOLD_CUT: Final = 0.01
+#: A follower does not go farther [rad], [m].
+_MOST: Final = (200 * math.pi, MAX_LENGTH_M)
 #: A joint with a smaller range stands still [rad or m].
 LEAST_RANGE: Final = 1e-5
 
@@ -82,8 +87,14 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
     for name, drive in moving.items():
         if drive.dof not in moving:
             raise HandError(f"joint {name!r} follows {drive.dof!r}, which is dropped; fix it: --fix {name}=0")
+    if not moving and still:
+        names = ", ".join(list(still)[:6]) + (", ..." if len(still) > 6 else "")
+        raise HandError(f"no moving joint is left: the limits of {names} leave one value; fill them in")
     if not moving:
-        raise HandError("no moving joint is left; fix or drop less")
+        how = (
+            "fix or drop less" if options.fix or options.drop else f"nothing below {root!r} moves, name another --root"
+        )
+        raise HandError(f"no moving joint is left; {how}")
     names = tuple(name for name in robot.joints if name in moving)
     dofs = tuple(name for name in names if moving[name].dof == name)
     lower, upper = np.array([_fold_limits(dof, moving, robot, options) for dof in dofs]).T
@@ -101,9 +112,9 @@ def _check_names(robot: Robot, options: HandOptions) -> None:
     for kind, names, known in (("joint", joints, set(robot.joints)), ("link", links, set(robot.links))):
         for name in names:
             if name not in known:
-                raise HandError(f"asset.json names the {kind} {name!r}, which the URDF does not have")
+                raise HandError(f"the {robot.format} has no {kind} {name!r}{did_you_mean(name, known)}")
             if kind == "joint" and robot.joints[name].type == "fixed":
-                raise HandError(f"asset.json names the joint {name!r}, which cannot move")
+                raise HandError(f"joint {name!r} is fixed; nothing can be said of how it moves")
     check_tendons(robot, options.tendons or {})
 
 
@@ -180,7 +191,20 @@ def _fold_limits(dof: str, moving: dict[str, Drive], robot: Robot, options: Hand
             f"joint {narrowest!r} may only go {joint.lower:g} .. {joint.upper:g}, but follows {dof!r} with "
             f"{drive.multiplier:g}, which leaves {dof!r} no room; correct the coupling or its limits"
         )
+    _check_travel(dof, lower, upper, moving, robot)
     return lower, upper
+
+
+def _check_travel(dof: str, lower: float, upper: float, moving: dict[str, Drive], robot: Robot) -> None:
+    """A follower whose own limits do not bind it goes where its drive takes it, but not to the moon."""
+    for name, drive in moving.items():
+        way, most = abs(drive.multiplier) * (upper - lower), _MOST[robot.joints[name].type == "prismatic"]
+        if drive.dof == dof and name != dof and (way > most or abs(drive.offset) > most):
+            unit = "m" if robot.joints[name].type == "prismatic" else "rad"
+            raise HandError(
+                f"joint {name!r} follows {dof!r} with {drive.multiplier:g} and offset {drive.offset:g}, which moves it "
+                f"by {max(way, abs(drive.offset)):.3g} {unit}; correct the coupling"
+            )
 
 
 def _binds(joint: Joint, drive: Drive, robot: Robot, options: HandOptions) -> bool:
@@ -198,6 +222,16 @@ def passed_limits(robot: Robot, tree: Tree, options: HandOptions) -> list[str]:
             ends = sorted(drive.multiplier * end + drive.offset for end in (tree.lower[at], tree.upper[at]))
             if ends[0] < joint.lower - LEAST_RANGE or ends[1] > joint.upper + LEAST_RANGE:
                 found.append(name)
+    return found
+
+
+def cut_drives(robot: Robot, tree: Tree) -> list[str]:
+    """What followers' limits leave of a dof's own range, where that is less."""
+    found = []
+    for dof, lower, upper in zip(tree.dof_names, tree.lower, tree.upper, strict=True):
+        own = robot.joints[dof]
+        if upper - lower < (1 - _TOLD_CUT) * (own.upper - own.lower):
+            found.append(f"limits of what follows {dof} leave it {lower:.3g} .. {upper:.3g}")
     return found
 
 

@@ -15,7 +15,7 @@ from worker.hands.load import body_model, files_from_path, main_file
 from worker.hands.model import Floats, HandModel
 from worker.hands.options import HandOptions, parse_options
 from worker.hands.read import read_robot
-from worker.hands.robot import MOVING, Robot, chain_to
+from worker.hands.robot import FREE, MOVING, Robot, chain_to
 from worker.hands.tree import build_tree
 
 
@@ -59,7 +59,7 @@ def read_arm(path: str | Path, mount: str, hand_pose: Floats) -> Arm:
         xacro=options.xacro,
         root=robot.root,
         drop=tuple(joint.child for joint in robot.joints.values() if joint.parent == mount),
-        fix={joint: _rest(robot, joint) for joint in _others(robot, moving)},
+        fix={joint: _rest(robot, joint) for joint in _others(robot, moving, mount)},
     )
     tree = build_tree(robot, chosen)
     digest = digest_files(AssetKind.HAND, files)
@@ -69,8 +69,14 @@ def read_arm(path: str | Path, mount: str, hand_pose: Floats) -> Arm:
     return Arm(model, mount, body, np.asarray(pose, float), hand_pose)
 
 
-def _others(robot: Robot, moving: list[str]) -> list[str]:
-    return [name for name, joint in robot.joints.items() if joint.type in MOVING and name not in moving]
+def _others(robot: Robot, moving: list[str], mount: str) -> list[str]:
+    """Joints that stand still: those that do not lead to the mount, and one by which the base floats."""
+    chain = {joint.name for joint in chain_to(robot, mount)}
+    return [
+        name
+        for name, joint in robot.joints.items()
+        if name not in moving and joint.type != "fixed" and (name not in chain or joint.type in FREE)
+    ]
 
 
 def _rest(robot: Robot, joint: str) -> float:

@@ -85,23 +85,28 @@ def check_in_child(
         the finding, and the model for viewers (glTF); empty where it was refused or making it would take too long.
     """
     with tempfile.TemporaryDirectory(prefix="graspd-ingest-") as folder:
-        source, target = Path(folder) / "files.zip", Path(folder) / "check.json"
+        source, target, errors = (Path(folder) / file for file in ("files.zip", "check.json", "errors.txt"))
         source.write_bytes(pack(files))
         limits = [str(memory_bytes), str(cpu_s)]
         command = [sys.executable, "-m", "worker.stages.ingest", kind.value, name, str(source), str(target), *limits]
-        with subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-            env=_environment(),
-        ) as child:
+        # A file, whose size is limited: a pipe that nobody empties would stop the child, one that is read has no end.
+        with (
+            errors.open("wb") as stderr,
+            subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=stderr,
+                start_new_session=True,
+                env=_environment(),
+            ) as child,
+        ):
             code = _wait(child, context, wall_s)
-            complaint = (child.stderr.read() if child.stderr else b"")[-4000:].decode(errors="replace")
+        complaint = errors.read_bytes()[-4000:].decode(errors="replace")
         if code == 0 and target.is_file() and target.stat().st_size > _FINDING_BYTES:
-            complaint = f"it has more to say than {_FINDING_BYTES >> 20} MiB"
-        elif code == 0 and target.is_file():
+            why = f"the check finds more to say than {_FINDING_BYTES >> 20} MiB; simplify it, or shorten its names"
+            return _refused(kind, name, why), b""
+        if code == 0 and target.is_file():
             model = target.with_name(_MODEL)
             return dict(json.loads(target.read_bytes())), model.read_bytes() if model.is_file() else b""
         if os.strerror(errno.ENOSPC) in complaint:
@@ -145,6 +150,10 @@ def _refusal(
     else:
         last = complaint.strip().splitlines()[-1:] or [f"exit code {code}"]
         why = f"reading it ended the checker ({last[0][:200]}); repair or re-export the file"
+    return _refused(kind, name, why)
+
+
+def _refused(kind: AssetKind, name: str, why: str) -> dict[str, Any]:
     return {"verdict": "refuse", "message": f"{name}: {why}", "repairs": [], "facts": {"kind": kind.value}}
 
 

@@ -16,6 +16,7 @@ from service.index.views import AssetView, Page
 from service.model.errors import NotFoundError
 from service.model.projects import EVERYTHING, Reach
 from service.model.states import AssetKind
+from service.model.suggestions import SEARCHED, known_names
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,8 @@ class Assets:
                     .distinct()
                     .order_by(assets.c.name)
                 )
-                names = ", ".join(connection.scalars(known.limit(20)))
-                raise NotFoundError(f"there is no {kind.value} {name_or_digest!r}; there are: {names or 'none yet'}")
+                names = list(connection.scalars(known.limit(SEARCHED)))
+                raise NotFoundError(f"there is no {kind.value} {name_or_digest!r}{known_names(name_or_digest, names)}")
         return _asset_view(row)
 
     def sizes(self, kind: AssetKind, wanted: Collection[str], *, reach: Reach = EVERYTHING) -> dict[str, int]:

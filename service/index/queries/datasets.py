@@ -24,6 +24,7 @@ from service.model.outcomes import shortfall
 from service.model.planning import job_state, stages_of
 from service.model.projects import EVERYTHING, Reach
 from service.model.states import Stage, State
+from service.model.suggestions import SEARCHED, known_names
 
 _SHARE: Final[ColumnElement[float]] = case(
     (tasks.c.state == State.SUCCEEDED.value, 1.0),
@@ -137,9 +138,9 @@ def _dataset_row(connection: Connection, name: str, reach: Reach = EVERYTHING) -
     query = select(datasets).where(datasets.c.name == name, *seen_datasets(reach))
     row = connection.execute(query).mappings().first()
     if row is None:
-        known = select(datasets.c.name).where(*seen_datasets(reach)).order_by(datasets.c.created.desc()).limit(20)
-        names = ", ".join(connection.scalars(known))
-        raise NotFoundError(f"there is no dataset {name!r}; there are: {names or 'none yet'}")
+        known = select(datasets.c.name).where(*seen_datasets(reach)).order_by(datasets.c.created.desc())
+        names = list(connection.scalars(known.limit(SEARCHED)))
+        raise NotFoundError(f"there is no dataset {name!r}{known_names(name, names)}")
     return row
 
 

@@ -12,6 +12,7 @@ from service.index.dataset_views import ObjectSetView
 from service.index.reach import seen_sets
 from service.model.errors import NotFoundError
 from service.model.projects import EVERYTHING, Reach
+from service.model.suggestions import SEARCHED, known_names
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,5 @@ class ObjectSets:
         """The newest version of a set of objects; NotFoundError if there is none of that name."""
         found = {view.name: view for view in self.newest(reach=reach)}
         if name not in found:
-            known = ", ".join(list(found)[:20]) or "none yet"
-            raise NotFoundError(f"there is no set of objects {name!r}; there are: {known}")
+            raise NotFoundError(f"there is no set of objects {name!r}{known_names(name, list(found)[:SEARCHED])}")
         return found[name]

@@ -225,6 +225,8 @@ def test_unknown_ids_are_named(parts: Parts) -> None:
             call("nothing-here")
     with pytest.raises(NotFoundError, match="there are: gripper"):
         parts.index.assets.get(AssetKind.HAND, "nothing-here")
+    with pytest.raises(NotFoundError, match=r"there are: gripper; did you mean gripper\?"):
+        parts.index.assets.get(AssetKind.HAND, "griper")
 
 
 def test_a_shard_shows_its_manifest(parts: Parts) -> None:

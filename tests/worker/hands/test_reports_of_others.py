@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.worker.hands.mjcfs import FOUR_BAR
+from tests.worker.hands.mjcfs import CLAW, FOUR_BAR
 from tests.worker.hands.urdfs import joint, link, robot
 from worker.commands.hands import report_hand
 from worker.hands.check import check_hand
@@ -158,3 +158,118 @@ def test_actuators_on_spatial_tendons_are_told() -> None:
 
 def test_a_name_that_is_nearly_a_built_in_is_answered_with_that() -> None:
     assert report_hand("alegro")["message"].endswith("; did you mean allegro?")
+
+
+def claw(old: str = "", new: str = "", *more: str) -> bytes:
+    """The MJCF claw without its mesh, some of it written otherwise."""
+    text = CLAW.replace('<geom type="mesh" mesh="tip" pos="0 0 0.03"/>', "")
+    text = re.sub('<mesh name="tip"[^>]*/>', "", text)
+    for before, after in zip((old, *more[::2]), (new, *more[1::2]), strict=True):
+        assert before in text
+        text = text.replace(before, after)
+    return text.encode()
+
+
+_WRIST = '<joint name="wrist" axis="0 1 0" range="-30 30"/>'
+_LEG = (
+    '<body name="leg"><geom type="sphere" size="0.05"/><body name="knee"><joint name="knee" axis="0 1 0"/>'
+    '<geom fromto="0 0 0 0 0 0.3" size="0.01"/></body></body><body name="mount"'
+)
+
+
+@pytest.mark.parametrize("root", [None, "palm"])
+@pytest.mark.parametrize(
+    "model",
+    [
+        claw(_WRIST, '<joint name="wrist" type="ball"/>'),
+        claw(_WRIST, '<joint name="wrist" axis="0 1 0" range="-9000 9000"/>'),
+        claw('<body name="mount"', _LEG, "<equality>", '<equality><connect body1="knee" body2="leg" anchor="0 0 .1"/>'),
+    ],
+    ids=["a ball joint", "a range of many turns", "a loop that nothing drives"],
+)
+def test_what_a_model_has_beside_its_hand_does_not_matter(model: bytes, root: str | None) -> None:
+    report = check_hand({"h.xml": model}, "h", {"root": root} if root else {})
+    assert report["verdict"] == "accept", report["message"]
+    assert report["facts"]["root"] == "palm"
+
+
+def test_a_model_that_floats_is_told_to_stand() -> None:
+    report = check_hand({"h.xml": claw('euler="10 20 30">', 'euler="10 20 30"><freejoint/>')}, "h")
+    assert "'mount' is free to float, and taken as fixed" in report["facts"]["notes"]
+
+
+def test_a_loop_that_turns_on_a_ball_joint_is_told_as_that() -> None:
+    model = FOUR_BAR.replace('<joint name="back" axis="0 -1 0" range="-1 1"/>', '<joint name="back" type="ball"/>')
+    message = check_hand({"h.xml": model.encode()}, "h")["message"]
+    assert "turns on back, which is no hinge or slide joint" in message
+
+
+def test_two_joints_that_follow_each_other_are_coupled_once() -> None:
+    again = '<equality><joint joint1="left_spread" joint2="right_curl" polycoef="0.2 -2 0 0 0"/>'
+    report = check_hand({"h.xml": claw("<equality>", again)}, "h")
+    assert report["verdict"] == "accept", report["message"]
+    assert "a second equality of 'right_curl' was left out" in report["facts"]["notes"]
+
+
+def test_a_drive_that_its_followers_limits_cut_is_told() -> None:
+    free = jaws().replace(b'<mimic joint="jl" multiplier="-1"/>', b"").replace(b'xyz="1 0 0"', b'xyz="-1 0 0"')
+    report = check_hand({"h.urdf": free}, "h", {"couplings": {"jr": {"of": "jl", "multiplier": 2.0}}})
+    assert "limits of what follows jl leave it 0 .. 0.02" in report["message"]
+
+
+def test_a_follower_whose_coupling_is_junk_is_refused_by_its_way() -> None:
+    message = check_hand({"h.urdf": jaws().replace(b'multiplier="-1"', b'multiplier="-1000"')}, "h")["message"]
+    assert "joint 'jr' follows 'jl' with -1000 and offset 0, which moves it by 40 m" in message
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        '<joint name="above" type="floating">{}</joint>',
+        '<joint name="above" type="revolute">{}</joint>',
+        '<joint name="above" type="prismatic">{}<limit lower="-90" upper="90"/></joint>',
+        '<joint name="above" type="revolute">{}<axis xyz="0 0 0"/><limit lower="-1" upper="1"/></joint>',
+        '<joint name="above" type="revolute">{}<limit lower="-1" upper="1"/><mimic joint="none"/></joint>',
+    ],
+    ids=["free", "no limits", "a long rail", "no axis", "follows nothing"],
+)
+def test_a_joint_above_a_named_root_does_not_matter_and_is_told(fault: str) -> None:
+    above = fault.format('<parent link="world"/><child link="base"/>')
+    report = check_hand({"h.urdf": jaws(LIMIT, LIMIT, '<link name="world"/>', above)}, "h", {"root": "base"})
+    assert report["verdict"] == "accept", report["message"]
+    assert re.search(r"above \(\w+\) above the palm taken as fixed", report["message"])
+
+
+def test_fingers_whose_limits_were_left_empty_are_told_on_an_arm_as_well() -> None:
+    arm = '<link name="world"/>' + joint("arm", "world", "base")
+    empty = '<limit lower="0" upper="0"/>'
+    message = check_hand({"h.urdf": jaws(empty, empty, arm)}, "h")["message"]
+    assert "the limits of jl leave one value; fill them in" in message
+
+
+def test_a_root_below_which_nothing_moves_is_told_as_that() -> None:
+    assert "nothing below 'left' moves" in check_hand({"h.urdf": jaws()}, "h", {"root": "left"})["message"]
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"root": "bse"}, "the URDF has no link 'bse'; did you mean base?"),
+        ({"fix": {"wrist": 0}}, "the URDF has no joint 'wrist'"),
+        ({"palm": "bace"}, "the hand has no link 'bace' to be its palm; did you mean base?"),
+        ({"fingertips": ["lefd"]}, "the hand has no link 'lefd' to be a fingertip; did you mean left?"),
+        ({"preshape": {"jll": 0}}, "'jll' is no joint of the hand (jl); did you mean jl?"),
+    ],
+)
+def test_an_option_that_names_nothing_is_told_without_a_word_of_a_file(options: dict[str, object], told: str) -> None:
+    assert check_hand({"h.urdf": jaws()}, "h", options)["message"] == told
+
+
+def test_a_flat_mesh_is_told_with_its_link(tmp_path: Path) -> None:
+    import trimesh
+
+    flat = trimesh.Trimesh([[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0.01, 0.01, 0]], [[0, 1, 2], [1, 3, 2]])
+    mesh = '<link name="left"><collision><geometry><mesh filename="pad.stl"/></geometry></collision>'
+    data = jaws().replace(b'<link name="left">', mesh.encode())
+    files = {"h.urdf": data, "pad.stl": bytes(flat.export(file_type="stl"))}
+    assert "collision mesh 'pad.stl' of link 'left': " in check_hand(files, "h")["message"]

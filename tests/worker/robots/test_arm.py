@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 import yourdfpy
 
-from service.model.transforms import compose, pose_from_matrix
+from service.model.transforms import IDENTITY_POSE, compose, pose_from_matrix
 from tests.worker.robots.arms import JOINTS, write_arm
 from tests.worker.robots.shards import run
+from worker.robots.arm import read_arm
 from worker.robots.timing import ASSUMED_RAD_S
 
 pytest.importorskip("mink")
@@ -161,3 +162,11 @@ def test_a_real_arm_carries_grasps(table_shard: Path, tmp_path: Path, name: str)
                 "--mount-pose", MOUNT_POSE, "--base", "-0.5 0 0 1 0 0 0", "-o", tmp_path, "--json")  # fmt: skip
     assert found.exit_code == 0, found.output
     assert json.loads(found.stdout.splitlines()[-1])["reach_share"] > 0
+
+
+@pytest.mark.parametrize("kind", ["floating", "planar"])
+def test_an_arm_on_a_base_that_floats_stands_still_there(kind: str, tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    free = f'<link name="world"/><joint name="free" type="{kind}"><parent link="world"/><child link="base"/></joint>'
+    urdf.write_text(urdf.read_text().replace("</robot>", f"{free}</robot>"))
+    assert read_arm(urdf, "flange", IDENTITY_POSE).model.joint_names == tuple(NAMES)

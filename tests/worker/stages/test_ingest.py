@@ -188,3 +188,17 @@ def test_a_check_loads_no_engine() -> None:
         [sys.executable, "-c", f"{code}print(*sys.modules)"], capture_output=True, text=True, check=True
     )
     assert not {"warp", "newton", "mujoco"} & set(done.stdout.split())
+
+
+def test_a_finding_that_is_too_long_is_told_as_that(context: TaskContext, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ingest, "_FINDING_BYTES", 10)
+    found, _ = ingest.check_in_child(AssetKind.OBJECT, "t", OBJECT, context)
+    assert found["verdict"] == "refuse"
+    assert "finds more to say" in found["message"] and "ended the checker" not in found["message"]
+
+
+def test_a_check_that_complains_at_length_goes_on(context: TaskContext, monkeypatch: pytest.MonkeyPatch) -> None:
+    environment = ingest._environment()
+    # Python tells each import: more than a pipe holds.
+    monkeypatch.setattr(ingest, "_environment", lambda: {**environment, "PYTHONVERBOSE": "1"})
+    assert ingest.check_in_child(AssetKind.OBJECT, "t", OBJECT, context, wall_s=60)[0]["verdict"] == "accept"
