@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class ObjectModel:
     """A prepared object. Mass scales out: inertia is per unit of mass."""
 
@@ -48,35 +48,38 @@ class ObjectModel:
     repairs: tuple[str, ...] = ()
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Middle of the mesh [m]; zero for a model that is `centred`."""
-    about_centre: ObjectModel | None = field(default=None, repr=False)
-    """The object about its middle; None: it is that already."""
+    about_centre: Floats | None = field(default=None, repr=False)
+    """(V + H + 1, 3) vertices, hull and centre of mass about the middle [m]; None: they are that already."""
 
     @cached_property
     def content(self) -> str:
         """Digest of what was prepared. `digest` is the file's: the same for every fidelity."""
         return content_of(self)
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, ObjectModel) and other.content == self.content
-
-    def __hash__(self) -> int:
-        return hash(self.content)
-
     @property
     def centred(self) -> ObjectModel:
         """The object in the frame of its middle: the same bits wherever the file's origin lies."""
         if self.about_centre is None:
             return self
-        return replace(self.about_centre, name=self.name, digest=self.digest)
+        count = len(self.vertices)
+        vertices, hull, mass = self.about_centre[:count], self.about_centre[count:-1], self.about_centre[-1]
+        return self._in_frame(vertices, hull, mass, (0.0, 0.0, 0.0), None)
 
     def at(self, centre: tuple[float, float, float]) -> ObjectModel:
         """An object that is centred, in a frame in which its middle lies at `centre` [m]."""
         if not any(centre):
             return self
+        held = np.concatenate([self.vertices, self.hull_vertices, self.centre_of_mass[None]])
+        return self._in_frame(
+            self.vertices + centre, self.hull_vertices + centre, self.centre_of_mass + centre, centre, held
+        )
+
+    def _in_frame(
+        self, vertices: Floats, hull: Floats, mass: Floats, centre: tuple[float, float, float], held: Floats | None
+    ) -> ObjectModel:
         return replace(
-            self, vertices=self.vertices + centre, hull_vertices=self.hull_vertices + centre,
-            centre_of_mass=self.centre_of_mass + centre, centre=centre, about_centre=self,
-        )  # fmt: skip
+            self, vertices=vertices, hull_vertices=hull, centre_of_mass=mass, centre=centre, about_centre=held
+        )
 
     @property
     def gyration_radius(self) -> float:

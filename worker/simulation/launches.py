@@ -61,7 +61,7 @@ class Launches:
 
 def launch(kernel: Any, dim: Any, *, device: Any = None, **given: Any) -> None:
     """`warp.launch`, with the processor time of a kernel on the CPU counted where somebody wants to know it."""
-    with _counted() if wp.get_device(device).is_cpu else nullcontext():
+    with nullcontext() if wp.get_device(device).is_cuda else _counted():
         wp.launch(kernel, dim, device=device, **given)
 
 
