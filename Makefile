@@ -71,9 +71,9 @@ clusters: ## files for clusters read by SkyPilot, Ray and spython, in an environ
 	.venv-clusters/bin/python -m pip install --quiet --disable-pip-version-check 'skypilot>=0.10,<1' 'spython>=0.3,<0.4' 'ray>=2.40,<3'
 	.venv-clusters/bin/python tests/deploy/cluster_tools.py
 
-pins: $(STAMP) ## versions that the images install: those of .venv
+pins: $(STAMP) ## versions and hashes that the images install: those of .venv (asks the package index)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,postgres,otel,gpu]'
-	$(BIN)/python docker/pin.py > docker/constraints.txt.new && mv docker/constraints.txt.new docker/constraints.txt
+	$(BIN)/python docker/pin.py
 
 licences: $(STAMP) ## licences of what graspd runs with, into docs/licences.md
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,arm]'

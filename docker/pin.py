@@ -1,10 +1,12 @@
 """Pins of the images: every package they install, at the version that is installed here and that the tests ran with.
 
-python docker/pin.py > docker/constraints.txt
+`python docker/pin.py` writes constraints.txt, and api.lock, worker.lock and build.lock with the hashes of the wheels.
 """
 
 from __future__ import annotations
 
+import json
+import subprocess
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator
@@ -15,8 +17,14 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
+FOLDER = ROOT / "docker"
 #: What the images are made of; `graspd up` and its embedded Redis do not run there.
-EXTRAS = ("api", "worker", "postgres", "otel", "gpu")
+IMAGES = {"api": ("api", "postgres", "otel"), "worker": ("worker", "otel", "gpu")}
+EXTRAS = tuple(dict.fromkeys(extra for extras in IMAGES.values() for extra in extras))
+#: Machines that images are built for, and their Python.
+MACHINES = ("x86_64", "aarch64")
+PYTHON = "3.11"
+_NOTE = "# Versions in the images; `make pins` writes this file."
 
 
 def requirements(*extras: str) -> list[Requirement]:
@@ -55,7 +63,47 @@ def _needs(name: str, extras: frozenset[str]) -> Iterator[Requirement]:
             yield requirement
 
 
+def wheels(wanted: Iterable[str]) -> dict[str, tuple[str, set[str]]]:
+    """Version and SHA-256 of the wheels that pip would take, on each machine that images are built for.
+
+    Asks the package index. SystemExit where a package has no wheel.
+    """
+    found: dict[str, tuple[str, set[str]]] = {}
+    for machine in MACHINES:
+        platforms = [f"manylinux_2_{minor}_{machine}" for minor in range(5, 37)] + [f"manylinux2014_{machine}"]
+        command = [sys.executable, "-m", "pip", "install", "--dry-run", "--ignore-installed", "--no-deps", "--quiet"]
+        command += ["--report", "-", "--only-binary", ":all:", "--python-version", PYTHON, "--implementation", "cp"]
+        command += [word for one in platforms for word in ("--platform", one)]
+        done = subprocess.run([*command, "--target", "unused", *wanted], capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise SystemExit(f"{machine}: {done.stderr.strip().splitlines()[-1]}")
+        for one in json.loads(done.stdout[done.stdout.index("{") :])["install"]:
+            name, version = canonicalize_name(one["metadata"]["name"]), one["metadata"]["version"]
+            _, known = found.setdefault(name, (version, set()))
+            known.add(one["download_info"]["archive_info"]["hashes"]["sha256"])
+    return found
+
+
+def main() -> None:
+    """Write the pins, and for each image those that it installs with the hashes of their wheels."""
+    pins = _versions(requirements(*EXTRAS))
+    lines = [f"{name}=={version}" for name, version in sorted(pins.items())]
+    (FOLDER / "constraints.txt").write_text("\n".join([_NOTE, *lines, ""]))
+    build = tomllib.loads((ROOT / "pyproject.toml").read_text())["build-system"]["requires"]
+    known = wheels([*lines, *build])
+    names = {image: _versions(requirements(*extras)).keys() for image, extras in IMAGES.items()}
+    names["build"] = {canonicalize_name(Requirement(one).name) for one in build}
+    for image, its in names.items():
+        locked = [
+            " \\\n    --hash=sha256:".join([f"{name}=={known[name][0]}", *sorted(known[name][1])])
+            for name in sorted(its)
+        ]
+        (FOLDER / f"{image}.lock").write_text("\n".join([_NOTE, *locked, ""]))
+
+
+def _versions(wanted: Iterable[Requirement]) -> dict[str, str]:
+    return {name: version.partition("+")[0] for name, version in closure(wanted).items()}
+
+
 if __name__ == "__main__":
-    pins = closure(requirements(*EXTRAS))
-    sys.stdout.write("# Versions in the images; `make pins` writes this file.\n")
-    sys.stdout.writelines(f"{name}=={version.partition('+')[0]}\n" for name, version in sorted(pins.items()))
+    main()

@@ -192,6 +192,24 @@ def test_what_the_images_install_is_pinned(pin: ModuleType, extra: str) -> None:
     assert not wanted - pins().keys(), "run `make pins`"
 
 
+@pytest.mark.parametrize("image", ["api", "worker"])
+def test_a_lock_holds_all_that_its_image_installs_with_hashes(pin: ModuleType, image: str) -> None:
+    lines = (REPOSITORY / "docker" / f"{image}.lock").read_text().replace("\\\n", "").splitlines()
+    locked = dict(line.split(maxsplit=1) for line in lines if not line.startswith("#"))
+    wanted = pin.closure(pin.requirements(*pin.IMAGES[image]))
+    assert locked.keys() == {f"{name}=={pins()[name]}" for name in wanted}, "run `make pins`"
+    assert all(re.fullmatch(r"(--hash=sha256:[0-9a-f]{64}\s*)+", hashes) for hashes in locked.values())
+
+
+def test_nothing_is_installed_from_an_index_without_its_hash() -> None:
+    runs = [command for keyword, rest in instructions() if keyword == "RUN" for command in rest.split("&&")]
+    installs = [command for command in runs if "pip install" in command]
+    assert len(installs) == 7
+    for command in installs:
+        asks_nothing = "--no-build-isolation" in command and ("--no-index" in command or "--no-deps" in command)
+        assert asks_nothing or "--require-hashes" in command, command
+
+
 def test_hadolint_finds_nothing() -> None:
     program = shutil.which("hadolint") or shutil.which("hadolint", path=str(Path(sys.executable).parent))
     if program is None:
