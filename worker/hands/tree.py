@@ -88,8 +88,8 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
         if drive.dof not in moving:
             raise HandError(f"joint {name!r} follows {drive.dof!r}, which is dropped; fix it: --fix {name}=0")
     if not moving and still:
-        names = ", ".join(list(still)[:6]) + (", ..." if len(still) > 6 else "")
-        raise HandError(f"no moving joint is left: the limits of {names} leave one value; fill them in")
+        shown = ", ".join(list(still)[:6]) + (", ..." if len(still) > 6 else "")
+        raise HandError(f"no moving joint is left: the limits of {shown} leave one value; fill them in")
     if not moving:
         how = (
             "fix or drop less" if options.fix or options.drop else f"nothing below {root!r} moves, name another --root"
