@@ -34,12 +34,13 @@ def wanted(name: str = "grasps", **changes: Any) -> DatasetRequest:
     return DatasetRequest.model_validate({"name": name, **given, **changes})
 
 
-def finish(parts: Parts, job: str, *, batches: int | None = None) -> None:
-    """Do the first tasks of a job."""
+def finish(parts: Parts, job: str, *, batches: int | None = None, lost: dict[str, int] | None = None) -> None:
+    """Do the first tasks of a job; of each, so many candidates are `lost` by outcome."""
     record = read_record(JobRecord, parts.store, names.job_record(job))
     for task in plan(record):
         if batches is None or task.batch < batches:
-            parts.index.write.add_manifest(make_shard(parts.store, message_of(record, task, attempt=1, max_attempt=3)))
+            made = make_shard(parts.store, message_of(record, task, attempt=1, max_attempt=3))
+            parts.index.write.add_manifest(made.model_copy(update={"info": {"outcomes": lost}}) if lost else made)
 
 
 def fail(parts: Parts, job: str, reason: str = "it broke") -> None:

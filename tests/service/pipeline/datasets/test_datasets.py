@@ -137,6 +137,21 @@ def test_status_tells_each_cell(either: Parts) -> None:
     assert whole.seconds == pytest.approx(1.5) and whole.shards == 3
 
 
+def test_a_dataset_that_found_fewer_grasps_says_what_became_of_the_others(either: Parts) -> None:
+    actions.create(either, wanted(objects=("ball",)))
+    plan_all(either)
+    first, second = jobs_of(either, "grasps")
+    finish(either, first, lost={"slipped": 3})
+    assert status(either.index, "grasps").dataset.reason is None
+    finish(either, second, lost={"slipped": 1, "turned": 2})
+    found = status(either.index, "grasps")
+    whole = found.dataset
+    assert whole.valid < 64 and whole.outcomes == {"turned": 2, "slipped": 4}
+    assert whole.reason is not None and f"found {whole.valid} of 64 valid" in whole.reason
+    reasons = [cell.reason or "" for cell in found.cells]
+    assert "3 slipped;" in reasons[0] and "2 turned in the hand, 1 slipped;" in reasons[1]
+
+
 def test_cells_come_in_pages_and_by_state(either: Parts) -> None:
     actions.create(either, wanted(objects=("ball", "cube", "cone")))
     plan_all(either)
