@@ -63,7 +63,7 @@ def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str
         if element.tag == "default":
             # MuJoCo refuses what else stands there; others pass over it.
             element.attrib = {name: value for name, value in element.attrib.items() if name == "class"}
-    notes = _spatial_drives(root)
+    notes = _passed_over(root)
     _prune(root)
     _prune_actuators(root)
     compiler = root.find("compiler")
@@ -78,16 +78,39 @@ def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str
     return ElementTree.tostring(root, encoding="unicode"), assets, notes
 
 
-def _spatial_drives(root: Element) -> list[str]:
-    """What a user must know of actuators on tendons that run over sites: these are not modelled."""
+def _passed_over(root: Element) -> list[str]:
+    """What a user must know of drives and constraints that are left out; call it before they are."""
     spatial = {tendon.get("name") for tendon in root.iter("spatial")}
-    names = [
-        f"{one.get('name') or one.get('tendon')}" for one in root.iterfind("actuator/*") if one.get("tendon") in spatial
+    drives = list(root.iterfind("actuator/*"))
+    pulled = [one for one in drives if one.get("tendon") in spatial]
+    others = [one for one in drives if one not in pulled and not _is_read(one)]
+    held = [
+        one
+        for one in root.iterfind("equality/*")
+        if (one.tag == "weld" and len(one.attrib.keys() & {"body1", "body2", "site1", "site2"}) == 2)
+        or {one.get("tendon1"), one.get("tendon2")} & spatial - {None}
     ]
-    if not names:
-        return []
-    shown = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
-    return [f"{shown} on spatial tendons, which are passed over: joints are planned as if each had a drive of its own"]
+    notes = []
+    if pulled:
+        notes.append(
+            f"{_shown(pulled)} on spatial tendons, which are passed over: joints are planned as if each had a drive of "
+            "its own"
+        )
+    if others:
+        notes.append(f"{_shown(others)} passed over: only motors and servos of joints and fixed tendons are read")
+    if held:
+        notes.append(f"{_shown(held)} passed over: what it holds together is planned as free")
+    return notes
+
+
+def _shown(elements: list[Element]) -> str:
+    names = [one.get("name") or one.get("tendon") or one.tag for one in elements]
+    return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+
+
+def _is_read(actuator: Element) -> bool:
+    """Whether it drives joints or tendons in a way that is modelled."""
+    return actuator.tag in _ACTUATORS and bool(actuator.attrib.keys() & {"joint", "jointinparent", "tendon"})
 
 
 def _means_radians(root: Element) -> bool:
@@ -195,8 +218,7 @@ def _prune_actuators(root: Element) -> None:
     tendons = {tendon.get("name") for section in root.findall("tendon") for tendon in section.findall("fixed")}
     for section in root.findall("actuator"):
         for actuator in list(section):
-            drives = "joint" in actuator.attrib or "jointinparent" in actuator.attrib
-            if actuator.tag not in _ACTUATORS or not (drives or actuator.get("tendon") in tendons):
+            if not _is_read(actuator) or actuator.get("tendon") not in {None, *tendons}:
                 section.remove(actuator)
     for section in root.findall("equality"):
         for constraint in list(section):

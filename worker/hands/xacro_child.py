@@ -13,6 +13,7 @@ import io
 import json
 import os
 import posixpath
+import re
 import resource
 import sys
 from types import SimpleNamespace
@@ -24,6 +25,8 @@ _TOP: Final = "/hand"
 _MAX_NODES: Final = 100_000
 #: What the interpreter does of itself when it evaluates an expression.
 _HARMLESS: Final = frozenset({"compile", "exec", "builtins.id", "object.__getattr__"})
+#: What Python calls an object that has no text of its own: its place in memory.
+_ADDRESS: Final = re.compile(r" at 0x[0-9a-f]{6,}")
 #: Attributes that lead from a generator, a coroutine or a traceback to the frames around it.
 _FRAMES: Final = ("gi_", "cr_", "ag_", "f_", "tb_", "co_", "func_")
 
@@ -126,7 +129,7 @@ def _expand(given: dict[str, Any]) -> str:
     text = document.toxml()
     if len(text) > given["limit"]:
         raise Refused(f"it expands to {len(text)} characters; at most {given['limit']} are taken")
-    if " object at 0x" in text:
+    if _ADDRESS.search(text):
         raise Refused("an expression gives an object where a text belongs, and another one each time; write list(...)")
     return text
 

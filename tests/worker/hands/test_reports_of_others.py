@@ -156,6 +156,19 @@ def test_actuators_on_spatial_tendons_are_told() -> None:
     assert not any("spatial" in note for note in check_hand({"h.xml": FOUR_BAR.encode()}, "h")["facts"]["notes"])
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ('<position joint="thumb" kp="5"/>', '<muscle name="pull" joint="thumb"/>', "pull passed over: only motors"),
+        ('<position joint="thumb" kp="5"/>', '<adhesion body="thumb" ctrlrange="0 1"/>', "adhesion passed over"),
+        ("<equality>", '<equality><weld name="glue" body1="thumb" body2="base"/>', "glue passed over: what it holds"),
+    ],
+)
+def test_drives_and_constraints_that_are_passed_over_are_told(old: str, new: str, told: str) -> None:
+    report = check_hand({"h.xml": FOUR_BAR.replace(old, new).encode()}, "h")
+    assert any(told in note for note in report["facts"]["notes"])
+
+
 def test_a_name_that_is_nearly_a_built_in_is_answered_with_that() -> None:
     assert report_hand("alegro")["message"].endswith("; did you mean allegro?")
 

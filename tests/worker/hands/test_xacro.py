@@ -185,8 +185,9 @@ def test_the_working_directory_does_not_show_in_an_expansion(tmp_path: Path, mon
     assert tmp_path.name.encode() not in expand({**FILES, "urdf/claw.urdf.xacro": text}, "urdf/claw.urdf.xacro", {})
 
 
-def test_what_differs_from_expansion_to_expansion_is_refused() -> None:
-    text = CLAW.replace("<robot", '<robot note="${str(map(str, [1]))}"', 1).encode()
+@pytest.mark.parametrize("value", ["str(map(str, [1]))", "(x for x in [1])", "lambda: 1", "xacro.load_yaml", "xacro"])
+def test_what_differs_from_expansion_to_expansion_is_refused(value: str) -> None:
+    text = CLAW.replace("<robot", f'<robot note="${{{value}}}"', 1).encode()
     with pytest.raises(HandError, match="another one each time"):
         expand({**FILES, "urdf/claw.urdf.xacro": text}, "urdf/claw.urdf.xacro", {})
 
