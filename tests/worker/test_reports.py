@@ -87,6 +87,12 @@ def inline_comment(folder: Path, _: Path) -> None:
     assert accepted(report_object(str(folder / "box.obj")))["facts"]["volume_m3"] == pytest.approx(120e-6)
 
 
+def far_from_origin(folder: Path, out: Path) -> None:
+    report = accepted(report_object(str(folder / "box_5m.obj")))
+    assert report["facts"]["origin_distance_m"] == pytest.approx(6.16, abs=0.1)
+    assert synthesized(out, "barrett", folder / "box_5m.obj", 8)["valid"] == 8
+
+
 def centimetres(folder: Path, _: Path) -> None:
     for unit in ("cm", "in"):
         report = refused(report_object(str(folder / f"mug_sized_{unit}.obj")), f"--units {unit}")
@@ -118,6 +124,7 @@ CASES: dict[str, Callable[[Path, Path], None]] = {
     "O01_off_header_glued": glued_header,
     "O02_concave_ngon": concave_polygons,
     "O04b_inline_comment": inline_comment,
+    "O12_far_from_origin": far_from_origin,
     "O13_centimetres": centimetres,
     "O17_git_lfs_pointer": lfs_pointer,
     "X01_isaac_prim_names": prim_names,
