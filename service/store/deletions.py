@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+from collections.abc import Iterable
 from typing import Final, Literal
 
 from pydantic import Field
@@ -65,18 +66,19 @@ def removed_before(key: str, at: str) -> bool:
 
 def deletions(store: Store, what: str = "") -> list[Deletion]:
     """Deletions that can be taken back, the newest first; of one kind of thing or of all."""
-    keys = [entry.key for entry in store.list(names.DELETIONS) if entry.key.count("/") == 2]
-    keys = [key for key in keys if not what or key.split("/")[1] == what]
-    keys += [
-        entry.key
-        for entry in store.list(names.REMOVED)
-        if entry.key.count("/") == 2 and (not what or entry.key.split("-")[1] == what)
-    ]
     found: dict[str, Deletion] = {}
-    for key in keys:
-        with contextlib.suppress(NotFoundError, DamagedError):
-            deletion = read_record(Deletion, store, key)
-            found[removed_folder(deletion)] = deletion
+
+    def read(keys: Iterable[str]) -> None:
+        for key in keys:
+            with contextlib.suppress(NotFoundError, DamagedError):
+                deletion = read_record(Deletion, store, key)
+                found[removed_folder(deletion)] = deletion
+
+    # What the keeper moves meanwhile is in the second folder before it leaves the first.
+    waiting = [entry.key for entry in store.list(names.DELETIONS) if entry.key.count("/") == 2]
+    read(key for key in waiting if not what or key.split("/")[1] == what)
+    removed = [entry.key for entry in store.list(names.REMOVED) if entry.key.count("/") == 2]
+    read(key for key in removed if not what or key.split("-")[1] == what)
     return sorted(found.values(), key=lambda one: one.at, reverse=True)
 
 

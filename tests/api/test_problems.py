@@ -96,7 +96,7 @@ def test_a_body_that_grows_over_the_limit_is_refused_while_it_arrives(http: Test
     [
         ("queue", "ping", QueueUnavailable("Redis does not answer"), "queue-unavailable"),
         ("store", "put", StoreUnavailable("the store cannot be written"), "store-unavailable"),
-        ("index.write", "add_job", IndexUnavailable("the index does not answer"), "index-unavailable"),
+        ("index.write", "enter_job", IndexUnavailable("the index does not answer"), "index-unavailable"),
     ],
 )
 def test_a_part_that_is_away_is_503_and_worth_another_try(

@@ -14,6 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from service.model.errors import GraspdError
+from service.parquet import arrow
 
 
 @contextmanager
@@ -93,9 +94,7 @@ def _hdf5(path: Path) -> None:
 
 
 def _table(path: Path) -> None:
-    import pyarrow.parquet
-
-    pyarrow.parquet.ParquetFile(path).read_row_group(0)
+    arrow().parquet.ParquetFile(path).read_row_group(0)
 
 
 def _tar(path: Path) -> None:
