@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
 from typing import Any, Final
 
 from sqlalchemy import Connection, delete, func, select, update
@@ -33,8 +32,6 @@ class Due:
     hook: WebhookView
     end: EndView
     attempts: int
-    failed_last: bool = False
-    """Whether the last attempt at this address, of this delivery or another, failed."""
 
 
 def note_ends(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
@@ -187,8 +184,7 @@ class Outgoing:
                 connection.execute(seen)
 
     def due(self, now: float) -> list[Due]:
-        """Deliveries to try now, the oldest of each webhook: projects in turn, in each first who was not tried for the
-        longest time."""
+        """Deliveries to try now, the oldest of each webhook."""
         hooks = {hook.id: hook for hook in self.hooks()}
         first = (
             select(func.min(deliveries.c.seq).label("seq"), deliveries.c.webhook)
@@ -201,24 +197,13 @@ class Outgoing:
             .join(first, first.c.seq == ends.c.seq)
             .join(deliveries, (deliveries.c.seq == first.c.seq) & (deliveries.c.webhook == first.c.webhook))
         )
-        tried = select(deliveries.c.webhook, deliveries.c.tried, deliveries.c.state).where(
-            deliveries.c.tried.in_(
-                select(func.max(deliveries.c.tried)).group_by(deliveries.c.webhook).scalar_subquery()
-            )
-        )
         with self.database.reading() as connection:
             rows = connection.execute(query).mappings().all()
-            last = {
-                row.webhook: (row.tried, row.state != "delivered")
-                for row in sorted(connection.execute(tried), key=lambda row: row.tried)
-            }
-        found: dict[str, list[Due]] = {}
-        for row in sorted(rows, key=lambda row: last.get(row["webhook"], ("", False))[0]):
-            if (hook := hooks.get(row["webhook"])) is not None:
-                end = EndView(**{name: row[name] for name in EndView.model_fields})
-                failed = last.get(hook.id, ("", False))[1]
-                found.setdefault(hook.project, []).append(Due(hook, end, row["attempts"], failed))
-        return [due for turn in zip_longest(*found.values()) for due in turn if due is not None]
+        return [
+            Due(hooks[row["webhook"]], EndView(**{name: row[name] for name in EndView.model_fields}), row["attempts"])
+            for row in rows
+            if row["webhook"] in hooks
+        ]
 
     def settle(self, due: Due, *, status: int | None, detail: str, done: bool, final: bool = False) -> None:
         """How an attempt ended. After a failure all that waits for the address rests as long as this delivery does;

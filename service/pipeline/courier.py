@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from itertools import zip_longest
 from typing import Final
 
 from service.index.outgoing import Due
@@ -51,12 +52,18 @@ class Courier:
         self._forget_again = -math.inf
         self._lock = threading.Lock()
         self._under_way: dict[str, Due] = {}
+        self._ended = threading.Event()
+        #: Of each webhook: when it was tried last, and whether it took nothing then.
+        self._last: dict[str, tuple[float, bool]] = {}
         self._pool = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="webhooks")
 
     def run(self) -> None:
         """Rounds until told to stop."""
         look_again = -math.inf
-        while not self._stop.wait(_PAUSE_S):
+        while not self._stop.is_set():
+            # To one address goes one at a time: the next one as soon as the last has ended.
+            self._ended.wait(_PAUSE_S)
+            self._ended.clear()
             try:
                 if time.monotonic() > look_again:
                     self.tell_datasets()
@@ -84,15 +91,25 @@ class Courier:
             return []
         out.plan()
         started = []
-        for due in out.due(time.time() if now is None else now):
+        for due in self._in_turn(out.due(time.time() if now is None else now)):
             with self._lock:
-                slow = sum(one.failed_last for one in self._under_way.values())
-                full = len(self._under_way) >= AT_ONCE or (due.failed_last and slow >= SLOW_AT_ONCE)
+                slow = sum(map(self._failed_last, self._under_way.values()))
+                full = len(self._under_way) >= AT_ONCE or (self._failed_last(due) and slow >= SLOW_AT_ONCE)
                 if full or due.hook.id in self._under_way:
                     continue
                 self._under_way[due.hook.id] = due
             started.append(self._pool.submit(self._try, due))
         return started
+
+    def _in_turn(self, found: list[Due]) -> list[Due]:
+        """Projects, and keys without one, in turn; in each first what was not tried for the longest time."""
+        of_project: dict[str, list[Due]] = {}
+        for due in sorted(found, key=lambda one: self._last.get(one.hook.id, (0.0, False))):
+            of_project.setdefault(due.hook.project or f"key {due.hook.owner}", []).append(due)
+        return [due for turn in zip_longest(*of_project.values()) for due in turn if due is not None]
+
+    def _failed_last(self, due: Due) -> bool:
+        return due.attempts > 0 or self._last.get(due.hook.id, (0.0, False))[1]
 
     def tell_datasets(self) -> None:
         """Put datasets that ended into the feed."""
@@ -104,8 +121,10 @@ class Courier:
             self._parts.index.outgoing.tell_dataset(name, untold[name], row)
 
     def _try(self, due: Due) -> None:
+        is_settled = False
         try:
             self._deliver(due)
+            is_settled = True
         except UnavailableError as error:
             log.warning("a webhook waits: %s", error)
         except Exception:
@@ -113,6 +132,8 @@ class Courier:
         finally:
             with self._lock:
                 del self._under_way[due.hook.id]
+            if is_settled:
+                self._ended.set()
 
     def _deliver(self, due: Due) -> None:
         body = body_of(due.end)
@@ -124,6 +145,7 @@ class Courier:
             SIGNATURE: signature(secret_of(self._master, due.hook.id), at, body),
         }
         answer = self._send(due.hook.url, body, headers, allowed=self._allowed)
+        self._last[due.hook.id] = (time.monotonic(), not answer.is_taken)
         self._parts.index.outgoing.settle(
             due, status=answer.status, detail=answer.detail, done=answer.is_taken, final=answer.is_final
         )

@@ -26,6 +26,7 @@ from service.pipeline.posting import Answer
 from service.settings import Settings
 from tests.api.factories import add_job, finish_all
 from tests.planning import plan_all
+from tests.waiting import PATIENCE_S, until
 
 ADDRESS = "https://ci.example.org/graspd"
 MASTER = "a secret of the operator's"
@@ -258,6 +259,24 @@ def test_silent_addresses_keep_no_other_waiting(parts: Parts, dead: int, theirs:
         assert len(set(ear.asked)) == len(ear.asked)
     finally:
         ear.let_go.set()
+
+
+def test_a_burst_of_ends_is_told_without_a_pause_between_them(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.pipeline.courier._PAUSE_S", PATIENCE_S)
+    ear, stop = Ear(parts), threading.Event()
+    ear.courier = Courier(parts, stop, send=ear.send)
+    hooks(parts, 1, "a", "good")
+    for number in range(20):
+        end_jobs_of(parts, "a", str(number))
+    ear.courier.deliver()
+    thread = threading.Thread(target=ear.courier.run)
+    thread.start()
+    try:
+        until(lambda: len(ear.heard) == 20, "all are told")
+    finally:
+        stop.set()
+        ear.courier._ended.set()
+        thread.join()
 
 
 def test_an_address_that_failed_rests_with_all_that_waits_for_it(parts: Parts, ear: Ear) -> None:
