@@ -30,6 +30,10 @@ _MOST_ITEMS: Final = 1000
 #: No byte of deflate becomes more than so many; and what a dataset may claim without having been written [bytes].
 _MOST_DEFLATED: Final = 1032
 _FREE_BYTES: Final = 1 << 16
+#: What a whole file may unpack to, whatever its size, and how often its size beyond that [bytes]: masks shrink a
+#: thousandfold, and no shard is made of them alone.
+_FREE_IN_ALL: Final = 1 << 28
+_MOST_IN_ALL: Final = 64
 #: What h5py and the filters of HDF5 raise where they meet bytes that make no sense.
 _UNREADABLE: Final = (OSError, KeyError, ValueError, TypeError, RuntimeError, OverflowError, MemoryError)
 
@@ -162,22 +166,31 @@ def _check_contents(file: h5py.File, name: str) -> None:
 
     HDF5 follows links into other files, reads raw bytes of any file as values, and makes up what was never written.
     """
-    seen, waiting = 0, [(file, "")]
+    claimed = held = 0
+    seen, waiting = {h5py.h5o.get_info(file["/"].id).addr}, [(file, "")]
     while waiting:
         group, place = waiting.pop()
         for key in group:
-            path, seen = f"{place}{key}", seen + 1
-            if seen > _MOST_ITEMS:
+            path = f"{place}{key}"
+            if len(seen) > _MOST_ITEMS:
                 raise InputError(f"{name} holds more than {_MOST_ITEMS} datasets and groups, which no shard does")
             if not isinstance(group.get(key, getlink=True), h5py.HardLink):
                 raise InputError(f"{name}: {path} is a link; a shard holds its own values")
             item = group[key]
+            if (address := h5py.h5o.get_info(item.id).addr) in seen:
+                raise InputError(f"{name}: {path} is a link; a shard holds its own values")
+            seen.add(address)
             if isinstance(item, h5py.Group):
                 waiting.append((item, f"{path}/"))
             elif not isinstance(item, h5py.Dataset) or item.is_virtual or item.external:
                 raise InputError(f"{name}: {path} has its values in another file; a shard holds its own")
-            elif item.nbytes > _MOST_DEFLATED * item.id.get_storage_size() + _FREE_BYTES:
-                raise InputError(f"{name}: {path} claims {item.nbytes} bytes, which the file does not hold")
+            else:
+                size = item.id.get_storage_size()
+                claimed, held = claimed + item.nbytes, held + size
+                if item.nbytes > _MOST_DEFLATED * size + _FREE_BYTES:
+                    raise InputError(f"{name}: {path} claims {item.nbytes} bytes, which the file does not hold")
+    if claimed > _MOST_IN_ALL * held + _FREE_IN_ALL:
+        raise InputError(f"{name} claims {claimed} bytes, {claimed // held} times what it holds, as no shard does")
 
 
 def kind_of(file: h5py.File, name: str) -> ShardKind:

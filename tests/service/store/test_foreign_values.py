@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -37,12 +38,37 @@ def made_up(file: h5py.File, _: Path) -> None:
     file.create_dataset("grasp/hand_pose", (50_000_000, 7), "f8", chunks=(4096, 7), fillvalue=1.0)
 
 
+def deflated_zeros(file: h5py.File, _: Path) -> None:
+    dataset = file.create_dataset("grasp/hand_pose", (50_000_000, 7), "f8", chunks=(1 << 20, 7), compression="gzip")
+    piece = zlib.compress(bytes(dataset.chunks[0] * 7 * 8), 9)
+    for start in range(0, 48 << 20, 1 << 20):
+        dataset.id.write_direct_chunk((start, 0), piece)
+
+
+def one_dataset_under_many_names(file: h5py.File, _: Path) -> None:
+    file["grasp/hand_pose"] = np.zeros((1000, 7))
+    for number in range(500):
+        file[f"name{number}"] = file["grasp/hand_pose"]
+
+
 def many(file: h5py.File, _: Path) -> None:
     for number in range(1200):
         file.create_group(f"g{number}")
 
 
-@pytest.mark.parametrize("change", [external_link, soft_link, external_storage, virtual, made_up, many])
+@pytest.mark.parametrize(
+    "change",
+    [
+        external_link,
+        soft_link,
+        external_storage,
+        virtual,
+        made_up,
+        deflated_zeros,
+        one_dataset_under_many_names,
+        many,
+    ],
+)
 @pytest.mark.parametrize("as_bytes", [False, True])
 def test_values_from_elsewhere_are_refused(
     change: Callable[[h5py.File, Path], None], as_bytes: bool, tmp_path: Path
