@@ -209,8 +209,8 @@ def _weld(mesh: Repaired) -> Repaired:
 def _fill_pinholes(mesh: Repaired) -> Repaired:
     """A fan over each small hole; the whole mesh stays open if one is large."""
     extent = float(np.ptp(mesh.vertices, axis=0).max())
-    loops = _rims(mesh.faces)
-    if loops is None:
+    loops = [loop for loop in _rims(mesh.faces) or [] if len(loop) > 2]
+    if not loops:
         return mesh
     if any(np.ptp(mesh.vertices[loop], axis=0).max() > HOLE * extent for loop in loops):
         return mesh

@@ -109,6 +109,14 @@ def test_a_small_hole_is_filled_and_a_large_one_refused() -> None:
     assert large["verdict"] == "refuse" and "--allow-open" in large["message"]
 
 
+def test_a_wall_inside_a_mesh_is_no_hole_and_no_traceback() -> None:
+    (one, faces), (other, more) = box(), box(at=(0.06, 0.0, 0.0))
+    # Their common face is there once: its four edges have three faces each.
+    kept = ~np.isclose(other[more][:, :, 0], 0.03).all(axis=1)
+    report = check(join((one, faces), (other, more[kept])))
+    assert report["verdict"] == "refuse" and "not watertight (4 open edges)" in report["message"]
+
+
 def test_a_seam_that_does_not_quite_close_is_welded() -> None:
     vertices, faces = sphere()
     corners = vertices[faces].reshape(-1, 3) + np.random.default_rng(0).normal(scale=1e-8, size=(3 * len(faces), 3))
