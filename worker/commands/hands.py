@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from json import dumps
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
@@ -32,7 +34,7 @@ from worker.hands.check import check_hand
 from worker.hands.load import files_from_path, hand_from_path, main_file
 from worker.hands.model import HandModel
 from worker.hands.options import parse_options
-from worker.run import Run
+from worker.run import ALONE, Run
 
 app = typer.Typer(add_completion=False)
 
@@ -72,7 +74,8 @@ def check(
         urdf=urdf, xacro=xacro, palm=palm, approach=approach, root=root, pre_shape=pre_shape, closing=closing,
         fingertips=fingertips, fix=fix, drop=drop,
     )  # fmt: skip
-    report = report_hand(file, options)
+    with _bar("reading     ", quiet=json) as run:
+        report = report_hand(file, options, run)
     if picture and report["verdict"] != "refuse":
         _draw(hand_from_path(file, options), picture, collision=collision)
     if write and report["verdict"] != "refuse":
@@ -93,14 +96,23 @@ def _tried(file: str, options: dict[str, Any], *, quiet: bool) -> dict[str, Any]
     """The facts of the self-test; a terminal sees how far it is."""
     from worker.stages.hand_self_test import tried_softly
 
-    columns = (TextColumn("  self-test          {task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True) as bar:
-        task = bar.add_task("starting; the first one on a machine compiles its kernels", total=1.0)
+    with _bar("self-test   ", "starting; the first one on a machine compiles its kernels", quiet=quiet) as run:
+        return tried_softly(lambda: hand_from_path(file, options), run)
+
+
+@contextmanager
+def _bar(what: str, first: str = "", *, quiet: bool) -> Iterator[Run]:
+    """A run that tells a terminal how far it is."""
+    columns = (TextColumn(f"  {what}       {{task.description}}"), BarColumn(), TimeElapsedColumn())
+    console = Console(stderr=True)
+    # Elsewhere than on a terminal its end would be an empty line.
+    with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
+        task = bar.add_task(first, total=1.0)
 
         def tell(done: float, total: float, message: str) -> None:
-            bar.update(task, completed=done / total, description="grasps of plain objects")
+            bar.update(task, completed=done / total, description=message)
 
-        return tried_softly(lambda: hand_from_path(file, options), Run(progress=tell))
+        yield Run(progress=tell)
 
 
 def _draw(hand: HandModel, picture: Path, *, collision: bool) -> None:
@@ -124,10 +136,10 @@ def _write(file: str, options: dict[str, Any], report: dict[str, Any], target: P
         raise InputError(f"{target} cannot be written: {error.strerror}") from None
 
 
-def report_hand(file: str, options: dict[str, Any] | None = None) -> dict[str, Any]:
+def report_hand(file: str, options: dict[str, Any] | None = None, run: Run = ALONE) -> dict[str, Any]:
     """`check_hand` of a path; what cannot even be read is refused in the same form."""
     try:
         name, files, stated = files_from_path(file)
     except GraspdError as error:
         return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": {}}
-    return check_hand(files, name, {**stated, **(options or {})})
+    return check_hand(files, name, {**stated, **(options or {})}, run)

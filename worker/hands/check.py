@@ -18,13 +18,18 @@ from worker.hands.read import read_robot
 from worker.hands.robot import Robot, chain_to
 from worker.hands.surface import sample_surface
 from worker.hands.tree import build_tree, cut_drives, joints_above, passed_limits
+from worker.run import ALONE, Run
 
 #: Points with which the outer surface is measured.
 _SURFACE_POINTS = 512
+#: Among what was guessed: the direction out of the palm could as well be its opposite.
+TIED = "approach (a tie)"
 
 
-def check_hand(files: Mapping[str, bytes], name: str, options: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """What `load_hand` makes of these files.
+def check_hand(
+    files: Mapping[str, bytes], name: str, options: Mapping[str, Any] | None = None, run: Run = ALONE
+) -> dict[str, Any]:
+    """What `load_hand` makes of these files; `run` is told of which link the shapes are made.
 
     Returns:
         verdict: accept, repair or refuse; message: one line; repairs: what was changed; facts: what was measured or
@@ -34,7 +39,7 @@ def check_hand(files: Mapping[str, bytes], name: str, options: Mapping[str, Any]
         settings = parse_options(files, options)
         main = main_file(files, settings)
         robot = read_robot(files, main, settings.xacro)
-        hand = assemble(robot, settings, files, main, name=name, digest="0" * 32)
+        hand = assemble(robot, settings, files, main, name=name, digest="0" * 32, run=run)
         area = float(sample_surface(hand, _SURFACE_POINTS).area.sum())
         require_opposing(hand)
     except InputError as error:
@@ -45,7 +50,8 @@ def check_hand(files: Mapping[str, bytes], name: str, options: Mapping[str, Any]
     }  # fmt: skip
     facts = hand_facts(hand, robot) | {
         "surface_area_m2": area,
-        "guessed": [key for key, said in stated.items() if not said],
+        "guessed": [key for key, said in stated.items() if not said]
+        + ([TIED] if (tie := _tie(hand, settings)) else []),
     }
     message = (
         f"{name}: {hand.dofs} degrees of freedom in {len(hand.joint_names)} joints, {len(hand.fingertips)} fingertips, "
@@ -56,7 +62,7 @@ def check_hand(files: Mapping[str, bytes], name: str, options: Mapping[str, Any]
         message += f"; opens {1e3 * jaws.opening:.0f} mm"
     notes = [
         *robot.notes,
-        *_tie(hand, settings),
+        *tie,
         *_tendons(hand),
         *_limits(robot, settings),
         *_left_out(robot, hand, settings),

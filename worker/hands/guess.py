@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from service.model.errors import HandError
 from service.model.suggestions import did_you_mean
 from service.model.transforms import IDENTITY_POSE, apply, compose, quat_rotate
-from worker.hands.jaws import MAX_DOFS, Jaws, closing_by_geometry, find_jaws, slides
+from worker.hands.jaws import MAX_DOFS, Jaws, closing_by_geometry, find_jaws, sign_of, slides
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel, PalmFrame
 from worker.hands.options import HandOptions
@@ -24,11 +24,25 @@ PRESHAPE_SHARE = 0.25
 #: Fingertips that end so many times as far from each other as they began have opened; those that close end at 0.2 to
 #: 0.8 of it.
 PARTED = 1.3
-#: Fingertips whose ways across the hand sum to less than this share of their lengths close around an axis: 0 of three
-#: like fingers, .4 and more of hands with a thumb or with two fingers that oppose one.
-RADIAL = 0.25
+#: A finger bends so many times as far one way as the other: twice, whatever the last digits of its limits are.
+FAR = 1.99
+#: Fingertips whose ways across the hand sum to less than this share of their lengths close on one another: 0 of like
+#: fingers around an axis, .3 to .55 where two oppose one, .75 and more of hands with a thumb.
+OPPOSED = 0.65
 #: Tips that are no farther ahead of where their fingers begin than this share of these places' spread are beside them.
 LEAST_AHEAD = 0.1
+#: A sum of two unit witnesses that is shorter than this tells no direction: they contradict each other.
+CONTRADICTING = 0.2
+#: Tips whose ways across their strongest line are less than this share of it close along that line.
+SIDEWAYS = 0.3
+#: Ways that part or bring together less than this share of the most are rounding noise.
+NOISE = 1e-3
+#: Lines this near to each other are one line, and a root axis so near to it is it [degrees].
+SAME_LINE = 1.0
+#: Lines and root axes this near to a rough direction may be what it stands for [degrees]; and to a good one.
+ROUGH, GOOD = 40.0, 10.0
+#: Joints whose axes are looked at.
+_JOINTS = 64
 #: A wrist or a rim that stands so far above the palm between the fingers is not the palm [m].
 RIM_M = 0.02
 
@@ -60,7 +74,7 @@ def _gripper(hand: HandModel, jaws: Jaws, tree: Tree, options: HandOptions) -> H
     """The hand with what its jaws tell: it comes open, the pads ahead, and takes hold between them."""
     approach = _stated_approach(hand, tree, options)
     if approach is None:
-        approach = _snapped(_ahead(hand, jaws))
+        approach = _approach_of_jaws(hand, jaws)
     pads = tuple(body for side in jaws.bodies for body in side if body > 0)
     hand = replace(hand, fingertips=hand.fingertips if options.fingertips else pads)
     hand = replace(hand, preshape=_preshape(hand, tree, options, share=0.0))
@@ -72,6 +86,15 @@ def _gripper(hand: HandModel, jaws: Jaws, tree: Tree, options: HandOptions) -> H
         centre = between + min(height - float(between @ approach), 0.0) * approach
         return replace(hand, palm=PalmFrame(centre, approach))
     return replace(hand, palm=_palm(hand, tree, options, approach))
+
+
+def _approach_of_jaws(hand: HandModel, jaws: Jaws) -> Floats:
+    """Direction ahead of a gripper: across its joints' axes and the line on which it closes, where it has hinges."""
+    ahead, axis = _unit(_ahead(hand, jaws)), jaws.axis[len(jaws.q) // 2]
+    if (line := _line_of_joints(hand, ahead, ROUGH, 2, axis)) is not None:
+        return line
+    # A root frame that the jaws do not close along says nothing.
+    return _snapped(ahead) if _angle(axis, _root_axis(axis)) < GOOD else ahead
 
 
 def _ahead(hand: HandModel, jaws: Jaws) -> Floats:
@@ -116,7 +139,7 @@ def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int,
 def _closing_by_limits(hand: HandModel) -> Floats:
     """Fingers bend far one way and little the other; what moves as far both ways spreads. A wrist closes nothing."""
     up, down = np.maximum(hand.upper, 0), np.maximum(-hand.lower, 0)
-    closing = np.where(up > 2 * down, 1.0, np.where(down > 2 * up, -1.0, 0.0))
+    closing = np.where(up > FAR * down, 1.0, np.where(down > FAR * up, -1.0, 0.0))
     carrying = set(_carriers(hand))
     for body, name in zip(hand.joint_body, hand.joint_names, strict=True):
         if body in carrying and name in hand.dof_names:
@@ -147,7 +170,8 @@ def _closed_together(hand: HandModel) -> HandModel:
         return hand
     steps = np.diag(0.1 * hand.span)
     parting = np.array([_apart(hand, half + step) - _apart(hand, half - step) for step in steps])
-    return replace(hand, closing=np.where(hand.closing != 0, -np.sign(parting), 0.0))
+    told = np.abs(parting) > NOISE * np.abs(parting).max()
+    return replace(hand, closing=np.where((hand.closing != 0) & told, -np.sign(parting), hand.closing))
 
 
 def _apart(hand: HandModel, q: Floats) -> float:
@@ -184,25 +208,31 @@ def _dof_axes(hand: HandModel) -> tuple[Floats, NDArray[np.bool_]]:
 
 
 def _guess_approach(hand: HandModel) -> Floats:
-    """Direction out of the palm, snapped to a root axis within 40 degrees.
-
-    Two witnesses: the mean way of the fingertips as the hand closes, which points out of a human-like palm but sideways
-    where two fingers oppose one; and where the tips of the half-closed hand are, which is ahead of the palm on a
-    gripper but also far along the fingers of a human-like hand. Their sum errs least. Where fingers stand around an
-    axis, the ways of their tips cancel, and what is left of them is rounding noise: see `_around_axis`.
-    """
-    ways, ahead = _ways(hand), _tips_ahead(hand)
-    if _cancelling(ways, ahead) < RADIAL:
-        return _around_axis(hand)[0]
-    mean = _unit(ways.sum(axis=0)) + _unit(ahead)
-    if np.linalg.norm(mean) < 1e-6:
-        return np.array([0.0, 0, 1])
-    return _snapped(mean)
+    """Direction out of the palm: see `_witnessed`."""
+    return _witnessed(hand)[0]
 
 
 def approach_is_tied(hand: HandModel) -> bool:
     """Whether nothing tells on which side of its fingers a hand takes hold."""
-    return _cancelling(_ways(hand), _tips_ahead(hand)) < RADIAL and _around_axis(hand)[1]
+    return _witnessed(hand)[1]
+
+
+def _witnessed(hand: HandModel) -> tuple[Floats, bool]:
+    """Direction out of the palm, and whether that is a tie.
+
+    Two witnesses: the mean way of the fingertips as the hand closes, which points out of a human-like palm; and where
+    the tips of the half-closed hand are, which is ahead of the palm on a gripper but also far along the fingers of a
+    human-like hand. Their sum errs least. Where fingers oppose each other the ways of their tips cancel, and what is
+    left of them is sideways or rounding noise: see `_between_fingers`.
+    """
+    ways, ahead = _ways(hand), _unit(_tips_ahead(hand))
+    if _cancelling(ways, ahead) < OPPOSED:
+        return _between_fingers(hand)
+    mean = _unit(ways.sum(axis=0)) + ahead
+    tied = bool(np.linalg.norm(mean) < CONTRADICTING)
+    rough = ahead if tied else _unit(mean)
+    line = _line_of_joints(hand, rough, ROUGH, 3)
+    return (_snapped(rough) if line is None else line), tied
 
 
 def _ways(hand: HandModel) -> Floats:
@@ -226,29 +256,78 @@ def _cancelling(ways: Floats, ahead: Floats) -> float:
     return float(np.linalg.norm(across.sum(axis=0)) / max(np.linalg.norm(across, axis=1).sum(), 1e-12))
 
 
-def _around_axis(hand: HandModel) -> tuple[Floats, bool]:
-    """Direction out of the palm of a hand whose fingers stand around it: from where they begin to their half-closed
-    tips; and whether that is a tie, since they lie in the plane in which they begin."""
+def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
+    """Direction out of the palm of a hand whose fingers oppose each other: from where they begin to their half-closed
+    tips, across the line on which they close if they do so on one; and whether that is a tie, since they lie in the
+    plane in which they begin."""
     body = _carriers(hand)[-1]
     q = posture(hand, 0.5)
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0]
     bases, tips = poses[hand.parent == body, :3], _tips(hand, q)
     along = tips.mean(axis=0) - bases.mean(axis=0)
     spread = float(np.linalg.norm(bases - bases.mean(axis=0), axis=1).max())
-    if np.linalg.norm(along) < LEAST_AHEAD * max(spread, 1e-6):
+    tied = bool(np.linalg.norm(along) < LEAST_AHEAD * max(spread, 1e-6))
+    if tied:
         # The plane's normal is known, its side is not: one is taken, and told.
         normal = np.linalg.svd(np.vstack([bases, tips]) - bases.mean(axis=0))[2][-1]
-        return _snapped(normal * np.sign(normal[np.argmax(np.abs(normal))]), within=5.0), True
-    return _snapped(along, within=5.0), False
+        along = normal * sign_of(normal)
+    else:
+        ways = _ways(hand)
+        _, strength, lines = np.linalg.svd(ways - ways.mean(axis=0))
+        if len(ways) > 1 and strength[1] < SIDEWAYS * strength[0]:
+            # More fingers on one side than on the other shift the middle of their tips.
+            along = along - (along @ lines[0]) * lines[0]
+    along = _unit(along)
+    line = _line_of_joints(hand, along, GOOD, 2)
+    return (_snapped(along, GOOD / 2) if line is None else line), tied
 
 
-def _snapped(mean: Floats, within: float = 40.0) -> Floats:
+def _line_of_joints(
+    hand: HandModel, rough: Floats, within: float, least: int, beside: Floats | None = None
+) -> Floats | None:
+    """The direction that most axes of joints, and lines across two of them, agree on near a rough one.
+
+    The hand tells its own directions, however its root frame is turned.
+
+    Args:
+        hand: the hand.
+        rough: (3,) unit.
+        within: how near to it [degrees].
+        least: how many must agree; else None.
+        beside: (3,) another line, such as that on which jaws close.
+    """
+    body = hand.joint_body[:_JOINTS]
+    pose = body_poses(hand, IDENTITY_POSE, hand.expand(np.clip(0.0, hand.lower, hand.upper)))[0, body]
+    axes = quat_rotate(pose[:, 3:], hand.axis[body])
+    axes = axes if beside is None else np.vstack([axes, beside])
+    one, other = np.triu_indices(len(axes), 1)
+    across = np.cross(axes[one], axes[other])
+    length = np.linalg.norm(across, axis=1)
+    lines = np.concatenate([axes, across[length > 0.5] / length[length > 0.5, None]])
+    lines = lines * np.where(lines @ rough < 0, -1.0, 1.0)[:, None]
+    lines = lines[lines @ rough > np.cos(np.deg2rad(within))]
+    alike = lines @ lines.T > np.cos(np.deg2rad(SAME_LINE))
+    if not len(lines) or alike.sum(axis=1).max() < least:
+        return None
+    mean = _unit(lines[alike[int(np.argmax(alike.sum(axis=1)))]].mean(axis=0))
+    return _snapped(mean, SAME_LINE)
+
+
+def _snapped(mean: Floats, within: float = ROUGH) -> Floats:
     """The direction as a unit vector, on a root axis where it is `within` so many degrees of one."""
-    mean = _unit(mean)
-    axis = int(np.argmax(np.abs(mean)))
-    if abs(mean[axis]) > np.cos(np.deg2rad(within)):
-        return np.sign(mean[axis]) * np.eye(3)[axis]
-    return mean
+    axis = _root_axis(mean)
+    return axis if _angle(mean, axis) < within else _unit(mean)
+
+
+def _root_axis(direction: Floats) -> Floats:
+    """The root axis, either way, that is nearest to a direction."""
+    axis = int(np.argmax(np.abs(direction)))
+    return np.asarray(np.sign(direction[axis]) * np.eye(3)[axis])
+
+
+def _angle(one: Floats, other: Floats) -> float:
+    """Between two directions [degrees]."""
+    return float(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other)))
 
 
 def _unit(vector: Floats) -> Floats:

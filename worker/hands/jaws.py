@@ -246,13 +246,23 @@ def _sides(
     """Points of the two pads, or None where they are not on different bodies."""
     # The line along which most of the pads' area looks.
     values, vectors = np.linalg.eigh((points.area[every, None] * normal[every]).T @ normal[every])
-    along = normal[every] @ vectors[:, int(np.argmax(values))]
+    line = vectors[:, int(np.argmax(values))]
+    line = -sign_of(line) * line
+    along = normal[every] @ line
     one, two = (_on_pads(side, points, faced) for side in (every[along > _FACING_COS], every[along < -_FACING_COS]))
     if not len(one) or not len(two) or set(points.body[one]) & set(points.body[two]):
         return None
-    middle = place[every].mean(axis=0) @ vectors[:, int(np.argmax(values))]
-    # The first pad looks at the second one: it lies on the lower side of the line.
-    return (one, two) if (place[one].mean(axis=0) @ vectors[:, int(np.argmax(values))]) <= middle else (two, one)
+    # The first pad looks at the second one: it lies on the lower side of the line, that of the larger coordinate.
+    return (one, two) if (place[one].mean(axis=0) @ line) <= place[every].mean(axis=0) @ line else (two, one)
+
+
+def sign_of(line: Floats) -> float:
+    """1, or -1 where a line's largest component is negative; of equally large ones the first counts.
+
+    The sign that a decomposition gives to a vector is rounding noise.
+    """
+    size = np.abs(line)
+    return float(np.sign(line[int(np.argmax(size > (1 - 1e-6) * size.max()))]))
 
 
 def _on_pads(side: Ints, points: SurfacePoints, faced: Floats) -> Ints:

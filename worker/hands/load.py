@@ -31,6 +31,7 @@ from worker.hands.tendons import tendons_of
 from worker.hands.tree import Tree, build_tree, joint_type
 from worker.hands.visuals import PlacedShape, Visuals
 from worker.objects.kept_arrays import recalling
+from worker.run import ALONE, Run
 
 #: Mass of a link whose URDF gives none, per volume of its pieces [kg/m^3].
 DENSITY = 1000.0
@@ -60,11 +61,18 @@ def load_hand(
 
 
 def assemble(
-    robot: Robot, options: HandOptions, files: Mapping[str, bytes], main: str, *, name: str, digest: str
+    robot: Robot,
+    options: HandOptions,
+    files: Mapping[str, bytes],
+    main: str,
+    *,
+    name: str,
+    digest: str,
+    run: Run = ALONE,
 ) -> HandModel:
-    """The model of a checked robot and options."""
+    """The model of a checked robot and options. Raises TaskCancelled where `run` is cancelled."""
     tree = build_tree(robot, options)
-    hand = complete(body_model(robot, tree, options, files, main, name=name, digest=digest), tree, options)
+    hand = complete(body_model(robot, tree, options, files, main, name=name, digest=digest, run=run), tree, options)
     hand = with_drive(
         hand, stated_gains(robot, tree.dof_names, options), assumed_efforts(robot, tree.dof_names, options)
     )
@@ -79,7 +87,15 @@ def _drag(robot: Robot, hand: HandModel) -> Drag:
 
 
 def body_model(
-    robot: Robot, tree: Tree, options: HandOptions, files: Mapping[str, bytes], main: str, *, name: str, digest: str
+    robot: Robot,
+    tree: Tree,
+    options: HandOptions,
+    files: Mapping[str, bytes],
+    main: str,
+    *,
+    name: str,
+    digest: str,
+    run: Run = ALONE,
 ) -> HandModel:
     """Bodies, joints and pieces of a tree, without what makes them a hand: palm, fingers, closing, neighbours.
 
@@ -87,7 +103,7 @@ def body_model(
         HandError: nothing of it can touch, or a mesh or a number cannot be used.
     """
     base = str(PurePosixPath(main).parent).removeprefix(".")
-    pieces = _pieces(robot, tree, files, base, options.shapes == "visual")
+    pieces = _pieces(robot, tree, files, base, options.shapes == "visual", run)
     if not pieces:
         raise HandError(
             f"no link of the hand, from {tree.body_names[0]!r} on, has collision geometry, so nothing can touch; add "
@@ -138,11 +154,13 @@ def main_file(files: Mapping[str, bytes], options: HandOptions) -> str:
 
 
 def _pieces(
-    robot: Robot, tree: Tree, files: Mapping[str, bytes], base: str, as_it_looks: bool
+    robot: Robot, tree: Tree, files: Mapping[str, bytes], base: str, as_it_looks: bool, run: Run
 ) -> tuple[ConvexPiece, ...]:
     """Of the collision elements; or, as it looks, of a link's visual ones, where it has both."""
     pieces, hulls = [], Hulls()
-    for link, (body, pose) in tree.links.items():
+    for number, (link, (body, pose)) in enumerate(tree.links.items()):
+        run.check("reading the hand")
+        run.progress(number, len(tree.links), f"shapes of {link}")
         shapes, seen = robot.links[link].shapes, robot.links[link].visuals
         for shape in seen if as_it_looks and shapes and seen else shapes:
             placed = compose(pose, shape.pose)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from service.model.transforms import IDENTITY_POSE, quat_conjugate, quat_rotate
 from worker.hands.jaws import jaws_of
@@ -15,6 +16,8 @@ from worker.hands.surface import sample_surface
 
 #: Share of a fingertip's speed, and so of its length, within which its points are its pad.
 PAD: Final = 0.5
+#: Least cosine of a pad's normals with its motion.
+_AHEAD: Final = 0.7
 #: Points of the hand's surface that pads are made of.
 _POINTS: Final = 1000
 
@@ -58,7 +61,21 @@ def fingertip_pad(hand: HandModel, tip: int) -> Pad:
     driven = [b for b in chain if hand.closing[hand.dof[b]] != 0] or chain
     if not len(place) or not driven:
         return Pad(tip, np.zeros(3), np.array([0.0, 0, 1]), np.zeros((0, 3)))
-    dof = int(hand.dof[driven[0]])
+    # A joint that turns the tip about itself moves no side of it ahead: then one nearer to the palm tells.
+    chosen = next((part for body in driven if (part := _moved_ahead(hand, tip, body, place, normal)).any()), None)
+    if chosen is None:
+        # Nothing tells; normals of a whole tip would cancel to rounding noise. The palm looks at what is held.
+        ahead = quat_rotate(quat_conjugate(_pose(hand, tip)[3:]), hand.palm.approach)
+        chosen = normal @ ahead > _AHEAD
+        if not chosen.any():
+            return Pad(tip, place.mean(axis=0), ahead, place)
+    look = normal[chosen].mean(axis=0)
+    return Pad(tip, place[chosen].mean(axis=0), look / max(float(np.linalg.norm(look)), 1e-9), place[chosen])
+
+
+def _moved_ahead(hand: HandModel, tip: int, driven: int, place: Floats, normal: Floats) -> NDArray[np.bool_]:
+    """(P,) points of a tip that the joint of a body moves along their normals, and of those the fastest."""
+    dof = int(hand.dof[driven])
     step = np.zeros(hand.dofs)
     step[dof] = 1e-4 * (hand.closing[dof] or 1.0)
     q = np.stack([hand.preshape, hand.preshape + step])
@@ -66,8 +83,10 @@ def fingertip_pad(hand: HandModel, tip: int) -> Pad:
     moved = quat_rotate(pose[:, None, 3:], place[None]) + pose[:, None, :3]
     move = quat_rotate(quat_conjugate(pose[0, 3:]), moved[1] - moved[0])
     speed = np.linalg.norm(move, axis=1)
-    ahead = np.einsum("ij,ij->i", move / np.maximum(speed, 1e-12)[:, None], normal) > 0.7
+    ahead = np.einsum("ij,ij->i", move / np.maximum(speed, 1e-12)[:, None], normal) > _AHEAD
     far = speed >= speed.max() - PAD * np.ptp(speed)
-    chosen = next((part for part in (ahead & far, ahead) if part.any()), far)
-    look = normal[chosen].mean(axis=0)
-    return Pad(tip, place[chosen].mean(axis=0), look / max(float(np.linalg.norm(look)), 1e-9), place[chosen])
+    return np.asarray(ahead & far if (ahead & far).any() else ahead)
+
+
+def _pose(hand: HandModel, body: int) -> Floats:
+    return np.asarray(body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0, body])

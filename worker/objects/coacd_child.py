@@ -1,6 +1,7 @@
-"""CoACD in a process of its own: `python -m worker.objects.coacd_child` reads an npz and writes one.
+"""CoACD in a process of its own: `python -m worker.objects.coacd_child SECONDS` reads an npz and writes one.
 
-In: arrays `vertices`, `faces`, and `options` (JSON). Out: one array of corners per piece.
+It ends by a signal where it computes for longer than so many seconds. In: arrays `vertices`, `faces`, and `options`
+(JSON). Out: one array of corners per piece.
 """
 
 from __future__ import annotations
@@ -8,13 +9,16 @@ from __future__ import annotations
 import io
 import json
 import os
+import resource
 import sys
 
 import numpy as np
 
 
-def main() -> None:
+def main(cpu_s: int) -> None:
     """Decompose the mesh on standard input onto standard output."""
+    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+    resource.setrlimit(resource.RLIMIT_CPU, (cpu_s if hard == resource.RLIM_INFINITY else min(cpu_s, hard), hard))
     # The library prints to standard output, which carries the result: send its words elsewhere first.
     result = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
@@ -29,4 +33,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(int(sys.argv[1]))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import logging
+import signal
 import subprocess
 import sys
 import zipfile
@@ -20,26 +22,40 @@ from service import user_cache
 
 Floats = NDArray[np.float64]
 
+log = logging.getLogger(__name__)
 
-def coacd_parts(
-    vertices: Floats, faces: NDArray[Any], options: Mapping[str, Any], timeout_s: float
-) -> tuple[Floats, ...]:
-    """Corners (V, 3) of each convex piece; none where CoACD fails or takes longer than `timeout_s`.
 
-    CoACD holds the interpreter lock, so it runs in a child and stops no heartbeat.
+class TooMuchWork(Exception):
+    """A decomposition needs more computing than it is given."""
+
+
+def coacd_parts(vertices: Floats, faces: NDArray[Any], options: Mapping[str, Any], cpu_s: int) -> tuple[Floats, ...]:
+    """Corners (V, 3) of each convex piece; none where CoACD fails.
+
+    CoACD holds the interpreter lock, so it runs in a child and stops no heartbeat. Its limit is one of computing: a
+    busy machine gives the same pieces as an idle one.
 
     Args:
         vertices: (V, 3) of the mesh.
         faces: (F, 3) triangles.
         options: arguments of `coacd.run_coacd`, the threshold among them.
-        timeout_s: wall time.
+        cpu_s: computing that it may take [s].
+
+    Raises:
+        TooMuchWork: it takes more.
     """
     given = io.BytesIO()
     np.savez(given, vertices=vertices, faces=faces, options=np.array(json.dumps(dict(options))))
-    command = [sys.executable, "-m", "worker.objects.coacd_child"]
+    command = [sys.executable, "-m", "worker.objects.coacd_child", str(cpu_s)]
     try:
-        done = subprocess.run(command, input=given.getvalue(), capture_output=True, timeout=timeout_s, check=True)
-    except (subprocess.CalledProcessError, subprocess.TimeoutExpired, OSError):
+        done = subprocess.run(command, input=given.getvalue(), capture_output=True, check=True)
+    except subprocess.CalledProcessError as error:
+        if error.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+            raise TooMuchWork(f"more than {cpu_s} s of computing") from None
+        log.warning("CoACD failed: %s", error.stderr.decode(errors="replace").strip()[-200:] or error.returncode)
+        return ()
+    except OSError as error:
+        log.warning("CoACD did not start: %s", error)
         return ()
     with np.load(io.BytesIO(done.stdout)) as stored:
         return tuple(stored[name] for name in stored.files)

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from service.model.states import AssetKind
 from service.model.transforms import Floats, quat_from_axis_angle, quat_multiply, quat_rotate
+from service.store.asset_summary import summary
+from service.store.assets import builtin_files
 from tests.worker.hands.urdfs import joint, link, robot
 from worker.hands.check import check_hand
+from worker.hands.jaws import sign_of
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
+from worker.hands.pads import fingertip_pad
 
 RADIUS = 0.045
+_PLATE = '<geometry><box size="0.16 0.1 0.02"/></geometry>'
 
 
 def rpy(matrix: Floats) -> str:
@@ -87,6 +95,71 @@ def test_a_tie_is_told_and_one_that_is_settled_is_not() -> None:
     lying = flat.replace(b'lower="-3.141592653589793" upper="1.4"', b'lower="1.0707963" upper="2.0707963"').replace(
         b'multiplier="0.7"', b'multiplier="0"'
     )
-    assert told in check_hand({"h.urdf": lying}, "h")["facts"]["notes"]
+    facts = check_hand({"h.urdf": lying}, "h")["facts"]
+    assert told in facts["notes"] and "approach (a tie)" in facts["guessed"]
+    assert any("approach (a tie)" in line for line in summary(AssetKind.HAND, facts))
     assert told not in check_hand({"h.urdf": lying}, "h", {"approach": (0, 0, 1)})["facts"]["notes"]
     assert told not in check_hand({"h.urdf": claw(3, TURNS["upright"])}, "h")["facts"]["notes"]
+
+
+@pytest.mark.parametrize("degrees", [7.0, 20.0, 35.0, 100.0])
+def test_a_turned_root_frame_turns_the_palm_with_it(degrees: float) -> None:
+    turn = quat_from_axis_angle(np.array([1.0, 2, 3]) / np.sqrt(14), np.asarray(np.deg2rad(degrees)))
+    for fingers in (2, 3):
+        model = hand(claw(fingers, turn))
+        np.testing.assert_allclose(model.palm.approach, quat_rotate(turn, np.array([0, 0, 1.0])), atol=1e-6)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_two_fingers_that_oppose_one_take_hold_between_them_and_not_sideways(mirrored: bool) -> None:
+    """What the tips do as such a hand closes points half to the side."""
+    side = -1 if mirrored else 1
+    places = ((side * 0.05, 0.0, 0.0), (-side * 0.05, 0.03, np.pi), (-side * 0.05, -0.03, np.pi))
+    parts = [link("palm", f'<collision><origin xyz="{side * 0.03} 0 -0.02"/>{_PLATE}</collision>')]
+    for k, (x, y, yaw) in enumerate(places):
+        about = yaw if not mirrored else np.pi - yaw
+        bend = {"axis": "0 -1 0", "limit": '<limit lower="0" upper="1.4" effort="10"/>'}
+        base = joint(f"j{k}", "palm", f"f{k}", origin=f"{x} {y} 0", **bend)
+        parts += [
+            link(f"f{k}", _bar(0.05)), base.replace("<origin xyz", f'<origin rpy="0 0 {about}" xyz'),
+            link(f"t{k}", _bar(0.04)), joint(f"k{k}", f"f{k}", f"t{k}", origin="0 0 0.05", **bend),
+        ]  # fmt: skip
+    np.testing.assert_allclose(hand(robot(*parts)).palm.approach, [0, 0, 1], atol=1e-9)
+
+
+def test_a_published_hand_in_a_turned_root_frame_faces_as_it_did() -> None:
+    urdf, turn = builtin_files(AssetKind.HAND, "barrett"), "0.3 -0.5 1.1"
+    name = next(name for name in urdf if name.endswith(".urdf"))
+    above = f'{link("world", "")}<joint name="mount" type="fixed"><parent link="world"/><child link="palm"/>'
+    mounted = urdf[name].replace(b"</robot>", f'{above}<origin rpy="{turn}"/></joint></robot>'.encode())
+    options = {"root": "world"}
+    as_it_is = load_hand({name: urdf[name]}, name="h", digest="0" * 32)
+    turned = load_hand({name: mounted}, name="h", digest="0" * 32, options=options)
+    pose = turned.frames["palm"][1]
+    np.testing.assert_allclose(turned.palm.approach, quat_rotate(pose[3:], as_it_is.palm.approach), atol=1e-4)
+    assert turned.closing.tolist() == as_it_is.closing.tolist()
+
+
+def test_limits_of_twice_as_far_one_way_close_whatever_their_last_digit_is() -> None:
+    for lower in ("-0.7", "-0.7000001", "-0.6999999"):
+        assert (hand(claw(3, TURNS["upright"]).replace(b'"-0.4"', f'"{lower}"'.encode())).closing == 1).all()
+
+
+def test_a_tip_that_only_turns_about_itself_presses_where_the_joint_before_it_moves_it() -> None:
+    roll = joint("roll{0}", "b{0}", "c{0}", origin="0 0 0.045", axis="0 0 1")
+    ball = (
+        '<collision><origin xyz="0 0 0.01"/><geometry><cylinder radius="0.008" length="0.02"/></geometry></collision>'
+    )
+    tips = "".join(link(f"c{k}", ball) + roll.format(k) for k in range(3))
+    model = hand(claw(3, TURNS["upright"]).replace(b"</robot>", tips.encode() + b"</robot>"))
+    still = replace(model, preshape=np.zeros(model.dofs))
+    for tip in still.fingertips:
+        # Inwards: -x of the finger's frame, as even as the points of its surface are.
+        assert fingertip_pad(still, tip).normal[0] < -0.9
+
+
+def test_the_order_of_two_jaws_is_not_that_of_rounding() -> None:
+    for noise in (1e-17, -1e-17):
+        line = np.array([noise, 1.0, -noise])
+        assert sign_of(line) == 1 and sign_of(-line) == -1
+        assert sign_of(np.array([1.0, -1.0 - noise, 0])) == 1

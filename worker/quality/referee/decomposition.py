@@ -8,6 +8,7 @@ Excess is what the pieces' union has more of volume, over the object's surface: 
 from __future__ import annotations
 
 import hashlib
+import logging
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -20,10 +21,12 @@ from service.model.digests import digest_json
 from service.model.errors import MeshError
 from service.model.libraries import version_of
 from worker.hands.primitives import triangle_areas
-from worker.objects.convex import coacd_parts, default_cache, keep_parts, load_parts, union_volume
+from worker.objects.convex import TooMuchWork, coacd_parts, default_cache, keep_parts, load_parts, union_volume
 from worker.objects.model import ObjectModel
 
 Floats = NDArray[np.float64]
+
+log = logging.getLogger(__name__)
 
 #: Pieces whose mean excess is at most this are good [m]: a grasp's verdict does not feel less than that.
 GOOD_EXCESS_M: Final = 8.5e-4
@@ -41,8 +44,8 @@ _COACD: Final = {
     "max_convex_hull": MAX_PIECES,
     "seed": 1,
 }
-#: One run of CoACD may take this long; without its result the coarser one stands [s].
-TIMEOUT_S: Final = 300.0
+#: Computing that one run of CoACD may take; without its result the coarser one stands, and a log line says so [s].
+CPU_S: Final = 300
 #: Pieces thinner than this are splinters that the engine cannot build [m^3].
 _MIN_VOLUME: Final = 1e-9
 
@@ -141,7 +144,11 @@ def _make(obj: ObjectModel) -> tuple[Floats, ...]:
     for threshold in THRESHOLDS:
         if excess <= GOOD_EXCESS_M:
             break
-        made = coacd_parts(obj.vertices, obj.faces, {"threshold": threshold, **_COACD}, TIMEOUT_S)
+        try:
+            made = coacd_parts(obj.vertices, obj.faces, {"threshold": threshold, **_COACD}, CPU_S)
+        except TooMuchWork as error:
+            log.warning("%s: finer pieces than %d need %s; these stand", obj.name or "an object", len(best), error)
+            break
         parts = tuple(part for part in made if _solid(part))
         found = _excess(union_volume(parts), obj)
         if parts and found < excess:
