@@ -28,7 +28,7 @@ from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
 from worker.planners.port import Wanted
-from worker.quality.referee.decomposition import ConvexPieces, decompose
+from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.judge import judge
 from worker.quality.referee.key import Level
 from worker.run import ALONE
@@ -74,10 +74,10 @@ class Cell:
                 info: dict[str, object] = {"cpu_seconds": float(stored["cpu_seconds"])}
                 return GraspSet(*parts, stored["loss"], seconds=float(stored["seconds"]), info=info)
         # Kernels are loaded and pieces made before the clock starts.
-        pieces = decompose(self.obj)
-        planned(self.hand, self.obj, pieces, count=1, seed=1, fidelity="draft")
+        decompose(self.obj)
+        planned(self.hand, self.obj, count=1, seed=1, fidelity="draft")
         began, cpu = time.perf_counter(), time.process_time()
-        found = planned(self.hand, self.obj, pieces, count=self.count, seed=SEED)
+        found = planned(self.hand, self.obj, count=self.count, seed=SEED)
         found.seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
         found.info = {"cpu_seconds": cpu}
         arrays: dict[str, Any] = {
@@ -116,12 +116,14 @@ class Cell:
         return kept_json(self.folder / f"{name}.json", make)
 
 
-def planned(
-    hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, *, count: int, seed: int, fidelity: str = "standard"
-) -> GraspSet:
-    """Raw grasps of a free object as a job plans them: candidates go through the trial of `trial_on`."""
-    trial = trial_on(ALONE, hand, obj, lambda: pieces, in_scenes=False)
-    return synthesize(hand, obj, Wanted(count, FIDELITIES[fidelity], seed, trial=trial))
+def planned(hand: HandModel, obj: ObjectModel, *, count: int, seed: int, fidelity: str = "standard") -> GraspSet:
+    """Raw grasps of a free object as a job plans them: candidates go through the trial of `trial_on`.
+
+    Like a job's they are planned about the middle of the object, and their positions are on the grid.
+    """
+    trial = trial_on(ALONE, hand, obj.centred, lambda: decompose(obj.centred), in_scenes=False)
+    found = synthesize(hand, obj.centred, Wanted(count, FIDELITIES[fidelity], seed, trial=trial))
+    return found.moved(np.zeros(3)).moved(obj.centre)
 
 
 def kept_json(file: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:

@@ -31,7 +31,6 @@ from worker.hands.same_hand import SameHand, same_hand
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.quality.intervals import wilson
-from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.foreign import driven_as, in_other_model, with_our_shapes, with_their_shapes
 from worker.quality.referee.judge import judge
 
@@ -90,10 +89,9 @@ class Bench:
 
     def tried(self, obj: ObjectModel, count: int, seed: int) -> dict[str, dict[str, list[int]]]:
         """Of each plan and each model: which of the grasps hold."""
-        pieces = decompose(obj)
         out: dict[str, dict[str, list[int]]] = {}
         for plan, hand in self.hands.items():
-            grasps = planned(hand, obj, pieces, count=count, seed=seed)
+            grasps = planned(hand, obj, count=count, seed=seed)
             held = {
                 name: judge(model, obj, posed).success for name, (model, posed) in self.models(plan, grasps).items()
             }

@@ -48,7 +48,7 @@ class Results:
     def add(self, hand: HandModel, obj: ObjectModel, count: int) -> str:
         """Grasps of one more object; the cells of its row."""
         pieces = decompose(obj)
-        found = planned(hand, obj, pieces, count=count, seed=SEED)
+        found = planned(hand, obj, count=count, seed=SEED)
         self.seconds += found.seconds
         self.success.append(judge(hand, obj, found, pieces=pieces).success)
         self.hard.append(judge(hand, obj, found, hard=True, pieces=pieces).success)

@@ -15,8 +15,7 @@ from tests.system.conftest import System
 from worker.certified import certified_grasps
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
-from worker.scenes.kinds import rest_poses, supports_of
-from worker.simulation.surroundings import Scenes
+from worker.scenes.beside import scenes_of
 
 pytestmark = pytest.mark.chaos
 
@@ -51,9 +50,8 @@ def test_a_worker_killed_in_mid_synthesis_leaves_the_same_grasps(start: Callable
     block = object_from_path("block", face_error_m=request.knobs.face_error_m)
     scenes = None
     if request.in_scene:
-        poses = rest_poses(request.place, block, count=request.scenes, seed=request.seed)["scene/object_pose"]
-        scenes = Scenes(supports_of(request.place), poses)
-        np.testing.assert_array_equal(kept["scene/object_pose"], poses)
+        scenes, poses = scenes_of(request.place, block, [], count=request.scenes, seed=request.seed)
+        np.testing.assert_array_equal(kept["scene/object_pose"], poses["scene/object_pose"])
     undisturbed = certified_grasps(hand_from_path("barrett"), block, request, count=24, scenes=scenes).grasps
     np.testing.assert_array_equal(kept["grasp/hand_pose"], undisturbed.grasp.hand_pose)
     np.testing.assert_array_equal(kept["grasp/joint_positions"], undisturbed.grasp.joint_positions)

@@ -105,7 +105,7 @@ def archive() -> bytes:
         (b'<?xml version="1.0"?>\n<Error><Code>AccessDenied</Code></Error>', "storage server"),
         (b'{"message": "Not Found", "status": "404"}', "an error message in JSON"),
         (archive(), "a ZIP archive"),
-        (gzip.compress(b"solid"), "a compressed archive"),
+        (gzip.compress(b"solid", mtime=0), "a compressed archive"),
         (POINTER.decode().encode("utf-16"), "a Git LFS pointer"),
         (POINTER.replace(b"git-lfs", b"hawser"), "a Git LFS pointer"),
         (b"../shared/mug.stl", "the text of a symbolic link"),

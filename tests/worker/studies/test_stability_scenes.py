@@ -49,9 +49,9 @@ def test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so(tmp_path: Path) -> 
         "--scenes", "1", "-n", "2", "--budget", "2", "--fidelity", "draft", "-o", str(tmp_path / "g.h5"),
     ]  # fmt: skip
     result = CliRunner().invoke(build(), words)
-    assert result.exit_code == 0, result.output
-    assert "2 valid ones were wanted: the budget of tries ended first" in result.stdout
-    assert "of the tries are clear of what stands there" in result.stdout
+    assert result.exit_code == 3, result.output
+    assert "the budget of 2 tries for each ended first" in result.output
+    assert "of the tries are clear of what stands there" in result.output
 
 
 @pytest.mark.parametrize("gap", [5, 30])
