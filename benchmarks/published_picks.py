@@ -22,7 +22,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binomtest
@@ -39,7 +38,7 @@ from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.judge import judge
 from worker.quality.referee.lift import Lift, LiftOutcome
 from worker.quality.referee.lifting import judge_lifts
-from worker.quality.referee.model import OBJECT_MASS, MujocoOptions, build
+from worker.quality.referee.model import MujocoOptions, build
 from worker.quality.referee.protocol import STAGE_S, Outcome, Trial
 from worker.quality.table import measure
 from worker.scenes.way import plan_way
@@ -96,11 +95,6 @@ class Pick(Lift):
         super().__init__(scene, placed)
         self.terms = terms
 
-    def _put(self, hand_pose: Floats, joints: Floats) -> None:
-        super()._put(hand_pose, joints)
-        mass = float(self.scene.model.body_mass[self.scene.object_body])
-        self.data.xfrc_applied[self.scene.object_body, :3] *= mass / OBJECT_MASS
-
     def pick(self, grasps: GraspSet, row: int) -> tuple[str, float]:
         """What became of it, and the worst motion over its limit."""
         if self._begin(grasps, row).outcome is LiftOutcome.PENETRATION:
@@ -153,12 +147,8 @@ def picked(case: Case, pieces: ConvexPieces, terms: Terms) -> dict[str, Any]:
     if terms.from_grasp:
         grasps = replace(grasps, pregrasp=grasps.grasp)
     placed = on_table(case)
+    obj = obj.weighing(density=DENSITY) if terms.light else obj
     scene = build(hand, obj, pieces, MujocoOptions(friction=(terms.friction, 0.02)), placed.supports)
-    if terms.light:
-        factor = DENSITY * obj.volume / OBJECT_MASS
-        scene.model.body_mass[scene.object_body] *= factor
-        scene.model.body_inertia[scene.object_body] *= factor
-        mujoco.mj_setConst(scene.model, mujoco.MjData(scene.model))
 
     def part(rows: range) -> list[tuple[str, float]]:
         test = Pick(scene, placed, terms)

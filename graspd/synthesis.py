@@ -37,6 +37,9 @@ def synthesize(
     fidelity: str = "standard",
     seed: int = 0,
     friction: float = 1.0,
+    mass: float | None = None,
+    density: float | None = None,
+    object_friction: float | None = None,
     units: str | None = None,
     scale_to: float | None = None,
     device: str = "auto",
@@ -69,6 +72,9 @@ def synthesize(
         fidelity: draft, standard or fine.
         seed: with hand, object and options all that decides the result.
         friction: Coulomb coefficient of the quality metrics.
+        mass: of the object [kg]; by default its own, 0.1 kg where its file says none.
+        density: of the object [kg/m^3], in place of the mass.
+        object_friction: Coulomb coefficient of contacts in simulation; by default the object's own, else 0.6.
         units: of the mesh: m, cm, mm or in; guessed if not given.
         scale_to: longest side of the object [m].
         device: cpu, cuda:0 or auto.
@@ -91,7 +97,7 @@ def synthesize(
         request = JobOptions(
             grasps=count, want=want, budget=budget, referee=referee, method=method, seed=seed, friction=friction,
             options=of_this_machine(method, options), min_distance=min_distance, audits=0, robust=robust,
-            robust_models=robust_models,
+            robust_models=robust_models, mass=mass, density=density, object_friction=object_friction,
         )  # fmt: skip
     except ValidationError as error:
         raise InputError(validation_line(error)) from None

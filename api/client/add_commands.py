@@ -25,6 +25,7 @@ from service.store.asset_options import (
     DropOption,
     FingertipsOption,
     FixOption,
+    FrictionOption,
     KeepLargestOption,
     LicenceOption,
     MassOption,
@@ -98,6 +99,7 @@ def add_object(
     allow_open: AllowOpenOption = False,
     density: DensityOption = None,
     mass: MassOption = None,
+    friction: FrictionOption = None,
     licence: LicenceOption = None,
     source: SourceOption = None,
     shared: SharedOption = False,
@@ -116,6 +118,7 @@ def add_object(
         allow_open=allow_open,
         density=density,
         mass=mass,
+        friction=friction,
     )
     options |= provenance(licence, source)
     if len(sizes) > 1:

@@ -36,6 +36,7 @@ from service.model.domain import AUDITS, NETWORK_METHODS
 from service.model.errors import InputError
 from service.model.scene_options import scene_option
 from service.model.states import AssetKind, State
+from service.store.asset_options import DensityOption, MassOption, ObjectFrictionOption
 from service.store.asset_summary import hand_line, self_test_line
 
 app = typer.Typer(no_args_is_help=True)
@@ -90,6 +91,9 @@ def submit(
     height: Annotated[int, typer.Option(help="Picture height [px].")] = 240,
     channels: Annotated[list[str] | None, typer.Option(help="distance, normals or occlusion; several times.")] = None,
     friction: Annotated[float, typer.Option(help="Coulomb coefficient of the metrics.")] = 1.0,
+    mass: MassOption = None,
+    density: DensityOption = None,
+    object_friction: ObjectFrictionOption = None,
     wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
     url: UrlOption = None,
     json: JsonFlag = False,
@@ -129,6 +133,9 @@ def submit(
                 "height": height,
                 "channels": channels or [],
                 "friction": friction,
+                "mass": mass,
+                "density": density,
+                "object_friction": object_friction,
             }
         )
         job = client.submit(request)

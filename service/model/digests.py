@@ -88,6 +88,7 @@ def shard_id(
             "fidelity": request.knobs.model_dump(mode="json"),
             "friction": request.friction,
             **({"options": request.options} if request.options else {}),
+            **({"matter": request.matter} if request.matter else {}),
             **_judgement(request, batch),
         }
     elif stage is Stage.SCENE:

@@ -19,6 +19,7 @@ from service.model.labels import DIGEST
 from service.model.labels import Digest as Digest
 from service.model.labels import Name as Name
 from service.model.labels import Word as Word
+from service.model.matter import FRICTION, MASS_KG, Density, Friction, Mass
 from service.model.projects import Project
 from service.model.robust import MODELS, MOST_MODELS
 from service.model.scene_kinds import has_table
@@ -97,6 +98,18 @@ class JobOptions(Model):
         (), description="what pictures show besides colour, depth and segmentation"
     )
     friction: float = Field(1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics")
+    mass: Mass | None = Field(
+        None, exclude_if=lambda value: value is None,
+        description=f"mass of the object [kg]; by default its own, {MASS_KG:g} kg where it has none",
+    )  # fmt: skip
+    density: Density | None = Field(
+        None, exclude_if=lambda value: value is None, description="density of the object [kg/m^3], in place of the mass"
+    )  # fmt: skip
+    object_friction: Friction | None = Field(
+        None, exclude_if=lambda value: value is None,
+        description="Coulomb coefficient of contacts in simulation; by default the object's own, "
+        f"{FRICTION:g} where it has none",
+    )  # fmt: skip
     want: Literal["valid", "raw"] = Field(
         "valid",
         description="whether `grasps` counts grasps that are valid (sound ones where the referee is none), or all that "
@@ -178,6 +191,17 @@ class JobOptions(Model):
         return data
 
     @model_validator(mode="after")
+    def _one_mass(self) -> Self:
+        if self.mass is not None and self.density is not None:
+            raise ValueError("mass and density both: give one of them")
+        if self.referee == "letter" and self.matter:
+            raise ValueError(
+                f"referee letter is DexGraspBench's protocol, which gives all objects {MASS_KG:g} kg and friction "
+                f"{FRICTION:g}: {', '.join(self.matter)} goes with certificate, screen or none"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _planned_in_its_scene(self) -> Self:
         if self.place.kind == "free":
             return self
@@ -213,6 +237,12 @@ class JobOptions(Model):
         if self.models and self.referee == "none":
             raise ValueError("robust counts verdicts: choose a referee")
         return self
+
+    @property
+    def matter(self) -> dict[str, float]:
+        """What it says of the object's mass, density and friction; empty: nothing."""
+        said = {"mass": self.mass, "density": self.density, "object_friction": self.object_friction}
+        return {name: value for name, value in said.items() if value is not None}
 
     @property
     def models(self) -> int:

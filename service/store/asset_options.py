@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 import typer
 
 from service.model.errors import InputError
+from service.model.matter import FRICTION, MASS_KG
 
 PalmOption = Annotated[str | None, typer.Option("--palm", help="Link that is the palm.")]
 ApproachOption = Annotated[
@@ -52,8 +53,16 @@ ScaleSweepOption = Annotated[
 CompoundOption = Annotated[bool, typer.Option("--compound", help="Components that lie apart are one rigid body.")]
 KeepLargestOption = Annotated[bool, typer.Option("--keep-largest", help="Of several components keep the largest.")]
 AllowOpenOption = Annotated[bool, typer.Option("--allow-open", help="Take a mesh that is not watertight.")]
-DensityOption = Annotated[float | None, typer.Option("--density", help="Density in kg/m3.")]
-MassOption = Annotated[float | None, typer.Option("--mass", help="Mass in kg.")]
+DensityOption = Annotated[
+    float | None, typer.Option("--density", help="Density of the object in kg/m3, in place of the mass.")
+]
+MassOption = Annotated[
+    float | None, typer.Option("--mass", help=f"Mass of the object in kg; {MASS_KG:g} where nothing is said.")
+]
+_FRICTION_HELP: Final = f"Coulomb coefficient of the object's contacts in simulation; {FRICTION:g} where none is given."
+FrictionOption = Annotated[float | None, typer.Option("--friction", help=_FRICTION_HELP)]
+#: Where `--friction` is the coefficient of the metrics.
+ObjectFrictionOption = Annotated[float | None, typer.Option("--object-friction", help=_FRICTION_HELP)]
 LicenceOption = Annotated[
     str | None, typer.Option("--licence", help="Terms it may be used on, for dataset cards: CC-BY-4.0.")
 ]
@@ -107,6 +116,7 @@ def object_options(
     allow_open: bool = False,
     density: float | None = None,
     mass: float | None = None,
+    friction: float | None = None,
 ) -> dict[str, Any]:
     """Keys of an object's `asset.json`; those not given are left out."""
     options = {
@@ -117,6 +127,7 @@ def object_options(
         "allow_open": allow_open or None,
         "density": density,
         "mass": mass,
+        "friction": friction,
     }
     return {key: value for key, value in options.items() if value is not None}
 

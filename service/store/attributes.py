@@ -38,6 +38,8 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "object_digest": RootAttribute("text", "digest of the files it came from"),
     "object_source": RootAttribute("text", "where a command of this machine read it, if it is not built in"),
     "object_options": RootAttribute("text", "with which options the mesh was read, as JSON"),
+    "object_mass_kg": RootAttribute("number", "mass that the object has in simulation [kg]", _BASE),
+    "object_friction": RootAttribute("number", "Coulomb coefficient of its contacts in simulation", _BASE),
     "object_scale": RootAttribute("number", "imported grasps: scale of the object's mesh", _BASE),
     "method": RootAttribute("text", "planner"),
     "fidelity": RootAttribute("text", "its knobs, as JSON"),

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import trimesh
 
 from service.model.domain import JobOptions
 from service.model.errors import InputError
 from service.store.attributes import ATTRIBUTES, check_attributes
 from service.store.columns import SCHEMAS
-from tests.worker.models import two_finger_hand
+from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.files.base_attributes import base_attributes
 from worker.grasps import GraspSet, Posture
 
@@ -45,7 +46,13 @@ def test_grasps_come_back_from_the_columns_they_went_into(in_scenes: bool) -> No
 
 @pytest.mark.parametrize(("key", "level"), [("k", "letter"), (None, "none")])
 def test_a_base_shard_says_who_judged_its_grasps(key: str | None, level: str) -> None:
-    said = base_attributes(two_finger_hand(), JobOptions(referee="letter"), tried=7, verdict_key=key)
+    said = base_attributes(
+        two_finger_hand(),
+        object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05))),
+        JobOptions(referee="letter"),
+        tried=7,
+        verdict_key=key,
+    )
     check_attributes("base", said)
     assert said["verdict_level"] == level and said.get("verdict_key") == key and said["tried"] == 7
 

@@ -14,6 +14,7 @@ from service.store.asset_options import (
     AllowOpenOption,
     CompoundOption,
     DensityOption,
+    FrictionOption,
     KeepLargestOption,
     MassOption,
     ScaleToOption,
@@ -42,6 +43,7 @@ def check(
     allow_open: AllowOpenOption = False,
     density: DensityOption = None,
     mass: MassOption = None,
+    friction: FrictionOption = None,
     picture: Annotated[Path | None, typer.Option(help="Draw the prepared mesh: a PNG.")] = None,
     json: JsonFlag = False,
 ) -> None:
@@ -54,6 +56,7 @@ def check(
         allow_open=allow_open,
         density=density,
         mass=mass,
+        friction=friction,
     )
     if several := _several(file):
         if picture:

@@ -31,7 +31,10 @@ from service.model.scene_spec import parse_scene
 from service.store.asset_options import (
     AllowOpenOption,
     CompoundOption,
+    DensityOption,
     KeepLargestOption,
+    MassOption,
+    ObjectFrictionOption,
     ScaleToOption,
     UnitsOption,
     object_options,
@@ -79,6 +82,9 @@ def synth(
     friction: Annotated[
         float, typer.Option(help="Coulomb coefficient of the quality metrics", min=0.01, max=3.0)
     ] = 1.0,
+    mass: MassOption = None,
+    density: DensityOption = None,
+    object_friction: ObjectFrictionOption = None,
     units: UnitsOption = None,
     scale_to: ScaleToOption = None,
     keep_largest: KeepLargestOption = False,
@@ -116,7 +122,8 @@ def synth(
     """
     if not out.parent.is_dir():
         raise InputError(f"the folder {out.parent} does not exist; create it or choose another --out")
-    request = _request(want, budget, referee, robust, robust_models).model_copy(
+    matter = {"mass": mass, "density": density, "object_friction": object_friction}
+    request = _request(want, budget, referee, robust, robust_models, matter).model_copy(
         update={
             "grasps": grasps, "method": method, "seed": seed,
             "options": of_this_machine(method, parsed_options(option or [])),
@@ -150,7 +157,9 @@ def synth(
         raise typer.Exit(FEWER)
 
 
-def _request(want: str, budget: float, referee: str, robust: float, models: int) -> JobOptions:
+def _request(
+    want: str, budget: float, referee: str, robust: float, models: int, matter: dict[str, float | None]
+) -> JobOptions:
     """Options of a job with these; InputError for a word that is none."""
     if want not in ("valid", "raw"):
         raise InputError(f"unknown --want {want!r}; choose valid or raw")
@@ -159,7 +168,7 @@ def _request(want: str, budget: float, referee: str, robust: float, models: int)
     # An audit is a sample that watches over many jobs; a file can be judged by the letter whole.
     try:
         return JobOptions(
-            want=want, budget=budget, referee=referee, audits=0, robust=robust, robust_models=models
+            want=want, budget=budget, referee=referee, audits=0, robust=robust, robust_models=models, **matter
         )  # fmt: skip
     except ValidationError as error:
         raise InputError(validation_line(error)) from None

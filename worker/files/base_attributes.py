@@ -9,10 +9,12 @@ from service.model.domain import JobOptions
 from service.store.attributes import Attribute
 from service.store.shards import json_attribute
 from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
 
 
 def base_attributes(
     hand: HandModel,
+    obj: ObjectModel,
     request: JobOptions,
     *,
     tried: int,
@@ -23,6 +25,7 @@ def base_attributes(
 
     Args:
         hand: the hand.
+        obj: the object as it was judged.
         request: friction, want, referee and scene.
         tried: grasps tried until the last one kept.
         verdict_key: digest of the terms of the verdicts; None: nobody judged.
@@ -32,6 +35,8 @@ def base_attributes(
         "joint_names": list(hand.joint_names),
         "mu": request.friction,
         "root_link": hand.root_link,
+        "object_mass_kg": obj.mass,
+        "object_friction": obj.friction,
         "want": request.want,
         "tried": tried,
     }

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from service.model.errors import ConflictError, InputError
+from service.model.matter import FRICTION, MASS_KG
 from service.model.states import AssetKind
 from service.readers.ways import scene_spec_of
 from service.store.attributes import Attribute
@@ -29,6 +30,7 @@ from worker.simulation.surroundings import Placed, Scenes
 
 #: Neighbours are looked at and kept clear of, not grasped.
 NEIGHBOUR_FACE_ERROR_M: Final = 3e-4
+_MATTER: Final = {"object_mass_kg": MASS_KG, "object_friction": FRICTION}
 
 
 def hand_of_shard(shard: Shard, given: str | None) -> HandModel:
@@ -56,7 +58,14 @@ def hand_files_of_shard(shard: Shard, given: str | None) -> Found:
 
 
 def object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
-    """The object named by `given`, simplified as in the shard; see `hand_of_shard`."""
+    """The object named by `given`, simplified and as heavy as in the shard; see `hand_of_shard`."""
+    said = shard.attributes
+    # What older shards do not say was the same for all objects.
+    mass, friction = (float(said.get(key, default)) for key, default in _MATTER.items())  # type: ignore[arg-type]
+    return _object_of_shard(shard, given).weighing(mass=mass, friction=friction)
+
+
+def _object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
     knobs = options_of(shard.attributes.get("fidelity"))
     stated = knobs.get("face_error_m")
     error = float(stated) if isinstance(stated, int | float) else 3e-4

@@ -28,6 +28,7 @@ from worker.files.origin import remembered
 from worker.grasps import joined_columns
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
+from worker.objects.matter import as_asked
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import planner
@@ -81,6 +82,8 @@ class Synthesized:
             "valid": int(self.arrays["quality/valid"].sum()),
             "sound": int(self.arrays["quality/sound"].sum()),
             "referee": request.referee,
+            "mass_kg": self.attributes["object_mass_kg"],
+            "object_friction": self.attributes["object_friction"],
             "want": request.want,
             "wanted": request.grasps,
             "reason": self.reason,
@@ -175,7 +178,7 @@ def synthesized(
     wanted = parse_join(str(join))
     options = dict(mesh or {})
     model = hand_from_path(hand)
-    thing = object_from_path(obj, face_error_m=request.knobs.face_error_m, options=options)
+    thing = as_asked(object_from_path(obj, face_error_m=request.knobs.face_error_m, options=options), request)
     chosen = Device(device).resolve()
     began = time.perf_counter()
     others = [object_from_path(one.object, face_error_m=NEIGHBOUR_FACE_ERROR_M) for one in place.neighbours]
@@ -267,5 +270,5 @@ def _attributes(
     tried = sum(batch.tried for batch in batches)
     outcomes = totals(batch.outcomes for batch in batches)
     return attributes | base_attributes(
-        hand, request, tried=tried, verdict_key=batches[0].verdict_key, outcomes=outcomes
+        hand, obj, request, tried=tried, verdict_key=batches[0].verdict_key, outcomes=outcomes
     )

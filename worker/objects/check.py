@@ -43,7 +43,8 @@ def check_object(
         return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": facts}
     size = " x ".join(f"{1e3 * extent:.0f}" for extent in facts["extents_m"])
     parts = [
-        f"{name}: {size} mm, {facts['faces']} faces, {1e6 * facts['volume_m3']:.1f} cm3",
+        f"{name}: {size} mm, {facts['faces']} faces, {1e6 * facts['volume_m3']:.1f} cm3, {facts['mass_kg']:.3g} kg"
+        + ("" if facts["mass_stated"] else " assumed"),
         *mesh.repairs,
         *facts["notes"],
     ]
@@ -57,9 +58,7 @@ def _facts(mesh: Repaired, face_error_m: float, options: ObjectOptions) -> dict[
     notes = list(mesh.notes)
     if away > FAR * extents.max():
         notes.append(f"its origin lies {away:.4g} m from the middle of the mesh; poses of hands are told from there")
-    mass = options.mass
-    if mass is None and options.density is not None:
-        mass = options.density * model.volume
+    model = model.weighing(mass=options.mass, density=options.density, friction=options.friction)
     return {
         "faces": len(mesh.faces),
         "prepared_faces": len(model.faces),
@@ -68,7 +67,9 @@ def _facts(mesh: Repaired, face_error_m: float, options: ObjectOptions) -> dict[
         "self_intersections": mesh.self_intersections,
         "extents_m": [float(extent) for extent in extents],
         "volume_m3": model.volume,
-        "mass_kg": mass,
+        "mass_kg": model.mass,
+        "mass_stated": options.mass is not None or options.density is not None,
+        "friction": model.friction,
         "centre_of_mass_m": [float(value) for value in model.centre_of_mass],
         "origin_distance_m": away,
         "radius_m": model.radius,

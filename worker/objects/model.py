@@ -12,7 +12,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.objects.content import content_of
+from service.model.errors import MeshError
+from service.model.matter import FRICTION, MASS_KG, MOST_KG
+from worker.objects.content import TOLD_IF_SET, content_of
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -20,7 +22,7 @@ Ints = NDArray[np.int32]
 
 @dataclass(frozen=True)
 class ObjectModel:
-    """A prepared object. Mass scales out: inertia is per unit of mass."""
+    """A prepared object: its shape, its mass and its friction."""
 
     name: str
     digest: str
@@ -48,6 +50,10 @@ class ObjectModel:
     repairs: tuple[str, ...] = ()
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Middle of the mesh [m]; zero for a model that is `centred`."""
+    mass: float = field(default=MASS_KG, metadata=TOLD_IF_SET)
+    """[kg]"""
+    friction: float = field(default=FRICTION, metadata=TOLD_IF_SET)
+    """Coulomb coefficient of its contacts in simulation."""
     about_centre: Floats | None = field(default=None, repr=False)
     """(V + H + 1, 3) vertices, hull and centre of mass about the middle [m]; None: they are that already."""
 
@@ -80,6 +86,27 @@ class ObjectModel:
         return replace(
             self, vertices=vertices, hull_vertices=hull, centre_of_mass=mass, centre=centre, about_centre=held
         )
+
+    def weighing(
+        self, *, mass: float | None = None, density: float | None = None, friction: float | None = None
+    ) -> ObjectModel:
+        """The same with another mass [kg], or density [kg/m^3], and another friction; None: as it is.
+
+        Raises:
+            MeshError: it would weigh more than `MOST_KG`.
+        """
+        if mass is None:
+            mass = self.mass if density is None else density * self.volume
+        if mass > MOST_KG:
+            raise MeshError(
+                f"{self.name}: it would weigh {mass:.4g} kg; the most is {MOST_KG:g} kg: is its unit right?"
+            )
+        return replace(self, mass=mass, friction=self.friction if friction is None else friction)
+
+    @property
+    def published(self) -> ObjectModel:
+        """The same with mass and friction of DexGraspBench's protocol, which are the same for all objects."""
+        return replace(self, mass=MASS_KG, friction=FRICTION)
 
     @property
     def gyration_radius(self) -> float:

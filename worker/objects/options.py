@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from service.model.errors import MeshError
+from service.model.matter import Density, Friction, Mass
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+#: Keys that decide how heavy and how slippery the object is, and not its shape.
+OF_MATTER: Final = ("density", "mass", "friction")
 
 #: Metres per unit.
 UNITS: Final = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
@@ -31,8 +34,15 @@ class ObjectOptions(BaseModel):
     keep_largest: bool = Field(False, description="of several components keep the largest")
     compound: bool = Field(False, description="components that lie apart are one rigid body")
     allow_open: bool = Field(False, description="take a mesh that encloses no volume")
-    density: Positive | None = Field(None, description="[kg/m^3]")
-    mass: Positive | None = Field(None, description="[kg]")
+    density: Density | None = Field(None, description="[kg/m^3]")
+    mass: Mass | None = Field(None, description="[kg]; instead of the density")
+    friction: Friction | None = Field(None, description="Coulomb coefficient of its contacts in simulation")
+
+    @model_validator(mode="after")
+    def _one_of_mass_and_density(self) -> Self:
+        if self.mass is not None and self.density is not None:
+            raise ValueError("mass and density both: give one of them")
+        return self
 
 
 def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = None) -> ObjectOptions:
@@ -48,6 +58,8 @@ def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = 
     if not isinstance(stated, dict):
         raise MeshError('asset.json is no JSON object; write one such as {"file": "mug.stl", "units": "mm"}')
     given = {key: value for key, value in (extra or {}).items() if value is not None}
+    if given.keys() & {"mass", "density"}:
+        stated = {key: value for key, value in stated.items() if key not in ("mass", "density")}
     try:
         return ObjectOptions.model_validate({**stated, **given})
     except ValidationError as error:

@@ -20,7 +20,7 @@ from worker.objects.kept import kept_or_made
 from worker.objects.mass import mass_properties
 from worker.objects.model import Floats, Ints, ObjectModel
 from worker.objects.normals import corner_normals
-from worker.objects.options import ObjectOptions, parse_options
+from worker.objects.options import OF_MATTER, ObjectOptions, parse_options
 from worker.objects.repair import Repaired, repair
 from worker.objects.simplify import simplify
 
@@ -45,8 +45,9 @@ def load_object(
     """
     settings = parse_options(files, options)
     main = main_file(files, settings)
-    model = _prepared(main, files[main], settings.model_dump_json(), float(face_error_m))
-    return replace(model, name=name, digest=digest)
+    shape = settings.model_dump_json(exclude=set(OF_MATTER))
+    model = replace(_prepared(main, files[main], shape, float(face_error_m)), name=name, digest=digest)
+    return model.weighing(mass=settings.mass, density=settings.density, friction=settings.friction)
 
 
 def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:

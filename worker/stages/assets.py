@@ -22,6 +22,7 @@ from service.store.store import Store
 from worker.files.of_shard import NEIGHBOUR_FACE_ERROR_M
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
+from worker.objects.matter import as_asked
 from worker.objects.model import ObjectModel
 from worker.planners.learned.known import keep
 from worker.stages.hand_files import load_hand_files
@@ -62,7 +63,7 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
             publish_model(store, AssetKind.OBJECT, shown)
         return obj
 
-    return _cached(key, load)
+    return as_asked(_cached(key, load), message.request)
 
 
 def neighbours_of(store: Store, message: TaskMessage) -> list[ObjectModel]:

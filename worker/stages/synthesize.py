@@ -70,7 +70,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         **_json(found.grasps.info),
     }
     said = base_attributes(
-        hand, message.request, tried=found.tried, verdict_key=found.verdict_key, outcomes=found.outcomes
+        hand, obj, message.request, tried=found.tried, verdict_key=found.verdict_key, outcomes=found.outcomes
     )
     of_scenes: dict[str, Attribute] = {"scene_shard": message.inputs[0]} if scenes is not None else {}
     said |= of_scenes | beside_attributes(message)

@@ -16,6 +16,7 @@ import pytest
 import trimesh
 
 from service.model.errors import InputError, MeshError, TaskCancelled
+from service.model.matter import MASS_KG
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.quality.helpers import pad_hand, plate_hand, posture
 from worker.grasps import GraspSet, Posture
@@ -28,7 +29,7 @@ from worker.quality.referee import model, protocol
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.judge import judge
 from worker.quality.referee.key import LEVEL_MOVES, MOVES, Level, verdict_key
-from worker.quality.referee.model import OBJECT_MASS, MujocoOptions, blend, build
+from worker.quality.referee.model import MujocoOptions, blend, build
 from worker.quality.referee.protocol import Outcome, Test
 from worker.quality.referee.robustness import robustness
 from worker.run import Run
@@ -293,8 +294,8 @@ def test_joint_limits_reach_the_engine_in_radians() -> None:
 def test_object_weighs_100_grams_with_its_own_inertia() -> None:
     model = build(PADS, BOX, WHOLE, MujocoOptions()).model
     body = model.body("object")
-    assert body.mass[0] == pytest.approx(OBJECT_MASS)
-    assert sorted(body.inertia) == pytest.approx(sorted(OBJECT_MASS * np.linalg.eigvalsh(BOX.inertia)), rel=1e-6)
+    assert body.mass[0] == pytest.approx(MASS_KG)
+    assert sorted(body.inertia) == pytest.approx(sorted(MASS_KG * np.linalg.eigvalsh(BOX.inertia)), rel=1e-6)
 
 
 def test_the_mass_lies_in_the_centre_of_mass_wherever_the_mesh_has_its_origin() -> None:

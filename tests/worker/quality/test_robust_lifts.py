@@ -15,7 +15,7 @@ from worker.grasps import GraspSet, joined
 from worker.quality.referee.lift import LiftOutcome, LiftTrial
 from worker.quality.referee.lifting import judge_lifts
 from worker.quality.referee.model import FRICTION, HARD, MujocoOptions
-from worker.quality.referee.protocol import PUSH, STAGES
+from worker.quality.referee.protocol import STAGES
 from worker.quality.referee.robust import robust
 from worker.quality.referee.variant import NOMINAL, Variant
 from worker.quality.referee.varied import Models, VariantLift, motion_of, seen, upright
@@ -88,7 +88,9 @@ def test_lifts_that_end_early_say_of_the_wanted_share_what_all_of_them_say(
 def test_a_heavier_object_weighs_more_and_takes_more_to_lift() -> None:
     test = VariantLift(models().scene(Variant(mass=2.0)), PLACED, Variant(mass=2.0), None)
     test._begin(MANY, 0)
-    assert test.data.xfrc_applied[test.scene.object_body, :3] == pytest.approx(2.0 * PUSH * np.array([0, 0, 1.0]))
+    assert test.data.xfrc_applied[test.scene.object_body, :3] == pytest.approx(
+        2.0 * test.scene.push * np.array([0, 0, 1.0])
+    )
     lifted = [models().lift(MANY, 2, WHERE, Variant(mass=mass)).success for mass in (1.0, 2.0)]
     assert lifted == [True, False]
 

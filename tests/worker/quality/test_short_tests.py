@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from service.model.matter import MASS_KG
 from tests.worker.quality.test_lift import BOX, HAND, PLACED, WHOLE, grasp
 from worker.grasps import GraspSet, joined
-from worker.quality.referee.model import OBJECT_MASS
+from worker.quality.referee.model import ACCELERATION
 from worker.quality.referee.protocol import MAX_DISPLACEMENT_M, STAGE_S
 from worker.quality.referee.short import DEEP, HANGING, PHYSICS, PULL, PUSHED, SLIPS, ShortLifts, push_trial
 from worker.simulation.surroundings import Placed
@@ -25,7 +26,7 @@ def scores(*squeezes: float, threads: int = 1) -> np.ndarray:
 def fallen(hold: float) -> float:
     """Score of a box of 0.1 kg that slips out of friction `hold` [N] from rest: how far it falls, over 5 cm."""
     seconds = round(STAGE_S / PHYSICS.timestep) * PHYSICS.timestep * HANGING
-    return 0.5 * (PULL - hold) / OBJECT_MASS * seconds**2 / MAX_DISPLACEMENT_M
+    return 0.5 * (PULL * ACCELERATION - hold / MASS_KG) * seconds**2 / MAX_DISPLACEMENT_M
 
 
 def test_the_box_falls_by_what_friction_does_not_carry() -> None:
@@ -85,7 +86,7 @@ def test_a_free_box_hardly_moves_where_friction_carries_the_pushes() -> None:
 
 def test_a_free_box_that_nothing_holds_flies_as_far_as_the_push_takes_it() -> None:
     seconds = round(STAGE_S * PUSHED / PHYSICS.timestep) * PHYSICS.timestep
-    freely = 0.5 * PULL / OBJECT_MASS * seconds**2 / MAX_DISPLACEMENT_M
+    freely = 0.5 * PULL * ACCELERATION * seconds**2 / MAX_DISPLACEMENT_M
     # Along the pads' normals they are in its way; it turns where it meets one.
     assert pushed(-0.02)[0] - SLIPS >= 0.95 * ACROSS * freely
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from service.model.matter import MASS_KG
 from service.model.robust import Axis
 from service.model.transforms import apply
 from tests.worker.models import object_from_mesh, piece, two_finger_hand
@@ -21,7 +22,7 @@ from worker.quality.postures import pregrasp, squeeze
 from worker.quality.referee import model
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.judge import judge
-from worker.quality.referee.model import OBJECT_MASS, MujocoOptions
+from worker.quality.referee.model import MujocoOptions
 from worker.quality.referee.protocol import STAGES, Test
 from worker.quality.referee.refit import fits_of, grown, refitted
 from worker.quality.referee.variant import NOMINAL, SHAPES, Variant, axes_of, draw
@@ -167,7 +168,7 @@ def test_numbers_reach_the_engine() -> None:
     assert other.actuator_gainprm[:, 0] == pytest.approx(2 * own.actuator_gainprm[:, 0])
     assert other.actuator_biasprm[:, 1] == pytest.approx(2 * own.actuator_biasprm[:, 1])
     assert other.geom_friction[:, :2] == pytest.approx(0.75 * own.geom_friction[:, :2])
-    assert other.body_mass[thing] == pytest.approx(1.5 * OBJECT_MASS)
+    assert other.body_mass[thing] == pytest.approx(1.5 * MASS_KG)
     assert other.body_inertia[thing] == pytest.approx(1.5 * own.body_inertia[thing])
     # Contacts are as stiff as inverse masses say.
     assert other.body_invweight0[thing, 0] == pytest.approx(own.body_invweight0[thing, 0] / 1.5)

@@ -18,6 +18,7 @@ from worker.files.base_attributes import base_attributes
 from worker.files.exchange.imported import Imported, Origin
 from worker.files.exchange.names import plain_name
 from worker.files.exchange.objects import mesh_file
+from worker.objects.matter import as_asked
 from worker.objects.prepare import files_from_path
 from worker.run import ALONE, Run
 
@@ -57,7 +58,8 @@ def write_scored(
     except ValueError:
         raise InputError(f"unknown level {referee!r}; choose letter, certificate, screen or none") from None
     scenes = None if found.placed is None else found.placed.everywhere
-    made = scored(found.hand, found.obj, found.grasps, request, scenes=scenes, run=run)
+    obj = as_asked(found.obj, request)
+    made = scored(found.hand, obj, found.grasps, request, scenes=scenes, run=run)
     folder.mkdir(parents=True, exist_ok=True)
     mesh = mesh_file(found.obj, folder / f"{name}-{found.scale:g}.obj")
     attributes: dict[str, Attribute] = {
@@ -68,7 +70,7 @@ def write_scored(
         "shard_id": digest_json([origin.source, found.hand.digest, _digest(mesh), ordinal, len(found.grasps)]),
         "batch": ordinal,
     }  # fmt: skip
-    attributes |= base_attributes(found.hand, request, tried=made.tried, verdict_key=made.verdict_key)
+    attributes |= base_attributes(found.hand, obj, request, tried=made.tried, verdict_key=made.verdict_key)
     arrays = {**made.grasps.to_columns(), **made.columns}
     if found.published is not None and (found.published >= 0).any():
         arrays["quality/published"] = found.published

@@ -102,7 +102,7 @@ def judge(
 
     Args:
         hand: the hand; its stiffness and effort are the actuators' gains and limits.
-        obj: the object, 0.1 kg whatever it is made of.
+        obj: the object, with its mass and friction; `ObjectModel.published` has those of the protocol.
         grasps: N grasps with pregrasp and squeeze postures.
         level: letter, certificate or screen.
         hard: sliding friction halved, torsional friction a tenth.

@@ -22,17 +22,17 @@ from worker.quality.referee.decomposition import ConvexPieces, decompose
 Level = Literal["letter", "certificate", "screen"]
 
 #: Raise when the code of the protocol or of the scene changes what it says, constants aside.
-REVISION: Final = 5
+REVISION: Final = 6
 
 _EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "SURE", "LOST_ROTATION")
 #: The constants that move a verdict, module by module, and those that only one level reads. A constant of these modules
 #: that stands in neither moves none.
 MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
     protocol: (
-        "DIRECTIONS", "PUSH", "MAX_DISPLACEMENT_M", "MAX_ROTATION", "MAX_PENETRATION_M", "STAGES", "STAGE_S", "HOLD_S",
+        "DIRECTIONS", "MAX_DISPLACEMENT_M", "MAX_ROTATION", "MAX_PENETRATION_M", "STAGES", "STAGE_S", "HOLD_S",
     ),
     model: (
-        "OBJECT_MASS", "FRICTION", "HARD", "DAMPING_TIME", "HAND_SOLIMP", "HAND_SOLREF", "COUPLING_SOLREF",
+        "ACCELERATION", "FRICTION", "HARD", "DAMPING_TIME", "HAND_SOLIMP", "HAND_SOLREF", "COUPLING_SOLREF",
         "COUPLING_SOLIMP", "NOT_IN_3_3_2", "_BARE_RADIUS", "_MIN_MASS",
     ),
     opening: (
@@ -79,6 +79,7 @@ def verdict_key(
             "engine": mujoco.__version__,
             "hand": [hand.digest, digest_bytes(shapes)],
             "gains": [array.tolist() for array in (hand.stiffness, hand.effort, hand.masses)],
+            "matter": [obj.mass, obj.friction],
             "object": [obj.digest, np.round(obj.inertia, 12).tolist(), np.round(obj.centre_of_mass, 9).tolist()],
             "pieces": pieces.digest,
             "physics": asdict(model.MujocoOptions().hardened() if hard else model.MujocoOptions()),

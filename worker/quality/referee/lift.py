@@ -22,11 +22,10 @@ from numpy.typing import NDArray
 from service.model.transforms import invert, quat_conjugate, quat_rotate, slerp
 from worker.engines.mujoco_warnings import void
 from worker.grasps import GraspSet, Posture
-from worker.quality.referee.model import OBJECT_MASS, Scene, blend
+from worker.quality.referee.model import ACCELERATION, Scene, blend
 from worker.quality.referee.protocol import (
     MAX_PENETRATION_M,
     MAX_ROTATION,
-    PUSH,
     STAGE_S,
     STAGES,
     Outcome,
@@ -130,11 +129,11 @@ class Lift(Test):
     def _put(self, hand_pose: Floats, joints: Floats) -> None:
         self.scene.place(self.data, hand_pose, joints)
         self.data.mocap_pos[1], self.data.mocap_quat[1] = self._scene_pose[:3], self._scene_pose[3:]
-        self.data.xfrc_applied[self.scene.object_body, :3] = -PUSH * self._up
+        self.data.xfrc_applied[self.scene.object_body, :3] = -self.scene.push * self._up
         for free, pose in zip(self.scene.neighbours, self._beside, strict=True):
             centre = pose[:3] + quat_rotate(pose[3:], free.centre)
             self.data.qpos[free.qpos : free.qpos + 7] = [*centre, *pose[3:]]
-            self.data.xfrc_applied[free.body, :3] = -PUSH / OBJECT_MASS * free.mass * self._up
+            self.data.xfrc_applied[free.body, :3] = -ACCELERATION * free.mass * self._up
 
     def _neighbours_moved(self) -> bool:
         """Whether a neighbour is not where it stood, or has toppled."""

@@ -74,7 +74,7 @@ def judge_lifts(
 
     Args:
         hand: the hand; its stiffness and effort are the actuators' gains and limits.
-        obj: the object, 0.1 kg whatever it is made of.
+        obj: the object, with its mass and friction; `ObjectModel.published` has those of the protocol.
         grasps: N grasps with pregrasp, squeeze and, for level lift, approach.
         placed: their scenes; `index` has a scene for each.
         level: letter or lift.

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.matter import FRICTION as SLIDING
 from service.model.transforms import slerp
 from worker.engines.mujoco_warnings import ARENA
 from worker.grasps import Posture
@@ -23,11 +24,12 @@ from worker.simulation.surroundings import CLEAR_M, Neighbour, Obstacle
 
 Floats = NDArray[np.float64]
 
-OBJECT_MASS: Final = 0.1
+#: A push and the weight are so much a kilogram [m/s^2].
+ACCELERATION: Final = 10.0
 #: Of neighbours [kg/m^3].
 DENSITY: Final = 500.0
 #: Sliding and torsional friction; `hard` scales them by `HARD`.
-FRICTION: Final = (0.6, 0.02)
+FRICTION: Final = (SLIDING, 0.02)
 HARD: Final = (0.5, 0.1)
 #: Joint damping over position gain [s]: 0.1 N m s/rad at the protocol's gain of 5.
 DAMPING_TIME: Final = 0.02
@@ -55,7 +57,8 @@ class MujocoOptions:
     root: str = "weld"
     """weld: free root held to a mocap body (the protocol); fixed: the root itself is the mocap body."""
     friction: tuple[float, float] = FRICTION
-    """Sliding and torsional coefficient of every contact."""
+    """Sliding and torsional coefficient of every contact with an object whose own is `FRICTION`; of others in
+    proportion."""
 
     def hardened(self) -> MujocoOptions:
         """The same at the friction of the hard protocol."""
@@ -101,6 +104,8 @@ class Scene:
     """(A, D) controls of the actuators from these values; None: they are the values."""
     centre: Floats
     """(3,) the object's centre of mass in the object frame."""
+    mass: float
+    """The object's [kg]."""
     support_geoms: NDArray[np.bool_]
     """(G,) geoms of the scene's supports and neighbours; the scene frame is the mocap body 1."""
     neighbours: tuple[FreeBody, ...]
@@ -109,6 +114,11 @@ class Scene:
     """(G,) geoms of fingertips."""
     pressing: Floats
     """(G,) how deep fingertips that come may press into a geom [m]: above 0 of supports that say so."""
+
+    @property
+    def push(self) -> float:
+        """A push, and the weight [N]."""
+        return ACCELERATION * self.mass
 
     def place(self, data: Any, hand_pose: Floats, joints: Floats) -> None:
         """Reset `data` with the hand in a posture (7,), (J,) and the object at its initial pose."""
@@ -161,6 +171,7 @@ def build(
         dof_shift=shift,
         pulls=actuators(hand.tendons, hand.dofs) if hand.tendons else None,
         centre=obj.centre_of_mass,
+        mass=obj.mass,
         support_geoms=np.asarray(support),
         neighbours=beside,
         tip_geoms=np.isin(body_of_geom, [model.body(f"body{b}").id for b in hand.fingertips]),
@@ -202,9 +213,10 @@ def scene_spec(
     option.noslip_iterations = physics.noslip_iterations
     spec.memory = ARENA
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) | (NOT_IN_3_3_2 & ~several_contacts(hand))
-    friction = [*physics.friction, 1e-4]
+    slide, twist = (coefficient * obj.friction / SLIDING for coefficient in physics.friction)
+    friction = [slide, twist, 1e-4]
     _add_hand(spec, hand, friction, physics.root)
-    add_object(spec, obj, pieces.vertices, friction, OBJECT_MASS)
+    add_object(spec, obj, pieces.vertices, friction, obj.mass)
     if supports:
         _add_supports(spec, supports, friction)
     for k, one in enumerate(neighbours):

@@ -19,13 +19,11 @@ from numpy.typing import NDArray
 
 from worker.engines.mujoco_warnings import void
 from worker.grasps import GraspSet, Posture
-from worker.quality.referee.model import OBJECT_MASS, Scene, blend
+from worker.quality.referee.model import Scene, blend
 
 Floats = NDArray[np.float64]
 
 DIRECTIONS: Final = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
-#: Push [N]: an acceleration of 10 m/s^2 on the object.
-PUSH: Final = 10.0 * OBJECT_MASS
 MAX_DISPLACEMENT_M: Final = 0.05
 MAX_ROTATION: Final = math.radians(15.0)
 MAX_PENETRATION_M: Final = 0.010
@@ -200,7 +198,7 @@ class Test:
 
     def _push(self, direction: int) -> None:
         self.data.xfrc_applied[:] = 0.0
-        self.data.xfrc_applied[self.scene.object_body, :3] = PUSH * np.array(DIRECTIONS[direction])
+        self.data.xfrc_applied[self.scene.object_body, :3] = self.scene.push * np.array(DIRECTIONS[direction])
 
     def _hold(self, trial: Trial) -> Outcome:
         """Sequential test: reject on a broken limit, accept when the present rates keep well inside it for 2 s."""

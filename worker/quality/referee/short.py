@@ -27,7 +27,7 @@ from worker.quality.referee.compiled import scene_of
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.lift import Lift, LiftOutcome
 from worker.quality.referee.model import MujocoOptions, Scene
-from worker.quality.referee.protocol import PUSH, STAGE_S, Outcome, Test
+from worker.quality.referee.protocol import STAGE_S, Outcome, Test
 from worker.simulation.surroundings import Placed
 
 Floats = NDArray[np.float64]
@@ -43,8 +43,8 @@ HANGING: Final = 3
 #: the time.
 FREE_CLOSING: Final = 2
 PUSHED: Final = 2
-#: Pull while the object hangs, and of a push [N].
-PULL: Final = 2.0 * PUSH
+#: Pull while the object hangs, and of a push, in its weights.
+PULL: Final = 2.0
 #: Where a free object is pushed: no direction is farther from all of them than 71 degrees.
 CORNERS: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
 #: How far supports go away [m]: farther than any scene is high.
@@ -90,7 +90,7 @@ class ShortLift(Lift):
     def _hung(self, enough: float = np.inf) -> float:
         """Displacement or rotation over its limit when the support has gone; that is all if it is `enough` before."""
         self.data.mocap_pos[1] = self._scene_pose[:3] - AWAY_M * self._up
-        self.data.xfrc_applied[self.scene.object_body, :3] = -PULL * self._up
+        self.data.xfrc_applied[self.scene.object_body, :3] = -PULL * self.scene.push * self._up
         for _ in range(HANGING):
             self._run(STAGE_S)
             excess = LOST if void(self.data) else self._excess()
@@ -131,7 +131,7 @@ class ShortPush(Test):
         worst = 0.0
         for corner in CORNERS:
             self._restore()
-            self.data.xfrc_applied[self.scene.object_body, :3] = PULL * corner
+            self.data.xfrc_applied[self.scene.object_body, :3] = PULL * self.scene.push * corner
             self._run(PUSHED * STAGE_S)
             worst = max(worst, LOST if void(self.data) else self._excess())
             if worst >= 1.0:

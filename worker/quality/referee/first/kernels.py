@@ -19,7 +19,6 @@ STAGES = wp.constant(protocol.STAGES)
 FIRST_LOOK = wp.constant(round(protocol.FIRST_LOOK_S / protocol.INTERVAL_S))
 HOLD = wp.constant(round(protocol.HOLD_S / protocol.INTERVAL_S))
 PUSHES = wp.constant(len(protocol.DIRECTIONS))
-PUSH = wp.constant(protocol.PUSH)
 MOVED = wp.constant(protocol.MAX_DISPLACEMENT_M)
 TURNED = wp.constant(protocol.MAX_ROTATION)
 SURE = wp.constant(protocol.SURE)
@@ -107,6 +106,8 @@ class Terms:
 
     object_qpos: wp.int32
     object_body: wp.int32
+    push: wp.float32
+    """[N]"""
     centre: wp.vec3
     """Of the object's mass in its frame [m]."""
 
@@ -163,7 +164,7 @@ def push(w: wp.int32, number: wp.int32, terms: Terms, worlds: Worlds, engine: En
     for k in range(engine.qvel.shape[1]):
         engine.qvel[w, k] = worlds.qvel[w, k]
         engine.warmstart[w, k] = worlds.warmstart[w, k]
-    way = float(1 - 2 * (number % 2)) * PUSH
+    way = float(1 - 2 * (number % 2)) * terms.push
     axis = number / 2
     force = wp.vec3(0.0)
     force[axis] = way

@@ -73,6 +73,7 @@ class WorldPool:
     def _make_terms(self) -> Any:
         scene, terms = self.scene, kernels.Terms()
         terms.object_qpos, terms.object_body = scene.object_qpos, scene.object_body
+        terms.push = scene.push
         terms.centre = wp.vec3(*(float(x) for x in scene.centre))
         return terms
 
