@@ -9,6 +9,8 @@ from pydantic import Field
 #: Of an object of which nobody says what it weighs [kg], and its coefficient of sliding friction: DexGraspBench's.
 MASS_KG: Final = 0.1
 FRICTION: Final = 0.6
+#: Weight of a kilogram, and a push on it, in the protocol [m/s^2].
+ACCELERATION: Final = 10.0
 #: A hand lifts nothing heavier [kg].
 MOST_KG: Final = 100.0
 

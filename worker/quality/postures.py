@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.matter import ACCELERATION
 from worker.grasps import Posture
 from worker.hands.jaws import jaws_of
 from worker.hands.model import Floats, HandModel
@@ -39,6 +40,8 @@ CLOSING_M: Final = 0.009
 #: of what is held, for forces at the edge of their cones slip as soon as a contact is not quite where it was thought.
 TOTAL_NORMAL_FORCE: Final = 50.0
 FRICTION: Final = 0.3
+#: The same over the object's weight, at least.
+OF_WEIGHT: Final = 10.0
 
 
 def pregrasp(
@@ -87,16 +90,17 @@ def squeeze(
     obj: ObjectModel,
     grasp: Posture,
     *,
-    total_normal_force: float = TOTAL_NORMAL_FORCE,
+    total_normal_force: float | None = None,
     friction: float = FRICTION,
     device: str = "cpu",
 ) -> Posture:
     """N commanded postures that press: q + Kp^-1 J^T f, the root unchanged; see `worker.quality.squeeze`."""
+    force = normal_force(obj) if total_normal_force is None else total_normal_force
     if (jaws := jaws_of(hand)) is not None:
         probe = posing_of(hand, obj, points=_POINTS, device=device).probe
-        return jaw_squeeze(probe, jaws, grasp, total_normal_force=total_normal_force)
+        return jaw_squeeze(probe, jaws, grasp, total_normal_force=force)
     holds = hold_forces(
-        hand, obj, grasp, total_normal_force=total_normal_force, friction=friction, closing=CLOSING_M, device=device
+        hand, obj, grasp, total_normal_force=force, friction=friction, closing=CLOSING_M, device=device
     )  # fmt: skip
     q = hand.reduce(grasp.joint_positions) + holds.torque / hand.stiffness
     return Posture(np.array(grasp.hand_pose, float), hand.expand(q))
@@ -107,7 +111,7 @@ def hold_forces(
     obj: ObjectModel,
     grasp: Posture,
     *,
-    total_normal_force: float = TOTAL_NORMAL_FORCE,
+    total_normal_force: float | None = None,
     friction: float = FRICTION,
     closing: float = 0.0,
     device: str = "cpu",
@@ -116,9 +120,14 @@ def hold_forces(
     nothing press with their points that are nearer than `closing` [m]."""
     posing = posing_of(hand, obj, points=_POINTS, device=device)
     return balanced(
-        posing, grasp, total_normal_force=total_normal_force, friction=friction, within=PRESSING_M, most=MAX_PRESSING,
-        closing=closing,
+        posing, grasp, total_normal_force=normal_force(obj) if total_normal_force is None else total_normal_force,
+        friction=friction, within=PRESSING_M, most=MAX_PRESSING, closing=closing,
     )  # fmt: skip
+
+
+def normal_force(obj: ObjectModel) -> float:
+    """Sum of the contact forces' normal components with which an object is held [N]."""
+    return max(TOTAL_NORMAL_FORCE, OF_WEIGHT * ACCELERATION * obj.mass)
 
 
 def touching_links(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.int32]:

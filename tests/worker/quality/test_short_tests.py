@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.model.matter import MASS_KG
+from service.model.matter import ACCELERATION, MASS_KG
 from tests.worker.quality.test_lift import BOX, HAND, PLACED, WHOLE, grasp
 from worker.grasps import GraspSet, joined
-from worker.quality.referee.model import ACCELERATION
 from worker.quality.referee.protocol import MAX_DISPLACEMENT_M, STAGE_S
 from worker.quality.referee.short import DEEP, HANGING, PHYSICS, PULL, PUSHED, SLIPS, ShortLifts, push_trial
 from worker.simulation.surroundings import Placed

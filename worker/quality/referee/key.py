@@ -39,7 +39,7 @@ MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
         "CLEARANCE_M", "STUCK_M", "PALM_CLEARANCE_M", "PLAIN_OPENING", "OPENING_STEP", "SLIDING_STEP_M",
         "OPENING_STEPS", "JAM_M", "WAY", "JAM_LOOKS", "RETREATS_M",
     ),
-    postures: ("PRESSING_M", "CLOSING_M", "TOTAL_NORMAL_FORCE", "FRICTION", "MAX_PRESSING", "_POINTS"),
+    postures: ("PRESSING_M", "CLOSING_M", "TOTAL_NORMAL_FORCE", "OF_WEIGHT", "FRICTION", "MAX_PRESSING", "_POINTS"),
     squeeze: ("SPREAD", "TORQUE", "SUM"),
     jaw_squeeze: ("GAP_M", "STALL", "LEAST_WAY"),
 }  # fmt: skip

@@ -19,10 +19,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.matter import ACCELERATION
 from service.model.transforms import invert, quat_conjugate, quat_rotate, slerp
 from worker.engines.mujoco_warnings import void
 from worker.grasps import GraspSet, Posture
-from worker.quality.referee.model import ACCELERATION, Scene, blend
+from worker.quality.referee.model import Scene, blend
 from worker.quality.referee.protocol import (
     MAX_PENETRATION_M,
     MAX_ROTATION,

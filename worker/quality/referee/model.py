@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.matter import ACCELERATION
 from service.model.matter import FRICTION as SLIDING
 from service.model.transforms import slerp
 from worker.engines.mujoco_warnings import ARENA
@@ -24,8 +25,6 @@ from worker.simulation.surroundings import CLEAR_M, Neighbour, Obstacle
 
 Floats = NDArray[np.float64]
 
-#: A push and the weight are so much a kilogram [m/s^2].
-ACCELERATION: Final = 10.0
 #: Of neighbours [kg/m^3].
 DENSITY: Final = 500.0
 #: Sliding and torsional friction; `hard` scales them by `HARD`.
