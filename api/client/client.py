@@ -142,7 +142,8 @@ class Client:
         deadline = time.monotonic() + timeout_s
         while (asset := self.asset(kind, name)).verdict is None:
             if time.monotonic() > deadline:
-                raise UnavailableError(f"no worker has checked {kind.value} {name!r} yet; is one running?")
+                why = asset.message or "is one running?"
+                raise UnavailableError(f"no worker has checked {kind.value} {name!r} yet; {why}")
             time.sleep(_POLL_S)
         return asset
 
