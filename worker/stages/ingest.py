@@ -105,13 +105,14 @@ def check_in_child(
         ):
             code = _wait(child, context)
         complaint = errors.read_bytes()[-4000:].decode(errors="replace")
-        # A finding stands whatever became of the model after it.
         if target.is_file() and target.stat().st_size > _FINDING_BYTES:
             why = f"the check finds more to say than {_FINDING_BYTES >> 20} MiB; simplify it, or shorten its names"
             return _refused(kind, name, why), b""
         if target.is_file():
-            model = target.with_name(_MODEL)
-            return dict(json.loads(target.read_bytes())), model.read_bytes() if model.is_file() else b""
+            # A finding stands whatever became of the model after it; one that was cut off is none.
+            with contextlib.suppress(ValueError):
+                found, model = dict(json.loads(target.read_bytes())), target.with_name(_MODEL)
+                return found, model.read_bytes() if code == 0 and model.is_file() else b""
         if os.strerror(errno.ENOSPC) in complaint:
             # No word about the file: the check waits for room.
             raise OSError(errno.ENOSPC, f"{os.strerror(errno.ENOSPC)} to check {name}")

@@ -163,8 +163,13 @@ def test_a_check_that_the_machine_killed_says_nothing_about_the_file(
 
 def test_a_finding_stands_whatever_its_picture_costs(context: TaskContext, monkeypatch: pytest.MonkeyPatch) -> None:
     finding = '{"verdict": "accept"}'
-    child_does(monkeypatch, f"open(sys.argv[1], 'w').write({finding!r})\nos.kill(os.getpid(), signal.SIGXCPU)")
-    assert ingest.check_in_child(AssetKind.OBJECT, "t", OBJECT, context) == ({"verdict": "accept"}, b"")
+    half = "open(os.path.dirname(sys.argv[1]) + '/model.glb', 'w').write('half')"
+    end = f"{half}\nos.kill(os.getpid(), signal.SIGXCPU)"
+    with monkeypatch.context() as patch:
+        child_does(patch, f"with open(sys.argv[1], 'w') as file: file.write({finding!r})\n{end}")
+        assert ingest.check_in_child(AssetKind.OBJECT, "t", OBJECT, context) == ({"verdict": "accept"}, b"")
+    child_does(monkeypatch, f"with open(sys.argv[1], 'w') as file: file.write({finding[:5]!r})\n{end}")
+    assert ingest.check_in_child(AssetKind.OBJECT, "t", OBJECT, context)[0]["verdict"] == "refuse"
 
 
 def test_the_child_knows_no_credentials(context: TaskContext, monkeypatch: pytest.MonkeyPatch) -> None:
