@@ -39,9 +39,11 @@ class Assets:
     def __init__(self, parts: Parts) -> None:
         self._parts = parts
 
-    def page(self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None) -> Page[AssetView]:
-        """All of a kind, by name."""
-        return self._parts.index.assets.page(kind, limit=limit, cursor=cursor, reach=reach())
+    def page(
+        self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None, refused: bool = False
+    ) -> Page[AssetView]:
+        """All of a kind, newest first; those that the check refused only where asked for."""
+        return self._parts.index.assets.page(kind, limit=limit, cursor=cursor, refused=refused, reach=reach())
 
     def one(self, kind: AssetKind, name: str) -> AssetView:
         return self._parts.index.assets.get(kind, name, reach=reach())

@@ -95,11 +95,11 @@ class Client:
         params = query.model_dump(mode="json", exclude_none=True) | {"limit": limit, "cursor": cursor}
         return Page[GraspView].model_validate_json(self.send("GET", "/v1/grasps", params=params).content)
 
-    def assets(self, kind: AssetKind) -> Iterator[AssetView]:
-        """All hands, objects or networks."""
+    def assets(self, kind: AssetKind, *, refused: bool = False) -> Iterator[AssetView]:
+        """All hands, objects or networks; those that the check refused only where asked for."""
         cursor: str | None = None
         while True:
-            answer = self.send("GET", f"/v1/{kind.value}s", params={"limit": 200, "cursor": cursor})
+            answer = self.send("GET", f"/v1/{kind.value}s", params={"limit": 200, "cursor": cursor, "refused": refused})
             page = Page[AssetView].model_validate_json(answer.content)
             yield from page.items
             cursor = page.next

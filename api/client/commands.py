@@ -246,10 +246,14 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
 
     @group.command("list")
     @reporting_errors
-    def list_assets(url: UrlOption = None, json: JsonFlag = False) -> None:
+    def list_assets(
+        refused: Annotated[bool, typer.Option("--refused", help="Also those that the check refused.")] = False,
+        url: UrlOption = None,
+        json: JsonFlag = False,
+    ) -> None:
         """All of them."""
         with open_client(url) as client:
-            assets = list(client.assets(kind))
+            assets = list(client.assets(kind, refused=refused))
         if json:
             emit({f"{kind.value}s": [asset.model_dump(mode="json") for asset in assets]})
             return

@@ -9,7 +9,7 @@ from functools import cache
 from threading import BoundedSemaphore
 from typing import Annotated, Final
 
-from fastapi import APIRouter, Depends, Form, Request, Response, UploadFile
+from fastapi import APIRouter, Depends, Form, Query, Request, Response, UploadFile
 from starlette.datastructures import UploadFile as AnyUpload
 
 from api.catalog.assets import Assets
@@ -47,10 +47,15 @@ def asset_router(kind: AssetKind) -> APIRouter:
 
     @router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 422, 503), name=f"list_{kind}s")
     def list_assets(
-        request: Request, response: Response, assets: AssetsOf, limit: Limit = 50, cursor: Cursor = None
+        request: Request,
+        response: Response,
+        assets: AssetsOf,
+        limit: Limit = 50,
+        cursor: Cursor = None,
+        refused: Annotated[bool, Query(description="also those that the check refused")] = False,
     ) -> Page[AssetView]:
-        """All of them, by name."""
-        page = assets.page(kind, limit=limit, cursor=cursor)
+        """All of them, newest first; those that the check refused only where asked for."""
+        page = assets.page(kind, limit=limit, cursor=cursor, refused=refused)
         link_next(request, response, page.next)
         return page
 
