@@ -42,6 +42,15 @@ def valid_yield(made: Any) -> str:
     return percent(made.valid_yield)
 
 
+def worker_time(stage: Any) -> str:
+    """Time that workers spent on a stage for its job; what another job had made before is said and not counted."""
+    if not stage.reused:
+        return duration(stage.seconds) if stage.seconds else NONE
+    if stage.reused == stage.succeeded:
+        return "none, reused"
+    return f"{duration(stage.seconds)}, {stage.reused} reused"
+
+
 def duration(seconds: float | None) -> str:
     """The two largest units of a time span."""
     if seconds is None:
@@ -91,6 +100,7 @@ FILTERS: Final[Mapping[str, Callable[..., str]]] = {
     "valid_yield": valid_yield,
     "place": place,
     "duration": duration,
+    "worker_time": worker_time,
     "bytes": size,
     "stamp": stamp,
 }

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
+from urllib.parse import quote
 
 import httpx
 from httpx_sse import EventSource
@@ -74,7 +75,7 @@ class Client:
         return JobDetail.model_validate_json(answer.content)
 
     def job(self, job_id: str) -> JobDetail:
-        return JobDetail.model_validate_json(self.send("GET", f"/v1/jobs/{job_id}").content)
+        return JobDetail.model_validate_json(self.send("GET", path_of("jobs", job_id)).content)
 
     def jobs(self, *, state: State | None = None, limit: int = 50, cursor: str | None = None) -> Page[Job]:
         """Jobs, newest first."""
@@ -82,14 +83,14 @@ class Client:
         return Page[Job].model_validate_json(self.send("GET", "/v1/jobs", params=params).content)
 
     def cancel(self, job_id: str) -> JobDetail:
-        return JobDetail.model_validate_json(self.send("POST", f"/v1/jobs/{job_id}/cancel").content)
+        return JobDetail.model_validate_json(self.send("POST", path_of("jobs", job_id, "cancel")).content)
 
     def delete(self, path: str, **params: Any) -> None:
         """Take away what stands under an address: `/v1/jobs/ID`, `/v1/objects/NAME`."""
         self.send("DELETE", path, params=params)
 
     def retry(self, job_id: str) -> JobDetail:
-        return JobDetail.model_validate_json(self.send("POST", f"/v1/jobs/{job_id}/retry").content)
+        return JobDetail.model_validate_json(self.send("POST", path_of("jobs", job_id, "retry")).content)
 
     def grasps(self, query: GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
         params = query.model_dump(mode="json", exclude_none=True) | {"limit": limit, "cursor": cursor}
@@ -107,7 +108,7 @@ class Client:
                 return
 
     def asset(self, kind: AssetKind, name: str) -> AssetView:
-        return AssetView.model_validate_json(self.send("GET", f"/v1/{kind.value}s/{name}").content)
+        return AssetView.model_validate_json(self.send("GET", path_of(f"{kind.value}s", name)).content)
 
     def upload(
         self,
@@ -182,7 +183,7 @@ class Client:
         """A job at each change until it ends; survives a restart of the API."""
         while True:
             try:
-                for event, data in self._events(f"/v1/jobs/{job_id}/events"):
+                for event, data in self._events(path_of("jobs", job_id, "events")):
                     if event in ("progress", "end"):
                         yield Job.model_validate(data)
                     if event == "end":
@@ -226,6 +227,11 @@ class Client:
             time.sleep(min(wait, float(answer.headers.get("retry-after", wait))))
         _raise_for(answer)
         return answer
+
+
+def path_of(*parts: str) -> str:
+    """Address of a thing of the API by its parts, whatever characters a name holds: `/v1/tags/good%20ones/remove`."""
+    return "/v1/" + "/".join(quote(part, safe="") for part in parts)
 
 
 def _address(url: str) -> httpx.URL:

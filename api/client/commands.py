@@ -13,7 +13,7 @@ from rich.table import Table
 
 from api.client import key_commands, project_commands, tag_commands, webhook_commands
 from api.client.add_commands import add_hand, add_network, add_object
-from api.client.client import Client
+from api.client.client import Client, path_of
 from api.client.datasets import DatasetClient
 from api.client.job_options import pairs
 from api.client.reports import (
@@ -185,7 +185,7 @@ def delete(job_id: JobArgument, yes: YesOption = False, url: UrlOption = None, j
         job = client.job(_full_id(client, job_id))
         asked = f"Delete job {job.id[:12]}, {job.hand} on {job.object}, with its {count(job.grasps)} grasps?"
         confirm(asked, f"job {job.id[:12]}", yes=yes)
-        client.delete(f"/v1/jobs/{job.id}")
+        client.delete(path_of("jobs", job.id))
     say_deleted("job", job.id, json=json, undo=f"graspd restore {job.id[:12]}")
 
 
@@ -292,7 +292,7 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         with open_client(url) as client:
             client.asset(kind, name)
             confirm(f"Delete the {kind.value} {name}?", f"the {kind.value} {name}", yes=yes)
-            client.delete(f"/v1/{kind.value}s/{name}")
+            client.delete(path_of(f"{kind.value}s", name))
         say_deleted(kind.value, name, json=json, undo=f"graspd {kind.value}s restore {name}")
 
     @group.command("restore", epilog=f"graspd {kind.value}s restore my_{kind.value}")
