@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import Any, Final
@@ -103,4 +104,5 @@ FILTERS: Final[Mapping[str, Callable[..., str]]] = {
     "worker_time": worker_time,
     "bytes": size,
     "stamp": stamp,
+    "shell": shlex.quote,
 }

@@ -138,12 +138,16 @@ class Client:
             raise InputError(f"{path} cannot be read: {error.strerror}") from None
         return AssetView.model_validate_json(answer.content)
 
-    def wait_checked(self, kind: AssetKind, name: str, *, timeout_s: float = 120.0) -> AssetView:
-        """An uploaded asset once a worker has checked it; UnavailableError if none did in time."""
+    def wait_checked(self, kind: AssetKind, digest: str, *, timeout_s: float = 120.0) -> AssetView:
+        """An uploaded asset once a worker has checked it; UnavailableError if none did in time.
+
+        Args:
+            digest: of its files: a name stands for another asset as soon as this one is refused.
+        """
         deadline = time.monotonic() + timeout_s
-        while (asset := self.asset(kind, name)).verdict is None:
+        while (asset := self.asset(kind, digest)).verdict is None:
             if time.monotonic() > deadline:
-                raise UnavailableError(f"no worker has checked {kind.value} {name!r} yet; is one running?")
+                raise UnavailableError(f"no worker has checked {kind.value} {asset.name!r} yet; is one running?")
             time.sleep(_POLL_S)
         return asset
 

@@ -349,7 +349,7 @@ def _uploaded(client: Client, kind: AssetKind, value: str) -> str:
     if not path.is_file():
         raise InputError(f"there is no file {value}; give a path that exists, or the name of a known {kind.value}")
     asset = client.upload(kind, path, name=name_of_upload(path.name))
-    if not asset.builtin and (asset := client.wait_checked(kind, asset.name)).verdict == "refuse":
+    if not asset.builtin and (asset := client.wait_checked(kind, asset.digest)).verdict == "refuse":
         raise InputError(f"refused: {asset.message}")
     return asset.name
 

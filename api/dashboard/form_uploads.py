@@ -148,7 +148,7 @@ def _fix(options: dict[str, Any]) -> Fix | None:
 def _store(request: Request, assets: Assets, kind: AssetKind, file: UploadFile, units: str) -> AssetView:
     options = json.dumps({"units": units}) if kind is AssetKind.OBJECT and units != "m" else ""
     limit = request.app.state.settings.max_upload_bytes
-    return store_upload(assets, kind, file, None, limit_bytes=limit, options=options)
+    return store_upload(assets, kind, file, None, limit_bytes=limit, options=options, rename=True)
 
 
 def _again(assets: Assets, kind: AssetKind, digest: str, fields: FormData) -> AssetView:
@@ -163,7 +163,7 @@ def _again(assets: Assets, kind: AssetKind, digest: str, fields: FormData) -> As
     for key, value in said.items():
         known = stated.get(key)
         stated[key] = {**known, **value} if isinstance(known, dict) and isinstance(value, dict) else value
-    return assets.add(kind, before.name, {**files, "asset.json": json.dumps(stated).encode()})
+    return assets.add(kind, before.name, {**files, "asset.json": json.dumps(stated).encode()}, rename=True)
 
 
 def pressed(fields: FormData, kind: AssetKind) -> dict[str, Any]:

@@ -45,7 +45,7 @@ def grasps_page(
     """Every grasp of the index: filters, order, pages. The address holds all of it, and no empty field."""
     given = {key: value for key, value in request.query_params.items() if value}
     if len(given) < len(request.query_params):
-        # A form without a script sends every field; what is shared should be short.
+        # Forms send every field; what is shown in the browser and shared should be short.
         return RedirectResponse(f"/grasps?{urlencode(given)}" if given else "/grasps", status_code=303)
     said = did(given)
     cursor, view = given.pop("cursor", None), given.pop("view", "cards")

@@ -80,12 +80,6 @@
   showCopies(document);
   sayTimes(document);
   setInterval(() => sayTimes(document), 15000);
-  // An address that is shown and shared holds what was filled in and nothing else.
-  document.addEventListener("htmx:config:request", (event) => {
-    const { sourceElement, request } = event.detail.ctx;
-    if (!sourceElement.hasAttribute("hx-push-url")) return;
-    for (const [name, value] of [...request.body]) if (value === "") request.body.delete(name);
-  });
   document.addEventListener("htmx:after:swap", () => sayTimes(document));
   if (document.body.dataset.events) watch();
   const poll = Number(document.body.dataset.poll);

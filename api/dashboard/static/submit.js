@@ -27,10 +27,11 @@
     constructor(asset, page) { super(asset.message); this.page = page; }
   }
 
-  async function check(kind, file, options, name) {
+  async function check(kind, file, options) {
     const data = new FormData();
     data.append("file", file);
-    if (name) data.append("name", name);
+    // A file of another content is another object, whatever it is called.
+    data.append("rename", "true");
     if (Object.keys(options).length) data.append("options", JSON.stringify(options));
     let asset = await document_(await fetch(`${root}v1/${kind}s`, { method: "POST", body: data }));
     const until = Date.now() + PATIENCE_MS;
@@ -59,9 +60,8 @@
     const said = thing.querySelector("[data-found]");
     const select = thing.querySelector(`select[name=${kind}]`);
     const figure = thing.querySelector("figure");
-    // The file that the form means, whether or not its check has ended; and what it was accepted as.
+    // The file that the form means, whether or not its check has ended.
     let held = null;
-    let accepted = null;
     let fixes = {};
     let round = 0;
     const say = (text, state) => { said.textContent = text; said.dataset.state = state; };
@@ -84,15 +84,12 @@
       const [file, mine] = [held, ++round];
       const unit = units?.value ?? "m";
       const options = unit === "m" ? fixes : { ...fixes, units: unit };
-      // Once a file was accepted, its name stands for those units.
-      const name = accepted && accepted.unit !== unit ? `${accepted.name}-${unit}` : "";
       say(`Checking ${file.name}`, "busy");
       show("", `${file.name} (being checked)`, "");
       hold(thing, `${file.name} is being checked.`);
       try {
-        const asset = await check(kind, file, options, name);
+        const asset = await check(kind, file, options);
         if (mine !== round) return;
-        accepted ??= { name: asset.name, unit };
         // It is in the store: the form need not send it a second time.
         input.value = "";
         show(asset.name, asset.name, `${root}v1/${kind}s/${asset.digest}/model`);
@@ -110,7 +107,7 @@
     input.addEventListener("change", () => {
       // A dialog that was cancelled empties the field; the file stays what the form means.
       if (!input.files[0]) return;
-      [held, accepted, fixes] = [input.files[0], null, {}];
+      [held, fixes] = [input.files[0], {}];
       thing.querySelector("[data-refused]")?.remove();
       upload();
     });
@@ -136,7 +133,7 @@
     units?.addEventListener("change", upload);
     select.addEventListener("change", () => {
       round += 1;
-      [held, accepted, input.value] = [null, null, ""];
+      [held, input.value] = [null, ""];
       select.querySelector("option[data-own]:not(:checked)")?.remove();
       figure.querySelector("[data-say]").textContent = "";
       figure.dataset.model = select.value ? `${root}v1/${kind}s/${encodeURIComponent(select.value)}/model` : "";

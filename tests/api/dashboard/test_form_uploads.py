@@ -219,3 +219,22 @@ def test_a_name_of_something_refused_is_free(http: TestClient, parts: Parts) -> 
     answer = http.post("/v1/objects", files={"file": ("part.stl", b"solid another\nendsolid\n")})
     assert answer.status_code == 202 and answer.json()["digest"] != refused.digest
     assert http.get("/v1/objects/part").json()["digest"] == answer.json()["digest"]
+
+
+def test_a_file_of_other_content_and_the_same_name_is_another_object(http: TestClient, parts: Parts) -> None:
+    first = uploaded(http, parts, "accept")
+    other = {"file": ("part.stl", b"solid another\nendsolid\n")}
+    assert http.post("/v1/objects", files=other).status_code == 409
+    second = http.post("/v1/objects", files=other, data={"rename": "true"}).json()
+    assert second["name"] == "part-2"
+    again = http.post("/v1/objects", files={"file": MESH}, data={"rename": "true"}).json()
+    assert (again["name"], again["digest"]) == ("part", first.digest)
+
+
+def test_a_refused_file_is_found_again_though_its_name_stands_for_another(http: TestClient, parts: Parts) -> None:
+    refused = uploaded(http, parts, "refuse")
+    good = http.post("/v1/objects", files={"file": ("part.stl", b"solid another\nendsolid\n")}).json()
+    for sent in ({}, {"name": "other"}):
+        again = http.post("/v1/objects", files={"file": MESH}, data=sent)
+        assert (again.status_code, again.json()["digest"], again.json()["verdict"]) == (202, refused.digest, "refuse")
+    assert http.get("/v1/objects/part").json()["digest"] == good["digest"]

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import zipfile
+from html import unescape
 from typing import Any
 
 import numpy as np
@@ -237,6 +238,7 @@ def test_a_tag_may_be_of_several_words(http: TestClient, made: ShardManifest) ->
     assert http.get("/v1/tags/good%20for%20training").json()["grasps"] == 1
     page = http.get("/grasps?tag=good+for+training").text
     assert 'action="/tags/good%20for%20training/delete"' in page and "/grasps?tag=good%20for%20training" in page
+    assert unescape(page).count("'good for training'") == 1 and "'good for training.zip'" in unescape(page)
     export = http.get("/v1/grasps/export", params={"tag": "good for training", "format": "csv"})
     assert export.status_code == 200 and " for " not in export.headers["content-disposition"]
     gone = http.post("/tags/good%20for%20training/delete", data={"typed": "good for training"})
