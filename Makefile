@@ -58,9 +58,9 @@ results: $(STAMP) ## every figure and picture of the docs again, resumable (DATA
 	$(BIN)/python -m benchmarks.results $(if $(QUICK),--quick) $(if $(DATA),--data $(DATA)) \
 		$(if $(SOURCES),--sources $(SOURCES)) $(if $(BEFORE),--before $(BEFORE))
 
-gpu-check: $(STAMP) ## every kernel compiled for CUDA: registers, stack, spills (no GPU needed)
+gpu-check: $(STAMP) ## every kernel compiled for CUDA: registers, stack, spills (no GPU needed; ARCH="80 90": these alone)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,gpu-check]'
-	$(BIN)/python -m benchmarks.gpu_check
+	$(BIN)/python -m benchmarks.gpu_check $(foreach arch,$(ARCH),--arch $(arch))
 
 dist: $(STAMP) ## wheel and sdist in dist/, the same bytes from the same sources; see docs/release.md
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,release]'

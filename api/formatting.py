@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import Any, Final
@@ -40,6 +41,15 @@ def valid_yield(made: Any) -> str:
     if made.valid_yield is None:
         return "not judged" if made.tried else NONE
     return percent(made.valid_yield)
+
+
+def worker_time(stage: Any) -> str:
+    """Time that workers spent on a stage for its job; what another job had made before is said and not counted."""
+    if not stage.reused:
+        return duration(stage.seconds) if stage.seconds else NONE
+    if stage.reused == stage.succeeded:
+        return "none, reused"
+    return f"{duration(stage.seconds)}, {stage.reused} reused"
 
 
 def duration(seconds: float | None) -> str:
@@ -91,6 +101,8 @@ FILTERS: Final[Mapping[str, Callable[..., str]]] = {
     "valid_yield": valid_yield,
     "place": place,
     "duration": duration,
+    "worker_time": worker_time,
     "bytes": size,
     "stamp": stamp,
+    "shell": shlex.quote,
 }

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from service.index.views import AttemptView, GraspView, Judged, ShardView, StageProgress, TagView, WorkerView
 from service.model.diversity import CELLS
 from service.model.domain import Digest, JobRequest
-from service.model.labels import Name
+from service.model.labels import TagName
 from service.model.metric_fields import OfferedName, filters, means, with_fields
 from service.model.records import Choice
 from service.model.robust import WORDS
@@ -235,7 +235,7 @@ class Selection(BaseModel):
 class TagRequest(Selection):
     """Grasps that shall have a tag."""
 
-    name: Name
+    name: TagName
 
 
 class TagChange(BaseModel):

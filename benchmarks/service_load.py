@@ -1,6 +1,6 @@
 """What the service costs around the engine: queue, indexer, workers, API at a million grasps; prints Markdown.
 
-usage: python -m benchmarks.service_load queue|workers|indexer|api [--index-url URL] [--data-dir DIR]
+usage: python -m benchmarks.service_load queue|workers|indexer|api|beside [--index-url URL] [--data-dir DIR]
 
 `api` needs a filled index: python -m benchmarks.large_index --data-dir DIR [--index-url URL].
 Workers do no work here (tests.fakes): what is measured is everything else.
@@ -22,11 +22,12 @@ from typing import Any, Final
 import httpx
 
 import worker.process.main
+from api.access.keys import KeyFile, Scope
 from service.index.index import Index
 from service.model import names
-from service.model.planning import message_of, plan
+from service.model.planning import message_of, plan, task_id
 from service.model.records import JobRecord
-from service.model.states import Lane, State
+from service.model.states import Lane, Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.run.supervisor import Supervisor
@@ -42,6 +43,9 @@ BATCH_S: Final = 1.0
 
 #: Requests of each kind.
 REPEATS: Final = 100
+#: Jobs of one key, and grasps of each, beside which another key submits.
+LARGE_JOBS: Final = 5
+LARGE: Final = 1_000_000
 
 
 def cpu_s(pid: int) -> float:
@@ -57,16 +61,23 @@ def say(line: str) -> None:
 
 @contextmanager
 def service(*, workers: int, task_s: float = 0.0, **settings: Any) -> Iterator[Parts]:
+    """The parts of `running`, for one that needs no API."""
+    with running(workers=workers, task_s=task_s, api=False, **settings) as (_, parts):
+        yield parts
+
+
+@contextmanager
+def running(*, workers: int, task_s: float, api: bool, **settings: Any) -> Iterator[tuple[Supervisor, Parts]]:
     """A whole service of real processes with workers that wait `task_s` for each task."""
     os.environ["FAKE_SECONDS"] = str(task_s)
     with tempfile.TemporaryDirectory(prefix="graspd-bench-") as folder:
         wanted = Settings(data_dir=Path(folder), port=0, device="cpu", log_level="WARNING", **settings)
         fakes = (sys.executable, "-m", "tests.fakes")
-        with Supervisor(wanted, workers=workers, api=False, worker_command=fakes) as supervisor:
+        with Supervisor(wanted, workers=workers, api=api, worker_command=fakes) as supervisor:
             supervisor.wait_ready()
             parts = Parts.open(supervisor.settings)
             add_assets(parts)
-            yield parts
+            yield supervisor, parts
             parts.close()
 
 
@@ -185,9 +196,44 @@ def _requests(http: httpx.Client, pid: int) -> None:
         say(f"| {name} | {statistics.median(times):.1f} ms | {p95:.1f} ms | {cpu:.1f} ms |")
 
 
+def beside(url: str | None) -> None:
+    """How long small jobs of one key wait for an answer and for the queue, while large ones of another are entered."""
+    with running(workers=2, task_s=1.0, api=True, **({"index_url": url} if url else {})) as (supervisor, parts):
+        keys = KeyFile(supervisor.settings.resolved_keys_file)
+        large, small = (keys.add(name, Scope.SUBMIT) for name in ("large", "small"))
+        seeds = iter(range(10**6))
+
+        def post(http: httpx.Client, key: str, grasps: int) -> tuple[str, float]:
+            wanted = request(grasps=grasps, seed=next(seeds)).model_dump(mode="json", exclude_defaults=True)
+            start = time.perf_counter()
+            answer = http.post("/v1/jobs", json=wanted, headers={"Authorization": f"Bearer {key}"})
+            answer.raise_for_status()
+            return answer.json()["id"], time.perf_counter() - start
+
+        answers, queued = list[float](), list[float]()
+        with httpx.Client(base_url=supervisor.api_url, timeout=120, trust_env=False) as http:
+            of_large = [post(http, large, LARGE)[1] for _ in range(LARGE_JOBS)]
+            start = time.perf_counter()
+            while not answers or parts.index.write.entering():
+                job, answered = post(http, small, 32)
+                began, task = time.perf_counter(), task_id(job, Stage.SYNTHESIZE, 0)
+                # What a worker has is in the queue no more, and in the index no longer queued.
+                while task not in parts.queue.waiting() and parts.index.jobs.task(task).state is State.QUEUED:
+                    time.sleep(0.01)
+                answers.append(answered)
+                queued.append(answered + time.perf_counter() - began)
+                time.sleep(1.0)
+            took = time.perf_counter() - start
+    say(f"{LARGE_JOBS} jobs of {LARGE:,} grasps, each answered within {max(of_large):.2f} s, entered in {took:.0f} s;")
+    say(f"meanwhile {len(answers)} jobs of 32 grasps of another key:")
+    say("| a small job is | the first | median | the slowest |\n| --- | --: | --: | --: |")
+    for what, times in (("answered after", answers), ("in the queue after", queued)):
+        say(f"| {what} | {times[0]:.2f} s | {statistics.median(times):.2f} s | {max(times):.2f} s |")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["queue", "workers", "indexer", "api"])
+    parser.add_argument("what", choices=["queue", "workers", "indexer", "api", "beside"])
     parser.add_argument("--data-dir", type=Path, help="folder of a filled index, for `api`")
     parser.add_argument("--index-url", help="PostgreSQL; default: SQLite")
     given = parser.parse_args()
@@ -195,8 +241,8 @@ def main() -> None:
         if given.data_dir is None:
             parser.error("`api` needs --data-dir with a filled index: see benchmarks.large_index")
         api(given.data_dir, given.index_url)
-    elif given.what == "indexer":
-        indexer(given.index_url)
+    elif given.what in ("indexer", "beside"):
+        {"indexer": indexer, "beside": beside}[given.what](given.index_url)
     else:
         {"queue": queue, "workers": workers}[given.what]()
 

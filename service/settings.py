@@ -115,7 +115,9 @@ class Settings(BaseSettings):
         1000, ge=1, description="tasks kept waiting in a lane, or two a worker; the rest waits in the index"
     )
     shard_grace_s: float = Field(
-        7 * 86400.0, ge=0, description="how long shards are kept that no job needs since theirs was deleted [s]"
+        7 * 86400.0,
+        ge=0,
+        description="how long what was deleted can be restored, and its shards stay where no job needs them [s]",
     )
     scrub_mb_per_s: float = Field(
         1.0, ge=0, description="how fast the keeper reads through the store for damage [MiB/s]; 0: never"

@@ -39,9 +39,11 @@ class Assets:
     def __init__(self, parts: Parts) -> None:
         self._parts = parts
 
-    def page(self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None) -> Page[AssetView]:
-        """All of a kind, by name."""
-        return self._parts.index.assets.page(kind, limit=limit, cursor=cursor, reach=reach())
+    def page(
+        self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None, refused: bool = False
+    ) -> Page[AssetView]:
+        """All of a kind, newest first; those that the check refused only where asked for."""
+        return self._parts.index.assets.page(kind, limit=limit, cursor=cursor, refused=refused, reach=reach())
 
     def one(self, kind: AssetKind, name: str) -> AssetView:
         return self._parts.index.assets.get(kind, name, reach=reach())
@@ -67,12 +69,14 @@ class Assets:
         *,
         self_test: bool = False,
         shared: bool = False,
+        rename: bool = False,
     ) -> AssetView:
         """Keep what was uploaded. The keeper queues the check of a hand or an object, which ends with grasps if
         `self_test` says so; a network is checked here.
 
         Args:
             shared: whether every project may use it.
+            rename: where the name stands for other content, give the next free one; what is known keeps its own.
 
         Raises:
             ConflictError: the name stands for other content, or the content has another name or belongs to another
@@ -83,6 +87,13 @@ class Assets:
         project = reach().project
         digest = self._mark(kind, name, files, "" if shared else project)
         self._refuse_hidden(kind, digest)
+        with contextlib.suppress(NotFoundError):
+            known = self.one(kind, digest)
+            # A refused upload holds no name, so it does not matter under which it was sent.
+            if rename or known.verdict == "refuse":
+                return known
+        if rename:
+            name = self._free_name(kind, name)
         self._refuse_taken(kind, name, digest)
         index, store = self._parts.index, self._parts.store
         said = {"owner": caller_id(), "project": project, "shared": shared, "self_test": self_test}
@@ -136,18 +147,19 @@ class Assets:
                 files.update(mark)
                 with contextlib.suppress(NotFoundError):
                     return self.one(AssetKind.HAND, digest_files(AssetKind.HAND, files))
-        return self.add(AssetKind.HAND, new_name or self._next_name(hand.name), files)
+        return self.add(AssetKind.HAND, new_name or self._next_name(AssetKind.HAND, hand.name), files)
 
-    def _next_name(self, name: str) -> str:
+    def _free_name(self, kind: AssetKind, name: str) -> str:
+        return self._next_name(kind, name) if self._holder(kind, name) else name
+
+    def _next_name(self, kind: AssetKind, name: str) -> str:
         stem, _, number = name.rpartition("-")
         stem, first = (stem, int(number) + 1) if stem and number.isdigit() and len(number) < 4 else (name, 2)
         for tried in range(first, first + _NAMES_TRIED):
             named = f"{stem[: _MAX_NAME - 5]}-{tried}"
-            try:
-                self.one(AssetKind.HAND, named)
-            except NotFoundError:
+            if not self._holder(kind, named):
                 return named
-        raise ConflictError(f"there are many hands named {stem}-...; choose a name")
+        raise ConflictError(f"there are many {kind.value}s named {stem}-...; choose a name")
 
     def delete(self, kind: AssetKind, name: str) -> None:
         """Take a hand, object or network away that nothing needs.
@@ -185,12 +197,15 @@ class Assets:
                 return
             raise ConflictError(f"another project keeps this {kind.value} to itself; upload it without sharing it")
 
-    def _refuse_taken(self, kind: AssetKind, name: str, digest: str) -> None:
+    def _holder(self, kind: AssetKind, name: str) -> str:
+        """Digest of what a name stands for; empty: it is free."""
         with contextlib.suppress(NotFoundError):
             # Another project's names take none from this one, an admin's neither.
             known = self._parts.index.assets.get(kind, name, reach=replace(reach(), everything=False))
-            # A refused upload holds no name: the same file with the mend must get in.
-            if known.digest != digest and known.verdict != "refuse":
-                raise ConflictError(
-                    f"there is another {kind.value} named {name!r}; rename the file, or add it with --name"
-                )
+            # A refused upload holds no name: the same file with the fix must get in.
+            return known.digest if known.verdict != "refuse" else ""
+        return ""
+
+    def _refuse_taken(self, kind: AssetKind, name: str, digest: str) -> None:
+        if self._holder(kind, name) not in ("", digest):
+            raise ConflictError(f"there is another {kind.value} named {name!r}; give this one another name")

@@ -88,6 +88,6 @@ def _rate(stage: StageProgress, running: list[TaskView], paces: Paces) -> float 
     known = [pace for task in running if (pace := paces.of(task)) is not None]
     if known:
         return sum(known) * len(running) / len(known)
-    if stage.succeeded and stage.seconds > 0:
-        return stage.succeeded / stage.seconds * max(1, stage.running)
+    if stage.succeeded > stage.reused and stage.seconds > 0:
+        return (stage.succeeded - stage.reused) / stage.seconds * max(1, stage.running)
     return None

@@ -161,7 +161,7 @@ def _add(
         name = name or name_of_upload(file.name)
         asset = client.upload(kind, file, name=name, options=options, self_test=self_test, shared=shared)
         if wait:
-            asset = client.wait_checked(kind, asset.name, timeout_s=_SELF_TEST_S if self_test else _CHECK_S)
+            asset = client.wait_checked(kind, asset.digest, timeout_s=_SELF_TEST_S if self_test else _CHECK_S)
     show_asset(asset.model_dump(mode="json"), json=json)
     if asset.verdict == "refuse":
         raise InputError(f"refused: {asset.message}")

@@ -100,7 +100,7 @@ def upload_set(
     ]
     for one in told:
         if wait and one["verdict"] is None:
-            asset = client.wait_checked(AssetKind.OBJECT, one["name"])
+            asset = client.wait_checked(AssetKind.OBJECT, one["digest"])
             one.update(verdict=asset.verdict, message=asset.message or "", repairs=asset.repairs)
         if say is not None:
             say(verdict_line(one))
@@ -118,4 +118,7 @@ def _upload(
             asset = client.upload(AssetKind.OBJECT, archive, name=name, options=options, shared=shared)
     except InputError as error:
         return {"name": name, "verdict": "refuse", "message": str(error), "repairs": []}
-    return {"name": asset.name, "verdict": asset.verdict, "message": asset.message or "", "repairs": asset.repairs}
+    return {
+        "name": asset.name, "digest": asset.digest, "verdict": asset.verdict, "message": asset.message or "",
+        "repairs": asset.repairs,
+    }  # fmt: skip

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
+from urllib.parse import quote
 
 import httpx
 from httpx_sse import EventSource
@@ -74,7 +75,7 @@ class Client:
         return JobDetail.model_validate_json(answer.content)
 
     def job(self, job_id: str) -> JobDetail:
-        return JobDetail.model_validate_json(self.send("GET", f"/v1/jobs/{job_id}").content)
+        return JobDetail.model_validate_json(self.send("GET", path_of("jobs", job_id)).content)
 
     def jobs(self, *, state: State | None = None, limit: int = 50, cursor: str | None = None) -> Page[Job]:
         """Jobs, newest first."""
@@ -82,24 +83,24 @@ class Client:
         return Page[Job].model_validate_json(self.send("GET", "/v1/jobs", params=params).content)
 
     def cancel(self, job_id: str) -> JobDetail:
-        return JobDetail.model_validate_json(self.send("POST", f"/v1/jobs/{job_id}/cancel").content)
+        return JobDetail.model_validate_json(self.send("POST", path_of("jobs", job_id, "cancel")).content)
 
     def delete(self, path: str, **params: Any) -> None:
         """Take away what stands under an address: `/v1/jobs/ID`, `/v1/objects/NAME`."""
         self.send("DELETE", path, params=params)
 
     def retry(self, job_id: str) -> JobDetail:
-        return JobDetail.model_validate_json(self.send("POST", f"/v1/jobs/{job_id}/retry").content)
+        return JobDetail.model_validate_json(self.send("POST", path_of("jobs", job_id, "retry")).content)
 
     def grasps(self, query: GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
         params = query.model_dump(mode="json", exclude_none=True) | {"limit": limit, "cursor": cursor}
         return Page[GraspView].model_validate_json(self.send("GET", "/v1/grasps", params=params).content)
 
-    def assets(self, kind: AssetKind) -> Iterator[AssetView]:
-        """All hands, objects or networks."""
+    def assets(self, kind: AssetKind, *, refused: bool = False) -> Iterator[AssetView]:
+        """All hands, objects or networks; those that the check refused only where asked for."""
         cursor: str | None = None
         while True:
-            answer = self.send("GET", f"/v1/{kind.value}s", params={"limit": 200, "cursor": cursor})
+            answer = self.send("GET", f"/v1/{kind.value}s", params={"limit": 200, "cursor": cursor, "refused": refused})
             page = Page[AssetView].model_validate_json(answer.content)
             yield from page.items
             cursor = page.next
@@ -107,7 +108,7 @@ class Client:
                 return
 
     def asset(self, kind: AssetKind, name: str) -> AssetView:
-        return AssetView.model_validate_json(self.send("GET", f"/v1/{kind.value}s/{name}").content)
+        return AssetView.model_validate_json(self.send("GET", path_of(f"{kind.value}s", name)).content)
 
     def upload(
         self,
@@ -137,12 +138,17 @@ class Client:
             raise InputError(f"{path} cannot be read: {error.strerror}") from None
         return AssetView.model_validate_json(answer.content)
 
-    def wait_checked(self, kind: AssetKind, name: str, *, timeout_s: float = 120.0) -> AssetView:
-        """An uploaded asset once a worker has checked it; UnavailableError if none did in time."""
+    def wait_checked(self, kind: AssetKind, digest: str, *, timeout_s: float = 120.0) -> AssetView:
+        """An uploaded asset once a worker has checked it; UnavailableError if none did in time.
+
+        Args:
+            digest: of its files: a name stands for another asset as soon as this one is refused.
+        """
         deadline = time.monotonic() + timeout_s
-        while (asset := self.asset(kind, name)).verdict is None:
+        while (asset := self.asset(kind, digest)).verdict is None:
             if time.monotonic() > deadline:
-                raise UnavailableError(f"no worker has checked {kind.value} {name!r} yet; is one running?")
+                why = asset.message or "is one running?"
+                raise UnavailableError(f"no worker has checked {kind.value} {asset.name!r} yet; {why}")
             time.sleep(_POLL_S)
         return asset
 
@@ -182,7 +188,7 @@ class Client:
         """A job at each change until it ends; survives a restart of the API."""
         while True:
             try:
-                for event, data in self._events(f"/v1/jobs/{job_id}/events"):
+                for event, data in self._events(path_of("jobs", job_id, "events")):
                     if event in ("progress", "end"):
                         yield Job.model_validate(data)
                     if event == "end":
@@ -226,6 +232,11 @@ class Client:
             time.sleep(min(wait, float(answer.headers.get("retry-after", wait))))
         _raise_for(answer)
         return answer
+
+
+def path_of(*parts: str) -> str:
+    """Address of a thing of the API by its parts, whatever characters a name holds: `/v1/tags/good%20ones/remove`."""
+    return "/v1/" + "/".join(quote(part, safe="") for part in parts)
 
 
 def _address(url: str) -> httpx.URL:

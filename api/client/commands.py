@@ -13,7 +13,7 @@ from rich.table import Table
 
 from api.client import key_commands, project_commands, tag_commands, webhook_commands
 from api.client.add_commands import add_hand, add_network, add_object
-from api.client.client import Client
+from api.client.client import Client, path_of
 from api.client.datasets import DatasetClient
 from api.client.job_options import pairs
 from api.client.reports import (
@@ -192,7 +192,7 @@ def delete(job_id: JobArgument, yes: YesOption = False, url: UrlOption = None, j
         job = client.job(_full_id(client, job_id))
         asked = f"Delete job {job.id[:12]}, {job.hand} on {job.object}, with its {count(job.grasps)} grasps?"
         confirm(asked, f"job {job.id[:12]}", yes=yes)
-        client.delete(f"/v1/jobs/{job.id}")
+        client.delete(path_of("jobs", job.id))
     say_deleted("job", job.id, json=json, undo=f"graspd restore {job.id[:12]}")
 
 
@@ -253,10 +253,14 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
 
     @group.command("list")
     @reporting_errors
-    def list_assets(url: UrlOption = None, json: JsonFlag = False) -> None:
+    def list_assets(
+        refused: Annotated[bool, typer.Option("--refused", help="Also those that the check refused.")] = False,
+        url: UrlOption = None,
+        json: JsonFlag = False,
+    ) -> None:
         """All of them."""
         with open_client(url) as client:
-            assets = list(client.assets(kind))
+            assets = list(client.assets(kind, refused=refused))
         if json:
             emit({f"{kind.value}s": [asset.model_dump(mode="json") for asset in assets]})
             return
@@ -295,7 +299,7 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         with open_client(url) as client:
             client.asset(kind, name)
             confirm(f"Delete the {kind.value} {name}?", f"the {kind.value} {name}", yes=yes)
-            client.delete(f"/v1/{kind.value}s/{name}")
+            client.delete(path_of(f"{kind.value}s", name))
         say_deleted(kind.value, name, json=json, undo=f"graspd {kind.value}s restore {name}")
 
     @group.command("restore", epilog=f"graspd {kind.value}s restore my_{kind.value}")
@@ -352,7 +356,7 @@ def _uploaded(client: Client, kind: AssetKind, value: str) -> str:
     if not path.is_file():
         raise InputError(f"there is no file {value}; give a path that exists, or the name of a known {kind.value}")
     asset = client.upload(kind, path, name=name_of_upload(path.name))
-    if not asset.builtin and (asset := client.wait_checked(kind, asset.name)).verdict == "refuse":
+    if not asset.builtin and (asset := client.wait_checked(kind, asset.digest)).verdict == "refuse":
         raise InputError(f"refused: {asset.message}")
     return asset.name
 

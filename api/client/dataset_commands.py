@@ -12,7 +12,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from rich.table import Table
 
 from api.client.add_sets import name_of_set, upload_set
-from api.client.client import Client
+from api.client.client import Client, path_of
 from api.client.dataset_reports import print_cells, print_dataset, print_estimate, watch_dataset
 from api.client.dataset_specs import SpecOption, Wanted, wanted
 from api.client.datasets import DatasetClient
@@ -177,7 +177,7 @@ def delete(
         goes = f"{count(found.cells)} cell{'s' * (found.cells != 1)}, {count(found.grasps)} grasps"
         goes += f" ({size(found.size_bytes)})" + ", its snapshots" * with_snapshots
         confirm(f"Delete dataset {name} with {goes}?", f"dataset {name}", yes=yes)
-        client.delete(f"/v1/datasets/{name}", with_snapshots=with_snapshots)
+        client.delete(path_of("datasets", name), with_snapshots=with_snapshots)
     say_deleted("dataset", name, json=json, undo=f"graspd datasets restore {name}")
 
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from pydantic import TypeAdapter
 
-from api.client.client import Client
+from api.client.client import Client, path_of
 from service.index.dataset_views import CellView, DatasetView, ObjectSetView, SnapshotView
 from service.index.views import Page
 from service.model.dataset_records import Snapshot, SnapshotShard
@@ -44,14 +44,14 @@ class DatasetClient:
         return Page[DatasetView].model_validate_json(answer.content)
 
     def dataset(self, name: str) -> DatasetView:
-        return DatasetView.model_validate_json(self._client.send("GET", f"/v1/datasets/{name}").content)
+        return DatasetView.model_validate_json(self._client.send("GET", path_of("datasets", name)).content)
 
     def cells(self, name: str, *, state: State | None = None) -> Iterator[CellView]:
         """All cells of a dataset, or those in a state."""
         cursor: str | None = None
         while True:
             params = {"limit": _PAGE, "cursor": cursor, "state": state}
-            answer = self._client.send("GET", f"/v1/datasets/{name}/cells", params=params)
+            answer = self._client.send("GET", path_of("datasets", name, "cells"), params=params)
             page = Page[CellView].model_validate_json(answer.content)
             yield from page.items
             cursor = page.next
@@ -59,27 +59,28 @@ class DatasetClient:
                 return
 
     def cancel(self, name: str) -> DatasetView:
-        return DatasetView.model_validate_json(self._client.send("POST", f"/v1/datasets/{name}/cancel").content)
+        return DatasetView.model_validate_json(self._client.send("POST", path_of("datasets", name, "cancel")).content)
 
     def retry(self, name: str) -> DatasetView:
-        return DatasetView.model_validate_json(self._client.send("POST", f"/v1/datasets/{name}/retry").content)
+        return DatasetView.model_validate_json(self._client.send("POST", path_of("datasets", name, "retry")).content)
 
     def take_snapshot(self, name: str) -> SnapshotView:
-        return SnapshotView.model_validate_json(self._client.send("POST", f"/v1/datasets/{name}/snapshots").content)
+        answer = self._client.send("POST", path_of("datasets", name, "snapshots"))
+        return SnapshotView.model_validate_json(answer.content)
 
     def snapshots(self, name: str) -> Page[SnapshotView]:
         """The newest snapshots of a dataset."""
-        answer = self._client.send("GET", f"/v1/datasets/{name}/snapshots", params={"limit": _PAGE})
+        answer = self._client.send("GET", path_of("datasets", name, "snapshots"), params={"limit": _PAGE})
         return Page[SnapshotView].model_validate_json(answer.content)
 
     def snapshot(self, name: str, digest: str) -> Snapshot:
         """A snapshot with its list of shards."""
-        answer = self._client.send("GET", f"/v1/datasets/{name}/snapshots/{digest}")
+        answer = self._client.send("GET", path_of("datasets", name, "snapshots", digest))
         return Snapshot.model_validate_json(answer.content)
 
     def fetch(self, shard: SnapshotShard) -> Iterator[bytes]:
         """Bytes of a shard's file."""
-        return self._client.fetch(f"/v1/shards/{shard.id}/file")
+        return self._client.fetch(path_of("shards", shard.id, "file"))
 
     def add_object_set(self, name: str, objects: Iterable[str]) -> ObjectSetView:
         answer = self._client.send("POST", "/v1/object-sets", json={"name": name, "objects": list(objects)})

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import sys
 from typing import Annotated, Any
-from urllib.parse import quote
 
 import typer
 from pydantic import ValidationError
 from rich.console import Console
 from rich.table import Table
 
-from api.client.client import Client
+from api.client.client import Client, path_of
 from api.client.watching import JobDisplay
-from api.formatting import count, duration, metric, percent
+from api.formatting import count, duration, metric, percent, worker_time
 from api.models import Diversity, JobDetail
 from service.cli import emit, load_settings
 from service.model.domain import JobRequest
@@ -65,7 +64,7 @@ def say_deleted(what: str, name: str, *, json: bool, undo: str = "") -> None:
 def restore(url: str | None, what: str, name: str, *, json: bool) -> None:
     """Bring back what was deleted, and say so."""
     with open_client(url) as client:
-        found = client.send("POST", f"/v1/{what}s/{quote(name, safe='')}/restore").json()
+        found = client.send("POST", path_of(f"{what}s", name, "restore")).json()
     if json:
         emit({"restored": found["id"], "kind": what})
     else:
@@ -135,7 +134,9 @@ def show_asset(asset: dict[str, Any], *, json: bool) -> None:
         emit(asset)
         return
     console = Console(highlight=False)
-    for name in ("name", "kind", "filename", "size_bytes", "digest", "created", "verdict", "message"):
+    # A built-in one came with the service: its time is that of the release.
+    times = () if asset.get("builtin") else ("created",)
+    for name in ("name", "kind", "filename", "size_bytes", "digest", *times, "verdict", "message"):
         if asset.get(name) is not None:
             console.print(f"{name:<18} {asset[name]}", markup=False, soft_wrap=True)
     for line in asset.get("repairs", []):
@@ -185,7 +186,7 @@ def _print_job(job: JobDetail, url: str) -> None:
     for stage in job.stages:
         done = f"{stage.succeeded} of {stage.tasks}"
         table.add_row(
-            stage.stage, stage.state, done, percent(stage.progress), duration(stage.seconds), duration(stage.eta_s)
+            stage.stage, stage.state, done, percent(stage.progress), worker_time(stage), duration(stage.eta_s)
         )
     console.print(table)
     if job.grasps:

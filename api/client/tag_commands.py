@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated, Any, Final
-from urllib.parse import quote
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
+from api.client.client import path_of
 from api.client.reports import UrlOption, YesOption, confirm, open_client, restore, say_deleted
 from api.formatting import count
 from service.cli import JsonFlag, emit, reporting_errors
@@ -80,19 +81,19 @@ def remove_tag(
     if "filter" in body:
         body["filter"]["tag"] = tag
     with open_client(url) as client:
-        _tell(client.send("POST", f"/v1/tags/{quote(tag, safe='')}/remove", json=body).json(), "fewer with", json=json)
+        _tell(client.send("POST", path_of("tags", tag, "remove"), json=body).json(), "fewer with", json=json)
 
 
 @app.command("delete", epilog="graspd tags delete good")
 @reporting_errors
 def delete_tag(tag: NameArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Take a tag away; its grasps stay."""
-    path = f"/v1/tags/{quote(tag, safe='')}"
+    path = path_of("tags", tag)
     with open_client(url) as client:
         has = client.send("GET", path).json()["grasps"]
         confirm(f"Delete the tag {tag}, which {count(has)} grasps have?", f"the tag {tag}", yes=yes)
         client.delete(path)
-    say_deleted("tag", tag, json=json, undo=f"graspd tags restore {tag}")
+    say_deleted("tag", tag, json=json, undo=f"graspd tags restore {shlex.quote(tag)}")
 
 
 @app.command("restore", epilog="graspd tags restore good")

@@ -8,6 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from api.client.client import path_of
 from api.client.reports import UrlOption, YesOption, confirm, open_client, say_deleted
 from service.cli import JsonFlag, emit, reporting_errors
 
@@ -55,7 +56,7 @@ def list_webhooks(url: UrlOption = None, json: JsonFlag = False) -> None:
 def show_log(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """What became of telling it, the newest first."""
     with open_client(url) as client:
-        found = client.send("GET", f"/v1/webhooks/{webhook}/deliveries").json()
+        found = client.send("GET", path_of("webhooks", webhook, "deliveries")).json()
     if json:
         emit({"deliveries": found})
         return
@@ -73,5 +74,5 @@ def delete_webhook(webhook: IdArgument, yes: YesOption = False, url: UrlOption =
     """Tell it nothing any more. Its secret is gone for good."""
     with open_client(url) as client:
         confirm(f"Delete the webhook {webhook} and its secret for good?", f"the webhook {webhook}", yes=yes)
-        client.delete(f"/v1/webhooks/{webhook}")
+        client.delete(path_of("webhooks", webhook))
     say_deleted("webhook", webhook, json=json)

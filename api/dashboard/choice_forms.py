@@ -19,13 +19,13 @@ from api.models import GraspName, GraspQuery, Selection
 from api.routes.dependencies import ExportsOf, TagsOf, may_read, may_submit
 from api.routes.grasps import exported
 from service.model.errors import InputError
-from service.model.labels import Name
+from service.model.labels import TagName
 
 _MAX_FIELDS: Final = 400
 #: Longest query of a list that a form gives back.
 _LONGEST_FILTER: Final = 40_000
 _PAGES: Final = re.compile(r"/grasps(/[0-9a-f]{32}/[0-9]{1,10})?|/jobs/[0-9a-f]{32}")
-_NAME: Final[TypeAdapter[str]] = TypeAdapter(Name)
+_NAME: Final[TypeAdapter[str]] = TypeAdapter(TagName)
 _FORMAT: Final[TypeAdapter[Format]] = TypeAdapter(Format)
 _DONE: Final = {
     "tagged": "{done} {grasps} given the tag {tag}.",

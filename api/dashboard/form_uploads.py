@@ -1,13 +1,15 @@
 """The hand and the object of the form of a job: a known one, or a file of the user's.
 
 What a form shows is what it runs. A file that was refused is neither forgotten nor replaced by a known object: it lies
-in the store, the form names it, and the next press checks it again under the options that the form then has.
+in the store, the form names it, and the next press checks it again under the options that the form then has. What a
+refusal suggests are buttons of the form: a visitor need not know the options of a command line.
 """
 
 from __future__ import annotations
 
 import json
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -19,12 +21,45 @@ from api.routes.assets import store_upload
 from service.index.views import AssetView
 from service.model.errors import GraspdError, InputError
 from service.model.states import AssetKind
+from service.store.assets import asset_json
 from service.store.descriptions import json_object
 
 _CHECK_WAIT_S: Final = 15.0
 UNITS: Final = (("m", "metres"), ("mm", "millimetres"), ("cm", "centimetres"), ("in", "inches"))
+#: What a button says of the option that it sets.
+_FIXES: Final = {
+    "keep_largest": "Keep the largest part alone",
+    "compound": "Take the parts as one rigid body",
+    "allow_open": "Take it as it is, open",
+}
+#: Options whose value a visitor chooses: label of the field, its attributes, what the button says.
+_ASKED: Final = {
+    "scale_to": ("Longest side [mm]", 'type="number" min="1" max="3000" step="any"', "Scale it to this size"),
+    "root": ("Link", 'type="text" maxlength="200"', "Begin the hand there"),
+}
 #: The field of a kind's file.
 FILE_FIELDS: Final = {AssetKind.HAND: "hand_file", AssetKind.OBJECT: "file"}
+
+
+@dataclass(frozen=True)
+class Fix:
+    """A button that checks a refused file again."""
+
+    value: str
+    """Keys of `asset.json` that it sets, as JSON; a value of null stands for the field beside the button."""
+    words: str
+    asks: str = ""
+    """The key whose value is in a field beside the button; empty: none."""
+    label: str = ""
+    attributes: str = ""
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why a file cannot be used, in words for a page."""
+
+    problem: str
+    fixes: tuple[Fix, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -33,14 +68,14 @@ class Chosen:
 
     name: str = ""
     """Of the asset that the job gets; empty: there is none yet."""
-    refused: str = ""
-    """Why the file cannot be used."""
+    refused: Refusal | None = None
+    """Why there is none."""
     file: str = ""
     """How a file that cannot be used is called."""
     held: str = ""
     """Digest under which that file lies in the store; empty: it has to be chosen again."""
 
-    def field(self, kind: AssetKind) -> str:
+    def place(self, kind: AssetKind) -> str:
         """The field of the form that a refusal belongs to."""
         return FILE_FIELDS[kind] if self.file else kind.value
 
@@ -52,7 +87,7 @@ def chosen(request: Request, assets: Assets, fields: FormData, kind: AssetKind) 
         try:
             asset = _store(request, assets, kind, file, _units(fields))
         except InputError as error:
-            return Chosen(refused=str(error), file=file.filename)
+            return Chosen(refused=Refusal(str(error)), file=file.filename)
         return _checked(assets, asset)
     if known:
         return Chosen(name=known)
@@ -60,24 +95,93 @@ def chosen(request: Request, assets: Assets, fields: FormData, kind: AssetKind) 
         try:
             return _checked(assets, _again(assets, kind, held, fields))
         except InputError as error:
-            return Chosen(refused=str(error), file=held, held=held)
-    return Chosen(refused=f"choose a known {kind.value}, or a file")
+            return Chosen(refused=Refusal(str(error)), file=held, held=held)
+    return Chosen(refused=Refusal(f"choose a known {kind.value}, or a file"))
+
+
+def refusal(asset: AssetView) -> Refusal:
+    """What the check of an asset says, with the options that it suggests as buttons.
+
+    What an upload says of itself stands beside what its check found, so facts may be of any type.
+    """
+    facts = asset.facts
+    lengths = facts.get("lengths_m")
+    units = [
+        Fix(json.dumps({"units": unit}), f"Read it as {words}" + _length(lengths, unit))
+        for unit in _entries(facts, "units_suggested")
+        if isinstance(unit, str) and (words := dict(UNITS).get(unit))
+    ]
+    others = [
+        fix for one in _entries(facts, "options_suggested") if isinstance(one, dict) and (fix := _fix(one)) is not None
+    ]
+    problem = facts.get("problem")
+    return Refusal(str(problem or asset.message or "it was refused"), (*units, *others))
+
+
+def _entries(facts: Mapping[str, Any], key: str) -> list[Any]:
+    found = facts.get(key)
+    return found if isinstance(found, list) else []
+
+
+def _length(lengths: Any, unit: str) -> str:
+    length = lengths.get(unit) if isinstance(lengths, dict) else None
+    return f": {1e3 * length:.3g} mm long" if isinstance(length, int | float) else ""
+
+
+def _fix(options: dict[str, Any]) -> Fix | None:
+    """The button of suggested options; None: this form has no words for them."""
+    ((key, value),) = options.items() if len(options) == 1 else (("", None),)
+    if key in _ASKED and value is None:
+        label, attributes, words = _ASKED[key]
+        return Fix(json.dumps(options), words, key, label, attributes)
+    if key in _FIXES:
+        words = _FIXES[key]
+    elif key == "root":
+        words = f"Begin the hand at {value}"
+    elif key == "fix" and isinstance(value, dict):
+        words = "Fix " + ", ".join(f"{joint} at {at}" for joint, at in value.items())
+    else:
+        return None
+    return Fix(json.dumps(options), words)
 
 
 def _store(request: Request, assets: Assets, kind: AssetKind, file: UploadFile, units: str) -> AssetView:
     options = json.dumps({"units": units}) if kind is AssetKind.OBJECT and units != "m" else ""
     limit = request.app.state.settings.max_upload_bytes
-    return store_upload(assets, kind, file, None, limit_bytes=limit, options=options)
+    return store_upload(assets, kind, file, None, limit_bytes=limit, options=options, rename=True)
 
 
 def _again(assets: Assets, kind: AssetKind, digest: str, fields: FormData) -> AssetView:
-    """The same file under the units that the form has now."""
-    before, units = assets.one(kind, digest), _units(fields)
-    if kind is not AssetKind.OBJECT or units == _text(fields, "held_units"):
+    """The same file under the units that the form has now, or what the pressed button suggests."""
+    before, said = assets.one(kind, digest), pressed(fields, kind)
+    if not said and kind is AssetKind.OBJECT and (units := _units(fields)) != _text(fields, "held_units"):
+        said = {"units": units}
+    if not said:
         return before
     files = assets.files(before)
-    stated = json_object(files["asset.json"], "asset.json")
-    return assets.add(kind, before.name, {**files, "asset.json": json.dumps(stated | {"units": units}).encode()})
+    stated = json_object(asset_json(files), "asset.json")
+    for key, value in said.items():
+        known = stated.get(key)
+        stated[key] = {**known, **value} if isinstance(known, dict) and isinstance(value, dict) else value
+    return assets.add(kind, before.name, {**files, "asset.json": json.dumps(stated).encode()}, rename=True)
+
+
+def pressed(fields: FormData, kind: AssetKind) -> dict[str, Any]:
+    """Options of the button that was pressed instead of the form's own, each value of null from its field.
+
+    Raises:
+        InputError: its field is empty, or holds no number where one is asked for.
+    """
+    said = json_object(text, "the option") if (text := _text(fields, f"{kind.value}_fix")) else {}
+    for key in [key for key, value in said.items() if value is None and key in _ASKED]:
+        label, given = _ASKED[key][0], _text(fields, f"{kind.value}_{key}").strip()
+        try:
+            said[key] = float(given) / 1e3 if key == "scale_to" else given
+        except ValueError:
+            raise InputError(f"{label}: {given[:20]!r} is no number") from None
+        if not given:
+            raise InputError(f"{label}: fill it in first")
+    return said
 
 
 def _checked(assets: Assets, asset: AssetView) -> Chosen:
@@ -87,7 +191,7 @@ def _checked(assets: Assets, asset: AssetView) -> Chosen:
         time.sleep(0.2)
         asset = assets.one(asset.kind, asset.digest)
     if asset.verdict == "refuse":
-        return Chosen(refused=asset.message or "it was refused", file=asset.name, held=asset.digest)
+        return Chosen(refused=refusal(asset), file=asset.name, held=asset.digest)
     return Chosen(name=asset.name)
 
 
@@ -107,10 +211,12 @@ def asset_choices(assets: Assets, kind: AssetKind) -> list[tuple[str, str]]:
         known = assets.page(kind, limit=200).items
     except GraspdError:
         return []
-    notes = {"refuse": " (refused)", None: " (being checked)"}
     # Of several versions of a name the newest is meant.
     newest = {asset.name: asset for asset in reversed(known)}
-    return [(name, name + ("" if one.builtin else notes.get(one.verdict, ""))) for name, one in sorted(newest.items())]
+    return [
+        (name, name if one.builtin or one.verdict else f"{name} (being checked)")
+        for name, one in sorted(newest.items())
+    ]
 
 
 def _text(fields: FormData, name: str) -> str:

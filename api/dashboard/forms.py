@@ -13,7 +13,7 @@ from starlette.datastructures import FormData, UploadFile
 from api.catalog.assets import Assets
 from api.catalog.jobs import Jobs
 from api.dashboard.expected import listed
-from api.dashboard.form_uploads import FILE_FIELDS, UNITS, Chosen, choices, chosen
+from api.dashboard.form_uploads import FILE_FIELDS, UNITS, Chosen, choices, chosen, refusal
 from api.dashboard.rendering import render
 from api.routes.dependencies import AssetsOf, JobsOf, may_read, may_submit
 from service.model.domain import JobRequest
@@ -35,6 +35,13 @@ def submit_page(request: Request, assets: AssetsOf) -> HTMLResponse:
     """The form; parameters of the address fill it in."""
     given = {key: value for key, value in request.query_params.items() if key in DEFAULTS}
     return _form(request, assets, DEFAULTS | given)
+
+
+@router.get("/submit/refusals/{kind}/{digest}", dependencies=[Depends(may_read)])
+def refused(request: Request, kind: AssetKind, digest: str, assets: AssetsOf) -> HTMLResponse:
+    """Why an upload was refused and what may be done, as a part of the form."""
+    found = refusal(assets.one(kind, digest))
+    return render(request, "refusal.html", kind=kind.value, problem=found.problem, fixes=found.fixes)
 
 
 @router.post("/submit", dependencies=[Depends(may_submit)], response_model=None)
@@ -83,7 +90,10 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
     # Without a default: a form that names no object gets none.
     form |= {kind.value: one.name for kind, one in things.items()}
     shown = DEFAULTS | form | {"units": fields.get("units") or "m"}
-    refused = {one.field(kind): one.refused for kind, one in things.items() if one.refused}
+    refused = {one.place(kind): one.refused.problem for kind, one in things.items() if one.refused}
+    if any(fields.get(f"{kind.value}_fix") for kind in FILE_FIELDS):
+        # The button of a suggestion shows what came of it; the next one submits.
+        return _form(request, assets, shown, things=things, errors=refused, status=422 if refused else 200)
     try:
         named = {kind.value: one.name or "unnamed" for kind, one in things.items()}
         body = JobRequest.model_validate(form | named | {"neighbours": listed(str(form.get("neighbours", "")))})
@@ -131,6 +141,7 @@ def _form(
         hands=choices(assets, AssetKind.HAND, str(form["hand"]), things[AssetKind.HAND]),
         objects=choices(assets, AssetKind.OBJECT, str(form["object"]), things[AssetKind.OBJECT]),
         held={kind.value: one.held for kind, one in things.items()},
+        fixes={kind.value: one.refused.fixes if one.refused else () for kind, one in things.items()},
         expected=request.app.state.expectations.of(form),
         units=UNITS,
         max_upload=request.app.state.settings.max_upload_bytes,

@@ -7,7 +7,7 @@ from typing import Any, Final
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends, Request
-from fastapi.responses import HTMLResponse
+from fastapi.responses import HTMLResponse, RedirectResponse
 
 from api.catalog.assets import Assets
 from api.catalog.tags import Tags
@@ -38,10 +38,15 @@ _WEAKEST: Final = {axis.word: words for axis, words in MEANINGS.items()}
 router = APIRouter(include_in_schema=False)
 
 
-@router.get("/grasps", dependencies=[Depends(may_read)])
-def grasps_page(request: Request, grasps: GraspsOf, shards: ShardsOf, assets: AssetsOf, tags: TagsOf) -> HTMLResponse:
-    """Every grasp of the index: filters, order, pages. The address holds all of it."""
+@router.get("/grasps", dependencies=[Depends(may_read)], response_model=None)
+def grasps_page(
+    request: Request, grasps: GraspsOf, shards: ShardsOf, assets: AssetsOf, tags: TagsOf
+) -> HTMLResponse | RedirectResponse:
+    """Every grasp of the index: filters, order, pages. The address holds all of it, and no empty field."""
     given = {key: value for key, value in request.query_params.items() if value}
+    if len(given) < len(request.query_params):
+        # Forms send every field; what is shown in the browser and shared should be short.
+        return RedirectResponse(f"/grasps?{urlencode(given)}" if given else "/grasps", status_code=303)
     said = did(given)
     cursor, view = given.pop("cursor", None), given.pop("view", "cards")
     view = view if view in PAGE_SIZES else "cards"
@@ -77,8 +82,8 @@ def grasps_page(request: Request, grasps: GraspsOf, shards: ShardsOf, assets: As
         weakest=list(_WEAKEST.items()),
         limits={metric.name: metric.limits for metric in indexed(Indexed.OFFERED)},
         sort=query.sort,
-        sorts=[(key, label) for key, label, _ in COLUMNS],
-        order=query.order,
+        # The default is no part of an address.
+        sorts=[("" if key == GraspQuery().sort else key, label) for key, label, _ in COLUMNS],
         descending=query.order == "desc",
         links={key: _sort_link(request, query, key) for key, _, _ in COLUMNS},
         show_pair=True,

@@ -35,8 +35,8 @@ router = APIRouter(prefix="/hands", include_in_schema=False)
 def hands_page(
     request: Request, assets: AssetsOf, cursor: Annotated[str | None, Query(max_length=512)] = None
 ) -> HTMLResponse:
-    """All hands, by name; and first of all the newest networks, which propose grasps of them."""
-    page = assets.page(AssetKind.HAND, limit=PAGE_SIZE, cursor=cursor)
+    """All hands, newest first, and the newest networks. Refused hands are among them: their page says why."""
+    page = assets.page(AssetKind.HAND, limit=PAGE_SIZE, cursor=cursor, refused=True)
     # What an upload says of itself stands beside what a check found: of any type.
     numbers = {
         hand.digest: [

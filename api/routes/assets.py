@@ -9,7 +9,7 @@ from functools import cache
 from threading import BoundedSemaphore
 from typing import Annotated, Final
 
-from fastapi import APIRouter, Depends, Form, Request, Response, UploadFile
+from fastapi import APIRouter, Depends, Form, Query, Request, Response, UploadFile
 from starlette.datastructures import UploadFile as AnyUpload
 
 from api.catalog.assets import Assets
@@ -47,10 +47,15 @@ def asset_router(kind: AssetKind) -> APIRouter:
 
     @router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 422, 503), name=f"list_{kind}s")
     def list_assets(
-        request: Request, response: Response, assets: AssetsOf, limit: Limit = 50, cursor: Cursor = None
+        request: Request,
+        response: Response,
+        assets: AssetsOf,
+        limit: Limit = 50,
+        cursor: Cursor = None,
+        refused: Annotated[bool, Query(description="also those that the check refused")] = False,
     ) -> Page[AssetView]:
-        """All of them, by name."""
-        page = assets.page(kind, limit=limit, cursor=cursor)
+        """All of them, newest first; those that the check refused only where asked for."""
+        page = assets.page(kind, limit=limit, cursor=cursor, refused=refused)
         link_next(request, response, page.next)
         return page
 
@@ -86,6 +91,9 @@ def asset_router(kind: AssetKind) -> APIRouter:
             Form(description="of a hand: its check ends with 64 grasps of plain objects, some minutes of a worker"),
         ] = False,
         shared: Annotated[bool, Form(description="whether every project may use it, not only that of the key")] = False,
+        rename: Annotated[
+            bool, Form(description="whether the next free name is given where the name stands for something else")
+        ] = False,
     ) -> AssetView:
         limit = request.app.state.settings.max_upload_bytes
         uploads: Turns = request.app.state.uploads
@@ -101,6 +109,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
             options=options,
             self_test=self_test,
             shared=shared,
+            rename=rename,
         )
         response.headers["Location"] = f"/v1/{kind.value}s/{asset.name}"
         if asset.verdict is None:
@@ -162,6 +171,7 @@ def store_upload(
     options: str = "",
     self_test: bool = False,
     shared: bool = False,
+    rename: bool = False,
 ) -> AssetView:
     """An asset of immutable bytes, and the task that checks it. The upload lies in a file of its own until then.
 
@@ -171,7 +181,8 @@ def store_upload(
     filename = file.filename or ""
     with _one_of_few():
         files = files_of_upload(kind, filename, file.file, limit_bytes=limit_bytes, options=options)
-        return assets.add(kind, name or name_of_upload(filename), files, self_test=self_test, shared=shared)
+        named = name or name_of_upload(filename)
+        return assets.add(kind, named, files, self_test=self_test, shared=shared, rename=rename)
 
 
 def store_correction(assets: Assets, name: str, corrections: HandCorrections, new_name: str | None) -> AssetView:

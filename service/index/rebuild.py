@@ -261,4 +261,6 @@ def _lasting(row: dict[str, Any]) -> dict[str, Any]:
         row["worker"] = None
     if "verdict" in row:  # attempts of a check are not kept in the store: it either ends in a finding or is repeated
         row["last_attempt"] = 0
+        if row["verdict"] is None:
+            row["message"] = None
     return row

@@ -56,7 +56,8 @@ class StageProgress(View):
     failed: int = 0
     cancelled: int = 0
     done: float = 0.0
-    seconds: float = Field(0.0, description="sum over the finished tasks")
+    reused: int = Field(0, description="of the succeeded tasks, those whose shard another job had made before")
+    seconds: float = Field(0.0, description="sum over the finished tasks, without the reused ones [s]")
 
 
 class JobView(Judged):

@@ -30,7 +30,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, Self
 
 from service.model.redaction import without_secrets
 
@@ -74,18 +74,38 @@ class ConflictError(InputError):
     slug, status, title = "conflict", 409, "Conflict"
 
 
-class MeshError(InputError):
-    """An object mesh that cannot be read or used."""
+class AssetError(InputError):
+    """A hand or an object that cannot be used.
 
-    slug, title = "bad-mesh", "The mesh cannot be used"
+    Args:
+        message: what is wrong, and the fix in options of the command line.
+        facts: what was found out before the refusal, as the report of a check has it.
+    """
 
     def __init__(self, message: str = "", *, facts: Mapping[str, Any] | None = None) -> None:
         super().__init__(message)
         self.facts = dict(facts or {})
-        """What was found out before the refusal, as the report of a check has it."""
+
+    @classmethod
+    def with_fixes(cls, problem: str, hint: str, *fixes: Mapping[str, Any], **facts: Any) -> Self:
+        """An error whose fixes are options: `problem` and `options_suggested` tell them without a command line.
+
+        Args:
+            problem: what is wrong.
+            hint: the fixes in options of the command line.
+            fixes: keys of `asset.json` with their values; None: the user chooses the value.
+            facts: further facts.
+        """
+        return cls(f"{problem}; {hint}", facts={"problem": problem, "options_suggested": list(fixes), **facts})
 
 
-class HandError(InputError):
+class MeshError(AssetError):
+    """An object mesh that cannot be read or used."""
+
+    slug, title = "bad-mesh", "The mesh cannot be used"
+
+
+class HandError(AssetError):
     """A hand description that cannot be read or used."""
 
     slug, title = "bad-hand", "The hand cannot be used"

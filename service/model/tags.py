@@ -9,7 +9,7 @@ from pydantic import Field
 
 from service.model.digests import digest_json
 from service.model.domain import Digest
-from service.model.labels import Name
+from service.model.labels import TagName
 from service.model.projects import Project
 from service.model.records import Record
 
@@ -26,7 +26,7 @@ class Tag(Record):
 
     version: Literal[1] = 1
     id: Digest
-    name: Name
+    name: TagName
     number: int = Field(ge=1)
     created: str
     changed: str

@@ -191,6 +191,9 @@ class Indexer:
         if event.kind is EventKind.FINISHED:
             kind, _, digest = event.output.partition("/")
             self.checked(AssetKind(kind), digest)
+        elif event.kind is EventKind.FAILED and event.stage is Stage.INGEST:
+            # Without a finding nobody knows whether the upload is good: its check is tried until it ends in one.
+            self._defer(event)
         elif event.kind is EventKind.FAILED:
             self.failed(read_record(AttemptRecord, self._parts.store, attempt_key(event.task_id, event.attempt)))
         elif event.kind is EventKind.DEFERRED:
@@ -210,7 +213,7 @@ class Indexer:
     def _wait_again(self, event: Event, not_before: float, message: str | None) -> None:
         if event.stage is Stage.INGEST:
             digest = event.output.partition("/")[2]
-            self._parts.index.live.set_asset_waiting([digest], queued=False, not_before=not_before)
+            self._parts.index.live.set_asset_waiting([digest], queued=False, not_before=not_before, message=message)
         else:
             self.tell(self._parts.index.live.set_waiting([event.task_id], not_before=not_before, message=message))
 

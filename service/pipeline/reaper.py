@@ -187,7 +187,9 @@ class Reaper:
 
     def _lose_check(self, message: IngestMessage) -> None:
         if message.attempt >= message.max_attempt:
-            reason = f"checking this {message.kind.value} ended its worker {message.attempt} times; it is not taken"
+            reason = (
+                f"checking this {message.kind.value} ended its worker {message.attempt} times; delete it to try again"
+            )
             found = {"verdict": "refuse", "message": reason, "repairs": [], "facts": {}}
             put_document(self._parts.store, names.asset_check(message.kind, message.digest), found)
             self._indexer.checked(message.kind, message.digest)

@@ -28,7 +28,8 @@ def usable(parts: Parts, kind: AssetKind, name: str, reach: Reach = EVERYTHING) 
     if asset.verdict == "refuse":
         raise InputError(f"{kind.value} {name!r} was refused: {asset.message}")
     if asset.verdict is None:
-        raise ConflictError(f"{kind.value} {name!r} is still being checked; submit again in a moment")
+        why = f" ({asset.message})" if asset.message else ""
+        raise ConflictError(f"{kind.value} {name!r} is still being checked{why}; submit again in a moment")
     return asset
 
 

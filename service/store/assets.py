@@ -26,6 +26,8 @@ _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
 #: The built-in assets carry the release's date, so that publishing them twice writes the same manifest.
 _BUILTIN_CREATED: Final = "2026-11-21T00:00:00Z"
 MAX_FILES: Final = 2000
+#: How zlib says that it has no memory, which is no damage.
+_NO_MEMORY: Final = "Error -4 "
 #: Of one name, and of all together: they stand in every list of hands or objects.
 MAX_NAME: Final = 255
 MAX_NAMES: Final = 128 << 10
@@ -190,7 +192,9 @@ def _measure_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int)
 def _damage_said(entry: zipfile.ZipInfo) -> Iterator[None]:
     try:
         yield
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, NotImplementedError, RuntimeError):
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, NotImplementedError, RuntimeError) as error:
+        if isinstance(error, zlib.error) and _NO_MEMORY in str(error):
+            raise MemoryError(str(error)) from None
         raise InputError(f"the archive entry {entry.filename!r} is damaged; zip the folder again") from None
 
 

@@ -148,8 +148,10 @@ def test_a_refused_file_stays_holds_the_button_and_runs_once_its_units_are_right
     assert "was refused" in page.inner_text("#blocked")
     assert page.input_value("#object") == ""
     assert page.get_attribute("[data-thing=object] figure", "data-state") == "none"
-    page.select_option("#units", "mm")
+    assert "--" not in page.inner_text("[data-thing=object] [data-found]")
+    page.click("button:has-text('Read it as millimetres: 60 mm long')")
     page.wait_for_selector("[data-thing=object] [data-found][data-state=good]")
+    assert page.input_value("#units") == "mm"
     assert "60 x 40 x 50 mm" in page.inner_text("[data-thing=object] [data-found]")
     assert page.input_value("#object") == "in-millimetres"
     page.wait_for_selector("[data-thing=object] figure[data-state=ready]")

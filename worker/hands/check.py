@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from service.model.errors import InputError
+from service.model.errors import AssetError, InputError
 from worker.hands.guess import approach_is_tied
 from worker.hands.jaws import jaws_of
 from worker.hands.load import assemble, assumed_efforts, main_file
@@ -33,7 +33,7 @@ def check_hand(
 
     Returns:
         verdict: accept, repair or refuse; message: one line; repairs: what was changed; facts: what was measured or
-        guessed, in SI units.
+        guessed, in SI units; of a refusal that options fix `problem` and `options_suggested`, keys of `HandOptions`.
     """
     try:
         settings = parse_options(files, options)
@@ -43,7 +43,8 @@ def check_hand(
         area = float(sample_surface(hand, _SURFACE_POINTS).area.sum())
         require_opposing(hand)
     except InputError as error:
-        return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": {}}
+        facts = error.facts if isinstance(error, AssetError) else {}
+        return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": facts}
     stated = {
         "palm": settings.palm is not None, "preshape": bool(settings.preshape), "closing": bool(settings.closing),
         "effort": not assumed_efforts(robot, hand.dof_names, settings),

@@ -105,9 +105,10 @@ def body_model(
     base = str(PurePosixPath(main).parent).removeprefix(".")
     pieces = _pieces(robot, tree, files, base, options.shapes == "visual", run)
     if not pieces:
-        raise HandError(
-            f"no link of the hand, from {tree.body_names[0]!r} on, has collision geometry, so nothing can touch; add "
-            "<collision> elements, or begin elsewhere: --root LINK"
+        raise HandError.with_fixes(
+            f"no link of the hand, from {tree.body_names[0]!r} on, has collision geometry, so nothing can touch",
+            "add <collision> elements, or begin elsewhere: --root LINK",
+            {"root": None},
         )
     moving = [tree.drives[joint.name] if joint else None for joint in tree.joint]
     dofs = len(tree.dof_names)

@@ -219,7 +219,7 @@ def require_opposing(hand: HandModel) -> None:
             )
             _holding[hand.content] = bool(made["opposes"])
         if not _holding[hand.content]:
-            raise HandError(f"{hand.name}: {_why_not(hand)}")
+            raise _why_not(hand)
 
 
 _holding: LRUCache[str, bool] = LRUCache(32)
@@ -229,15 +229,19 @@ def _is_one_answer(kept: Mapping[str, NDArray[Any]]) -> bool:
     return set(kept) == {"opposes"} and kept["opposes"].shape == () and kept["opposes"].dtype == bool
 
 
-def _why_not(hand: HandModel) -> str:
+def _why_not(hand: HandModel) -> HandError:
     """What is missing of a hand that can hold nothing, and the mend."""
     shaped = {piece.body for piece in hand.pieces}
     bare = [hand.body_names[tip] for tip in hand.fingertips if tip not in shaped]
     if bare:
-        return f"no two opposing digits: {', '.join(bare[:4])} have no collision shapes; give the hand with its fingers"
-    return (
-        "no two opposing digits: no two surfaces of it face each other and close, so it can hold nothing; "
-        "give the whole hand, or another --root"
+        return HandError(
+            f"{hand.name}: no two opposing digits: {', '.join(bare[:4])} have no collision shapes; give the hand with "
+            "its fingers"
+        )
+    return HandError.with_fixes(
+        f"{hand.name}: no two opposing digits: no two surfaces of it face each other and close, so it can hold nothing",
+        "give the whole hand, or another --root",
+        {"root": None},
     )
 
 

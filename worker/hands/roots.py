@@ -39,13 +39,18 @@ def pick_root(robot: Robot, options: HandOptions) -> str:
         return hands[0]
     if hands:
         named = ", or ".join(f"--root {link}" for link in hands[:6])
-        raise HandError(f"this is a robot with {len(hands)} hands; name its hand: {named}")
-    if stiff := tree.stiff_digits():
-        raise HandError(
-            f"no part of this robot branches into fingers that move: {', '.join(stiff[:4])} are fixed joints; give a "
-            "description in which its fingers move, or name another part: --root LINK"
+        raise HandError.with_fixes(
+            f"this is a robot with {len(hands)} hands", f"name its hand: {named}", *({"root": one} for one in hands[:6])
         )
-    raise HandError("no part of this robot branches into fingers; if it has a hand, name it: --root LINK")
+    if stiff := tree.stiff_digits():
+        raise HandError.with_fixes(
+            f"no part of this robot branches into fingers that move: {', '.join(stiff[:4])} are fixed joints",
+            "give a description in which its fingers move, or name another part: --root LINK",
+            {"root": None},
+        )
+    raise HandError.with_fixes(
+        "no part of this robot branches into fingers", "if it has a hand, name it: --root LINK", {"root": None}
+    )
 
 
 def hand_links(tree: _Moving, root: str) -> list[str]:

@@ -86,15 +86,18 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
     moving = {name: drive for name, drive in drives.items() if isinstance(drive, Drive)}
     for name, drive in moving.items():
         if drive.dof not in moving:
-            raise HandError(f"joint {name!r} follows {drive.dof!r}, which is dropped; fix it: --fix {name}=0")
+            raise HandError.with_fixes(
+                f"joint {name!r} follows {drive.dof!r}, which is dropped", f"fix it: --fix {name}=0", {"fix": {name: 0}}
+            )
     if not moving and still:
         shown = ", ".join(list(still)[:6]) + (", ..." if len(still) > 6 else "")
         raise HandError(f"no moving joint is left: the limits of {shown} leave one value; fill them in")
     if not moving:
-        how = (
-            "fix or drop less" if options.fix or options.drop else f"nothing below {root!r} moves, name another --root"
+        if options.fix or options.drop:
+            raise HandError("no moving joint is left; fix or drop less")
+        raise HandError.with_fixes(
+            f"no moving joint is left; nothing below {root!r} moves", "name another --root", {"root": None}
         )
-        raise HandError(f"no moving joint is left; {how}")
     names = tuple(name for name in robot.joints if name in moving)
     dofs = tuple(name for name in names if moving[name].dof == name)
     lower, upper = np.array([_fold_limits(dof, moving, robot, options) for dof in dofs]).T
@@ -180,7 +183,11 @@ def _fold_limits(dof: str, moving: dict[str, Drive], robot: Robot, options: Hand
         if not _binds(joint, drive, robot, options):
             continue
         if joint.type == "prismatic" and joint.upper - joint.lower >= 2 * UNLIMITED_M:
-            raise HandError(f"joint {name!r} slides without a range; give it one, or fix it: --fix {name}=0")
+            raise HandError.with_fixes(
+                f"joint {name!r} slides without a range",
+                f"give it one, or fix it: --fix {name}=0",
+                {"fix": {name: 0}},
+            )
         ends = sorted((limit - drive.offset) / drive.multiplier for limit in (joint.lower, joint.upper))
         if ends[0] > lower or ends[1] < upper:
             narrowest = name

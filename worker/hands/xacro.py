@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -38,6 +39,7 @@ def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) 
 
     Raises:
         HandError: it cannot be expanded, or reaches for what lies outside the hand's folder; the message says why.
+        OSError: the machine killed the child, or it neither computed nor ended: that says nothing about the file.
     """
     if find_spec("xacro") is None:
         raise HandError(f"{main}: the package xacro is not installed: pip install 'graspd[worker]', or expand it first")
@@ -57,7 +59,9 @@ def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) 
             timeout=_WALL_LIMIT_S, check=False, env={**passed_on, "PYTHONHASHSEED": "0"},
         )  # fmt: skip
     except subprocess.TimeoutExpired:
-        raise HandError(f"{main}: expanding it does not end; expand it yourself and give the URDF") from None
+        raise TimeoutError(f"{main}: expanding it did not end in {_WALL_LIMIT_S:.0f} s; try again") from None
+    if done.returncode == -signal.SIGKILL:
+        raise OSError(f"expanding {main} was killed; the machine may lack memory")
     try:
         answer = json.loads(done.stdout)
         urdf, error = answer["urdf"], answer["error"]

@@ -174,7 +174,9 @@ def _parents(name: str) -> list[str]:
 def _close_doors(cpu_s: int, memory_bytes: int) -> None:
     """From here on the process computes, and nothing else."""
     os.environ.clear()
-    limits = {"AS": memory_bytes, "CPU": cpu_s, "CORE": 0, "FSIZE": 0, "NOFILE": 3}
+    # The soft limit's signal tells from that of a machine without memory.
+    resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s + 1))
+    limits = {"AS": memory_bytes, "CORE": 0, "FSIZE": 0, "NOFILE": 3}
     for what, value in limits.items():
         resource.setrlimit(getattr(resource, f"RLIMIT_{what}"), (value, value))
     sys.addaudithook(_refuse)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from service.model.errors import InputError, MeshError
+from service.model.errors import AssetError, InputError
 from worker.objects.options import ObjectOptions, parse_options
 from worker.objects.prepare import build, main_file, repaired_mesh
 from worker.objects.repair import Repaired
@@ -31,7 +31,9 @@ def check_object(
 
     Returns:
         verdict: accept, repair or refuse; message: one line; repairs: what was changed; facts: what was measured, in
-        SI units; of a refusal for its size `units_suggested`, the likeliest first.
+        SI units. Of a refusal that options fix: `problem`, what is wrong, and `options_suggested`, keys of
+        `ObjectOptions` (None: a value to choose); for its size also `units_suggested`, the likeliest first, with
+        `lengths_m`, its longest extent in each [m].
     """
     try:
         settings = parse_options(files, options)
@@ -39,7 +41,7 @@ def check_object(
         mesh = repaired_mesh(main, files[main], settings)
         facts = _facts(mesh, face_error_m, settings)
     except InputError as error:
-        facts = error.facts if isinstance(error, MeshError) else {}
+        facts = error.facts if isinstance(error, AssetError) else {}
         return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": facts}
     size = " x ".join(f"{1e3 * extent:.0f}" for extent in facts["extents_m"])
     parts = [

@@ -43,6 +43,7 @@ def coacd_parts(vertices: Floats, faces: NDArray[Any], options: Mapping[str, Any
 
     Raises:
         TooMuchWork: it takes more.
+        OSError: the machine did not let it start or end; pieces made without it would be another shape.
     """
     given = io.BytesIO()
     np.savez(given, vertices=vertices, faces=faces, options=np.array(json.dumps(dict(options))))
@@ -50,12 +51,11 @@ def coacd_parts(vertices: Floats, faces: NDArray[Any], options: Mapping[str, Any
     try:
         done = subprocess.run(command, input=given.getvalue(), capture_output=True, check=True)
     except subprocess.CalledProcessError as error:
-        if error.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+        if error.returncode == -signal.SIGXCPU:
             raise TooMuchWork(f"more than {cpu_s} s of computing") from None
+        if error.returncode == -signal.SIGKILL:
+            raise OSError("CoACD was killed; the machine may lack memory") from None
         log.warning("CoACD failed: %s", error.stderr.decode(errors="replace").strip()[-200:] or error.returncode)
-        return ()
-    except OSError as error:
-        log.warning("CoACD did not start: %s", error)
         return ()
     with np.load(io.BytesIO(done.stdout)) as stored:
         return tuple(stored[name] for name in stored.files)

@@ -80,7 +80,7 @@ def repair(soup: Soup, options: ObjectOptions) -> Repaired:
         found, unit = centred(soup.vertices[np.unique(soup.faces)]), UNITS[options.units]
         if found.resolution * unit <= max(COARSE_M, 1e-3 * unit * float(np.ptp(found.points, axis=0).max())):
             raise
-        raise MeshError(f"{error}; {_coarse(found, unit)}") from None
+        raise MeshError(f"{error}; {_coarse(found, unit)}", facts=error.facts) from None
     if not mesh.repairs:
         return mesh
     moved = MeshDistance(given.vertices, given.faces).furthest(surface_points(mesh.vertices, mesh.faces, _SAMPLES))
@@ -116,9 +116,12 @@ def _to_metres(soup: Soup, options: ObjectOptions) -> Repaired:
         size = f"{extent:.4g} m long, too large" if extent > MAX_EXTENT_M else f"{1e3 * extent:.3g} mm long, too small"
         fitting = _fitting_units(extent / unit)
         hints = "; ".join(f"--units {name} makes it {_length(metres)} long" for name, metres in fitting.items())
-        raise MeshError(
-            f"the mesh is {size} to grasp; {hints or 'check its units'} (or give a size: --scale-to 0.1)",
-            facts={"units_suggested": list(fitting)},
+        raise MeshError.with_fixes(
+            f"the mesh is {size} to grasp",
+            f"{hints or 'check its units'} (or give a size: --scale-to 0.1)",
+            {"scale_to": None},
+            units_suggested=list(fitting),
+            lengths_m=fitting,
         )
     notes = (_coarse(given, unit),) if given.resolution * unit > COARSE_M else ()
     x, y, z = (float(value) for value in on_grid(given.centre * unit))
@@ -245,8 +248,10 @@ def _open(mesh: Repaired, options: ObjectOptions) -> Repaired:
         note = f"not watertight: {holes} open edges; the mass is that of the convex hull"
         return replace(mesh, watertight=False, notes=(*mesh.notes, note))
     what = f"{holes} open edges" if holes else "faces that no winding makes consistent"
-    raise MeshError(
-        f"the mesh is not watertight ({what}); close it in your modelling tool, or take it as it is: --allow-open"
+    raise MeshError.with_fixes(
+        f"the mesh is not watertight ({what})",
+        "close it in your modelling tool, or take it as it is: --allow-open",
+        {"allow_open": True},
     )
 
 
@@ -296,7 +301,11 @@ def _unite(
     holes = [p for p, hole in zip(parts, cavity, strict=True) if hole]
     united = solid.unite(positives, holes)
     if united is None:
-        raise MeshError("the mesh has components that are no solids; repair it where it was made, or --keep-largest")
+        raise MeshError.with_fixes(
+            "the mesh has components that are no solids",
+            "repair it where it was made, or --keep-largest",
+            {"keep_largest": True},
+        )
     if turned_parts:
         mesh = replace(mesh, repairs=(*mesh.repairs, f"winding of {turned_parts} components turned outward"))
     # A cavity is a shell of its own, of negative volume.
@@ -304,9 +313,11 @@ def _unite(
     groups = solid.groups(pieces, JOINED_M)
     if len(groups) > 1 and not options.compound:
         if not options.keep_largest:
-            raise MeshError(
-                f"the mesh has {len(groups)} separate components; keep the largest: --keep-largest, take them as one "
-                "rigid body: --compound, or upload each alone"
+            raise MeshError.with_fixes(
+                f"the mesh has {len(groups)} separate components",
+                "keep the largest: --keep-largest, take them as one rigid body: --compound, or upload each alone",
+                {"keep_largest": True},
+                {"compound": True},
             )
         best = united - solid.union([piece for group in groups[1:] for piece in group])
         return mesh.but(*solid.from_manifold(best), f"kept the largest of {len(groups)} components")

@@ -27,10 +27,9 @@ from worker.stages.context import TaskContext
 
 #: Address space of the child [bytes]: the largest meshes that are taken need about a tenth of it.
 MEMORY_LIMIT_BYTES: Final = 4 * 2**30
-#: Time of computing [s]: on a busy machine the same file takes longer, and is no worse for it.
+#: Time of computing [s]: on a busy machine the same file takes longer, and is no worse for it. A child that waits
+#: instead of computing is ended as every task is that takes too long, and the check is tried again.
 CPU_LIMIT_S: Final = 25
-#: A child that waits instead of computing is ended by the clock [s]: far from what a busy machine makes of the above.
-WALL_LIMIT_S: Final = 500.0
 _PASSED_ON: Final = ("PATH", "HOME", "LANG", "TMPDIR", "PYTHONPATH", "LD_LIBRARY_PATH", "VIRTUAL_ENV")
 _OUT_OF_MEMORY: Final = ("MemoryError", "bad_alloc", "Cannot allocate", "failed to map")
 _FINDING_BYTES: Final = 2**20
@@ -77,12 +76,15 @@ def check_in_child(
     *,
     memory_bytes: int = MEMORY_LIMIT_BYTES,
     cpu_s: int = CPU_LIMIT_S,
-    wall_s: float = WALL_LIMIT_S,
 ) -> tuple[dict[str, Any], bytes]:
     """What the check of a hand or object says, or a refusal that says how the check itself ended.
 
     Returns:
         the finding, and the model for viewers (glTF); empty where it was refused or making it would take too long.
+
+    Raises:
+        OSError: the machine ended the check, which says nothing about the file.
+        TaskCancelled: the task should stop.
     """
     with tempfile.TemporaryDirectory(prefix="graspd-ingest-") as folder:
         source, target, errors = (Path(folder) / file for file in ("files.zip", "check.json", "errors.txt"))
@@ -101,17 +103,21 @@ def check_in_child(
                 env=_environment(),
             ) as child,
         ):
-            code = _wait(child, context, wall_s)
+            code = _wait(child, context)
         complaint = errors.read_bytes()[-4000:].decode(errors="replace")
-        if code == 0 and target.is_file() and target.stat().st_size > _FINDING_BYTES:
+        if target.is_file() and target.stat().st_size > _FINDING_BYTES:
             why = f"the check finds more to say than {_FINDING_BYTES >> 20} MiB; simplify it, or shorten its names"
             return _refused(kind, name, why), b""
-        if code == 0 and target.is_file():
-            model = target.with_name(_MODEL)
-            return dict(json.loads(target.read_bytes())), model.read_bytes() if model.is_file() else b""
+        if target.is_file():
+            # A finding stands whatever became of the model after it; one that was cut off is none.
+            with contextlib.suppress(ValueError):
+                found, model = dict(json.loads(target.read_bytes())), target.with_name(_MODEL)
+                return found, model.read_bytes() if code == 0 and model.is_file() else b""
         if os.strerror(errno.ENOSPC) in complaint:
             # No word about the file: the check waits for room.
             raise OSError(errno.ENOSPC, f"{os.strerror(errno.ENOSPC)} to check {name}")
+        if code == -signal.SIGKILL:
+            raise OSError(f"the check of {name} was killed; the machine may lack memory")
         return _refusal(kind, name, code, complaint, memory_bytes, cpu_s), b""
 
 
@@ -121,29 +127,23 @@ def _environment() -> dict[str, str]:
     return passed_on | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
-def _wait(child: subprocess.Popen[bytes], context: TaskContext, wall_s: float) -> int | None:
-    """Exit code of the child; None if it was ended by the clock. Raises TaskCancelled when the task is."""
-    deadline = time.monotonic() + wall_s
+def _wait(child: subprocess.Popen[bytes], context: TaskContext) -> int:
+    """Exit code of the child. Raises TaskCancelled when the task is, and ends the child."""
     try:
-        while time.monotonic() < deadline:
+        while True:
             context.check()
             try:
                 return child.wait(timeout=0.1)
             except subprocess.TimeoutExpired:
                 continue
-        return None
     finally:
         if child.poll() is None:
             os.killpg(child.pid, signal.SIGKILL)
             child.wait()
 
 
-def _refusal(
-    kind: AssetKind, name: str, code: int | None, complaint: str, memory_bytes: int, cpu_s: int
-) -> dict[str, Any]:
-    if code is None:
-        why = "reading it did not end; simplify it, or try again when the machine is less busy"
-    elif code in (-signal.SIGXCPU, -signal.SIGKILL):
+def _refusal(kind: AssetKind, name: str, code: int, complaint: str, memory_bytes: int, cpu_s: int) -> dict[str, Any]:
+    if code == -signal.SIGXCPU:
         why = f"reading it takes longer than {cpu_s} s of computing; simplify it"
     elif any(sign in complaint for sign in _OUT_OF_MEMORY):
         why = f"reading it needs more than {memory_bytes / 2**30:.3g} GiB of memory; simplify it"
@@ -158,9 +158,10 @@ def _refused(kind: AssetKind, name: str, why: str) -> dict[str, Any]:
 
 
 def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cpu_s: str) -> None:
+    # The hard limit stays: its signal is that of a machine without memory, and children have limits of their own.
+    resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_s), resource.getrlimit(resource.RLIMIT_CPU)[1]))
     for limit, value in (
         (resource.RLIMIT_AS, int(memory_bytes)),
-        (resource.RLIMIT_CPU, int(cpu_s)),
         (resource.RLIMIT_CORE, 0),
         (resource.RLIMIT_FSIZE, _MODEL_BYTES),
     ):

@@ -1,5 +1,6 @@
 // Uploads are sent and checked as soon as they are chosen, so that one sees what graspd made of them before submitting.
-// A file that was refused stays, is checked again when its units change, and holds the button: a form runs what it shows.
+// A file that was refused stays, is checked again when its units change or a fix is pressed, and holds the button: a form
+// runs what it shows.
 // Without this script the form sends the files itself.
 (() => {
   "use strict";
@@ -21,18 +22,27 @@
     return body;
   }
 
-  async function check(kind, file, units, name) {
+  /** A file that its check refused; `page` has the reason in words, and buttons that fix it. */
+  class Refused extends Error {
+    constructor(asset, page) { super(asset.message); this.page = page; }
+  }
+
+  async function check(kind, file, options) {
     const data = new FormData();
     data.append("file", file);
-    if (name) data.append("name", name);
-    if (kind === "object" && units && units !== "m") data.append("options", JSON.stringify({ units }));
+    // A file of another content is another object, whatever it is called.
+    data.append("rename", "true");
+    if (Object.keys(options).length) data.append("options", JSON.stringify(options));
     let asset = await document_(await fetch(`${root}v1/${kind}s`, { method: "POST", body: data }));
     const until = Date.now() + PATIENCE_MS;
     while (asset.verdict === null && Date.now() < until) {
       await pause(POLL_MS);
       asset = await document_(await fetch(`${root}v1/${kind}s/${asset.digest}`));
     }
-    if (asset.verdict === "refuse") throw new Error(asset.message);
+    if (asset.verdict === "refuse") {
+      const page = await fetch(`${root}submit/refusals/${kind}/${asset.digest}`);
+      throw new Refused(asset, page.ok ? await page.text() : "");
+    }
     return asset;
   }
 
@@ -50,9 +60,9 @@
     const said = thing.querySelector("[data-found]");
     const select = thing.querySelector(`select[name=${kind}]`);
     const figure = thing.querySelector("figure");
-    // The file that the form means, whether or not its check has ended; and what it was accepted as.
+    // The file that the form means, whether or not its check has ended.
     let held = null;
-    let accepted = null;
+    let fixes = {};
     let round = 0;
     const say = (text, state) => { said.textContent = text; said.dataset.state = state; };
 
@@ -73,15 +83,13 @@
       if (!held) return;
       const [file, mine] = [held, ++round];
       const unit = units?.value ?? "m";
-      // Once a file was accepted, its name stands for those units.
-      const name = accepted && accepted.unit !== unit ? `${accepted.name}-${unit}` : "";
+      const options = unit === "m" ? fixes : { ...fixes, units: unit };
       say(`Checking ${file.name}`, "busy");
       show("", `${file.name} (being checked)`, "");
       hold(thing, `${file.name} is being checked.`);
       try {
-        const asset = await check(kind, file, unit, name);
+        const asset = await check(kind, file, options);
         if (mine !== round) return;
-        accepted ??= { name: asset.name, unit };
         // It is in the store: the form need not send it a second time.
         input.value = "";
         show(asset.name, asset.name, `${root}v1/${kind}s/${asset.digest}/model`);
@@ -91,20 +99,41 @@
         if (mine !== round) return;
         show("", `${file.name} (refused)`, "");
         say(error.message, "bad");
-        hold(thing, `${file.name} was refused: mend that, or choose a known ${kind}.`);
+        if (error.page) said.innerHTML = error.page;
+        hold(thing, `${file.name} was refused: fix that, or choose a known ${kind}.`);
       }
     }
 
     input.addEventListener("change", () => {
       // A dialog that was cancelled empties the field; the file stays what the form means.
       if (!input.files[0]) return;
-      [held, accepted] = [input.files[0], null];
+      [held, fixes] = [input.files[0], {}];
+      thing.querySelector("[data-refused]")?.remove();
       upload();
+    });
+    said.addEventListener("click", (event) => {
+      const button = event.target.closest(`button[name=${kind}_fix]`);
+      if (!button) return;
+      event.preventDefault();
+      for (const [key, value] of Object.entries(JSON.parse(button.value))) {
+        const field = said.querySelector(`input[name=${kind}_${key}]`);
+        if (key === "units" && units) units.value = value;
+        else if (value !== null) fixes[key] = typeof value === "object" ? { ...fixes[key], ...value } : value;
+        else if (field.value === "" || !field.reportValidity()) return field.focus();
+        else fixes[key] = key === "scale_to" ? Number(field.value) / 1000 : field.value;
+      }
+      upload();
+    });
+    // Enter in the field of a fix presses its button, not that of the form.
+    said.addEventListener("keydown", (event) => {
+      if (event.key !== "Enter" || !event.target.matches("input")) return;
+      event.preventDefault();
+      event.target.closest(".inline").querySelector("button").click();
     });
     units?.addEventListener("change", upload);
     select.addEventListener("change", () => {
       round += 1;
-      [held, accepted, input.value] = [null, null, ""];
+      [held, input.value] = [null, ""];
       select.querySelector("option[data-own]:not(:checked)")?.remove();
       figure.querySelector("[data-say]").textContent = "";
       figure.dataset.model = select.value ? `${root}v1/${kind}s/${encodeURIComponent(select.value)}/model` : "";

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 from sqlalchemy import Connection, delete, select, update
 
@@ -79,12 +80,15 @@ class Live:
                 touched |= set(connection.scalars(statement.returning(tasks.c.job_id)))
             return {job: settle(connection, job, []) for job in touched}
 
-    def set_asset_waiting(self, digests: Iterable[str], *, queued: bool, not_before: float = 0.0) -> None:
-        """Checks that no worker holds."""
+    def set_asset_waiting(
+        self, digests: Iterable[str], *, queued: bool, not_before: float = 0.0, message: str | None = None
+    ) -> None:
+        """Checks that no worker holds, and what they wait for, where that is known."""
+        values: dict[str, Any] = {"queued": queued, "not_before": not_before}
+        if message is not None:
+            values["message"] = clean(message)
         with self.database.writing() as connection:
-            connection.execute(
-                update(assets).where(assets.c.digest.in_(list(digests))).values(queued=queued, not_before=not_before)
-            )
+            connection.execute(update(assets).where(assets.c.digest.in_(list(digests))).values(**values))
 
     def set_workers(self, beats: Sequence[WorkerBeat], *, forget_before: str, lost_before: str = "9999") -> None:
         """The living workers; others turn to lost when last seen before a time, and are forgotten before another."""

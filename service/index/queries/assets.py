@@ -6,7 +6,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, and_, case, select, tuple_
+from sqlalchemy import ColumnElement, Connection, and_, case, or_, select, tuple_
 
 from service.index.database import Database, chunks
 from service.index.queries import cursors
@@ -26,11 +26,19 @@ class Assets:
     database: Database
 
     def page(
-        self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None, reach: Reach = EVERYTHING
+        self,
+        kind: AssetKind,
+        *,
+        limit: int = 50,
+        cursor: str | None = None,
+        refused: bool = False,
+        reach: Reach = EVERYTHING,
     ) -> Page[AssetView]:
-        """Hands or objects, all versions, newest first."""
+        """Hands or objects, all versions, newest first; those that the check refused only where asked for."""
         size = cursors.page_size(limit)
         query = select(assets).where(assets.c.kind == kind.value, *seen_assets(reach))
+        if not refused:
+            query = query.where(_not_refused())
         query = query.order_by(assets.c.created.desc(), assets.c.digest.desc()).limit(size + 1)
         if cursor is not None:
             query = query.where(tuple_(assets.c.created, assets.c.digest) < cursors.decode(cursor, str, str))
@@ -59,7 +67,7 @@ class Assets:
             if row is None:
                 known = (
                     select(assets.c.name)
-                    .where(assets.c.kind == kind.value, *seen_assets(reach))
+                    .where(assets.c.kind == kind.value, _not_refused(), *seen_assets(reach))
                     .distinct()
                     .order_by(assets.c.name)
                 )
@@ -83,6 +91,11 @@ class Assets:
             query = select(assets.c.kind, assets.c.digest).where(assets.c.digest.in_(some))
             known |= {(AssetKind(kind), digest) for kind, digest in within.execute(query)}
         return [f"{kind.value} {digest}" for kind, digest in wanted if (kind, digest) not in known]
+
+
+def _not_refused() -> ColumnElement[bool]:
+    """What can be used, or is still being checked."""
+    return or_(assets.c.verdict.is_(None), assets.c.verdict != "refuse")
 
 
 def _asset_view(row: Any) -> AssetView:

@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, select, tuple_
+from sqlalchemy import ColumnElement, Connection, Float, and_, case, cast, func, select, tuple_
 
 from service.index.database import Database, chunks
 from service.index.queries import cursors
@@ -155,6 +155,8 @@ def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[Stag
         (tasks.c.progress_total > 0, tasks.c.progress_done / tasks.c.progress_total),
         else_=0.0,
     )
+    # A task that succeeded ended when its shard was made; both times are texts of one form.
+    reused = and_(tasks.c.done, tasks.c.finished < tasks.c.created)
     query = (
         select(
             tasks.c.job_id,
@@ -163,7 +165,8 @@ def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[Stag
             tasks.c.state,
             func.count().label("tasks"),
             func.sum(cast(share, Float)).label("done"),
-            func.sum(func.coalesce(tasks.c.seconds, 0.0)).label("seconds"),
+            func.sum(case((reused, 0.0), else_=func.coalesce(tasks.c.seconds, 0.0))).label("seconds"),
+            func.sum(case((reused, 1), else_=0)).label("reused"),
         )
         .where(tasks.c.job_id.in_(ids))
         .group_by(tasks.c.job_id, tasks.c.position, tasks.c.stage, tasks.c.state)
@@ -171,10 +174,10 @@ def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[Stag
     stages: dict[str, dict[int, dict[str, Any]]] = defaultdict(dict)
     for row in connection.execute(query).mappings():
         stage = stages[row["job_id"]].setdefault(
-            row["position"], {"stage": row["stage"], "tasks": 0, "done": 0.0, "seconds": 0.0}
+            row["position"], {"stage": row["stage"], "tasks": 0, "done": 0.0, "seconds": 0.0, "reused": 0}
         )
         stage[row["state"]] = row["tasks"]
-        for name in ("tasks", "done", "seconds"):
+        for name in ("tasks", "done", "seconds", "reused"):
             stage[name] += row[name]
     return {job: [StageProgress(**stages[job][position]) for position in sorted(stages[job])] for job in ids}
 

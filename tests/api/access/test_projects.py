@@ -126,7 +126,8 @@ _URDF = b"""<robot name="two"><link name="base"/><link name="tip"/><joint name="
 _VALUES = {
     "job_id": ("job_id", "failed", "waiting"),
     "shard_id": ("shard_id", "views"),
-    "digest": ("digest",),
+    "kind": ("object", "hand"),
+    "digest": ("digest", "objects_digest"),
     "row": ("0",),
     "number": ("0",),
     "index": ("0",),

@@ -70,6 +70,14 @@ def test_finished_batches_give_the_rate_when_none_is_seen_running() -> None:
     assert status.eta_s == pytest.approx(20.0)
 
 
+def test_reused_batches_say_nothing_of_the_rate() -> None:
+    stage = StageProgress(stage=Stage.SYNTHESIZE, tasks=4, queued=1, succeeded=3, reused=2, done=3.0, seconds=10.0)
+    (status,) = stage_statuses(job(stage), [], Paces(Clock()))
+    assert status.eta_s == pytest.approx(10.0)
+    old = stage.model_copy(update={"succeeded": 2, "queued": 2, "seconds": 0.0})
+    assert stage_statuses(job(old), [], Paces(Clock()))[0].eta_s is None
+
+
 def test_a_job_has_no_end_in_sight_while_the_pace_of_a_stage_is_unknown() -> None:
     known = StageProgress(stage=Stage.SYNTHESIZE, tasks=2, running=1, succeeded=1, done=1.0, seconds=10.0)
     unknown = StageProgress(stage=Stage.SCENE, tasks=2, queued=2)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import httpx
 import pytest
 
-from api.client.client import Client, events_of
+from api.client import client as client_module
+from api.client.client import Client, events_of, path_of
 from api.models import Job, Shard
 from service.model.errors import (
     ConflictError,
@@ -170,3 +172,26 @@ def test_a_password_in_the_address_is_not_told() -> None:
     with Client("http://me:secret@127.0.0.1:1") as client, pytest.raises(UnavailableError) as away:
         client.health()
     assert "secret" not in f"{away.value} {client.url}"
+
+
+def test_names_in_addresses_are_quoted() -> None:
+    asked: list[bytes] = []
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        asked.append(request.url.raw_path)
+        return httpx.Response(404, json={"type": "/problems/not-found", "detail": "there is none"})
+
+    client = client_of(answer)
+    for ask in (
+        lambda: client.job("a b"), lambda: client.asset(AssetKind.OBJECT, "a/b?c#d"),
+        lambda: client.delete(path_of("tags", "good ones")),
+    ):  # fmt: skip
+        with pytest.raises(NotFoundError):
+            ask()
+    assert asked == [b"/v1/jobs/a%20b", b"/v1/objects/a%2Fb%3Fc%23d", b"/v1/tags/good%20ones"]
+
+
+def test_no_command_pastes_a_name_into_an_address() -> None:
+    folder = Path(client_module.__file__).parent
+    pasted = re.compile(r'f"/v1/(?!\{kind\.value\}s")')
+    assert [file.name for file in folder.glob("*.py") if pasted.search(file.read_text())] == []

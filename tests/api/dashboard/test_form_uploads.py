@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+from html import unescape
+from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
@@ -25,17 +27,19 @@ def no_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(form_uploads, "_CHECK_WAIT_S", 0.0)
 
 
-def check(parts: Parts, asset: AssetView, verdict: str) -> None:
+def check(parts: Parts, asset: AssetView, verdict: str, facts: dict[str, Any] | None = None) -> None:
     """What a worker would find."""
-    found: dict[str, object] = {"verdict": verdict, "message": "a thing of 60 m", "repairs": [], "facts": {}}
+    found = {"verdict": verdict, "message": "a thing of 60 m", "repairs": [], "facts": facts or {}}
     parts.store.put(names.asset_check(AssetKind.OBJECT, asset.digest), json.dumps(found).encode())
     parts.index.write.add_asset(load_asset(parts.store, AssetKind.OBJECT, asset.digest), found)
 
 
-def uploaded(http: TestClient, parts: Parts, verdict: str, **options: str) -> AssetView:
+def uploaded(
+    http: TestClient, parts: Parts, verdict: str, facts: dict[str, Any] | None = None, **options: str
+) -> AssetView:
     data = {"options": json.dumps(options)} if options else {}
     asset = AssetView.model_validate(http.post("/v1/objects", files={"file": MESH}, data=data).json())
-    check(parts, asset, verdict)
+    check(parts, asset, verdict, facts)
     return asset
 
 
@@ -135,3 +139,102 @@ def test_what_a_form_holds_must_be_there(http: TestClient, parts: Parts) -> None
     answer = http.post("/submit", data=FORM | {"object": "", "object_held": "0" * 32})
     assert answer.status_code == 422
     assert jobs(parts) == []
+
+
+#: What the check of a mesh in millimetres tells beside its message.
+TOO_LARGE = {
+    "problem": "the mesh is 60 m long", "units_suggested": ["mm", "cm"], "lengths_m": {"mm": 0.06, "cm": 0.6},
+    "options_suggested": [{"scale_to": None}],
+}  # fmt: skip
+
+
+def fixes_of(page: str) -> dict[str, str]:
+    """The buttons of a refusal: what each says, and its value."""
+    found = re.findall(r'<button class="button small" name="object_fix" value="([^"]*)"[^>]*>([^<]*)<', page)
+    return {words: unescape(value) for value, words in found}
+
+
+def test_a_refusal_is_told_in_words_with_buttons(http: TestClient, parts: Parts) -> None:
+    asset = uploaded(http, parts, "refuse", TOO_LARGE)
+    whole = http.post("/submit", data=FORM, files={"file": MESH}).text
+    part = http.get(f"/submit/refusals/object/{asset.digest}").text
+    for page in (whole, part):
+        assert "the mesh is 60 m long" in page and "a thing of 60 m" not in page
+        assert list(fixes_of(page)) == [
+            "Read it as millimetres: 60 mm long", "Read it as centimetres: 600 mm long", "Scale it to this size",
+        ]  # fmt: skip
+    assert "<html" not in part
+
+
+@pytest.mark.parametrize(
+    ("words", "field", "said"),
+    [
+        ("Read it as millimetres: 60 mm long", {}, {"units": "mm"}),
+        ("Scale it to this size", {"object_scale_to": "120"}, {"scale_to": 0.12}),
+    ],
+)
+def test_the_button_of_a_fix_checks_the_file_again_and_submits_nothing(
+    http: TestClient, parts: Parts, words: str, field: dict[str, str], said: dict[str, Any]
+) -> None:
+    uploaded(http, parts, "refuse", TOO_LARGE)
+    page = http.post("/submit", data=FORM, files={"file": MESH}).text
+    again = http.post("/submit", data=fields_of(page) | field | {"object_fix": fixes_of(page)[words]})
+    assert again.status_code == 200 and jobs(parts) == []
+    assert fields_of(again.text)["object"] == "part"
+    meant = parts.index.assets.get(AssetKind.OBJECT, "part")
+    assert json.loads(load_asset_files(parts.store, AssetKind.OBJECT, meant.digest)["asset.json"]) == {
+        "file": "part.stl", **said,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("typed", ["", "wide"])
+def test_a_fix_without_its_number_asks_for_it(http: TestClient, parts: Parts, typed: str) -> None:
+    uploaded(http, parts, "refuse", TOO_LARGE)
+    page = http.post("/submit", data=FORM, files={"file": MESH}).text
+    fix = fixes_of(page)["Scale it to this size"]
+    again = http.post("/submit", data=fields_of(page) | {"object_scale_to": typed, "object_fix": fix})
+    assert again.status_code == 422 and "Longest side [mm]" in again.text
+    assert fields_of(again.text)["object_held"] == fields_of(page)["object_held"]
+
+
+def test_facts_that_an_upload_says_of_itself_break_no_page(http: TestClient, parts: Parts) -> None:
+    odd = {"units_suggested": "mm", "options_suggested": [3, {}, {"a": 1}, {"root": "<b>"}], "lengths_m": [1]}
+    asset = uploaded(http, parts, "refuse", odd)
+    page = http.get(f"/submit/refusals/object/{asset.digest}").text
+    assert list(fixes_of(page)) == ["Begin the hand at &lt;b&gt;"]
+
+
+def test_what_was_refused_can_be_chosen_nowhere(http: TestClient, parts: Parts) -> None:
+    uploaded(http, parts, "refuse")
+    for page in ("/submit", "/datasets", "/grasps"):
+        assert not re.search(r">\s*part\b", http.get(page).text), page
+    assert "part" not in {one["name"] for one in http.get("/v1/objects").json()["items"]}
+    everything = http.get("/v1/objects", params={"refused": True}).json()["items"]
+    assert ("part", "refuse") in {(one["name"], one["verdict"]) for one in everything}
+    assert "part" not in http.get("/v1/objects/nothing").json()["detail"]
+
+
+def test_a_name_of_something_refused_is_free(http: TestClient, parts: Parts) -> None:
+    refused = uploaded(http, parts, "refuse")
+    answer = http.post("/v1/objects", files={"file": ("part.stl", b"solid another\nendsolid\n")})
+    assert answer.status_code == 202 and answer.json()["digest"] != refused.digest
+    assert http.get("/v1/objects/part").json()["digest"] == answer.json()["digest"]
+
+
+def test_a_file_of_other_content_and_the_same_name_is_another_object(http: TestClient, parts: Parts) -> None:
+    first = uploaded(http, parts, "accept")
+    other = {"file": ("part.stl", b"solid another\nendsolid\n")}
+    assert http.post("/v1/objects", files=other).status_code == 409
+    second = http.post("/v1/objects", files=other, data={"rename": "true"}).json()
+    assert second["name"] == "part-2"
+    again = http.post("/v1/objects", files={"file": MESH}, data={"rename": "true"}).json()
+    assert (again["name"], again["digest"]) == ("part", first.digest)
+
+
+def test_a_refused_file_is_found_again_though_its_name_stands_for_another(http: TestClient, parts: Parts) -> None:
+    refused = uploaded(http, parts, "refuse")
+    good = http.post("/v1/objects", files={"file": ("part.stl", b"solid another\nendsolid\n")}).json()
+    for sent in ({}, {"name": "other"}):
+        again = http.post("/v1/objects", files={"file": MESH}, data=sent)
+        assert (again.status_code, again.json()["digest"], again.json()["verdict"]) == (202, refused.digest, "refuse")
+    assert http.get("/v1/objects/part").json()["digest"] == good["digest"]

@@ -170,3 +170,10 @@ def test_the_list_takes_the_language_of_the_command_line(http: TestClient, parts
     assert page.status_code == 200 and 'value="epsilon &gt; 0.2 and valid"' in page.text
     wrong = http.get("/grasps", params={"where": "epsilon >"})
     assert wrong.status_code == 422 and "the expression ends where a value is expected" in wrong.text
+
+
+def test_an_address_holds_no_empty_fields(http: TestClient) -> None:
+    sent = {"hand": "allegro", "where": "", "tag": "", "min_epsilon": "", "sort": "", "order": ""}
+    answer = http.get("/grasps", params=sent, follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"]) == (303, "/grasps?hand=allegro")
+    assert http.get("/grasps", params={"hand": ""}, follow_redirects=False).headers["location"] == "/grasps"

@@ -229,3 +229,9 @@ def test_an_unforeseen_error_is_a_page_that_gives_nothing_away(
     assert (answer.status_code, answer.headers["content-type"]) == (500, "text/html; charset=utf-8")
     assert "a secret" not in answer.text
     assert answer.headers["x-request-id"] in answer.text
+
+
+def test_what_came_with_the_service_was_not_added(http: TestClient) -> None:
+    for path in ("/hands", "/hands/allegro"):
+        page = http.get(path).text
+        assert "built in" in page and "<time" not in page and "added" not in page.lower().replace("<th>added</th>", "")

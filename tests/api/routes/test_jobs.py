@@ -9,12 +9,14 @@ import pytest
 from starlette.testclient import TestClient
 
 from api.client.client import events_of
+from service.model.clock import timestamp
 from service.model.diversity import GraspType
 from service.model.planning import plan
 from service.pipeline.backends import Parts
 from service.store.study_records import publish
 from tests.api.factories import add_job, fail, finish, finish_all
 from tests.service.pipeline.test_fidelity_choice import scene_chart
+from tests.waiting import until
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 64, "scenes": 1, "views": 1}
 
@@ -155,3 +157,18 @@ def test_events_of_an_unknown_job_are_a_problem_not_a_stream(http: TestClient) -
     answer = http.get("/v1/jobs/none/events")
     assert answer.status_code == 404
     assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_time_that_another_job_spent_is_not_counted_twice(http: TestClient, parts: Parts) -> None:
+    first = add_job(parts, seed=7)
+    made = finish_all(parts, first)
+    until(lambda: timestamp() > made[0].created, "the clock moves on")
+    second = add_job(parts, seed=7, grasps=64)
+    (stage,) = http.get(f"/v1/jobs/{second.id}").json()["stages"]
+    assert (stage["succeeded"], stage["reused"], stage["seconds"]) == (1, 1, 0.0)
+    finish(parts, second, list(plan(second))[1])
+    (stage,) = http.get(f"/v1/jobs/{second.id}").json()["stages"]
+    assert (stage["succeeded"], stage["reused"], stage["seconds"]) == (2, 1, 12.5)
+    assert http.get(f"/v1/jobs/{first.id}").json()["stages"][0]["seconds"] == 12.5
+    assert "12 s, 1 reused" in http.get(f"/jobs/{second.id}").text
+    assert "none, reused" in http.get(f"/jobs/{add_job(parts, seed=7, scenes=1).id}").text

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import zipfile
+from html import unescape
 from typing import Any
 
 import numpy as np
@@ -229,3 +230,22 @@ def test_grasps_of_a_dataset_are_those_of_its_cells(http: TestClient, made: Shar
     finish_all(parts, add_job(parts, seed=5))
     assert rows_of(http, dataset="d") == list(range(32)) != rows_of(http)
     assert http.get("/v1/grasps?dataset=none").status_code == 404
+
+
+def test_a_tag_may_be_of_several_words(http: TestClient, made: ShardManifest) -> None:
+    assert give(http, " good for training ", grasps=named(made.shard_id, 3))["tag"]["name"] == "good for training"
+    assert rows_of(http, tag="good for training") == [3]
+    assert http.get("/v1/tags/good%20for%20training").json()["grasps"] == 1
+    page = http.get("/grasps?tag=good+for+training").text
+    assert 'action="/tags/good%20for%20training/delete"' in page and "/grasps?tag=good%20for%20training" in page
+    assert unescape(page).count("'good for training'") == 1 and "'good for training.zip'" in unescape(page)
+    export = http.get("/v1/grasps/export", params={"tag": "good for training", "format": "csv"})
+    assert export.status_code == 200 and " for " not in export.headers["content-disposition"]
+    gone = http.post("/tags/good%20for%20training/delete", data={"typed": "good for training"})
+    assert "The tag good for training is deleted" in gone.text
+
+
+@pytest.mark.parametrize("name", ["", " ", "two  spaces", "a\tb", "a\u00a0b", "a/b", "-a", "a" * 65])
+def test_a_tag_that_no_address_or_shell_takes_is_refused(http: TestClient, made: ShardManifest, name: str) -> None:
+    answer = http.post("/v1/tags", json={"name": name, "grasps": named(made.shard_id, 3)})
+    assert answer.status_code == 422

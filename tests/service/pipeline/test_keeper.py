@@ -11,7 +11,7 @@ import pytest
 from service.index.rebuild import differences
 from service.model import names
 from service.model.clock import timestamp
-from service.model.errors import QueueUnavailable, StoreUnavailable
+from service.model.errors import ConflictError, QueueUnavailable, StoreUnavailable
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import AssetKind, Stage, State
 from service.pipeline import job_actions
@@ -24,6 +24,7 @@ from service.store.library import publish_asset, stored_assets
 from tests.fakes import HAND_FILES, fake_stages, make_shard, request
 from tests.indexes import empty_index
 from tests.memory_queue import Delivery, MemoryQueue
+from tests.waiting import until
 from worker.process.runner import Runner
 from worker.stages.context import StopReason, TaskContext
 
@@ -349,6 +350,20 @@ def test_a_check_that_is_queued_while_the_keeper_looks_is_queued_once(
     monkeypatch.setattr(MemoryQueue, "leases", lambda _: [])
     bench.keeper._look_after_queue()
     assert bench.queue.waiting() == set(), "the worker's check waits a second time"
+
+
+def test_a_check_that_failed_is_told_and_tried_again(bench: Bench) -> None:
+    asset = publish_asset(bench.parts.store, AssetKind.HAND, "upload", HAND_FILES | {"extra": b"4"})
+    bench.parts.index.write.add_asset(asset, None)
+    bench.pass_time(1)
+    bench.do(bench.take(), ingest=explode)
+    bench.pass_time(1)
+    known = bench.parts.index.assets.get(AssetKind.HAND, "upload")
+    assert (known.verdict, known.message) == (None, "waits: the planner lost its way")
+    with pytest.raises(ConflictError, match="the planner lost its way"):
+        job_actions.submit(bench.parts, request(hand="upload"))
+    assert differences(bench.parts.index, bench.parts.store) == []
+    until(lambda: bench.keeper.round() or bench.queue.waiting(), "tried again")
 
 
 def test_a_task_between_queue_and_worker_is_not_taken_for_lost(bench: Bench) -> None:

@@ -61,7 +61,7 @@ def test_a_documented_command_accepts_its_hand(command: str, folder: Path, monke
         assert report["facts"]["preshape"]["joint_12.0"] == 1.2 and "palm" not in report["facts"]["guessed"]
 
 
-def _untried(hand: HandModel, run: Run, *, budget_s: float) -> SelfTest:
+def _untried(hand: HandModel, run: Run) -> SelfTest:
     return SelfTest(0.9, 0, 0.04, {})
 
 

@@ -129,6 +129,19 @@ def test_an_expansion_without_end_is_stopped(monkeypatch: pytest.MonkeyPatch) ->
     assert "takes more than" in refusal('<a b="${9**9**9}"/>')
 
 
+@pytest.mark.parametrize("code", ["os.kill(os.getpid(), signal.SIGKILL)", "signal.pause()"])
+def test_an_expansion_that_the_machine_ended_refuses_no_hand(code: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = subprocess.run
+
+    def other(command: list[str], **options: object) -> object:
+        return run([sys.executable, "-c", f"import os, signal; {code}"], **options)  # type: ignore[call-overload]
+
+    monkeypatch.setattr("worker.hands.xacro.subprocess.run", other)
+    monkeypatch.setattr("worker.hands.xacro._WALL_LIMIT_S", 0.5 if "pause" in code else 60.0)
+    with pytest.raises(OSError, match=r"x\.xacro"):
+        expand({"x.xacro": b"<robot/>"}, "x.xacro", {})
+
+
 @pytest.mark.parametrize(
     "attempt",
     [

@@ -175,4 +175,6 @@ def test_a_hint_of_units_fits_the_size(length: float, units: str, likely: list[s
     report = check_object({"mug.obj": mesh}, "mug", units=units)
     assert report["verdict"] == "refuse" and report["facts"]["units_suggested"] == likely
     assert f"--units {likely[0]}" in report["message"]
+    assert "--" not in report["facts"]["problem"] and report["facts"]["options_suggested"] == [{"scale_to": None}]
+    assert set(report["facts"]["lengths_m"]) == set(likely)
     assert all(check_object({"mug.obj": mesh}, "mug", units=unit)["verdict"] == "accept" for unit in likely)

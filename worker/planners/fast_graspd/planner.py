@@ -289,7 +289,7 @@ def _work(launch: _Launch, begun: _Begun) -> Part:
     # The coarse phase changes its own task as the dilation shrinks: nothing has converged before its end.
     launches = pair.iteration(launch.coarse, data, fidelity.optimizer, patience=0)
     curve: list[Floats] = []
-    state = _descend(launches, data, batches, rows, fidelity.coarse_iterations, "coarse", curve)
+    state = _descend(launches, data, batches, rows, fidelity.coarse_iterations, "coarse optimization", curve)
     losses = _losses(data, len(state.pivot))
     order = np.arange(n * fidelity.starts).reshape(n, -1)
     if last < fidelity.starts or (batches.has_trial and fidelity.starts > 1):
@@ -377,7 +377,7 @@ class _Seats:
         data.set_state(state)
         launches = launch.pair.iteration(launch.fine, data, fidelity.optimizer, patience=fidelity.patience)
         curve, self.curve = self.curve, []
-        state = _descend(launches, data, launch.batches, mine, fidelity.fine_iterations, "fine", curve)
+        state = _descend(launches, data, launch.batches, mine, fidelity.fine_iterations, "refinement", curve)
         if fidelity.fine_iterations:
             losses = _losses(data, len(flat))
         # Without iterations this only tells how deep each hand is.
