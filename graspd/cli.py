@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, Final
@@ -134,7 +135,21 @@ def load(module: str, name: str, ctx: Any = None) -> Any:
         for parent, child, room, text in JOINED:
             if parent == name:
                 command.add_command(Deferred(child, room, text))
+    escape_help(command)
     return command
+
+
+def escape_help(command: Any) -> None:
+    """Keep the brackets of a command and of all below it: typer reads help as Rich markup, and `[mm]` as a style.
+
+    `rich.markup.escape` does the same, and takes longer to import than most commands to start.
+    """
+    for one in (command, *command.params):
+        for name in ("help", "short_help", "epilog"):
+            if text := getattr(one, name, None):
+                setattr(one, name, re.sub(r"\[[a-z#/@][^\[]*?\]", r"\\\g<0>", text))
+    for inner in getattr(command, "commands", {}).values():
+        escape_help(inner)
 
 
 def missing_extra(module: str) -> str | None:

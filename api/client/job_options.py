@@ -82,7 +82,6 @@ def validated(model: type[BaseModel], values: dict[str, Any]) -> Any:
 def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:
     said = field.description or name
     words = _HELP.get(name) or f"{said[0].upper()}{said[1:]}."
-    words = words.replace("[", "(").replace("]", ")")  # the terminal takes brackets for markup
     if get_origin(field.annotation) is tuple:
         words += " Several times."
     flags = [_FLAGS.get(name, f"--{name.replace('_', '-')}"), *([_SHORT[name]] if name in _SHORT else [])]
