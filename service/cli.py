@@ -11,7 +11,7 @@ import os
 import signal
 import stat
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, ParamSpec, TextIO, TypeVar
@@ -23,6 +23,9 @@ from service.model.errors import GraspdError, InputError
 from service.model.redaction import without_secrets
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
     from service.settings import Settings
 
 P = ParamSpec("P")
@@ -145,6 +148,27 @@ def fail(message: str, code: int) -> NoReturn:
     """Say what is wrong on stderr and end with that exit code."""
     typer.echo(f"graspd: {' '.join(message.split())}", err=True)
     raise typer.Exit(code)
+
+
+def plain_console(*, stderr: bool = False) -> Console:
+    """A terminal that prints names, paths and messages as they are; Rich reads `[red]` as a style, `:x:` as a sign."""
+    from rich.console import Console  # what draws need not be loaded where nothing is drawn
+
+    return Console(stderr=stderr, markup=False, emoji=False, highlight=False)
+
+
+def plain_table(*headings: str, whole: Collection[str] = ()) -> Table:
+    """A table that cuts nothing at 80 columns: long names break.
+
+    Args:
+        whole: columns that keep their cells on one line, such as ids and times.
+    """
+    from rich.table import Table
+
+    table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
+    for name in headings:
+        table.add_column(name, no_wrap=name in whole, overflow="fold")
+    return table
 
 
 def emit(value: BaseModel | dict[str, Any]) -> None:

@@ -8,11 +8,10 @@ from typing import Annotated, Any, Final, get_args
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from service.cli import JsonFlag, emit, reporting_errors
+from service.cli import JsonFlag, emit, plain_console, reporting_errors
 from service.model.errors import InputError
 from service.model.robust import MEANINGS, MOST_MODELS
 from worker.files.cases import expand, load_case
@@ -97,9 +96,10 @@ def evaluate_command(
     other = None if judge_hand is None else hand_from_path(judge_hand, drag=True)
     twins = _joint_map(joint_map)
     rows: list[dict[str, Any]] = []
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-               TimeElapsedColumn(), TimeRemainingColumn())  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True), disable=json, transient=True) as bar:
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(),
+               TextColumn("{task.completed:.0f}/{task.total:.0f}"), TimeElapsedColumn(),
+               TimeRemainingColumn())  # fmt: skip
+    with Progress(*columns, console=plain_console(stderr=True), disable=json, transient=True) as bar:
         task = bar.add_task("reading", total=1)
         listed = [one for path in files for one in expand(path)]
         copies = _copies(files, listed, out, robust=robust, hard=hard)
@@ -142,7 +142,7 @@ def _tell(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
         verdicts = [{"file": row["file"], **one} for row in rows for one in row.pop("verdicts", [])]
         emit({key: value for key, value in whole.items() if key != "verdicts"} | {"verdicts": verdicts, "files": rows})
     else:
-        Console().print(_table(rows, whole))
+        plain_console().print(_table(rows, whole))
         if whole.get("robust_share") is not None:
             typer.echo(_said_of_models(whole))
         if "foreign_held" in whole:
@@ -198,7 +198,7 @@ def _table(rows: list[dict[str, Any]], whole: dict[str, Any]) -> Table:
         padding=(0, 1, 0, 0),
         pad_edge=False,
     )
-    table.add_column("grasps", max_width=16, no_wrap=True)
+    table.add_column("grasps", max_width=16, overflow="fold")
     for _, heading, _ in _COLUMNS:
         table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:

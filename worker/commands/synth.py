@@ -17,6 +17,7 @@ from service.cli import (
     emit,
     engine_settings,
     fail,
+    plain_console,
     reporting_errors,
     told_to_stop,
     validation_line,
@@ -171,13 +172,13 @@ def _bar(*, quiet: bool) -> Iterator[Report]:
     if quiet or not sys.stderr.isatty():
         yield lambda done, total, message: None
         return
-    from rich.console import Console  # where nobody looks at a bar, what draws it need not be loaded
+    # Where nobody looks at a bar, what draws it need not be loaded.
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     began = time.perf_counter()
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[rate]}"), TimeElapsedColumn(),
-               TimeRemainingColumn())  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[rate]}"),
+               TimeElapsedColumn(), TimeRemainingColumn())  # fmt: skip
+    with Progress(*columns, console=plain_console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None, rate="")
 
         def tell(done: float, total: float, message: str) -> None:
