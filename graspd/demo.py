@@ -13,7 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 from api.client.client import Client
-from api.client.reports import job_request, job_summary, means_of, yield_of
+from api.client.job_options import validated
+from api.client.reports import job_summary, means_of, yield_of
 from api.client.watching import JobDisplay
 from api.formatting import count, duration, metric
 from api.models import GraspQuery, JobDetail
@@ -65,7 +66,8 @@ def demo(
     json: JsonFlag = False,
 ) -> None:
     """The main job on built-in data: grasps, scenes, pictures, and a page that shows them."""
-    request = job_request(
+    request = validated(
+        JobRequest,
         {
             "hand": hand, "object": object, "grasps": grasps, "scenes": scenes, "views": views,
             "stereo": views > 0, "fidelity": fidelity, "seed": seed,

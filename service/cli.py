@@ -21,6 +21,7 @@ from pydantic import BaseModel, ValidationError
 
 from service.model.errors import GraspdError, InputError
 from service.model.redaction import without_secrets
+from service.model.refusals import refusal
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -44,7 +45,7 @@ def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
         except GraspdError as error:
             fail(str(error), error.exit_code)
         except ValidationError as error:
-            fail(validation_line(error), InputError.exit_code)
+            fail(refusal(error), InputError.exit_code)
         except BrokenPipeError:
             _silence(sys.stdout)  # the reader (head, less) has enough
             raise typer.Exit(0) from None
@@ -184,7 +185,8 @@ def load_settings(**overrides: Any) -> Settings:
     try:
         return Settings(**{name: value for name, value in overrides.items() if value is not None})
     except ValidationError as error:
-        raise InputError(validation_line(error)) from None
+        place, said = error.errors()[0]["loc"], refusal(error)
+        raise InputError(f"GRASPD_{place[0]}".upper() + said.removeprefix(str(place[0])) if place else said) from None
 
 
 @dataclass(frozen=True)
@@ -221,12 +223,3 @@ def keep_private(settings: Settings) -> None:
         status = settings.data_dir.stat()
         if status.st_uid == os.getuid() and stat.S_IMODE(status.st_mode) != 0o700:
             settings.data_dir.chmod(0o700)
-
-
-def validation_line(error: ValidationError) -> str:
-    """The first thing that is wrong with a model's input, in a line."""
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    if error.title == "Settings":
-        where = f"GRASPD_{where.upper()}"
-    return f"{where}: {first['msg']}" if where else first["msg"]

@@ -13,12 +13,11 @@ from api.client import key_commands, project_commands, tag_commands, webhook_com
 from api.client.add_commands import add_hand, add_network, add_object
 from api.client.client import Client
 from api.client.datasets import DatasetClient
-from api.client.job_options import pairs
+from api.client.job_options import pairs, validated
 from api.client.reports import (
     UrlOption,
     YesOption,
     confirm,
-    job_request,
     open_client,
     restore,
     say_deleted,
@@ -30,7 +29,7 @@ from api.formatting import count, minute, percent, size
 from api.uploads import MAIN_SUFFIXES, name_of_upload
 from service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
 from service.model.diversity import MIN_DISTANCE_M
-from service.model.domain import AUDITS, NETWORK_METHODS
+from service.model.domain import AUDITS, NETWORK_METHODS, JobRequest
 from service.model.errors import InputError
 from service.model.scene_options import scene_option
 from service.model.states import AssetKind, State
@@ -98,7 +97,8 @@ def submit(
         as_object = partial(_uploaded, client, AssetKind.OBJECT)
         if method in NETWORK_METHODS and "network" in options:
             options["network"] = _uploaded(client, AssetKind.NETWORK, str(options["network"]))
-        request = job_request(
+        request = validated(
+            JobRequest,
             {
                 "hand": _uploaded(client, AssetKind.HAND, hand),
                 "object": as_object(object),
@@ -127,7 +127,7 @@ def submit(
                 "height": height,
                 "channels": channels or [],
                 "friction": friction,
-            }
+            },
         )
         job = client.submit(request)
         if wait:

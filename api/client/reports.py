@@ -7,14 +7,12 @@ from typing import Annotated, Any
 from urllib.parse import quote
 
 import typer
-from pydantic import ValidationError
 
 from api.client.client import Client
 from api.client.watching import JobDisplay
 from api.formatting import count, duration, metric, percent
 from api.models import Diversity, JobDetail
 from service.cli import emit, load_settings, plain_console, plain_table
-from service.model.domain import JobRequest
 from service.model.errors import InputError, TaskError
 from service.model.states import AssetKind, State
 from service.run.address import recorded_address
@@ -68,16 +66,6 @@ def restore(url: str | None, what: str, name: str, *, json: bool) -> None:
         emit({"restored": found["id"], "kind": what})
     else:
         typer.echo(f"{what} {name} is restored")
-
-
-def job_request(values: dict[str, Any]) -> JobRequest:
-    """A job request; InputError names the first option that cannot be used."""
-    try:
-        return JobRequest.model_validate(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        option = f"--{first['loc'][0]}: " if first["loc"] else ""
-        raise InputError(option + first["msg"].removeprefix("Value error, ")) from None
 
 
 def watch(client: Client, job_id: str) -> JobDetail:

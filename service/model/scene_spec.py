@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from service.model.errors import InputError
 from service.model.labels import Digest
+from service.model.refusals import refusal
 
 #: Kinds of scenes; `free` is an object that floats, `file` one whose supports are given.
 SceneKind = Literal["free", "table", "bin", "shelf", "file"]
@@ -218,9 +219,7 @@ def first_mistake(error: ValidationError | TypeError) -> str:
     """What is wrong first, in one line that names the place."""
     if isinstance(error, TypeError):
         return str(error)
-    one = error.errors()[0]
-    place, words = ".".join(str(part) for part in one["loc"]), one["msg"].removeprefix("Value error, ")
-    return f"{place}: {words}" if place else words
+    return refusal(error)
 
 
 def check_quaternion(pose: tuple[float, ...]) -> None:

@@ -20,13 +20,13 @@ from service.cli import (
     plain_console,
     reporting_errors,
     told_to_stop,
-    validation_line,
     write_output,
 )
 from service.model.diversity import CELLS, MIN_DISTANCE_M
 from service.model.domain import JobOptions
 from service.model.errors import InputError, TaskCancelled
 from service.model.fidelity import FIDELITIES
+from service.model.refusals import refusal
 from service.model.robust import MODELS
 from service.model.scene_spec import parse_scene
 from service.store.asset_options import (
@@ -163,7 +163,7 @@ def _request(want: str, budget: float, referee: str, robust: float, models: int)
             want=want, budget=budget, referee=referee, audits=0, robust=robust, robust_models=models
         )  # fmt: skip
     except ValidationError as error:
-        raise InputError(validation_line(error)) from None
+        raise InputError(refusal(error)) from None
 
 
 @contextmanager

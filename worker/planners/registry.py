@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from service.model.errors import InputError
 from service.model.imports import imports
+from service.model.refusals import refusal
 from worker.planners.port import Joined, Method, Options, Planner
 
 if TYPE_CHECKING:
@@ -84,10 +85,8 @@ def _options(name: str, options: Mapping[str, Any] | None) -> Options:
     try:
         return known.options(**(options or {}))
     except ValidationError as error:
-        from service.cli import validation_line  # loads what commands need
-
         there_are = ", ".join(known.options.model_fields) or "none"
-        raise InputError(f"option of {name}: {validation_line(error)}; its options: {there_are}") from None
+        raise InputError(f"option of {name}: {refusal(error)}; its options: {there_are}") from None
 
 
 def of_this_machine(name: str, options: Mapping[str, Any] | None) -> dict[str, Any]:
