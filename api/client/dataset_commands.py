@@ -21,7 +21,8 @@ from api.formatting import count, minute, percent, size
 from service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
 from service.index.dataset_views import DatasetView
 from service.model.errors import InputError, TaskError
-from service.model.states import State
+from service.model.states import AssetKind, State
+from service.model.suggestions import did_you_mean, one_of
 from service.pipeline.datasets.estimate import Estimate
 from service.pipeline.datasets.export import FORMATS
 from service.pipeline.datasets.spec import DatasetRequest, Matrix
@@ -64,7 +65,7 @@ def create(
         datasets = DatasetClient(client)
         files, matrix = _matrix(client, asked)
         request = validated(DatasetRequest, {"name": asked.name, **matrix})
-        found = _estimate(datasets, matrix, files)
+        found = _estimate(client, matrix, files)
         print_estimate(found, console)
         if dry_run:
             _emit(json, estimate=found)
@@ -103,7 +104,7 @@ def estimate(
     asked = wanted(spec, name=None, hands=hands, objects=objects, options=options)
     with open_client(url) as client:
         files, matrix = _matrix(client, asked)
-        found = _estimate(DatasetClient(client), matrix, files)
+        found = _estimate(client, matrix, files)
     if json:
         emit(found)
     else:
@@ -237,7 +238,7 @@ def export(
 ) -> None:
     """Write a snapshot's files into a folder, each checked against its checksum."""
     if format not in FORMATS:
-        raise InputError(f"there is no format {format!r}; there are: {', '.join(FORMATS)}")
+        raise InputError(f"there is no format {format!r}; there are: {one_of(format, FORMATS)}")
     columns = (
         TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[files]}"),
         DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn(),
@@ -281,15 +282,16 @@ def _matrix(client: Client, asked: Wanted) -> tuple[Objects | None, dict[str, An
     return None, asked.shared_out(matrix, len(members))
 
 
-def _estimate(datasets: DatasetClient, matrix: dict[str, Any], files: Objects | None) -> Estimate:
+def _estimate(client: Client, matrix: dict[str, Any], files: Objects | None) -> Estimate:
     """The cost; InputError for a name that nobody knows and that is not about to be uploaded."""
     asked = matrix | {"sets": []} if files is not None else matrix
-    found = datasets.estimate(validated(Matrix, asked))
+    found = DatasetClient(client).estimate(validated(Matrix, asked))
     unknown = [name for name in found.unknown if name not in (files or {})]
     if unknown:
+        known = [one.name for kind in (AssetKind.HAND, AssetKind.OBJECT) for one in client.assets(kind)]
         raise InputError(
-            f"there is no hand or object {', '.join(map(repr, unknown[:5]))}; "
-            "`graspd hands list` and `graspd objects list` show what there is"
+            f"there is no hand or object {', '.join(map(repr, unknown[:5]))}; `graspd hands list` and `graspd objects "
+            f"list` show what there is{did_you_mean(unknown[0], known)}"
         )
     return found
 

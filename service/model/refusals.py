@@ -9,7 +9,7 @@ from typing import Any, Final
 from pydantic import ValidationError
 
 from service.model.labels import NAME
-from service.model.suggestions import did_you_mean
+from service.model.suggestions import one_of
 
 _WORDS: Final = {
     "missing": "is missing",
@@ -48,6 +48,11 @@ def words(entry: Mapping[str, Any]) -> str:
         expected = choices["expected"] if choices else facts["expected"]
         known = re.findall(r"'([^']*)'", expected)
         word = choices["word"] if choices else entry.get("input")
-        return f"must be one of {', '.join(known)}{did_you_mean(str(word), known)}" if known else message
+        return f"must be one of {one_of(str(word), known)}" if known else message
     said = _WORDS.get(entry["type"])
     return said.format(**facts) if said else message
+
+
+def why(error: Exception) -> str:
+    """What a library says of a file, the system's words without their number and the path once more."""
+    return getattr(error, "strerror", None) or str(error)

@@ -14,6 +14,7 @@ from rich.table import Table
 from service.cli import JsonFlag, emit, plain_console, reporting_errors
 from service.model.errors import InputError
 from service.model.robust import MEANINGS, MOST_MODELS
+from service.model.suggestions import one_of
 from worker.files.cases import expand, load_case
 from worker.files.evaluate import Protocol, combine, evaluate
 from worker.files.robust_copies import copy_paths, write_copy
@@ -127,11 +128,11 @@ def evaluate_command(
 def _checked_level(protocol: str, level: str) -> str:
     """The level of a protocol, its own default where none is said; InputError for what is neither's."""
     if protocol not in get_args(Protocol):
-        raise InputError(f"unknown protocol {protocol!r}; choose {', '.join(get_args(Protocol))}")
+        raise InputError(f"unknown protocol {protocol!r}; choose {one_of(protocol, get_args(Protocol))}")
     levels = get_args(LiftLevel if protocol == "lift" else Level)
     level = level or ("lift" if protocol == "lift" else "certificate")
     if level not in levels:
-        raise InputError(f"unknown level {level!r} of protocol {protocol}; choose one of {', '.join(levels)}")
+        raise InputError(f"unknown level {level!r} of protocol {protocol}; choose one of {one_of(level, levels)}")
     return level
 
 

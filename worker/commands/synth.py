@@ -29,6 +29,7 @@ from service.model.fidelity import FIDELITIES
 from service.model.refusals import refusal
 from service.model.robust import MODELS
 from service.model.scene_spec import parse_scene
+from service.model.suggestions import one_of
 from service.store.asset_options import (
     AllowOpenOption,
     CompoundOption,
@@ -117,6 +118,8 @@ def synth(
     """
     if not out.parent.is_dir():
         raise InputError(f"the folder {out.parent} does not exist; create it or choose another --out")
+    if out.is_dir():
+        raise InputError(f"{out} is a folder; name a file in it, such as --out {out / 'grasps.h5'}")
     request = _request(want, budget, referee, robust, robust_models).model_copy(
         update={
             "grasps": grasps, "method": method, "seed": seed,
@@ -155,8 +158,8 @@ def _request(want: str, budget: float, referee: str, robust: float, models: int)
     """Options of a job with these; InputError for a word that is none."""
     if want not in ("valid", "raw"):
         raise InputError(f"unknown --want {want!r}; choose valid or raw")
-    if referee not in (*get_args(Level), "none"):
-        raise InputError(f"unknown referee {referee!r}; choose one of {', '.join(get_args(Level))} or none")
+    if referee not in (levels := (*get_args(Level), "none")):
+        raise InputError(f"unknown referee {referee!r}; choose one of {one_of(referee, levels)}")
     # An audit is a sample that watches over many jobs; a file can be judged by the letter whole.
     try:
         return JobOptions(

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from service.model.errors import InputError
 from service.model.imports import imports
 from service.model.refusals import refusal
+from service.model.suggestions import known_names
 from worker.planners.port import Joined, Method, Options, Planner
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ def method(name: str) -> Method:
         return own
     offered = _offered()
     if name not in offered:
-        raise InputError(f"unknown method {name!r}; there are: {', '.join(method_names())}")
+        raise InputError(f"unknown method {name!r}{known_names(name, method_names())}")
     try:
         found = offered[name].load()
     except Exception as error:
