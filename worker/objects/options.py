@@ -9,6 +9,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from service.model.errors import MeshError
+from service.model.refusals import refusal
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -51,5 +52,4 @@ def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = 
     try:
         return ObjectOptions.model_validate({**stated, **given})
     except ValidationError as error:
-        first = error.errors()[0]
-        raise MeshError(f"asset.json: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise MeshError(f"asset.json: {refusal(error)}") from None

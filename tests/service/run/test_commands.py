@@ -77,7 +77,7 @@ def test_a_bad_model_names_the_field(capsys: pytest.CaptureFixture[str]) -> None
 
     with pytest.raises(typer.Exit):
         command()
-    assert capsys.readouterr().err == "graspd: grasps: Input should be greater than or equal to 1\n"
+    assert capsys.readouterr().err == "graspd: grasps: must be at least 1\n"
 
 
 def test_a_bad_setting_names_its_variable(monkeypatch: pytest.MonkeyPatch) -> None:
