@@ -157,7 +157,7 @@ def rebuild(
     from service.pipeline.identity import identify_if_redis_answers
     from service.pipeline.scrub import scan
 
-    parts = Parts.open(load_settings(data_dir=data_dir), patience=0)
+    parts = Parts.open(load_settings(data_dir=data_dir), patience=0, make=False)
     store, index = parts.store, parts.index
 
     def make() -> dict[str, int]:

@@ -40,7 +40,9 @@ def card(
             raise InputError(f"{source} is a folder; --snapshot goes with the name of a dataset")
         contents = contents_of_folder(Path(source))
     else:
-        contents = contents_of_store(open_store(load_settings(data_dir=data_dir).resolved_store_url), source, snapshot)
+        contents = contents_of_store(
+            open_store(load_settings(data_dir=data_dir).resolved_store_url, make=False), source, snapshot
+        )
     if assets is not None:
         contents = with_provenance(contents, assets)
     columns = (TextColumn("shards"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
