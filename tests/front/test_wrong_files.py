@@ -43,6 +43,8 @@ COMMANDS = (
     "datasets create x --spec FILE.toml",
     "datasets estimate --spec FILE.json",
     "hands check FILE.urdf",
+    "hands check FILE.zip",
+    "objects check FILE.zip",
     "objects check FILE.stl",
     "bench --hand FILE.urdf",
     "bench-render --object FILE.stl",
