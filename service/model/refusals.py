@@ -26,6 +26,7 @@ _WORDS: Final = {
 _NAMES: Final = "must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores"
 #: How pydantic begins: of what, not of which field.
 _SUBJECT: Final = re.compile(r"^(Value error, )|^\w+ should ")
+_CLASS: Final = re.compile(r"_[A-Z]\w*$")
 #: How typer names the choices of an option; pydantic gives them as `expected`.
 _CHOICES: Final = re.compile(r"'(?P<word>.*?)' is not one of (?P<expected>'.*')")
 
@@ -33,7 +34,8 @@ _CHOICES: Final = re.compile(r"'(?P<word>.*?)' is not one of (?P<expected>'.*')"
 def refusal(error: ValidationError) -> str:
     """The first thing that is wrong, after its place: `scene.touch: must be at least -1`."""
     first = error.errors(include_url=False)[0]
-    where = ".".join(str(part) for part in first["loc"])
+    # Of several models that would do, pydantic names the one that it tried.
+    where = ".".join(str(part) for part in first["loc"] if not _CLASS.match(str(part)))
     return f"{where}: {words(first)}" if where else words(first)
 
 
@@ -50,7 +52,8 @@ def words(entry: Mapping[str, Any]) -> str:
         word = choices["word"] if choices else entry.get("input")
         return f"must be one of {one_of(str(word), known)}" if known else message
     said = _WORDS.get(entry["type"])
-    return said.format(**facts) if said else message
+    bounds = {name: f"{value:g}" if isinstance(value, float) else value for name, value in facts.items()}
+    return said.format(**bounds) if said else message
 
 
 def why(error: Exception) -> str:

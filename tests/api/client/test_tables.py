@@ -45,7 +45,7 @@ class Service:
     def jobs(self, **_: Any) -> Any:
         return SimpleNamespace(items=[JOB])
 
-    def assets(self, _: Any) -> Iterator[Any]:
+    def assets(self, _: Any, **__: Any) -> Iterator[Any]:
         yield ASSET
 
     def send(self, _: str, path: str) -> Any:
