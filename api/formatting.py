@@ -80,6 +80,11 @@ def size(value: float | None) -> str:
     return f"{value:.1f} TB"
 
 
+def minute(value: str | None) -> str:
+    """An RFC 3339 time as a table of the command line shows it: `2026-11-26 03:14`, UTC; empty for none."""
+    return (value or "")[:16].replace("T", " ")
+
+
 def stamp(value: str) -> str:
     """What a reader without JavaScript sees of an RFC 3339 time; the script says it relative to now."""
     return datetime.fromisoformat(value).strftime("%Y-%m-%d %H:%M UTC")

@@ -111,7 +111,8 @@ class GraspQuery(BaseModel):
     )
     hand: str | None = Field(None, max_length=64)
     object: str | None = Field(None, max_length=64)
-    valid: bool | None = None
+    judged: bool | None = Field(None, description="whether the referee gave a verdict")
+    valid: bool | None = Field(None, description="false: judged, and not valid")
     success: bool | None = None
     type: Literal["power", "precision", "lateral"] | None = Field(None, description="what the hand does")
     scene: Literal["free", "table", "bin", "shelf", "file", "any"] | None = Field(

@@ -16,6 +16,7 @@ from starlette.exceptions import HTTPException
 from starlette.routing import Match
 
 from service.model.errors import GraspdError, InputError, RateError, StoreUnavailable
+from service.model.refusals import words
 
 MEDIA_TYPE: Final = "application/problem+json"
 RETRY_AFTER_S: Final = 2
@@ -181,7 +182,7 @@ def validation_answer(request: Request, error: RequestValidationError) -> JSONRe
 def _field_error(entry: dict[str, Any]) -> FieldError:
     place, *path = entry["loc"]
     tokens = [str(token).replace("~", "~0").replace("/", "~1") for token in path]
-    message = str(entry["msg"]).removeprefix("Value error, ")
+    message = words(entry)
     if entry["type"] == "json_invalid":
         message = str(entry.get("ctx", {}).get("error", message))
         tokens = []

@@ -11,6 +11,7 @@ from pathlib import PurePosixPath
 from typing import IO, Final
 
 from service.model.errors import InputError, LimitError
+from service.model.fitting_names import refuse_long
 from service.model.states import AssetKind
 from service.store.assets import UNPACK_FACTOR, ZipFiles, asset_json, check_path
 from service.store.descriptions import json_object
@@ -73,10 +74,10 @@ def files_of_upload(
 
 
 def name_of_upload(filename: str) -> str:
-    """A name a user may give, made of a file's name: `My mug (2).stl` is `My-mug-2`."""
+    """A name a user may give, made of a file's name: `My mug (2).stl` is `My-mug-2`; InputError for a long one."""
     leaf = PurePosixPath(filename.replace("\\", "/")).name
     stem = hand_name(leaf) if leaf.lower().endswith(SUFFIXES) else PurePosixPath(leaf).stem
-    return _NAME.sub("-", stem).strip("-._")[:64] or "unnamed"
+    return refuse_long(_NAME.sub("-", stem).strip("-._") or "unnamed")
 
 
 def _network(leaf: str, file: IO[bytes], size: int) -> bytes:

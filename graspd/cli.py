@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import os
+import re
+import sys
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, Final
 
 import typer
+from pydantic import ValidationError
 from typer.core import TyperCommand, TyperGroup
 
 from service.cli import at_the_door
 from service.model.imports import imports, own_process
+from service.model.refusals import words
+from service.model.suggestions import did_you_mean
 from service.model.version import PACKAGE_VERSION
 
 #: Command, module of its group, panel of the overview, help.
@@ -90,8 +95,25 @@ ROOMS: Final[dict[str, tuple[str, str]]] = {
 }
 
 
+#: Of typer's own, or of the click that an older one stands on.
+UsageError: Final[Any] = typer.BadParameter.__base__
+
+
 class LazyGroup(TyperGroup):
     """A group whose overview needs no import: a command's room is imported when the command is called."""
+
+    def main(self, *args: Any, **extra: Any) -> Any:
+        """Run it; what cannot be understood is one line and exit code 2, as any other mistake of a caller."""
+        try:
+            code = super().main(*args, **extra | {"standalone_mode": False})
+        except UsageError as error:
+            code = error.exit_code
+            if said := usage_line(error):  # else it is help, and printed
+                typer.echo(f"graspd: {said}", err=True)
+        except typer.Abort:
+            code = 1
+            typer.echo("graspd: stopped at a question", err=True)
+        sys.exit(code)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         # `graspd bench render` is the benchmark of another room.
@@ -99,7 +121,8 @@ class LazyGroup(TyperGroup):
             args = ["bench-render", *args[2:]]
         name, command, rest = super().resolve_command(ctx, args)
         module = next((module for known, module, _, _ in COMMANDS if known == name), None)
-        if module is None or name is None:
+        # Completion says nothing of what is not installed.
+        if module is None or name is None or (ctx.resilient_parsing and missing_extra(module)):
             return name, command, rest
         # A worker's image has no API, but checks hands and objects.
         room = next((room for parent, child, room, _ in JOINED if [parent, child] == [name, *rest[:1]]), None)
@@ -129,12 +152,41 @@ def load(module: str, name: str, ctx: Any = None) -> Any:
     with imports():
         group: Any = typer.main.get_command(import_module(module).app)
     # A Typer with a single command is that command itself, not a group.
-    command = group.get_command(ctx, name) if isinstance(group, TyperGroup) else group
+    command: Any = group.get_command(ctx, name) if isinstance(group, TyperGroup) else group
     if isinstance(command, TyperGroup):
         for parent, child, room, text in JOINED:
             if parent == name:
                 command.add_command(Deferred(child, room, text))
+    # A Typer of one command offers completion of its own, which would install that of `graspd`.
+    command.params = [one for one in command.params if not str(one.name).endswith("_completion")]
+    escape_help(command)
     return command
+
+
+def usage_line(error: Any) -> str:
+    """What is wrong with the words of a command line, and where it says which are right."""
+    said = re.sub(r"\.?\s*Did you mean (.*)\?", r"; did you mean \1?", error.format_message()).rstrip(".")
+    if hasattr(error, "possibilities"):
+        said = f"there is no option {error.option_name}{did_you_mean(error.option_name, error.possibilities or ())}"
+    elif isinstance(error.__cause__, ValidationError):
+        said = f"{max(error.param.opts, key=len)}: {words(error.__cause__.errors()[0])}"
+    else:
+        said = said[:1].lower() + said[1:].replace("'", "")
+    hint = f"; see `{error.ctx.command_path} --help`" if error.ctx and said and not said.endswith("?") else ""
+    return " ".join(f"{said}{hint}".split())
+
+
+def escape_help(command: Any) -> None:
+    """Keep the brackets of a command and of all below it: typer reads help as Rich markup, and `[mm]` as a style.
+
+    `rich.markup.escape` does the same, and takes longer to import than most commands to start.
+    """
+    for one in (command, *command.params):
+        for name in ("help", "short_help", "epilog"):
+            if text := getattr(one, name, None):
+                setattr(one, name, re.sub(r"\[[a-z#/@][^\[]*?\]", r"\\\g<0>", text))
+    for inner in getattr(command, "commands", {}).values():
+        escape_help(inner)
 
 
 def missing_extra(module: str) -> str | None:
@@ -150,7 +202,6 @@ def build() -> typer.Typer:
         help="A grasp-dataset factory: stable, contact-rich multi-finger grasps by differentiable simulation.",
         epilog="Try `graspd demo`, or `graspd COMMAND --help`.",
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
     )
 

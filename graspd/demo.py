@@ -13,11 +13,12 @@ from rich.console import Console
 from rich.table import Table
 
 from api.client.client import Client
-from api.client.reports import job_request, job_summary, means_of, yield_of
+from api.client.job_options import validated
+from api.client.reports import job_summary, means_of, yield_of
 from api.client.watching import JobDisplay
 from api.formatting import count, duration, metric
 from api.models import GraspQuery, JobDetail
-from service.cli import JsonFlag, emit, load_settings, reporting_errors, write_output
+from service.cli import JsonFlag, emit, load_settings, plain_console, reporting_errors, write_output
 from service.index.views import GraspView
 from service.model.domain import JobRequest
 from service.model.errors import TaskError
@@ -65,18 +66,19 @@ def demo(
     json: JsonFlag = False,
 ) -> None:
     """The main job on built-in data: grasps, scenes, pictures, and a page that shows them."""
-    request = job_request(
+    request = validated(
+        JobRequest,
         {
             "hand": hand, "object": object, "grasps": grasps, "scenes": scenes, "views": views,
             "stereo": views > 0, "fidelity": fidelity, "seed": seed,
         }
     )  # fmt: skip
-    console = Console(stderr=json, highlight=False)
+    console = plain_console(stderr=json)
     out.mkdir(parents=True, exist_ok=True)
     settings = load_settings(data_dir=out / "service", host="127.0.0.1", port=0)
     with Supervisor(settings, workers=1) as service:
         with console.status("starting Redis, API, keeper and a worker"):
-            service.wait_ready(say=lambda line: console.print(line, markup=False, soft_wrap=True))
+            service.wait_ready(say=lambda line: console.print(line, soft_wrap=True))
         console.print(f"the service runs at {service.api_url} until the job is done")
         with Client(service.api_url) as client:
             job, top, files = run(client, request, out, console)

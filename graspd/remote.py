@@ -8,9 +8,9 @@ from typing import Any, Self
 from pydantic import ValidationError
 
 from graspd.grasps import Grasps, joined
-from service.cli import validation_line
 from service.model.domain import JobRequest
 from service.model.errors import InputError, TaskError
+from service.model.refusals import refusal
 from service.model.states import State
 from service.store.shards import read_shard
 
@@ -58,7 +58,7 @@ class Client:
         try:
             request = JobRequest.model_validate({"hand": hand, "object": object, **options})
         except ValidationError as error:
-            raise InputError(validation_line(error)) from None
+            raise InputError(refusal(error)) from None
         return Job(self._http, self._http.submit(request))
 
     def job(self, job_id: str) -> Job:

@@ -9,10 +9,10 @@ from typing import Any, Literal
 from pydantic import ValidationError
 
 from graspd.grasps import Grasps
-from service.cli import validation_line
 from service.model.diversity import MIN_DISTANCE_M
 from service.model.domain import JobOptions
 from service.model.errors import InputError
+from service.model.refusals import refusal
 from service.model.scene_spec import parse_scene
 
 
@@ -100,7 +100,7 @@ def synthesize(
             robust_models=robust_models, mass=mass, density=density, object_friction=object_friction,
         )  # fmt: skip
     except ValidationError as error:
-        raise InputError(validation_line(error)) from None
+        raise InputError(refusal(error)) from None
     request = request.model_copy(update={"fidelity": chosen_fidelity(fidelity)})
     place = parse_scene(str(scene), faces=faces, touch=touch, beside=[str(one) for one in beside])
     made = synthesized(

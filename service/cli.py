@@ -11,7 +11,7 @@ import os
 import signal
 import stat
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, ParamSpec, TextIO, TypeVar
@@ -21,8 +21,12 @@ from pydantic import BaseModel, ValidationError
 
 from service.model.errors import GraspdError, InputError
 from service.model.redaction import without_secrets
+from service.model.refusals import refusal
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
     from service.settings import Settings
 
 P = ParamSpec("P")
@@ -41,7 +45,7 @@ def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
         except GraspdError as error:
             fail(str(error), error.exit_code)
         except ValidationError as error:
-            fail(validation_line(error), InputError.exit_code)
+            fail(refusal(error), InputError.exit_code)
         except BrokenPipeError:
             _silence(sys.stdout)  # the reader (head, less) has enough
             raise typer.Exit(0) from None
@@ -147,6 +151,27 @@ def fail(message: str, code: int) -> NoReturn:
     raise typer.Exit(code)
 
 
+def plain_console(*, stderr: bool = False) -> Console:
+    """A terminal that prints names, paths and messages as they are; Rich reads `[red]` as a style, `:x:` as a sign."""
+    from rich.console import Console  # what draws need not be loaded where nothing is drawn
+
+    return Console(stderr=stderr, markup=False, emoji=False, highlight=False)
+
+
+def plain_table(*headings: str, whole: Collection[str] = ()) -> Table:
+    """A table that cuts nothing at 80 columns: long names break.
+
+    Args:
+        whole: columns that keep their cells on one line, such as ids and times.
+    """
+    from rich.table import Table
+
+    table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
+    for name in headings:
+        table.add_column(name, no_wrap=name in whole, overflow="fold")
+    return table
+
+
 def emit(value: BaseModel | dict[str, Any]) -> None:
     """One JSON object on one line of stdout."""
     plain = value.model_dump(mode="json") if isinstance(value, BaseModel) else value
@@ -160,7 +185,8 @@ def load_settings(**overrides: Any) -> Settings:
     try:
         return Settings(**{name: value for name, value in overrides.items() if value is not None})
     except ValidationError as error:
-        raise InputError(validation_line(error)) from None
+        place, said = error.errors()[0]["loc"], refusal(error)
+        raise InputError(f"GRASPD_{place[0]}".upper() + said.removeprefix(str(place[0])) if place else said) from None
 
 
 @dataclass(frozen=True)
@@ -197,12 +223,3 @@ def keep_private(settings: Settings) -> None:
         status = settings.data_dir.stat()
         if status.st_uid == os.getuid() and stat.S_IMODE(status.st_mode) != 0o700:
             settings.data_dir.chmod(0o700)
-
-
-def validation_line(error: ValidationError) -> str:
-    """The first thing that is wrong with a model's input, in a line."""
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    if error.title == "Settings":
-        where = f"GRASPD_{where.upper()}"
-    return f"{where}: {first['msg']}" if where else first["msg"]

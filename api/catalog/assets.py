@@ -15,6 +15,7 @@ from service.index.views import AssetView, Page
 from service.model import names
 from service.model.digests import digest_files
 from service.model.errors import ConflictError, DamagedError, LimitError, NotFoundError
+from service.model.fitting_names import MOST, fitted
 from service.model.projects import marks_of
 from service.model.states import AssetKind
 from service.pipeline import deletion
@@ -28,7 +29,6 @@ from service.store.network_check import network_report
 from service.store.seals import get_sealed, put_document
 
 log = logging.getLogger(__name__)
-_MAX_NAME: Final = 64
 _NAMES_TRIED: Final = 100
 
 
@@ -156,7 +156,7 @@ class Assets:
         stem, _, number = name.rpartition("-")
         stem, first = (stem, int(number) + 1) if stem and number.isdigit() and len(number) < 4 else (name, 2)
         for tried in range(first, first + _NAMES_TRIED):
-            named = f"{stem[: _MAX_NAME - 5]}-{tried}"
+            named = f"{fitted(stem, MOST - 5)}-{tried}"
             if not self._holder(kind, named):
                 return named
         raise ConflictError(f"there are many {kind.value}s named {stem}-...; choose a name")

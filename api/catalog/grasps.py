@@ -143,6 +143,7 @@ def _bounded(query: GraspQuery) -> GraspFilter:
         scene=query.scene,
         neighbours=query.neighbours,
         lift_hard=query.lift_hard,
+        judged=query.judged,
         pushes_held=query.pushes_held,
         robust_weakest=query.robust_weakest,
         at_least=bounds["min"],

@@ -8,19 +8,16 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from api.client import key_commands, project_commands, tag_commands, webhook_commands
 from api.client.add_commands import add_hand, add_network, add_object
 from api.client.client import Client, path_of
 from api.client.datasets import DatasetClient
-from api.client.job_options import pairs
+from api.client.job_options import pairs, validated
 from api.client.reports import (
     UrlOption,
     YesOption,
     confirm,
-    job_request,
     open_client,
     restore,
     say_deleted,
@@ -28,11 +25,11 @@ from api.client.reports import (
     show_job,
     watch,
 )
-from api.formatting import count, percent, size
+from api.formatting import count, minute, percent, size
 from api.uploads import MAIN_SUFFIXES, name_of_upload
-from service.cli import JsonFlag, emit, reporting_errors
+from service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
 from service.model.diversity import MIN_DISTANCE_M
-from service.model.domain import AUDITS, NETWORK_METHODS
+from service.model.domain import AUDITS, NETWORK_METHODS, JobRequest
 from service.model.errors import InputError
 from service.model.scene_options import scene_option
 from service.model.states import AssetKind, State
@@ -104,7 +101,8 @@ def submit(
         as_object = partial(_uploaded, client, AssetKind.OBJECT)
         if method in NETWORK_METHODS and "network" in options:
             options["network"] = _uploaded(client, AssetKind.NETWORK, str(options["network"]))
-        request = job_request(
+        request = validated(
+            JobRequest,
             {
                 "hand": _uploaded(client, AssetKind.HAND, hand),
                 "object": as_object(object),
@@ -136,7 +134,7 @@ def submit(
                 "mass": mass,
                 "density": density,
                 "object_friction": object_friction,
-            }
+            },
         )
         job = client.submit(request)
         if wait:
@@ -158,14 +156,14 @@ def jobs(
     if json:
         emit({"jobs": [job.model_dump(mode="json") for job in page.items], "next": page.next})
         return
-    table = Table("job", "state", "hand", "object", "progress", "grasps", box=None, header_style="bold")
-    table.add_column("created", no_wrap=True)
+    names = ("job", "state", "hand", "object", "progress", "grasps", "created")
+    table = plain_table(*names, whole=("job", "state", "created"))
     for job in page.items:
         made = job.valid if job.standing == "valid" else job.grasps
         done = f"{count(made)} of {count(job.requested)} {job.standing}"
-        created = job.created[:16].replace("T", " ")
-        table.add_row(job.id[:12], job.state, job.hand, job.object, percent(job.progress), done, created)
-    Console().print(table if page.items else "no job yet; `graspd submit --hand allegro --object mug` makes one")
+        pair, last = (job.hand, job.object), (percent(job.progress), done, minute(job.created))
+        table.add_row(job.id[:12], job.state, *pair, *last)
+    plain_console().print(table if page.items else "no job yet; `graspd submit --hand allegro --object mug` makes one")
 
 
 @app.command(epilog="graspd status 3f2a --json")
@@ -234,16 +232,14 @@ def logs(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> 
     if json:
         emit({"job": job.id, "attempts": [attempt.model_dump(mode="json") for attempt in job.attempts]})
         return
-    console = Console(highlight=False)
+    console = plain_console()
     if not job.attempts:
         console.print("no attempt has failed")
     for attempt in job.attempts:
-        console.print(
-            f"{attempt.ended}  task {attempt.task_id[:8]}  attempt {attempt.number}  {attempt.worker}", markup=False
-        )
-        console.print(f"    {attempt.kind}: {attempt.reason}", markup=False)
+        console.print(f"{attempt.ended}  task {attempt.task_id[:8]}  attempt {attempt.number}  {attempt.worker}")
+        console.print(f"    {attempt.kind}: {attempt.reason}")
         if attempt.trace:
-            console.print("\n".join("    " + line for line in attempt.trace.splitlines()), style="dim", markup=False)
+            console.print("\n".join("    " + line for line in attempt.trace.splitlines()), style="dim")
 
 
 def asset_commands(kind: AssetKind) -> typer.Typer:
@@ -266,14 +262,14 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
             return
         # Files of networks have one name.
         second = "hand" if kind is AssetKind.NETWORK else "file"
-        table = Table("name", second, "size", "check", "digest", box=None, header_style="bold")
+        table = plain_table("name", second, "size", "check", "digest", whole=("size", "digest"))
         for asset in assets:
             origin = "built-in" if asset.builtin else (asset.verdict or "waiting")
             if says := self_test_line(asset.facts):
                 origin += f"; {says}"
             named = hand_line(asset.facts) if kind is AssetKind.NETWORK else asset.filename
             table.add_row(asset.name, named, size(asset.size_bytes), origin, asset.digest[:12])
-        Console().print(table)
+        plain_console().print(table)
 
     @group.command("show")
     @reporting_errors
@@ -330,12 +326,12 @@ def sets(url: UrlOption = None, json: JsonFlag = False) -> None:
     if json:
         emit({"sets": [one.model_dump(mode="json") for one in found]})
         return
-    table = Table("set", "objects", "", box=None, header_style="bold")
+    table = plain_table("set", "objects", "")
     for one in found:
         table.add_row(
             one.name, count(len(one.objects)), ", ".join(one.objects[:5]) + (", ..." * (len(one.objects) > 5))
         )
-    Console().print(table if found else "no set yet; `graspd objects add FOLDER` makes one")
+    plain_console().print(table if found else "no set yet; `graspd objects add FOLDER` makes one")
 
 
 app.add_typer(hands_app, name="hands")

@@ -9,7 +9,6 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
-from rich.table import Table
 
 from api.client.add_sets import name_of_set, upload_set
 from api.client.client import Client, path_of
@@ -18,11 +17,12 @@ from api.client.dataset_specs import SpecOption, Wanted, wanted
 from api.client.datasets import DatasetClient
 from api.client.job_options import validated, with_job_options
 from api.client.reports import UrlOption, YesOption, confirm, open_client, restore, say_deleted
-from api.formatting import count, percent, size
-from service.cli import JsonFlag, emit, reporting_errors
+from api.formatting import count, minute, percent, size
+from service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
 from service.index.dataset_views import DatasetView
 from service.model.errors import InputError, TaskError
-from service.model.states import State
+from service.model.states import AssetKind, State
+from service.model.suggestions import did_you_mean, one_of
 from service.pipeline.datasets.estimate import Estimate
 from service.pipeline.datasets.export import FORMATS
 from service.pipeline.datasets.spec import DatasetRequest, Matrix
@@ -57,7 +57,7 @@ def create(
     json: JsonFlag = False,
 ) -> None:
     """Make a dataset: a job for each hand and object. The same command again goes on where it was."""
-    console = Console(stderr=json)
+    console = plain_console(stderr=json)
     asked = wanted(spec, name=name, hands=hands, objects=objects, options=options)
     if not asked.name:
         raise InputError("say a name: graspd datasets create NAME, or name in the file of --spec")
@@ -65,7 +65,7 @@ def create(
         datasets = DatasetClient(client)
         files, matrix = _matrix(client, asked)
         request = validated(DatasetRequest, {"name": asked.name, **matrix})
-        found = _estimate(datasets, matrix, files)
+        found = _estimate(client, matrix, files)
         print_estimate(found, console)
         if dry_run:
             _emit(json, estimate=found)
@@ -79,11 +79,11 @@ def create(
             request = validated(DatasetRequest, {"name": asked.name, **matrix, "objects": []})
         dataset = datasets.create(request)
         if wait:
-            dataset = watch_dataset(datasets, asked.name, Console(stderr=True))
+            dataset = watch_dataset(datasets, asked.name, plain_console(stderr=True))
     _emit(json, estimate=found, dataset=dataset, refused=refused)
     if not json:
         if refused:
-            console.print(f"left out, because refused: {', '.join(refused)}", markup=False, soft_wrap=True)
+            console.print(f"left out, because refused: {', '.join(refused)}", soft_wrap=True)
         print_dataset(dataset, console)
         console.print(f"`graspd datasets status {asked.name}` shows each cell", style="dim")
     _must_succeed(dataset, asked=wait)
@@ -104,11 +104,11 @@ def estimate(
     asked = wanted(spec, name=None, hands=hands, objects=objects, options=options)
     with open_client(url) as client:
         files, matrix = _matrix(client, asked)
-        found = _estimate(DatasetClient(client), matrix, files)
+        found = _estimate(client, matrix, files)
     if json:
         emit(found)
     else:
-        print_estimate(found, Console())
+        print_estimate(found, plain_console())
 
 
 @group.command("list", epilog="graspd datasets list")
@@ -124,13 +124,23 @@ def list_datasets(
     if json:
         emit({"datasets": [dataset.model_dump(mode="json") for dataset in page.items], "next": page.next})
         return
-    table = Table("dataset", "state", "cells", "progress", "grasps", "size", "created", box=None, header_style="bold")
+    table = plain_table(
+        "dataset", "state", "cells", "progress", "grasps", "size", "created", whole=("state", "size", "created")
+    )
     for one in page.items:
         made = f"{count(one.counted)} {one.options.standing} of {count(one.asked)}"
         cells = count(one.cells)
-        table.add_row(one.name, one.state, cells, percent(one.progress), made, size(one.size_bytes), one.created)
+        table.add_row(
+            one.name,
+            one.state,
+            cells,
+            percent(one.progress),
+            made,
+            size(one.size_bytes),
+            minute(one.created),
+        )
     empty = "no dataset yet; `graspd datasets create NAME --hands allegro --objects mug,bottle` makes one"
-    Console().print(table if page.items else empty)
+    plain_console().print(table if page.items else empty)
 
 
 @group.command(epilog="graspd datasets status kitchen --state failed")
@@ -148,8 +158,8 @@ def status(
     if json:
         emit({**dataset.model_dump(mode="json"), "matrix": [cell.model_dump(mode="json") for cell in cells]})
         return
-    print_dataset(dataset, Console())
-    print_cells(dataset, cells, Console(highlight=False))
+    print_dataset(dataset, plain_console())
+    print_cells(dataset, cells, plain_console())
 
 
 @group.command(epilog="graspd datasets cancel kitchen")
@@ -195,7 +205,7 @@ def retry(name: NameArgument, wait: WaitOption = False, url: UrlOption = None, j
     with open_client(url) as client:
         dataset = DatasetClient(client).retry(name)
         if wait:
-            dataset = watch_dataset(DatasetClient(client), name, Console(stderr=True))
+            dataset = watch_dataset(DatasetClient(client), name, plain_console(stderr=True))
     _show(dataset, json=json)
     _must_succeed(dataset, asked=wait)
 
@@ -228,15 +238,15 @@ def export(
 ) -> None:
     """Write a snapshot's files into a folder, each checked against its checksum."""
     if format not in FORMATS:
-        raise InputError(f"there is no format {format!r}; there are: {', '.join(FORMATS)}")
+        raise InputError(f"there is no format {format!r}; there are: {one_of(format, FORMATS)}")
     columns = (
-        TextColumn(name), BarColumn(), TextColumn("{task.fields[files]}"), DownloadColumn(), TransferSpeedColumn(),
-        TimeRemainingColumn(),
+        TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[files]}"),
+        DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn(),
     )  # fmt: skip
     with open_client(url) as client:
         datasets = DatasetClient(client)
         taken = datasets.snapshot(name, snapshot or datasets.take_snapshot(name).digest)
-        console = Console(stderr=True)
+        console = plain_console(stderr=True)
         with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
             bar = progress.add_task(name, total=taken.size_bytes, files="")
 
@@ -272,22 +282,23 @@ def _matrix(client: Client, asked: Wanted) -> tuple[Objects | None, dict[str, An
     return None, asked.shared_out(matrix, len(members))
 
 
-def _estimate(datasets: DatasetClient, matrix: dict[str, Any], files: Objects | None) -> Estimate:
+def _estimate(client: Client, matrix: dict[str, Any], files: Objects | None) -> Estimate:
     """The cost; InputError for a name that nobody knows and that is not about to be uploaded."""
     asked = matrix | {"sets": []} if files is not None else matrix
-    found = datasets.estimate(validated(Matrix, asked))
+    found = DatasetClient(client).estimate(validated(Matrix, asked))
     unknown = [name for name in found.unknown if name not in (files or {})]
     if unknown:
+        known = [one.name for kind in (AssetKind.HAND, AssetKind.OBJECT) for one in client.assets(kind)]
         raise InputError(
-            f"there is no hand or object {', '.join(map(repr, unknown[:5]))}; "
-            "`graspd hands list` and `graspd objects list` show what there is"
+            f"there is no hand or object {', '.join(map(repr, unknown[:5]))}; `graspd hands list` and `graspd objects "
+            f"list` show what there is{did_you_mean(unknown[0], known)}"
         )
     return found
 
 
 def _upload(client: Client, files: Objects, set_name: str, console: Console) -> list[str]:
     """Send the objects of a folder and make them a set; returns those that are refused and so left out."""
-    told = upload_set(client, files, say=lambda line: console.print(line, markup=False, soft_wrap=True))
+    told = upload_set(client, files, say=lambda line: console.print(line, soft_wrap=True))
     taken = [one["name"] for one in told if one["verdict"] != "refuse"]
     if not taken:
         raise InputError(f"none of the {len(told)} objects can be used; see above why")
@@ -310,7 +321,7 @@ def _show(dataset: DatasetView, *, json: bool) -> None:
     if json:
         emit(dataset)
     else:
-        print_dataset(dataset, Console())
+        print_dataset(dataset, plain_console())
 
 
 def _must_succeed(dataset: DatasetView, *, asked: bool) -> None:

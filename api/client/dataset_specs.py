@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 from api.client.job_options import pairs, validated
 from service.model.domain import JobOptions, Name
 from service.model.errors import InputError
+from service.model.refusals import why
 from service.model.scene_options import known_name, scene_option
 
 SpecOption = Annotated[
@@ -98,7 +99,7 @@ def read_spec(file: Path) -> dict[str, Any]:
     try:
         text = file.read_text()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        raise InputError(f"{file} cannot be read: {why(error)}") from None
     try:
         found = json.loads(text) if file.suffix == ".json" else tomllib.loads(text)
     except (ValueError, RecursionError) as error:

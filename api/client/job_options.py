@@ -6,7 +6,7 @@ import functools
 import inspect
 import math
 from collections.abc import Callable, Iterable
-from typing import Annotated, Any, Final, Literal, get_origin
+from typing import Annotated, Any, Final, Literal, TypeVar, get_origin
 
 import typer
 from pydantic import BaseModel, ValidationError
@@ -15,6 +15,9 @@ from pydantic.fields import FieldInfo
 from service.model.domain import JobOptions
 from service.model.errors import InputError
 from service.model.fidelity import OFFERED
+from service.model.refusals import words
+
+ModelT = TypeVar("ModelT", bound=BaseModel)
 
 _HELP: Final = {
     "grasps": "Grasps for each hand and object.",
@@ -29,7 +32,8 @@ _HELP: Final = {
     "faces": "In a scene: drawn, as drops fall, or all, a scene for each stable face.",
 }
 _SHORT: Final = {"grasps": "-n"}
-_FLAGS: Final = {"options": "--option", "neighbours": "--with"}
+#: Where a field goes by another word; the name of a dataset is an argument.
+_FLAGS: Final = {"options": "--option", "neighbours": "--with", "name": "NAME"}
 
 
 def with_job_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -69,20 +73,20 @@ def _number(text: str) -> str | int | float:
     return text
 
 
-def validated(model: type[BaseModel], values: dict[str, Any]) -> Any:
+def validated(model: type[ModelT], values: dict[str, Any]) -> ModelT:
     """A model of what was given; InputError names the first option that cannot be used."""
     try:
         return model.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
-        option = f"--{str(first['loc'][0]).replace('_', '-')}: " if first["loc"] else ""
-        raise InputError(option + first["msg"].removeprefix("Value error, ")) from None
+        name = str(first["loc"][0]) if first["loc"] else ""
+        option = _FLAGS.get(name, f"--{name.replace('_', '-')}")
+        raise InputError(f"{option}: {words(first)}" if name else words(first)) from None
 
 
 def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:
     said = field.description or name
     words = _HELP.get(name) or f"{said[0].upper()}{said[1:]}."
-    words = words.replace("[", "(").replace("]", ")")  # the terminal takes brackets for markup
     if get_origin(field.annotation) is tuple:
         words += " Several times."
     flags = [_FLAGS.get(name, f"--{name.replace('_', '-')}"), *([_SHORT[name]] if name in _SHORT else [])]

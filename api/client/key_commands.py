@@ -7,11 +7,10 @@ from datetime import timedelta
 from typing import Annotated, Final
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from api.access.keys import Key, KeyFile, KeyLimits, Scope
-from service.cli import JsonFlag, emit, load_settings, reporting_errors
+from api.formatting import minute
+from service.cli import JsonFlag, emit, load_settings, plain_console, plain_table, reporting_errors
 from service.model.errors import InputError
 
 app = typer.Typer(no_args_is_help=True, help="Make, list, rotate, limit and revoke API keys.")
@@ -96,12 +95,12 @@ def list_keys(json: JsonFlag = False) -> None:
         return
     has_projects = any(key.project for key in found)
     names = ["name", "scope", *(["project"] if has_projects else []), "state", "created", "expires", "limits"]
-    table = Table(*names, box=None, header_style="bold")
+    table = plain_table(*names, whole=("state", "created", "expires"))
     for key in found:
         of = [key.project or "-"] if has_projects else []
-        times = key.created[:16], (key.expires or "")[:16]
+        times = minute(key.created), minute(key.expires)
         table.add_row(key.name, key.scope, *of, _state(key), *times, _shown(key.limits))
-    Console().print(table if found else "no key; the service is open and answers on this machine only")
+    plain_console().print(table if found else "no key; the service is open and answers on this machine only")
 
 
 @app.command("revoke", epilog="graspd keys revoke alice")

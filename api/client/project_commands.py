@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from api.access.keys import KeyFile, ProjectLimits
-from service.cli import JsonFlag, emit, load_settings, reporting_errors
+from service.cli import JsonFlag, emit, load_settings, plain_console, plain_table, reporting_errors
 from service.model.errors import InputError
 
 app = typer.Typer(no_args_is_help=True, help="List projects of keys, and limit what each may use.")
@@ -32,10 +30,10 @@ def list_projects(json: JsonFlag = False) -> None:
         ]
         emit({"projects": rows})
         return
-    table = Table("project", "keys", "limits", box=None, header_style="bold")
+    table = plain_table("project", "keys", "limits")
     for name, limits in found.items():
         table.add_row(name, ", ".join(live.get(name, [])) or "none that opens", _shown(limits))
-    Console().print(table if found else "no project yet; `graspd keys add NAME --project PROJECT` makes one")
+    plain_console().print(table if found else "no project yet; `graspd keys add NAME --project PROJECT` makes one")
 
 
 @app.command("limit", epilog="graspd projects limit vision --grasps-per-day 1000000 --gpu-seconds-per-day 86400")

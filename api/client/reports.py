@@ -6,16 +6,12 @@ import sys
 from typing import Annotated, Any
 
 import typer
-from pydantic import ValidationError
-from rich.console import Console
-from rich.table import Table
 
 from api.client.client import Client, path_of
 from api.client.watching import JobDisplay
 from api.formatting import count, duration, metric, percent, worker_time
 from api.models import Diversity, JobDetail
-from service.cli import emit, load_settings
-from service.model.domain import JobRequest
+from service.cli import emit, load_settings, plain_console, plain_table
 from service.model.errors import InputError, TaskError
 from service.model.states import AssetKind, State
 from service.run.address import recorded_address
@@ -71,19 +67,9 @@ def restore(url: str | None, what: str, name: str, *, json: bool) -> None:
         typer.echo(f"{what} {name} is restored")
 
 
-def job_request(values: dict[str, Any]) -> JobRequest:
-    """A job request; InputError names the first option that cannot be used."""
-    try:
-        return JobRequest.model_validate(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        option = f"--{first['loc'][0]}: " if first["loc"] else ""
-        raise InputError(option + first["msg"].removeprefix("Value error, ")) from None
-
-
 def watch(client: Client, job_id: str) -> JobDetail:
     """The job in its final state, with progress on standard error meanwhile."""
-    with JobDisplay(Console(stderr=True)) as display:
+    with JobDisplay(plain_console(stderr=True)) as display:
         return client.wait(job_id, display.update)
 
 
@@ -133,17 +119,17 @@ def show_asset(asset: dict[str, Any], *, json: bool) -> None:
     if json:
         emit(asset)
         return
-    console = Console(highlight=False)
+    console = plain_console()
     # A built-in one came with the service: its time is that of the release.
     times = () if asset.get("builtin") else ("created",)
     for name in ("name", "kind", "filename", "size_bytes", "digest", *times, "verdict", "message"):
         if asset.get(name) is not None:
-            console.print(f"{name:<18} {asset[name]}", markup=False, soft_wrap=True)
+            console.print(f"{name:<18} {asset[name]}", soft_wrap=True)
     for line in asset.get("repairs", []):
-        console.print(f"{'repair':<18} {line}", markup=False, soft_wrap=True)
+        console.print(f"{'repair':<18} {line}", soft_wrap=True)
     facts = asset.get("facts", {})
     for line in summary(AssetKind(asset["kind"]), facts) or [f"{name:<18} {value}" for name, value in facts.items()]:
-        console.print(line, markup=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)
 
 
 def yield_of(job: JobDetail) -> str:
@@ -174,15 +160,15 @@ def diversity_of(found: Diversity) -> str:
 
 
 def _print_job(job: JobDetail, url: str) -> None:
-    console = Console(highlight=False)
-    console.print(f"{job.hand} × {job.object}  {job.state.value}  {url}/jobs/{job.id}", markup=False, soft_wrap=True)
+    console = plain_console()
+    console.print(f"{job.hand} × {job.object}  {job.state.value}  {url}/jobs/{job.id}", soft_wrap=True)
     if job.choice:
-        console.print(f"fidelity: {job.fidelity}, {job.choice}", markup=False, soft_wrap=True)
+        console.print(f"fidelity: {job.fidelity}, {job.choice}", soft_wrap=True)
     if job.reason:
-        console.print(f"reason: {job.reason}", markup=False, soft_wrap=True)
+        console.print(f"reason: {job.reason}", soft_wrap=True)
     if job.note and job.note != job.reason:
-        console.print(f"note: {job.note}", markup=False)
-    table = Table("stage", "state", "batches", "progress", "worker time", "left", box=None, header_style="bold")
+        console.print(f"note: {job.note}")
+    table = plain_table("stage", "state", "batches", "progress", "worker time", "left")
     for stage in job.stages:
         done = f"{stage.succeeded} of {stage.tasks}"
         table.add_row(
@@ -190,6 +176,6 @@ def _print_job(job: JobDetail, url: str) -> None:
         )
     console.print(table)
     if job.grasps:
-        console.print(f"{yield_of(job)}; {means_of(job)}", markup=False)
+        console.print(f"{yield_of(job)}; {means_of(job)}")
         if job.diversity:
-            console.print(diversity_of(job.diversity), markup=False)
+            console.print(diversity_of(job.diversity))

@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from api.client.client import path_of
 from api.client.reports import UrlOption, YesOption, confirm, open_client, restore, say_deleted
-from api.formatting import count
-from service.cli import JsonFlag, emit, reporting_errors
+from api.formatting import count, minute
+from service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
 from service.model.errors import InputError
 
 app = typer.Typer(no_args_is_help=True, help="Names for grasps of the service, to find them and take them home.")
@@ -42,10 +40,12 @@ def list_tags(url: UrlOption = None, json: JsonFlag = False) -> None:
     if json:
         emit({"tags": found})
         return
-    table = Table("tag", "grasps", "changed", box=None, header_style="bold")
+    table = plain_table("tag", "grasps", "changed", whole=("grasps", "changed"))
     for one in found:
-        table.add_row(one["name"], count(one["grasps"]), one["changed"][:16])
-    Console().print(table if found else "no tag yet; `graspd tags add TAG --where EXPRESSION` gives one to grasps")
+        table.add_row(one["name"], count(one["grasps"]), minute(one["changed"]))
+    plain_console().print(
+        table if found else "no tag yet; `graspd tags add TAG --where EXPRESSION` gives one to grasps"
+    )
 
 
 @app.command("add", epilog='graspd tags add good --dataset kitchen --where "epsilon > 0.3 and lift"')

@@ -38,7 +38,7 @@ class JobDisplay:
             TextColumn("{task.percentage:>3.0f} %"),
             _Rate(),
             TimeRemainingColumn(compact=True, elapsed_when_finished=True),
-            TextColumn("[dim]{task.fields[message]}"),
+            TextColumn("{task.fields[message]}", style="dim", markup=False),
             console=console,
             disable=not console.is_terminal,
         )
@@ -83,7 +83,7 @@ class JobDisplay:
         if stage.state is state and (state is not State.RUNNING or now - at < _LINE_EVERY_S):
             return
         self._said[stage.stage] = (now, stage.state)
-        self._console.print(self._line(stage, job, now), highlight=False)
+        self._console.print(self._line(stage, job, now))
 
     def _line(self, stage: StageStatus, job: Job, now: float) -> str:
         elapsed = now - self._started.get(stage.stage, now)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from api.client.client import path_of
 from api.client.reports import UrlOption, YesOption, confirm, open_client, say_deleted
-from service.cli import JsonFlag, emit, reporting_errors
+from api.formatting import minute
+from service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
 
 app = typer.Typer(no_args_is_help=True, help="Addresses that are told when jobs and datasets end.")
 
@@ -45,10 +44,10 @@ def list_webhooks(url: UrlOption = None, json: JsonFlag = False) -> None:
     if json:
         emit({"webhooks": found})
         return
-    table = Table("id", "address", "on", "since", box=None, header_style="bold")
+    table = plain_table("id", "address", "on", "since", whole=("id", "since"))
     for one in found:
-        table.add_row(one["id"], one["url"], ", ".join(one["states"]), one["created"][:16])
-    Console().print(table if found else "no webhook yet; `graspd webhooks add URL` makes one")
+        table.add_row(one["id"], one["url"], ", ".join(one["states"]), minute(one["created"]))
+    plain_console().print(table if found else "no webhook yet; `graspd webhooks add URL` makes one")
 
 
 @app.command("log", epilog="graspd webhooks log 1a2b3c")
@@ -60,12 +59,12 @@ def show_log(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False)
     if json:
         emit({"deliveries": found})
         return
-    table = Table("what", "ended", "delivery", "attempts", "last", "", box=None, header_style="bold")
+    table = plain_table("what", "ended", "delivery", "attempts", "last", "", whole=("ended", "delivery", "last"))
     for one in found:
-        what = f"{one['kind']} {one['subject'][:16]}"
-        tried = (one["tried"] or "")[:19]
-        table.add_row(what, one["ended"], one["state"], str(one["attempts"]), tried, one["detail"])
-    Console().print(table if found else "nothing was to be told yet")
+        what = f"{one['kind']} {one['subject'][:12] if one['kind'] == 'job' else one['subject']}"
+        tried = (str(one["attempts"]), minute(one["tried"]))
+        table.add_row(what, one["ended"], one["state"], *tried, one["detail"])
+    plain_console().print(table if found else "nothing was to be told yet")
 
 
 @app.command("delete", epilog="graspd webhooks delete 1a2b3c")

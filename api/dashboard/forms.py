@@ -18,12 +18,15 @@ from api.dashboard.rendering import render
 from api.routes.dependencies import AssetsOf, JobsOf, may_read, may_submit
 from service.model.domain import JobRequest
 from service.model.errors import InputError
+from service.model.refusals import refusal as refused_line
+from service.model.refusals import words
 from service.model.states import AssetKind
 
 router = APIRouter(include_in_schema=False)
 
 DEFAULTS: Final[dict[str, Any]] = {
     "hand": "allegro", "object": "mug", "grasps": 32, "fidelity": "standard", "seed": 0, "friction": 1.0,
+    "mass": "", "object_friction": "",
     "scene": "free", "faces": "drawn", "touch": 0.0, "neighbours": "", "scenes": 0, "views": 0, "stereo": False,
     "width": 320, "height": 240, "want": "valid", "referee": "certificate",
     "min_distance": 0.005, "robust": 0.0,
@@ -71,12 +74,7 @@ def retry(job_id: str, jobs: JobsOf) -> RedirectResponse:
 
 def first_message(error: ValueError) -> str:
     """The first mistake of a validation, in one line."""
-    if isinstance(error, ValidationError):
-        entry = error.errors()[0]
-        where = ".".join(str(token) for token in entry["loc"])
-        message = entry["msg"].removeprefix("Value error, ")
-        return f"{where}: {message}" if where else message
-    return str(error)
+    return refused_line(error) if isinstance(error, ValidationError) else str(error)
 
 
 def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> HTMLResponse | RedirectResponse:
@@ -115,7 +113,7 @@ def _by_field(error: ValidationError) -> dict[str, str]:
         # A rule over several fields has no place of its own; those that a form can break are about scenes and robust.
         whole = "robust" if "robust" in entry["msg"] else "scenes"
         name = str(entry["loc"][0]) if entry["loc"] else whole
-        errors.setdefault(name, entry["msg"].removeprefix("Value error, "))
+        errors.setdefault(name, words(entry))
     return errors
 
 

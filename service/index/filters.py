@@ -27,7 +27,10 @@ class GraspFilter(Model):
     """An expression of `service.model.where`."""
     project: str | None = None
     """Of whose jobs; None: of everybody's."""
+    judged: bool | None = None
+    """Whether the referee gave a verdict."""
     valid: bool | None = None
+    """False: judged, and not valid."""
     success: bool | None = None
     scene: str | None = None
     """Kind of the scene that it was planned in; any: whichever, but not free."""

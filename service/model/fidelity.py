@@ -7,6 +7,7 @@ from typing import Final, Literal
 from pydantic import Field
 
 from service.model.base import Model
+from service.model.suggestions import did_you_mean
 
 
 class Fidelity(Model):
@@ -75,5 +76,6 @@ def resolve_fidelity(value: str | Fidelity) -> Fidelity:
     if isinstance(value, Fidelity):
         return value
     if value not in FIDELITIES:
-        raise ValueError(f"unknown fidelity {value!r}; choose one of {', '.join(FIDELITIES)}, or give the knobs")
+        meant = did_you_mean(str(value), FIDELITIES)
+        raise ValueError(f"unknown fidelity {value!r}; choose one of {', '.join(FIDELITIES)}, or give the knobs{meant}")
     return FIDELITIES[value]

@@ -7,7 +7,8 @@ from typing import Annotated, Final
 from pydantic import Field, StringConstraints
 
 #: A name a user gives: used in file names and URLs, so letters, digits, dot, dash and underscore only.
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+NAME: Final = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+Name = Annotated[str, Field(pattern=NAME)]
 #: A name a user gives to grasps: words of such characters with one space between.
 TagName = Annotated[
     str,

@@ -15,6 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from service.model.errors import InputError
 from service.model.labels import Digest
+from service.model.refusals import refusal, why
+from service.model.suggestions import did_you_mean
 
 #: Kinds of scenes; `free` is an object that floats, `file` one whose supports are given.
 SceneKind = Literal["free", "table", "bin", "shelf", "file"]
@@ -162,7 +164,10 @@ def parse_scene(
         raise InputError(f"unknown faces {faces!r}; choose drawn or all")
     path = Path(text)
     if text not in KINDS and path.suffix.lower() not in SCENE_FILES:
-        raise InputError(f"unknown scene {text!r}; choose one of {', '.join(KINDS)}, or give a JSON or YAML file")
+        meant = did_you_mean(text, KINDS)
+        raise InputError(
+            f"unknown scene {text!r}; choose one of {', '.join(KINDS)}, or give a JSON or YAML file{meant}"
+        )
     found = SceneSpec(kind=text) if text in KINDS else read_scene(path)
     touch = found.touch if touch is None else touch
     if faces == found.faces and touch == found.touch and not beside:
@@ -183,7 +188,7 @@ def read_scene(path: Path) -> SceneSpec:
             raise InputError(f"the scene file {path} is larger than {MAX_FILE_BYTES // 1024} KiB")
         text = path.read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"the scene file {path} cannot be read: {error}") from None
+        raise InputError(f"the scene file {path} cannot be read: {why(error)}") from None
     found = _loaded(text, path)
     if not isinstance(found, dict):
         raise InputError(f"the scene file {path} must hold one object with supports and a target")
@@ -210,17 +215,16 @@ def _loaded(text: str, path: Path) -> object:
 
         return yaml.safe_load(text)
     except Exception as error:
-        reason = " ".join(str(error).split())[:200]
-        raise InputError(f"the scene file {path} is not {path.suffix[1:].upper()}: {reason}") from None
+        mark, reason = getattr(error, "problem_mark", None), " ".join(str(error).split())
+        reason = f"{getattr(error, 'problem', None) or reason} (line {mark.line + 1})" if mark else reason
+        raise InputError(f"the scene file {path} is not {path.suffix[1:].upper()}: {reason[:200]}") from None
 
 
 def first_mistake(error: ValidationError | TypeError) -> str:
     """What is wrong first, in one line that names the place."""
     if isinstance(error, TypeError):
         return str(error)
-    one = error.errors()[0]
-    place, words = ".".join(str(part) for part in one["loc"]), one["msg"].removeprefix("Value error, ")
-    return f"{place}: {words}" if place else words
+    return refusal(error)
 
 
 def check_quaternion(pose: tuple[float, ...]) -> None:

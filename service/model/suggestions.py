@@ -22,3 +22,9 @@ def did_you_mean(word: str, choices: Iterable[str]) -> str:
     known = {choice.lower(): choice for choice in choices}
     like = difflib.get_close_matches(word.lower(), known, n=1)
     return f"; did you mean {known[like[0]]}?" if like else ""
+
+
+def one_of(word: str, choices: Iterable[str]) -> str:
+    """`A, B, C`, and which of them was meant."""
+    known = list(choices)
+    return f"{', '.join(known)}{did_you_mean(word, known)}"

@@ -21,6 +21,7 @@ from typing import Final
 from service.model.diversity import GraspType
 from service.model.errors import InputError
 from service.model.metrics import GRASP_METRICS
+from service.model.suggestions import one_of
 
 #: Longest expression, and deepest nesting of one.
 LONGEST: Final = 1000
@@ -30,7 +31,7 @@ _SHORT: Final = {"robust": "robust_share"}
 _WORDS: Final = ("hand", "object", "type")
 _TYPES: Final = tuple(kind.name.lower() for kind in GraspType)
 #: What stands alone: true or not.
-FLAGS: Final = ("valid", "sound", "held", "lift", "lift_hard", "pushes")
+FLAGS: Final = ("judged", "valid", "sound", "held", "lift", "lift_hard", "pushes")
 _COMPARISONS: Final = {"<": "<", "<=": "<=", ">": ">", ">=": ">=", "=": "=", "==": "=", "!=": "!="}
 _TOKEN: Final = re.compile(
     r"\s*(?:(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?![\w.])|(?P<op><=|>=|==|!=|[<>=()])"
@@ -162,8 +163,8 @@ class _Parser:
                 raise InputError(f"{name} is true or not: write `{name}` or `not {name}`")
             return Flag(name)
         if name not in _METRICS and name not in _WORDS:
-            known = ", ".join([*_METRICS, *FLAGS, *_WORDS])
-            raise InputError(f"there is no {token.text!r}; the names are {known}")
+            known = [*_METRICS, *FLAGS, *_WORDS]
+            raise InputError(f"there is no {token.text!r}; the names are {one_of(token.text, known)}")
         if not compared or following is None:
             raise InputError(f"{name} is to be compared, as in `{name} {'= power' if name == 'type' else '> 0'}`")
         self.at += 1
@@ -195,5 +196,5 @@ def _of_word(name: str, op: str, value: _Token) -> Node:
     if name != "type":
         return OfWord(name, op, value.text)
     if value.text not in _TYPES:
-        raise InputError(f"there is no type {value.text!r}; choose one of {', '.join(_TYPES)}")
+        raise InputError(f"there is no type {value.text!r}; choose one of {one_of(value.text, _TYPES)}")
     return OfType(op, GraspType[value.text.upper()])

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError
 from service.model.pinhole import EDGE, back_project, surface_normals
+from service.model.suggestions import one_of
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -215,5 +216,5 @@ def noise_of(given: str | DepthNoise | None) -> DepthNoise | None:
     if given is None or isinstance(given, DepthNoise):
         return given
     if given not in NOISES:
-        raise InputError(f"there is no depth noise {given!r}; choose one of {', '.join(NOISES)}")
+        raise InputError(f"there is no depth noise {given!r}; choose one of {one_of(given, NOISES)}")
     return NOISES[given]

@@ -168,7 +168,7 @@ def open_shards(
         StoreUnavailable: the store does not answer.
     """
     if isinstance(source, Store) or (isinstance(source, str) and "://" in source):
-        store = source if isinstance(source, Store) else open_store(source)
+        store = source if isinstance(source, Store) else open_store(source, make=False)
         found = _of_store(store, job, dataset, snapshot)
         kept = ShardCache(cache or folder("shards"), limit_bytes=cache_bytes)
         return Shards(_ordered(found), store, kept, stream)

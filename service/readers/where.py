@@ -68,6 +68,8 @@ def _flag(name: str, columns: Mapping[str, Array]) -> Mask:
         return standing.valid(columns)
     if name == "sound":
         return standing.sound(columns)
+    if name == "judged":
+        return np.asarray(columns.get("quality/success", np.full(len(columns["quality/valid"]), -1))) >= 0
     path = _FLAGS[name]
     return np.asarray(columns[path]) == 1 if path in columns else np.zeros(len(columns["quality/valid"]), bool)
 

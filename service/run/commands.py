@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
-from service.cli import JsonFlag, emit, keep_private, load_settings, log_to_stderr, reporting_errors
+from service.cli import JsonFlag, emit, keep_private, load_settings, log_to_stderr, plain_console, reporting_errors
 from service.heartbeat_file import HeartbeatFile
 from service.model import names
 from service.model.errors import IndexDamaged, QueueUnavailable, UnavailableError
@@ -58,12 +57,12 @@ def up(
     log_to_stderr(settings, "up")
     keep_private(settings)
     stop = stop_on_signals()
-    console = Console(stderr=True)
+    console = plain_console(stderr=True)
     others = joining(settings, share, host=share_host, port=redis_port) if share is not None else None
     supervisor = Supervisor(settings, workers=workers, joining=others)
     supervisor.start()
     try:
-        if supervisor.wait_ready(say=lambda line: console.print(line, markup=False, soft_wrap=True), stop=stop):
+        if supervisor.wait_ready(say=lambda line: console.print(line, soft_wrap=True), stop=stop):
             where = f"{supervisor.api_url} (data in {supervisor.settings.data_dir})"
             console.print(f"graspd is up: {where}; Ctrl-C stops it", soft_wrap=True)
             if json:
@@ -158,7 +157,7 @@ def rebuild(
     from service.pipeline.identity import identify_if_redis_answers
     from service.pipeline.scrub import scan
 
-    parts = Parts.open(load_settings(data_dir=data_dir), patience=0)
+    parts = Parts.open(load_settings(data_dir=data_dir), patience=0, make=False)
     store, index = parts.store, parts.index
 
     def make() -> dict[str, int]:

@@ -41,7 +41,7 @@ def verify(
     from service.pipeline.scrubber import Turn
     from service.store.packs import pack_at
 
-    parts = Parts.open(load_settings(data_dir=data_dir))
+    parts = Parts.open(load_settings(data_dir=data_dir), make=False)
     if repair:
         identify_if_redis_answers(parts)
     turn = Turn(parts, is_keeper=False)

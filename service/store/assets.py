@@ -76,6 +76,16 @@ def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
     return files
 
 
+def unpack_file(path: Path) -> dict[str, bytes]:
+    """`unpack` of a file, as large as an upload may be; its errors name the file."""
+    from service.settings import Settings
+
+    try:
+        return unpack(path.read_bytes(), limit_bytes=UNPACK_FACTOR * Settings().max_upload_bytes)
+    except InputError as error:
+        raise type(error)(f"{path}: {error}") from None
+
+
 def without_common_folder(files: dict[str, _T]) -> dict[str, _T]:
     """A folder zipped whole has its own name before every file: take it off."""
     tops = {name.partition("/")[0] for name in files}

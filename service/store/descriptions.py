@@ -9,6 +9,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_core import from_json, to_json
 
 from service.model.errors import InputError
+from service.model.refusals import refusal
 
 #: The built-in hands need 2 KB; the facts stand in every list of hands or objects.
 MAX_BYTES: Final = 64 << 10
@@ -44,12 +45,7 @@ def parse_description(data: bytes, what: str) -> Description:
     try:
         return Description.model_validate(given)
     except ValidationError as error:
-        first = error.errors(include_input=False)[0]
-        where = ".".join(map(str, first["loc"]))
-        message = first["msg"].removeprefix("Value error, ")
-        raise InputError(
-            f"{what}: asset.json must name the main file and hold short facts: {where}: {message}"
-        ) from None
+        raise InputError(f"{what}: asset.json must name the main file and hold short facts: {refusal(error)}") from None
 
 
 def json_object(text: bytes | str, what: str) -> dict[str, Any]:

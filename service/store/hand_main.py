@@ -87,7 +87,10 @@ def main_of(files: Mapping[str, bytes], wanted: str = "", *, where: str = "the h
             return found[0]
         if found:
             names = ", ".join(found[:8]) + (", ..." if len(found) > 8 else "")
-            raise InputError(f"{where} holds {len(found)} hand files ({names}); name one: --urdf {_short(found)}")
+            raise InputError(
+                f"{where} holds {len(found)} hand files ({names}); name one: --urdf {_short(found)}, or in a ZIP an "
+                f'asset.json with {{"file": "{_short(found)}"}}'
+            )
     raise InputError(f"{where} holds no hand file; a URDF, xacro or MJCF is needed, or the folder or ZIP it lies in")
 
 

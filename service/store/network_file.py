@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from service.model.errors import InputError, LimitError
 from service.model.labels import Digest, Name
+from service.model.refusals import refusal
 from service.store.descriptions import json_object
 
 SCHEMA: Final = "graspd/proposals@1"
@@ -138,7 +139,7 @@ def to_bytes(network: ProposalNetwork) -> bytes:
             points=network.points, steps=network.steps, sizes=sizes(joints), about=network.about,
         )  # fmt: skip
     except ValidationError as error:
-        raise InputError(f"the network cannot be written: {_first(error)}") from None
+        raise InputError(f"the network cannot be written: {refusal(error)}") from None
     arrays = {name: np.asarray(array, np.float32) for name, array in _arrays(network).items()}
     _check(arrays, joints, "the network cannot be written")
     buffer = io.BytesIO()
@@ -220,7 +221,7 @@ def _read_meta(archive: zipfile.ZipFile, what: str) -> _Meta:
     try:
         return _Meta.model_validate(json_object(text, f"{what}: {_META}"))
     except ValidationError as error:
-        raise InputError(f"{what}: {_META}: {_first(error)}") from None
+        raise InputError(f"{what}: {_META}: {refusal(error)}") from None
 
 
 def _read(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], what: str) -> Floats32:
@@ -268,10 +269,3 @@ def _difference(found: list[str], expected: Mapping[str, object]) -> str:
     missing, foreign = sorted(wanted - {*found, f"{_META}.npy"}), sorted(set(found) - wanted)
     parts = [f"{word} {', '.join(names[:4])}" for word, names in (("without", missing), ("besides", foreign)) if names]
     return "; ".join(parts) or "a name stands twice"
-
-
-def _first(error: ValidationError) -> str:
-    first = error.errors(include_input=False)[0]
-    where = ".".join(map(str, first["loc"]))
-    message = first["msg"].removeprefix("Value error, ")
-    return f"{where}: {message}" if where else message

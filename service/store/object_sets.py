@@ -9,6 +9,7 @@ from typing import Final
 
 from service.cli import load_settings
 from service.model.errors import InputError, LimitError
+from service.model.fitting_names import fitted
 from service.store.assets import MAX_FILES, UNPACK_FACTOR, unpack
 
 #: Meshes by their file names.
@@ -125,8 +126,8 @@ def _rank(name: str) -> tuple[int, str]:
 
 
 def _name(text: str, taken: Mapping[str, str]) -> str:
-    """A name the service takes, not given yet."""
-    name = re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._-")[:60] or "object"
+    """A name the service takes, not given yet; a long one is cut, which the log tells."""
+    name = fitted(re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._-") or "object", 60)
     number = 2
     while name in taken:
         name, number = f"{name[:57]}-{number}", number + 1

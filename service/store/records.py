@@ -12,6 +12,7 @@ from service.model import names
 from service.model.clock import timestamp
 from service.model.errors import DamagedError
 from service.model.records import AttemptRecord, JobEvent
+from service.model.refusals import refusal
 from service.store.seals import is_sealed, put_sealed
 from service.store.store import Store
 
@@ -31,9 +32,8 @@ def parse_record(model: type[RecordT], data: bytes, key: str) -> RecordT:
     try:
         return model.model_validate_json(data)
     except ValidationError as error:
-        first = error.errors()[0]
         raise DamagedError(
-            f"the record {key} in the store is damaged ({first['loc']}: {first['msg']}); put a copy in its place, or "
+            f"the record {key} in the store is damaged ({refusal(error)}); put a copy in its place, or "
             "remove it and retry its job"
         ) from None
 

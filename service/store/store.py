@@ -183,16 +183,19 @@ class Store:
         return time.perf_counter() - start
 
 
-def open_store(url: str, *, public_endpoint: str | None = None) -> Store:
-    """The store behind a URL: `file:///folder` (made if absent), `memory://`, `s3://`, `gs://`, `az://`.
+def open_store(url: str, *, public_endpoint: str | None = None, make: bool = True) -> Store:
+    """The store behind a URL: `file:///folder`, `memory://`, `s3://`, `gs://`, `az://`.
 
     Credentials and endpoints of the remote ones come from the usual variables (AWS_ACCESS_KEY_ID, ...).
 
     Args:
         public_endpoint: S3 endpoint as clients reach it. Without it, one given by AWS_ENDPOINT_URL is taken for an
             address of the service's own network: then no download is signed, and files go through the API.
+        make: whether a folder that is absent is made. What only reads finds nothing in an empty one, and a mistyped
+            path would pass for a sound store.
 
     Raises:
+        NotFoundError: the folder is absent, and not to be made.
         InputError: the URL names no known store.
         StoreUnavailable: the folder cannot be made or written.
     """
@@ -200,6 +203,8 @@ def open_store(url: str, *, public_endpoint: str | None = None) -> Store:
     if parts.scheme == "memory":
         return Store(MemoryStore(), url)
     if (folder := local_folder(url)) is not None:
+        if not make and not folder.is_dir():
+            raise NotFoundError(f"there is no store at {folder}; set GRASPD_DATA_DIR, or GRASPD_STORE_URL")
         return _open_local(folder, url)
     if parts.scheme not in ("s3", "gs", "az"):
         raise InputError(f"the store URL {url!r} names no known store; use file://, s3://, gs:// or az://")

@@ -37,7 +37,7 @@ from service.store.store import open_store
 from tests.api.factories import add_builtins, add_job, add_worker, fail, finish_all
 from tests.indexes import empty_index
 
-_EXAMPLES = 10
+_EXAMPLES = 6
 #: Parts of the long walk, which may run at once.
 _SHARES = 4
 _MANY_EXAMPLES = int(os.environ.get("CONTRACT_EXAMPLES", "1600"))

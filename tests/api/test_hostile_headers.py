@@ -227,9 +227,9 @@ def walk(applications: tuple[list[Any], str, list[str]], requests: int, seed: in
 
 
 def test_no_header_ends_in_a_5xx(applications: tuple[list[Any], str, list[str]]) -> None:
-    found = walk(applications, 2000, seed=1)
+    found = walk(applications, 1000, seed=1)
     # The walk meets what it is to meet: answers, refusals, and things that are not there.
-    assert found[200] > 200 and {401, 403, 404} <= set(found)
+    assert found[200] > 100 and {401, 403, 404} <= set(found)
 
 
 @pytest.mark.slow

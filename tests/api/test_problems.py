@@ -29,13 +29,13 @@ def problem(answer: Any, status: int, slug: str) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("change", "pointer", "words"),
     [
-        ({"grasps": 0}, "#/grasps", "greater than or equal to 1"),
-        ({"grasps": -3}, "#/grasps", "greater than or equal to 1"),
+        ({"grasps": 0}, "#/grasps", "must be at least 1"),
+        ({"grasps": -3}, "#/grasps", "must be at least 1"),
         ({"fidelity": "perfect"}, "#/fidelity", "draft, standard, fine"),
-        ({"seed": "x"}, "#/seed", "integer"),
-        ({"colour": "red"}, "#/colour", "not permitted"),
+        ({"seed": "x"}, "#/seed", "whole number"),
+        ({"colour": "red"}, "#/colour", "is not known"),
         ({"views": 3}, "#", "scenes >= 1"),
-        ({"hand": "../etc"}, "#/hand", "pattern"),
+        ({"hand": "../etc"}, "#/hand", "letters, digits"),
     ],
 )
 def test_a_field_in_error_is_pointed_at(http: TestClient, change: dict[str, Any], pointer: str, words: str) -> None:

@@ -82,6 +82,7 @@ def address(app: FastAPI) -> Iterator[str]:
         yield f"{outer}{PREFIX}"
 
 
+@pytest.mark.slow
 def test_every_part_of_the_dashboard_works_below_the_path(page: Any, parts: Parts, address: str) -> None:
     job = add_job(parts, grasps=6, scenes=1, views=1)
     page.goto(f"{address}/")

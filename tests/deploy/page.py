@@ -31,7 +31,8 @@ def calls() -> list[list[str]]:
         words = shlex.split(line.replace("…", "").rstrip(" &"), comments=True)
         start = next(i for i, word in enumerate(words) if word.endswith("graspd"))
         found.append(words[start + 1 :])
-    return [words for words in found if words]
+    # Options of the program itself are no command.
+    return [words for words in found if words and not words[0].startswith("--")]
 
 
 def run(name: str, folder: Path, environment: Mapping[str, str]) -> subprocess.CompletedProcess[str]:

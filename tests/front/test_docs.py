@@ -47,6 +47,7 @@ def test_the_page_runs_as_it_is_printed(environment: dict[str, str], tmp_path: P
     assert "no_such_file.stl" in said
 
 
+@pytest.mark.slow
 def test_the_notebook_runs(environment: dict[str, str], tmp_path: Path) -> None:
     notebook = json.loads((REPOSITORY / "examples" / "first_grasps.ipynb").read_text())
     cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
@@ -54,6 +55,7 @@ def test_the_notebook_runs(environment: dict[str, str], tmp_path: Path) -> None:
     assert (tmp_path / "grasps.h5").is_file()
 
 
+@pytest.mark.slow
 def test_a_hand_is_added_corrected_and_used_as_the_page_says(environment: dict[str, str], tmp_path: Path) -> None:
     write_my_hand(tmp_path)
     page = (REPOSITORY / "docs" / "hands.md").read_text()

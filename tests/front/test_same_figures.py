@@ -25,6 +25,7 @@ from worker.simulation.surroundings import Obstacle, Surroundings
 HANDS = ("allegro/allegro_hand_right.urdf", "barrett_bh280/bh280.urdf", "shadow/shadow_hand_right.urdf")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", [*HANDS, "allegro", "barrett", "shadow"])
 def test_pads_of_the_hands_hold_the_objects_of_the_docs(file: str, shared_data: Path) -> None:
     hand = hand_from_path(shared_data / "hands" / file if "/" in file else file)

@@ -219,7 +219,10 @@ def test_no_process_outlives_a_killed_supervisor_and_the_next_one_starts(tmp_pat
         again.wait_ready(PATIENCE_S)
 
 
-@pytest.mark.parametrize("remote", [False, pytest.param(True, marks=[pytest.mark.s3, pytest.mark.postgres])])
+@pytest.mark.parametrize(
+    "remote",
+    [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=[pytest.mark.s3, pytest.mark.postgres])],
+)
 @pytest.mark.parametrize(
     ("batches", "kills"),
     [

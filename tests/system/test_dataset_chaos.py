@@ -56,6 +56,7 @@ def test_a_dataset_goes_on_after_everything_was_killed(start: Callable[..., Syst
     assert taken.complete and len(taken.shards) == len(after)
 
 
+@pytest.mark.slow
 def test_a_dataset_that_is_cancelled_stops_and_stays_so(start: Callable[..., System]) -> None:
     system = start(environment={"FAKE_SECONDS": "0.3"}, lease_s=2.0, retry_backoff_s=0.1)
     for name in OBJECTS:

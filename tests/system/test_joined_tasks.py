@@ -43,6 +43,7 @@ def test_a_worker_killed_between_pack_and_event_has_its_tasks_done_all_the_same(
     assert not system.parts.index.jobs.attempts(job=job), "no attempt was used up"
 
 
+@pytest.mark.slow
 def test_a_task_that_kills_its_worker_takes_no_other_one_down(start: Start) -> None:
     system = start(environment={"FAKE_POISON": "1", "FAKE_SECONDS": "0.2"}, join="4", lease_s=2.0, retry_backoff_s=0.1)
     job = system.submit(wanted(grasps=96))

@@ -76,6 +76,7 @@ def test_one_that_is_started_again_under_its_name_need_not_wait(house: House) ->
     house.until(lambda: house.says("again", "this keeper leads"), "it leads again")
 
 
+@pytest.mark.slow
 @pytest.mark.chaos
 def test_keepers_share_the_work_and_take_over_from_one_that_is_killed(tmp_path: Path) -> None:
     # No worker is killed here: on a busy machine one may be silent for some time and is there all the same.

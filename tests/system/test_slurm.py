@@ -49,6 +49,7 @@ def slurm(tmp_path: Path) -> Iterator[FakeSlurm]:
     cluster.close()
 
 
+@pytest.mark.slow
 @pytest.mark.chaos
 def test_preemption_a_lost_node_and_a_time_limit_lose_nothing(tmp_path: Path, slurm: FakeSlurm) -> None:
     shared = tmp_path / "shared"

@@ -48,6 +48,7 @@ def older_worker(house: House, folder: Path) -> None:
         house.start("older", sys.executable, "-c", MAKES.format(OLD) + FAKES)
 
 
+@pytest.mark.slow
 @pytest.mark.chaos
 def test_each_version_of_worker_takes_what_it_can_and_the_keeper_holds_back_the_rest(
     house: House, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -12,6 +12,7 @@ from service.cli import JsonFlag, emit, reporting_errors
 from service.model.cores import available_cores
 from service.model.errors import InputError
 from service.model.fidelity import FIDELITIES, OFFERED, Fidelity
+from service.model.suggestions import one_of
 from worker.engines.devices import Device
 
 app = typer.Typer()
@@ -63,7 +64,7 @@ def _fidelities(names: list[str] | None, points: list[int] | None, errors: list[
     """The named fidelities, then the first of them with one knob changed at a time."""
     chosen = names or list(OFFERED)
     if unknown := [name for name in chosen if name not in FIDELITIES]:
-        raise InputError(f"unknown fidelity {unknown[0]!r}; choose one of {', '.join(FIDELITIES)}")
+        raise InputError(f"unknown fidelity {unknown[0]!r}; choose one of {one_of(unknown[0], FIDELITIES)}")
     found = [FIDELITIES[name] for name in chosen]
     changes: list[dict[str, Any]] = [{"fine_points": n, "name": f"{chosen[0]}/points={n}"} for n in points or []]
     changes += [{"face_error_m": e, "name": f"{chosen[0]}/error={json_.dumps(e)}"} for e in errors or []]

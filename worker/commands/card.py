@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from service.cli import JsonFlag, emit, load_settings, reporting_errors
+from service.cli import JsonFlag, emit, load_settings, plain_console, reporting_errors
 from service.model.errors import InputError
 from service.store.store import open_store
 
@@ -41,11 +40,13 @@ def card(
             raise InputError(f"{source} is a folder; --snapshot goes with the name of a dataset")
         contents = contents_of_folder(Path(source))
     else:
-        contents = contents_of_store(open_store(load_settings(data_dir=data_dir).resolved_store_url), source, snapshot)
+        contents = contents_of_store(
+            open_store(load_settings(data_dir=data_dir).resolved_store_url, make=False), source, snapshot
+        )
     if assets is not None:
         contents = with_provenance(contents, assets)
     columns = (TextColumn("shards"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
+    console = plain_console(stderr=True)
     with Progress(*columns, console=console, disable=json or not console.is_terminal, transient=True) as bar:
         task = bar.add_task("", total=len(contents.shards))
         found = write_card(

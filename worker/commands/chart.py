@@ -19,6 +19,7 @@ from service.model.errors import InputError
 from service.model.fidelity import FIDELITIES, OFFERED
 from service.model.robust import MODELS
 from service.model.scene_spec import SceneSpec, parse_scene
+from service.model.suggestions import one_of
 from worker.engines.devices import Device
 from worker.run import Run
 
@@ -195,7 +196,7 @@ def _number(text: str) -> int:
 def known_fidelities(names: Sequence[str]) -> list[str]:
     """The names, if all are known; raises InputError."""
     if unknown := [name for name in names if name not in FIDELITIES]:
-        raise InputError(f"unknown fidelity {unknown[0]!r}; choose of {', '.join(FIDELITIES)}")
+        raise InputError(f"unknown fidelity {unknown[0]!r}; choose of {one_of(unknown[0], FIDELITIES)}")
     return list(names)
 
 

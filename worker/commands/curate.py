@@ -6,10 +6,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
-from service.cli import JsonFlag, emit, reporting_errors
+from service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
 from service.model.errors import InputError
 from service.readers.where import parse
 from worker.files.balance import KINDS, Balance
@@ -89,18 +87,18 @@ def diff(
     if json:
         emit({"a": first, "b": second, **found})
         return
-    console = Console()
+    console = plain_console()
     if not found["cells"] and not found["settings"]:
-        console.print(f"the same grasps in {found['same_cells']} cells", markup=False)
+        console.print(f"the same grasps in {found['same_cells']} cells")
         return
-    table = Table("hand", "object", "grasps", "valid", "in both", box=None, header_style="bold")
+    table = plain_table("hand", "object", "grasps", "valid", "in both")
     for one in found["cells"]:
         counts = (f"{one['first']} | {one['second']}", f"{one['valid_first']} | {one['valid_second']}")
         table.add_row(one["hand"], one["object"], *counts, str(one["common"]))
     console.print(table if found["cells"] else "the same grasps")
     for name, values in found["settings"].items():
-        console.print(f"{name}: {_listed(values['first'])} | {_listed(values['second'])}", markup=False)
-    console.print(f"{found['same_cells']} cells have the same grasps", markup=False)
+        console.print(f"{name}: {_listed(values['first'])} | {_listed(values['second'])}")
+    console.print(f"{found['same_cells']} cells have the same grasps")
 
 
 def _version(source: str) -> tuple[str, str | None]:

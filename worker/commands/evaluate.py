@@ -8,13 +8,13 @@ from typing import Annotated, Any, Final, get_args
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from service.cli import JsonFlag, emit, reporting_errors
+from service.cli import JsonFlag, emit, plain_console, reporting_errors
 from service.model.errors import InputError
 from service.model.robust import MEANINGS, MOST_MODELS
+from service.model.suggestions import one_of
 from worker.files.cases import expand, load_case
 from worker.files.evaluate import Protocol, combine, evaluate
 from worker.files.robust_copies import copy_paths, write_copy
@@ -97,9 +97,10 @@ def evaluate_command(
     other = None if judge_hand is None else hand_from_path(judge_hand, drag=True)
     twins = _joint_map(joint_map)
     rows: list[dict[str, Any]] = []
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-               TimeElapsedColumn(), TimeRemainingColumn())  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True), disable=json, transient=True) as bar:
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(),
+               TextColumn("{task.completed:.0f}/{task.total:.0f}"), TimeElapsedColumn(),
+               TimeRemainingColumn())  # fmt: skip
+    with Progress(*columns, console=plain_console(stderr=True), disable=json, transient=True) as bar:
         task = bar.add_task("reading", total=1)
         listed = [one for path in files for one in expand(path)]
         copies = _copies(files, listed, out, robust=robust, hard=hard)
@@ -127,11 +128,11 @@ def evaluate_command(
 def _checked_level(protocol: str, level: str) -> str:
     """The level of a protocol, its own default where none is said; InputError for what is neither's."""
     if protocol not in get_args(Protocol):
-        raise InputError(f"unknown protocol {protocol!r}; choose {', '.join(get_args(Protocol))}")
+        raise InputError(f"unknown protocol {protocol!r}; choose {one_of(protocol, get_args(Protocol))}")
     levels = get_args(LiftLevel if protocol == "lift" else Level)
     level = level or ("lift" if protocol == "lift" else "certificate")
     if level not in levels:
-        raise InputError(f"unknown level {level!r} of protocol {protocol}; choose one of {', '.join(levels)}")
+        raise InputError(f"unknown level {level!r} of protocol {protocol}; choose one of {one_of(level, levels)}")
     return level
 
 
@@ -142,7 +143,7 @@ def _tell(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
         verdicts = [{"file": row["file"], **one} for row in rows for one in row.pop("verdicts", [])]
         emit({key: value for key, value in whole.items() if key != "verdicts"} | {"verdicts": verdicts, "files": rows})
     else:
-        Console().print(_table(rows, whole))
+        plain_console().print(_table(rows, whole))
         if whole.get("robust_share") is not None:
             typer.echo(_said_of_models(whole))
         if "foreign_held" in whole:
@@ -198,7 +199,7 @@ def _table(rows: list[dict[str, Any]], whole: dict[str, Any]) -> Table:
         padding=(0, 1, 0, 0),
         pad_edge=False,
     )
-    table.add_column("grasps", max_width=16, no_wrap=True)
+    table.add_column("grasps", max_width=16, overflow="fold")
     for _, heading, _ in _COLUMNS:
         table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:

@@ -11,7 +11,7 @@ import typer
 
 from service.cli import JsonFlag, emit, reporting_errors
 from service.model.errors import InputError
-from service.model.suggestions import did_you_mean
+from service.model.suggestions import one_of
 from service.store import standing
 from service.store.shards import read_shard
 from worker.files.choice import EveryOption, UnjudgedOption, choose
@@ -65,8 +65,7 @@ def export(
 ) -> None:
     """Write grasps or pictures as others read them."""
     if format_ not in EXPORTS:
-        meant = did_you_mean(format_, EXPORTS)
-        raise InputError(f"there is no export format {format_!r}; choose one of {', '.join(EXPORTS)}{meant}")
+        raise InputError(f"there is no export format {format_!r}; choose one of {one_of(format_, EXPORTS)}")
     if depth not in ("exr", "png"):
         raise InputError(f"there is no depth format {depth!r}; use exr or png")
     notes: list[str] = []
@@ -153,8 +152,7 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
     from worker.files.exchange import ddgc, dexgraspbench, dexgraspnet, dexgraspnet2, multidex, reference
 
     if format_ not in IMPORTS:
-        meant = did_you_mean(format_, IMPORTS)
-        raise InputError(f"there is no import format {format_!r}; choose one of {', '.join(IMPORTS)}{meant}")
+        raise InputError(f"there is no import format {format_!r}; choose one of {one_of(format_, IMPORTS)}")
     if not source.exists():
         raise InputError(f"{source} does not exist")
     if format_ == "reference":

@@ -9,10 +9,9 @@ from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from service.cli import JsonFlag, emit, reporting_errors
+from service.cli import JsonFlag, emit, plain_console, reporting_errors
 from service.model.errors import GraspdError, InputError
 from service.model.states import AssetKind
 from service.store.asset_options import (
@@ -103,8 +102,8 @@ def _tried(file: str, options: dict[str, Any], *, quiet: bool) -> dict[str, Any]
 @contextmanager
 def _bar(what: str, first: str = "", *, quiet: bool) -> Iterator[Run]:
     """A run that tells a terminal how far it is."""
-    columns = (TextColumn(f"  {what}       {{task.description}}"), BarColumn(), TimeElapsedColumn())
-    console = Console(stderr=True)
+    columns = (TextColumn(f"  {what}       {{task.description}}", markup=False), BarColumn(), TimeElapsedColumn())
+    console = plain_console(stderr=True)
     # Elsewhere than on a terminal its end would be an empty line.
     with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
         task = bar.add_task(first, total=1.0)

@@ -10,10 +10,9 @@ from typing import Annotated
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from service.cli import JsonFlag, emit, reporting_errors, write_output
+from service.cli import JsonFlag, emit, plain_console, reporting_errors, write_output
 from service.model.errors import InputError
 from service.model.scene_kinds import supports_in
 from service.model.transforms import compose
@@ -222,6 +221,6 @@ def _show(bar: Progress, task: TaskID, done: float, total: float, message: str) 
 
 def _progress(quiet: bool) -> Progress:
     return Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-        console=Console(stderr=True), disable=quiet, transient=True,
+        TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+        console=plain_console(stderr=True), disable=quiet, transient=True,
     )  # fmt: skip

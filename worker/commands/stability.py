@@ -15,6 +15,7 @@ from service.cli import JsonFlag, emit, load_settings, reporting_errors
 from service.model.clock import timestamp
 from service.model.errors import InputError
 from service.model.stability import Stability, from_json
+from service.model.suggestions import one_of
 from service.model.version import PACKAGE_VERSION
 
 app = typer.Typer()
@@ -47,7 +48,7 @@ def stability(
     from worker.studies.stability.report import markdown, write
 
     if unknown := [name for name in only or [] if name not in STUDIES]:
-        raise InputError(f"there is no study {unknown[0]!r}; choose of {', '.join(STUDIES)}")
+        raise InputError(f"there is no study {unknown[0]!r}; choose of {one_of(unknown[0], STUDIES)}")
     if source:
         found = _joined([_read(path) for path in source])
         found = replace(found, maps=[one for one in found.maps if not only or one.name in only])

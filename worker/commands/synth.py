@@ -17,17 +17,19 @@ from service.cli import (
     emit,
     engine_settings,
     fail,
+    plain_console,
     reporting_errors,
     told_to_stop,
-    validation_line,
     write_output,
 )
 from service.model.diversity import CELLS, MIN_DISTANCE_M
 from service.model.domain import JobOptions
 from service.model.errors import InputError, TaskCancelled
 from service.model.fidelity import FIDELITIES
+from service.model.refusals import refusal
 from service.model.robust import MODELS
 from service.model.scene_spec import parse_scene
+from service.model.suggestions import one_of
 from service.store.asset_options import (
     AllowOpenOption,
     CompoundOption,
@@ -122,6 +124,8 @@ def synth(
     """
     if not out.parent.is_dir():
         raise InputError(f"the folder {out.parent} does not exist; create it or choose another --out")
+    if out.is_dir():
+        raise InputError(f"{out} is a folder; name a file in it, such as --out {out / 'grasps.h5'}")
     matter = {"mass": mass, "density": density, "object_friction": object_friction}
     request = _request(want, budget, referee, robust, robust_models, matter).model_copy(
         update={
@@ -163,15 +167,15 @@ def _request(
     """Options of a job with these; InputError for a word that is none."""
     if want not in ("valid", "raw"):
         raise InputError(f"unknown --want {want!r}; choose valid or raw")
-    if referee not in (*get_args(Level), "none"):
-        raise InputError(f"unknown referee {referee!r}; choose one of {', '.join(get_args(Level))} or none")
+    if referee not in (levels := (*get_args(Level), "none")):
+        raise InputError(f"unknown referee {referee!r}; choose one of {one_of(referee, levels)}")
     # An audit is a sample that watches over many jobs; a file can be judged by the letter whole.
     try:
         return JobOptions(
             want=want, budget=budget, referee=referee, audits=0, robust=robust, robust_models=models, **matter
         )  # fmt: skip
     except ValidationError as error:
-        raise InputError(validation_line(error)) from None
+        raise InputError(refusal(error)) from None
 
 
 @contextmanager
@@ -180,13 +184,13 @@ def _bar(*, quiet: bool) -> Iterator[Report]:
     if quiet or not sys.stderr.isatty():
         yield lambda done, total, message: None
         return
-    from rich.console import Console  # where nobody looks at a bar, what draws it need not be loaded
+    # Where nobody looks at a bar, what draws it need not be loaded.
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     began = time.perf_counter()
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[rate]}"), TimeElapsedColumn(),
-               TimeRemainingColumn())  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[rate]}"),
+               TimeElapsedColumn(), TimeRemainingColumn())  # fmt: skip
+    with Progress(*columns, console=plain_console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None, rate="")
 
         def tell(done: float, total: float, message: str) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
+from service.model.suggestions import one_of
 from service.model.transforms import quat_conjugate, quat_rotate
 from service.store import standing
 from service.store.shards import Shard
@@ -39,7 +40,7 @@ class Balance:
 
     def __post_init__(self) -> None:
         if unknown := [one for one in self.by if one not in KINDS]:
-            raise InputError(f"grasps cannot be balanced by {unknown[0]!r}; choose of {', '.join(KINDS)}")
+            raise InputError(f"grasps cannot be balanced by {unknown[0]!r}; choose of {one_of(unknown[0], KINDS)}")
         if not self.by:
             raise InputError(f"say what to balance by: {', '.join(KINDS)}")
 

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
-from urllib.parse import unquote, urlsplit
 
 from pydantic_core import from_json
 
@@ -103,11 +102,8 @@ def _stored(sought: Sought, looked: list[str]) -> Found | None:
 
     url = Settings().resolved_store_url
     looked.append(f"in the store {url}")
-    parts = urlsplit(url)
-    if parts.scheme == "file" and not Path(unquote(parts.path)).is_dir():
-        return None  # to look must not make one
     try:
-        return Found(load_asset_files(open_store(url), sought.kind, sought.digest), {})
+        return Found(load_asset_files(open_store(url, make=False), sought.kind, sought.digest), {})
     except GraspdError:
         return None
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
+from service.model.suggestions import one_of
 from service.model.transforms import IDENTITY_POSE
 from service.store.shards import Shard, read_shard
 from worker.files.cases import load_case
@@ -61,7 +62,7 @@ def export_grasps(source: Path, format_: str, wishes: Wishes, folder: Path, run:
     """
     format_ = ALIASES.get(format_, format_)
     if format_ not in FORMATS:
-        raise InputError(f"there is no robot format {format_!r}; choose one of {', '.join(FORMATS)}")
+        raise InputError(f"there is no robot format {format_!r}; choose one of {one_of(format_, FORMATS)}")
     if not 0 < wishes.speed <= 1:
         raise InputError(f"--speed is {wishes.speed:g}; give a share of the velocity limits above 0 and at most 1")
     _check_arm(wishes)

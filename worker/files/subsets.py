@@ -41,7 +41,7 @@ def shards_of(source: str, snapshot: str | None = None) -> Shards:
     """
     if "/" in source or source in (".", "..") or Path(source).exists():
         return open_shards(Path(source))
-    return open_shards(open_store(load_settings().resolved_store_url), dataset=source, snapshot=snapshot)
+    return open_shards(open_store(load_settings().resolved_store_url, make=False), dataset=source, snapshot=snapshot)
 
 
 def base_shards(shards: Shards) -> Iterator[list[Shard]]:

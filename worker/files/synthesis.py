@@ -17,6 +17,7 @@ from service.model.errors import InputError, TaskCancelled
 from service.model.fidelity import FIDELITIES, Fidelity
 from service.model.outcomes import shortfall, totals
 from service.model.scene_spec import SceneSpec
+from service.model.suggestions import did_you_mean, one_of
 from service.store.attributes import Attribute
 from service.store.shards import json_attribute
 from worker.certified import Certified, certified_grasps
@@ -249,14 +250,17 @@ def chosen_fidelity(name: str, contact_solver: str = "") -> Fidelity:
         InputError: unknown fidelity or solver.
     """
     if name not in FIDELITIES:
-        raise InputError(f"unknown fidelity {name!r}; choose one of {', '.join(FIDELITIES)}")
+        raise InputError(f"unknown fidelity {name!r}; choose one of {one_of(name, FIDELITIES)}")
     knobs = FIDELITIES[name].model_dump()
     if contact_solver:
         knobs |= {"contact_solver": contact_solver, "name": f"{name}+{contact_solver}"}
     try:
         return Fidelity(**knobs)
     except ValueError:
-        raise InputError(f"unknown contact solver {contact_solver!r}; choose direct, jacobi or gauss_seidel") from None
+        meant = did_you_mean(contact_solver, ("direct", "jacobi", "gauss_seidel"))
+        raise InputError(
+            f"unknown contact solver {contact_solver!r}; choose direct, jacobi or gauss_seidel{meant}"
+        ) from None
 
 
 def _attributes(

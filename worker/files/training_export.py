@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from service.model.errors import InputError
+from service.model.suggestions import one_of
 from service.readers import Pictures, Shards, open_shards
 from service.readers.cloud_views import COLUMNS
 from service.readers.depth_noise import noise_of
@@ -48,7 +49,7 @@ def export_training(source: Path, format_: str, wishes: TrainingWishes, folder: 
         InputError: unknown format, no such grasps, a share that is none, or what the format's writer refuses.
     """
     if format_ not in FORMATS:
-        raise InputError(f"there is no training format {format_!r}; choose one of {', '.join(FORMATS)}")
+        raise InputError(f"there is no training format {format_!r}; choose one of {one_of(format_, FORMATS)}")
     if not 0 < wishes.held_out < 1:
         raise InputError(f"--held-out is {wishes.held_out:g}; give a share of the objects between 0 and 1")
     shards = open_shards(source)

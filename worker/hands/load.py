@@ -14,7 +14,7 @@ from service.model.errors import HandError, InputError, NotFoundError
 from service.model.states import AssetKind
 from service.model.suggestions import did_you_mean
 from service.model.transforms import compose
-from service.store.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack, without_common_folder
+from service.store.assets import builtin_files, builtin_names, unpack_file, without_common_folder
 from service.store.hand_files import files_of_hand
 from service.store.hand_main import hand_name, main_of
 from worker.hands import collisions, guess, primitives
@@ -257,10 +257,7 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
         meant = did_you_mean(str(path), known)
         raise NotFoundError(f"{path} is neither a file nor a built-in hand ({', '.join(known)}){meant}")
     if path.suffix.lower() == ".zip":
-        from service.settings import Settings
-
-        packed = unpack(path.read_bytes(), limit_bytes=UNPACK_FACTOR * Settings().max_upload_bytes)
-        return path.stem, without_common_folder(packed), {}
+        return path.stem, without_common_folder(unpack_file(path)), {}
     found, main = files_of_hand(path)
     files = {name: file.read_bytes() for name, file in found.items()}
     return hand_name(path.resolve().name), files, {"file": main} if main else {}

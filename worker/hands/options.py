@@ -10,6 +10,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from service.model.errors import HandError
+from service.model.refusals import refusal
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
@@ -87,9 +88,8 @@ def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = 
     try:
         return HandOptions.model_validate({**_hand_json(files, stated.get("file")), **stated})
     except ValidationError as error:
-        first = error.errors()[0]
-        place = "asset.json" if first["loc"][0] in stated else "hand.json"
-        raise HandError(f"{place}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        place = "asset.json" if error.errors()[0]["loc"][0] in stated else "hand.json"
+        raise HandError(f"{place}: {refusal(error)}") from None
 
 
 def _asset_json(files: Mapping[str, bytes]) -> dict[str, Any]:

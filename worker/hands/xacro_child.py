@@ -198,7 +198,7 @@ def _told(error: BaseException) -> str:
         at = getattr(at, "exc", None) or at.__cause__ or at.__context__
     line = " ".join(str(error).split())[:200] or type(error).__name__
     if "Undefined substitution argument" in line:
-        return f"{line}; say its value: --xacro NAME=VALUE"
+        return f'{line}; say its value: --xacro NAME=VALUE, or {{"xacro": {{"NAME": "VALUE"}}}} in asset.json'
     return f"cannot be expanded ({line}); correct it, or expand it yourself and give the URDF"
 
 

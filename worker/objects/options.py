@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from service.model.errors import MeshError
 from service.model.matter import Density, Friction, Mass
+from service.model.refusals import refusal
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 #: Keys that decide how heavy and how slippery the object is, and not its shape.
@@ -63,5 +64,4 @@ def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = 
     try:
         return ObjectOptions.model_validate({**stated, **given})
     except ValidationError as error:
-        first = error.errors()[0]
-        raise MeshError(f"asset.json: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise MeshError(f"asset.json: {refusal(error)}") from None

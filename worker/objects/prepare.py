@@ -14,7 +14,7 @@ from service.model.digests import digest_files, digest_variant
 from service.model.errors import MeshError, NotFoundError
 from service.model.states import AssetKind
 from service.model.suggestions import did_you_mean
-from service.store.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack
+from service.store.assets import builtin_files, builtin_names, unpack_file
 from worker.objects.formats import READERS, read_mesh
 from worker.objects.kept import kept_or_made
 from worker.objects.mass import mass_properties
@@ -161,9 +161,7 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
         meant = did_you_mean(str(path), known)
         raise NotFoundError(f"{path} is neither a file nor a built-in object ({', '.join(known)}){meant}")
     if path.suffix.lower() == ".zip":
-        from service.settings import Settings
-
-        return path.stem, unpack(path.read_bytes(), limit_bytes=UNPACK_FACTOR * Settings().max_upload_bytes), {}
+        return path.stem, unpack_file(path), {}
     files = {path.name: path.read_bytes()}
     beside = path.parent / "asset.json"
     if beside.is_file():

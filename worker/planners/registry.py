@@ -11,6 +11,8 @@ from pydantic import ValidationError
 
 from service.model.errors import InputError
 from service.model.imports import imports
+from service.model.refusals import refusal
+from service.model.suggestions import known_names
 from worker.planners.port import Joined, Method, Options, Planner
 
 if TYPE_CHECKING:
@@ -48,7 +50,7 @@ def method(name: str) -> Method:
         return own
     offered = _offered()
     if name not in offered:
-        raise InputError(f"unknown method {name!r}; there are: {', '.join(method_names())}")
+        raise InputError(f"unknown method {name!r}{known_names(name, method_names())}")
     try:
         found = offered[name].load()
     except Exception as error:
@@ -84,10 +86,8 @@ def _options(name: str, options: Mapping[str, Any] | None) -> Options:
     try:
         return known.options(**(options or {}))
     except ValidationError as error:
-        from service.cli import validation_line  # loads what commands need
-
         there_are = ", ".join(known.options.model_fields) or "none"
-        raise InputError(f"option of {name}: {validation_line(error)}; its options: {there_are}") from None
+        raise InputError(f"option of {name}: {refusal(error)}; its options: {there_are}") from None
 
 
 def of_this_machine(name: str, options: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -9,8 +9,8 @@ from typing import Annotated, Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
-from service.cli import validation_line
 from service.model.errors import InputError
+from service.model.refusals import refusal
 from worker.rendering.cameras import Floats, look_at
 
 #: Rotations of a file may be off by this: six digits are usual in JSON written by hand.
@@ -82,7 +82,7 @@ def read_cameras(path: Path) -> GivenCameras:
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
     except ValidationError as error:
-        raise InputError(f"{path}: {validation_line(error)}") from None
+        raise InputError(f"{path}: {refusal(error)}") from None
     extrinsics = None if file.cameras is None else np.stack([_place(path, k, c) for k, c in enumerate(file.cameras)])
     return GivenCameras(_matrix(path, file.intrinsics), extrinsics, file.width, file.height)
 

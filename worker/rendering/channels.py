@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from service.model.domain import EXTRA_CHANNELS
 from service.model.errors import InputError
 from service.model.pinhole import pixel_rays
+from service.model.suggestions import did_you_mean
 from worker.rendering.annotate import OBJECT
 from worker.rendering.cameras import Floats
 
@@ -25,7 +26,8 @@ def parse_channels(words: Iterable[str]) -> tuple[str, ...]:
     """
     wanted = {word.strip() for word in words if word.strip()}
     if unknown := sorted(wanted - {*EXTRA_CHANNELS, ALL}):
-        raise InputError(f"unknown channel {unknown[0]!r}; choose of {', '.join(EXTRA_CHANNELS)}, or {ALL}")
+        meant = did_you_mean(unknown[0], EXTRA_CHANNELS)
+        raise InputError(f"unknown channel {unknown[0]!r}; choose of {', '.join(EXTRA_CHANNELS)}, or {ALL}{meant}")
     return tuple(name for name in EXTRA_CHANNELS if name in wanted or ALL in wanted)
 
 

@@ -123,6 +123,10 @@ def conditions(where: GraspFilter | None) -> list[Test]:
             found.append(Condition("pair", grasps.c[name], operator.eq, wanted))
     flags = {name: getattr(where, name) for name in ("valid", "success", "lift_hard", "pushes_held")}
     found += [Condition("flag", grasps.c[name], is_, flag) for name, flag in flags.items() if flag is not None]
+    # What nobody judged was not rejected.
+    judged = True if where.valid is False else where.judged
+    if judged is not None:
+        found.append(Condition("flag", grasps.c.success, operator.ne if judged else operator.eq, None))
     if where.scene is not None:
         anyone = where.scene == "any"
         compared, kind = (operator.ne, "free") if anyone else (operator.eq, where.scene)

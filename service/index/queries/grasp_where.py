@@ -20,6 +20,7 @@ _OPERATORS: Final[dict[str, Callable[[Any, Any], ColumnElement[bool]]]] = {
     "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "=": operator.eq, "!=": operator.ne,
 }  # fmt: skip
 _FLAGS: Final[dict[str, Callable[[Columns], ColumnElement[bool]]]] = {
+    "judged": lambda grasps: grasps.success.is_not(None),
     "valid": lambda grasps: grasps.valid.is_(True),
     "held": lambda grasps: grasps.success.is_(True),
     # What judges a grasp that was planned in a scene is the lift.

@@ -59,3 +59,17 @@ def test_pages_show_the_share_of_the_judged(http: TestClient, jobs: dict[str, st
     home = http.get("/").text
     assert words in home and "320 more are not judged" in home
     assert words in http.get("/datasets").text
+
+
+def test_grasps_that_nobody_judged_are_found_as_such_and_not_among_the_rejected(
+    http: TestClient, jobs: dict[str, str]
+) -> None:
+    def found(**query: str) -> set[str]:
+        rows = http.get("/v1/grasps", params={"limit": 200, **query}).json()["items"]
+        assert rows
+        return {str(row["success"]) for row in rows}
+
+    rejected = http.get("/v1/grasps", params={"limit": 200, "valid": "false"}).json()["items"]
+    assert rejected and all(row["success"] is False for row in rejected)
+    assert found(judged="false") == found(where="not judged") == {"None"}
+    assert "None" not in found(judged="true") | found(where="judged and not valid")

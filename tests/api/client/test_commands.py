@@ -232,6 +232,15 @@ def test_a_mistake_is_one_line_and_exit_2(graspd: Shell, arguments: tuple[str, .
     assert words in said(done)
 
 
+@pytest.mark.parametrize(
+    "command", ["submit --hand alegro --object mug", "datasets estimate --hands alegro --objects mug --scenes 0"]
+)
+def test_a_name_that_nobody_knows_is_followed_by_the_one_that_is_like_it(graspd: Shell, command: str) -> None:
+    done = graspd(*command.split())
+    assert done.returncode == 2
+    assert "'alegro'" in done.stderr and "did you mean allegro?" in done.stderr
+
+
 @pytest.mark.parametrize("command", ["status", "cancel", "retry", "logs"])
 def test_an_unknown_job_is_exit_2(graspd: Shell, command: str) -> None:
     done = graspd(command, "0123456789")

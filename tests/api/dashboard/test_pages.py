@@ -148,7 +148,7 @@ def test_the_form_submits_a_job_and_shows_it(http: TestClient) -> None:
 
 @pytest.mark.parametrize(
     ("change", "words"),
-    [({"grasps": "0"}, "greater than or equal to 1"), ({"views": "3", "scenes": "0"}, "views need scenes")],
+    [({"grasps": "0"}, "must be at least 1"), ({"views": "3", "scenes": "0"}, "views need scenes")],
 )
 def test_a_form_in_error_keeps_what_was_typed_and_says_what_is_wrong(
     http: TestClient, change: dict[str, str], words: str

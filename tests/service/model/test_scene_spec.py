@@ -83,7 +83,7 @@ def test_how_near_fingertips_come_is_said_by_the_file_or_over_it(tmp_path: Path)
     assert (parse_scene(str(path)).touch, parse_scene(str(path), touch=1.0).touch) == (-0.5, 1.0)
     assert scene_option(str(path))["touch"] == -0.5
     path.write_text("supports: [{kind: half_space}]\ntouch: -3\n")
-    with pytest.raises(InputError, match="touch: Input should be greater than or equal to -1"):
+    with pytest.raises(InputError, match="touch: must be at least -1"):
         parse_scene(str(path))
 
 

@@ -68,12 +68,12 @@ def test_a_task_that_runs_is_not_queued_again_between_two_sweeps(parts: Parts) -
 def test_many_ends_at_once_are_one_round(parts: Parts) -> None:
     keeper = Keeper(parts, clock=Clock())
     keeper.round()
-    job, _ = job_actions.submit(parts, request(grasps=32 * 450), lane=Lane.BULK)
+    job, _ = job_actions.submit(parts, request(grasps=32 * 150), lane=Lane.BULK)
     for delivery in taken(parts):
         finish(parts, delivery)
     keeper.round()
     done = parts.index.jobs.get(job.id)
-    assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 450)
+    assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 150)
 
 
 def test_how_far_a_task_is_reaches_the_index_and_goes_with_its_worker(parts: Parts) -> None:

@@ -16,6 +16,7 @@ import typer
 from pydantic import BaseModel, Field
 from typer.testing import CliRunner
 
+from graspd import cli as program
 from service.cli import load_settings, reporting_errors
 from service.model.errors import InputError, StoreUnavailable, UnavailableError
 from service.pipeline import job_actions
@@ -77,7 +78,7 @@ def test_a_bad_model_names_the_field(capsys: pytest.CaptureFixture[str]) -> None
 
     with pytest.raises(typer.Exit):
         command()
-    assert capsys.readouterr().err == "graspd: grasps: Input should be greater than or equal to 1\n"
+    assert capsys.readouterr().err == "graspd: grasps: must be at least 1\n"
 
 
 def test_a_bad_setting_names_its_variable(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,6 +104,14 @@ def test_a_rebuild_of_a_sound_index_finds_no_difference(parts: Parts) -> None:
     told = json.loads(shown.stdout.splitlines()[-1])
     assert (told["differences"], told["changed"]) == ([], False)
     assert (told["jobs"], told["shards"]) == (1, 1)
+
+
+@pytest.mark.parametrize("command", [["store", "verify"], ["index", "rebuild", "--check"], ["index", "rebuild"]])
+def test_what_reads_a_store_makes_none_where_there_is_none(tmp_path: Path, command: list[str]) -> None:
+    shown = runner.invoke(program.build(), [*command, "--data-dir", str(tmp_path / "mistyped")])
+    assert shown.exit_code == 2
+    assert f"there is no store at {tmp_path / 'mistyped' / 'store'}" in " ".join(shown.output.split())
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_check_tells_differences_changes_nothing_and_exits_with_1(parts: Parts) -> None:

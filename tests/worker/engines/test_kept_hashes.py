@@ -143,6 +143,7 @@ print(hasher._whole, hasher.hash.hex(), len(context.user_modules[{OPTIMIZERS!r}]
 """
 
 
+@pytest.mark.slow
 def test_what_is_not_compiled_yet_is_compiled_under_the_kept_hash(tmp_path: Path) -> None:
     def run(compiled: str) -> list[str]:
         environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path / compiled), "GRASPD_KERNELS": ""}

@@ -11,6 +11,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import pytest
 import trimesh
 
 from service.model.digests import digest_bytes
@@ -74,6 +75,7 @@ def in_a_fresh_process(wanted: list[str]) -> dict[str, dict[str, str]]:
     return found
 
 
+@pytest.mark.slow
 def test_every_method_at_two_fidelities_in_one_process_is_as_in_fresh_ones() -> None:
     apart = [[f"{name}:{level}" for name in METHODS] for level in PAIR]
     # The other way round in methods, so that what methods share is met in another order, too.

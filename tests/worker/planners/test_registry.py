@@ -35,7 +35,7 @@ def test_options_of_a_method_are_read_from_text() -> None:
     [
         ({"speed": "9"}, "its options: standoff_m"),
         ({"standoff_m": "far"}, "standoff_m"),
-        ({"standoff_m": -1}, "greater"),
+        ({"standoff_m": -1}, "at least 0;"),
     ],
 )
 def test_a_wrong_option_is_refused_with_those_there_are(options: dict[str, object], message: str) -> None:

@@ -178,7 +178,7 @@ def test_a_camera_file_says_the_same_as_the_arrays(tmp_path):
         ('{"cameras": [{"extrinsics": [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}', "no rigid motion"),
         ('{"cameras": [{"extrinsics": [[-1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}', "no rigid motion"),
         ('{"intrinsics": [[500, 2, 320], [0, 500, 240], [0, 0, 1]]}', "no skew"),
-        ('{"intrinsics": {"fx": -5, "fy": 5, "cx": 1, "cy": 1}}', "greater than 0"),
+        ('{"intrinsics": {"fx": -5, "fy": 5, "cx": 1, "cy": 1}}', "intrinsics.fx: must be more than 0"),
         ('{"intrinsics": {"fx": NaN, "fy": 5, "cx": 1, "cy": 1}}', "finite"),
     ],
 )

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
+from service.model.refusals import why
 
 #: Most that the members of a file may unpack to [bytes]; no file of grasps of one object comes near.
 LARGEST: Final = 2**30
@@ -33,4 +34,4 @@ def load_npz(path: Path) -> dict[str, NDArray[Any]]:
         with np.load(path, allow_pickle=False) as found:
             return {name: found[name] for name in found.files}
     except (OSError, ValueError, EOFError, KeyError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path} is no .npz file that can be read safely: {error}") from None
+        raise InputError(f"{path} is no .npz file that can be read safely: {why(error)}") from None

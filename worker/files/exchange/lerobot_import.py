@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from service import parquet
 from service.model.errors import InputError
+from service.model.refusals import why
 from service.model.transforms import compose, invert
 from worker.files.exchange.bench_scene import placed_of
 from worker.files.exchange.imported import Imported, joints_by_name, verdicts
@@ -70,7 +71,7 @@ def _names(path: Path) -> list[str]:
         with file.open("rb") as stream:
             names = [str(name) for name in json.loads(stream.read(_LARGEST))["features"][STATE]["names"]]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{file} is no description of a LeRobot data set: {error}") from None
+        raise InputError(f"{file} is no description of a LeRobot data set: {why(error)}") from None
     if tuple(names[:7]) != ROOT:
         raise InputError(f"{path} is no data set of ours: its states do not begin with {', '.join(ROOT)}")
     return names[7:]

@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+from service.model.fitting_names import fitted
+
 
 def plain_name(name: str) -> str:
-    """A name fit for files and addresses."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.")[:64] or "unnamed"
+    """A name fit for files and addresses; a long one is cut, which the log tells."""
+    return fitted(re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "unnamed")
 
 
 def prim_name(name: str) -> str:

@@ -13,6 +13,7 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 
 from service.model.errors import InputError
+from service.model.refusals import why
 
 _HARMLESS: Final = {
     ("numpy", "ndarray"),
@@ -47,7 +48,7 @@ def load_npy(path: Path) -> Any:
     except pickle.UnpicklingError as error:
         raise InputError(f"{path} cannot be read safely: {error}") from None
     except Exception as error:  # a pickle of a stranger may raise anything
-        raise InputError(f"{path} is no NumPy file: {error}") from None
+        raise InputError(f"{path} is no NumPy file: {why(error)}") from None
     return found.item() if isinstance(found, np.ndarray) and found.shape == () else found
 
 

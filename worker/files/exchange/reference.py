@@ -9,6 +9,7 @@ import numpy as np
 from pydantic_core import from_json
 
 from service.model.errors import InputError
+from service.model.refusals import why
 from service.model.transforms import pose_from_matrix
 from worker.files.exchange.imported import Imported, completed, joints_by_name
 from worker.files.exchange.objects import scaled_object
@@ -49,7 +50,7 @@ def _stored(path: Path) -> dict[str, Any]:
     try:
         found = from_json(path.read_bytes())
     except (OSError, ValueError) as error:
-        raise InputError(f"{path} is no JSON file: {error}") from None
+        raise InputError(f"{path} is no JSON file: {why(error)}") from None
     if not isinstance(found, dict):
         raise InputError(f"{path} is no file of reference grasps: it holds no object")
     return found

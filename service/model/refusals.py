@@ -1,0 +1,61 @@
+"""What a model refuses, in a line of this project's words; pydantic's own are about inputs, types and patterns."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any, Final
+
+from pydantic import ValidationError
+
+from service.model.labels import NAME
+from service.model.suggestions import one_of
+
+_WORDS: Final = {
+    "missing": "is missing",
+    "extra_forbidden": "is not known",
+    "greater_than_equal": "must be at least {ge}",
+    "less_than_equal": "must be at most {le}",
+    "greater_than": "must be more than {gt}",
+    "less_than": "must be less than {lt}",
+    "string_pattern_mismatch": "must match {pattern}",
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "must be a whole number"),
+    **dict.fromkeys(("float_type", "float_parsing"), "must be a number"),
+    **dict.fromkeys(("bool_type", "bool_parsing"), "must be true or false"),
+}
+_NAMES: Final = "must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores"
+#: How pydantic begins: of what, not of which field.
+_SUBJECT: Final = re.compile(r"^(Value error, )|^\w+ should ")
+_CLASS: Final = re.compile(r"_[A-Z]\w*$")
+#: How typer names the choices of an option; pydantic gives them as `expected`.
+_CHOICES: Final = re.compile(r"'(?P<word>.*?)' is not one of (?P<expected>'.*')")
+
+
+def refusal(error: ValidationError) -> str:
+    """The first thing that is wrong, after its place: `scene.touch: must be at least -1`."""
+    first = error.errors(include_url=False)[0]
+    # Of several models that would do, pydantic names the one that it tried.
+    where = ".".join(str(part) for part in first["loc"] if not _CLASS.match(str(part)))
+    return f"{where}: {words(first)}" if where else words(first)
+
+
+def words(entry: Mapping[str, Any]) -> str:
+    """What is wrong by one entry of `ValidationError.errors()`, without its place."""
+    facts = entry.get("ctx", {})
+    message = _SUBJECT.sub(lambda found: "" if found[1] else "must ", entry["msg"])
+    if facts.get("pattern") == NAME:
+        return _NAMES
+    choices = _CHOICES.match(message)
+    if "expected" in facts or choices:
+        expected = choices["expected"] if choices else facts["expected"]
+        known = re.findall(r"'([^']*)'", expected)
+        word = choices["word"] if choices else entry.get("input")
+        return f"must be one of {one_of(str(word), known)}" if known else message
+    said = _WORDS.get(entry["type"])
+    bounds = {name: f"{value:g}" if isinstance(value, float) else value for name, value in facts.items()}
+    return said.format(**bounds) if said else message
+
+
+def why(error: Exception) -> str:
+    """What a library says of a file, the system's words without their number and the path once more."""
+    return getattr(error, "strerror", None) or str(error)

@@ -1,0 +1,116 @@
+"""What a terminal of 80 columns shows: every name, id and time whole, and as it is written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from rich.progress import Progress
+from typer.testing import CliRunner
+
+from api.client.watching import JobDisplay
+from graspd.cli import build
+from service.cli import plain_console, plain_table
+from service.model.domain import JobOptions
+from service.model.states import State
+
+NAME = "[red]mug[/] :mug: " + "a-very-long-name-of-an-object-that-somebody-gave-to-it"[:46]
+ID = "0123456789ab"
+CREATED = "2026-11-26T03:14:11.123456Z"
+JOB = SimpleNamespace(
+    id=ID + "0" * 20, state=State.SUCCEEDED, hand=NAME, object=NAME, progress=1.0, valid=100_000, grasps=100_000,
+    requested=100_000, standing="valid", created=CREATED,
+)  # fmt: skip
+DATASET = SimpleNamespace(
+    name=NAME, state=State.SUCCEEDED, cells=1000, progress=1.0, counted=10**6, asked=10**6, size_bytes=10**9 + 1,
+    created=CREATED, options=JobOptions(),
+)  # fmt: skip
+ASSET = SimpleNamespace(
+    name=NAME, filename=NAME, size_bytes=10**6, builtin=False, verdict="ok", facts={}, digest=ID + "0" * 52
+)  # fmt: skip
+TAG = {"name": NAME, "grasps": 10**6, "changed": CREATED}
+WEBHOOK = {"id": ID, "url": "https://example.org/" + NAME, "states": ["failed", "succeeded"], "created": CREATED}
+DELIVERY = {
+    "kind": "job", "subject": ID, "ended": "succeeded", "state": "delivered", "attempts": 3, "tried": CREATED,
+    "detail": NAME,
+}  # fmt: skip
+
+
+class Service:
+    """Answers each list with one row."""
+
+    def jobs(self, **_: Any) -> Any:
+        return SimpleNamespace(items=[JOB])
+
+    def assets(self, _: Any, **__: Any) -> Iterator[Any]:
+        yield ASSET
+
+    def send(self, _: str, path: str) -> Any:
+        rows = TAG if path.endswith("tags") else DELIVERY if path.endswith("deliveries") else WEBHOOK
+        return SimpleNamespace(json=lambda: [rows])
+
+    def datasets(self, **_: Any) -> Any:
+        return SimpleNamespace(items=[DATASET])
+
+
+@pytest.fixture
+def shown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
+    """Lines of a command on such a terminal."""
+
+    @contextmanager
+    def opened(_: str | None) -> Iterator[Service]:
+        yield Service()
+
+    for module in ("commands", "dataset_commands", "tag_commands", "webhook_commands"):
+        monkeypatch.setattr(f"api.client.{module}.open_client", opened)
+    monkeypatch.setattr("api.client.dataset_commands.DatasetClient", lambda client: client)
+
+    def run(*arguments: str) -> list[str]:
+        done = CliRunner().invoke(build(), arguments, env={"COLUMNS": "80"})
+        assert done.exit_code == 0, done.output
+        return done.stdout.splitlines()
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("command", "whole"),
+    [
+        ("jobs", [ID, "succeeded", "2026-11-26 03:14"]),
+        ("datasets list", ["succeeded", "2026-11-26 03:14", "1.0 GB"]),
+        ("hands list", [ID]),
+        ("tags list", ["2026-11-26 03:14", "1,000,000"]),
+        ("webhooks list", [ID, "2026-11-26 03:14"]),
+        ("webhooks log 1", ["succeeded", "delivered", "2026-11-26 03:14"]),
+    ],
+)
+def test_a_table_of_80_columns_cuts_nothing(shown: Any, command: str, whole: list[str]) -> None:
+    lines = shown(*command.split())
+    assert max(map(len, lines)) <= 80 and "…" not in "".join(lines)
+    assert all(any(text in line for line in lines) for text in whole), lines
+    # Broken, in whichever column, but every letter of it is there.
+    letters = "".join(sorted("".join("".join(lines).split())))
+    assert all(letters.count(letter) >= NAME.count(letter) for letter in set(NAME) - {" "})
+
+
+def test_names_are_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    text = "[red]mug[/] :mug: [/nothing]"
+    console, table = plain_console(), plain_table("name", text)
+    table.add_row("1", text)
+    console.print(text)
+    console.print(table)
+    assert capsys.readouterr().out.count(text) == 3
+
+
+def test_progress_shows_messages_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    console = plain_console()
+    monkeypatch.setattr(type(console), "is_terminal", True)
+    display = JobDisplay(console)
+    progress: Progress = display._progress
+    progress.add_task("render", total=1, message="[red]mug[/] [/nothing]", scale=1, unit="batches")
+    with console.capture() as got:
+        console.print(progress)
+    assert "[red]mug[/] [/nothing]" in got.get()
