@@ -32,8 +32,9 @@ _LEVELS: Final = {
     "screen": "MuJoCo, coarse physics, and the certificate where these are close to a limit",
 }
 _NOT_MODELLED: Final = """\
-- Verdicts are of a simulation: an object of 0.1 kg, friction 0.6, pushed with 1 N from six sides after the hand has
-  closed. They say little about another mass or friction, a lift, or a real hand. Nothing here was tried on a robot.
+- Verdicts are of a simulation: an object of its stated mass and friction (0.1 kg and 0.6 where none is stated), pushed
+  with its weight from six sides after the hand has closed. They say little about another mass or friction, a lift, or
+  a real hand. Nothing here was tried on a robot.
 - Objects and pads are rigid. Pads that give 2 mm change some verdicts, to either side.
 - There is no arm: whether one reaches a grasp, or stands in the table while it does, is not known. "Clear of the
   table" means the hand alone, at contact and on its way from the pregrasp.

@@ -60,7 +60,9 @@ def evaluate(
 ) -> dict[str, Any]:
     """One row of numbers, None where a number does not exist: too thin an object has no verdict.
 
-    Keys: n, protocol, level, hard, mu; gsr (share that holds), osr (1 if any holds), sgs (holding grasps per second of
+    Level letter has the protocol's own mass and friction, the others the object's.
+
+    Keys: n, protocol, level, hard, mu, mass_kg, object_friction; gsr (share that holds), osr (1 if any holds), sgs (holding grasps per second of
     making and judging them; of making them alone: sgs_without_referee), pd_mm and spd_mm (penetration,
     self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity: variance explained by
     the first principal component; nearest_mm: distance of the two grasps that are most alike.
@@ -77,9 +79,14 @@ def evaluate(
     if protocol == "lift" and case.placed is None:
         raise InputError(f"{case.name} has grasps around a free object: `graspd synth --scene` makes some to lift")
     case = case.centred
+    if level == "letter":
+        case = replace(case, obj=case.obj.published)
     mu = friction or case.friction or DEFAULT_FRICTION
     table = measure(case.hand, case.obj, case.grasps, friction=mu, thresholds_m=[THRESHOLD_M], run=run)
-    row: dict[str, Any] = {"n": len(case.grasps), "protocol": protocol, "level": None, "hard": hard, "mu": mu}
+    row: dict[str, Any] = {
+        "n": len(case.grasps), "protocol": protocol, "level": None, "hard": hard, "mu": mu, "mass_kg": case.obj.mass,
+        "object_friction": case.obj.friction,
+    }  # fmt: skip
     row |= _success(case, None, 0.0)
     try:
         pieces = decompose(case.obj, cache=cache)

@@ -33,8 +33,8 @@ from worker.simulation.surroundings import Placed
 
 Floats = NDArray[np.float64]
 
-#: Bisections of a factor of two: the payload is told to 4.5 %.
-BISECTIONS: Final = 4
+#: Bisections of a factor of two: the payload is told downwards, to 2.2 %.
+BISECTIONS: Final = 5
 
 
 class _Weighed(Test):
