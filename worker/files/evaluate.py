@@ -62,10 +62,10 @@ def evaluate(
 
     Level letter has the protocol's own mass and friction, the others the object's.
 
-    Keys: n, protocol, level, hard, mu, mass_kg, object_friction; gsr (share that holds), osr (1 if any holds), sgs (holding grasps per second of
-    making and judging them; of making them alone: sgs_without_referee), pd_mm and spd_mm (penetration,
-    self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity: variance explained by
-    the first principal component; nearest_mm: distance of the two grasps that are most alike.
+    Keys: n, protocol, level, hard, mu, mass_kg, object_friction; gsr (share that holds), osr (1 if any holds), sgs
+    (holding grasps per second of making and judging them; of making them alone: sgs_without_referee), pd_mm and spd_mm
+    (penetration, self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity: variance
+    explained by the first principal component; nearest_mm: distance of the two grasps that are most alike.
     verdicts, where somebody judged: see `told`. Judged in `models` models around the nominal one, by the same protocol:
     robust_share, the mean of those that hold in it, robust_n, how many, robust_axes, the share by axis; `tell` gets
     what became of each grasp.
