@@ -93,7 +93,8 @@ def _object(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
         lines.append(("repaired", f"surface moved by at most {1e3 * moved:.2g} mm"))
     if "volume_m3" in facts:
         mass = facts.get("mass_kg")
-        lines.append(("volume", f"{1e6 * facts['volume_m3']:.1f} cm3" + (f", {mass:.3g} kg" if mass else "")))
+        assumed = " assumed" if facts.get("mass_stated") is False else ""
+        lines.append(("volume", f"{1e6 * facts['volume_m3']:.1f} cm3" + (f", {mass:.3g} kg{assumed}" if mass else "")))
     return lines
 
 

@@ -217,7 +217,8 @@ def _said(found: dict[str, Any]) -> str:
     word = "valid" if judged else "sound"
     lines = [
         f"{found['file']}: {found[word]} {word} of {found['tried']} grasps tried"
-        f"{', judged at level ' + found['referee'] if judged else '; nobody judged them (--referee none)'}, "
+        f"{', judged at level ' + found['referee'] if judged else '; nobody judged them (--referee none)'}"
+        f"{' with ' + format(found['mass_kg'], '.3g') + ' kg' if judged else ''}, "
         f"{found['grasps_per_second']:.1f} grasps/s"
     ]
     if "robust_share" in found:
