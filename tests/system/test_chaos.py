@@ -109,6 +109,7 @@ def test_five_jobs_for_two_workers_finish_and_a_rebuild_changes_no_row(two_worke
     assert [system.parts.index.jobs.get(job) for job in jobs] == before
 
 
+@pytest.mark.slow
 def test_a_job_that_kills_its_worker_fails_and_the_others_go_on(start: Start) -> None:
     system = start(environment={"FAKE_POISON": "1"}, lease_s=2.0, task_attempts=2, retry_backoff_s=0.1)
     poisoned = system.submit(wanted(grasps=64))

@@ -66,6 +66,7 @@ def test_a_keeper_that_is_killed_or_stands_still_gives_way_and_nothing_is_lost(h
     house.until(lambda: house.says("second", "this keeper leads") == 2, "the second leads again")
 
 
+@pytest.mark.slow
 @pytest.mark.chaos
 def test_one_that_is_started_again_under_its_name_need_not_wait(house: House) -> None:
     house.keeper("first", GRASPD_KEEPER_NAME="node-1", GRASPD_LEASE_S="600")

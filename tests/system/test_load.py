@@ -37,6 +37,7 @@ def load() -> Iterator[None]:
             process.wait()
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(_LONGEST_S)
 def test_on_a_busy_machine_no_worker_is_lost_though_its_tasks_let_nothing_else_run(
     start: Callable[..., System],

@@ -23,6 +23,7 @@ from worker.planners.registry import of_this_machine
 pytestmark = pytest.mark.chaos
 
 
+@pytest.mark.slow
 def test_a_job_with_an_uploaded_network_gives_the_grasps_of_synth_with_the_file(
     start: Callable[..., System], tmp_path: Path
 ) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.cli import load_settings
-from service.model.errors import InputError
+from service.model.errors import InputError, NotFoundError
 from service.readers import Shards, open_shards
 from service.store.shards import Shard, read_shard
 from service.store.store import open_store
@@ -41,7 +41,11 @@ def shards_of(source: str, snapshot: str | None = None) -> Shards:
     """
     if "/" in source or source in (".", "..") or Path(source).exists():
         return open_shards(Path(source))
-    return open_shards(open_store(load_settings().resolved_store_url, make=False), dataset=source, snapshot=snapshot)
+    try:
+        store = open_store(load_settings().resolved_store_url, make=False)
+    except NotFoundError as error:
+        raise NotFoundError(f"{source} is no file or folder, and {error}") from None
+    return open_shards(store, dataset=source, snapshot=snapshot)
 
 
 def base_shards(shards: Shards) -> Iterator[list[Shard]]:

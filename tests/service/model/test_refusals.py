@@ -37,8 +37,8 @@ class Kind(BaseModel):
         ({"n": 10}, "n: must be at most 9"),
         ({"n": "many"}, "n: must be a whole number"),
         ({"n": 1.5}, "n: must be a whole number"),
-        ({"share": 0}, "share: must be more than 0.0"),
-        ({"share": 1}, "share: must be less than 1.0"),
+        ({"share": 0}, "share: must be more than 0"),
+        ({"share": 1}, "share: must be less than 1"),
         ({"share": "half"}, "share: must be a number"),
         ({"on": "perhaps"}, "on: must be true or false"),
         ({"name": "a/b"}, "name: must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes "

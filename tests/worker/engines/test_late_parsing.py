@@ -67,6 +67,7 @@ def test_sources_and_trees_of_all_kernels_are_those_of_warp() -> None:
     assert count > 200
 
 
+@pytest.mark.slow
 def test_a_later_process_parses_nothing_until_it_compiles_and_compiles_the_same(tmp_path: Path) -> None:
     first, of_all = declared(tmp_path / "home", compiled=tmp_path / "first")
     assert 0 < first <= of_all

@@ -69,6 +69,7 @@ def test_the_open_hand_touches_nothing_of_a_free_object_on_its_way(free: Executi
                 assert trial.penetration()[0] < 0.002
 
 
+@pytest.mark.slow
 def test_a_grasp_without_a_free_way_is_left_out_and_none_at_all_is_refused() -> None:
     hand = two_finger_hand()
     shell = trimesh.creation.icosphere(subdivisions=3, radius=0.12)

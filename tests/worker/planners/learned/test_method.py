@@ -79,6 +79,7 @@ def assert_same(one: GraspSet, other: GraspSet) -> None:
         np.testing.assert_array_equal(values, other.to_columns()[name], err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_grasp_depends_on_seed_and_index_but_not_on_batch_or_threads(hand, block, network) -> None:
     small, large = made(hand, block, network, 2), made(hand, block, network, 8, threads=2)
     assert_same(small, large.take(slice(0, 2)))
