@@ -11,6 +11,7 @@ from typing import Any, Final, Literal
 import mujoco
 import numpy as np
 
+from service.model import matter
 from service.model.digests import digest_bytes, digest_json
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
@@ -31,8 +32,9 @@ MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
     protocol: (
         "DIRECTIONS", "MAX_DISPLACEMENT_M", "MAX_ROTATION", "MAX_PENETRATION_M", "STAGES", "STAGE_S", "HOLD_S",
     ),
+    matter: ("ACCELERATION",),
     model: (
-        "ACCELERATION", "FRICTION", "HARD", "DAMPING_TIME", "HAND_SOLIMP", "HAND_SOLREF", "COUPLING_SOLREF",
+        "FRICTION", "HARD", "DAMPING_TIME", "HAND_SOLIMP", "HAND_SOLREF", "COUPLING_SOLREF",
         "COUPLING_SOLIMP", "NOT_IN_3_3_2", "_BARE_RADIUS", "_MIN_MASS",
     ),
     opening: (
