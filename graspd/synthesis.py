@@ -40,6 +40,8 @@ def synthesize(
     mass: float | None = None,
     density: float | None = None,
     object_friction: float | None = None,
+    payload: bool = False,
+    min_payload: float = 0.0,
     units: str | None = None,
     scale_to: float | None = None,
     device: str = "auto",
@@ -75,6 +77,8 @@ def synthesize(
         mass: of the object [kg]; by default its own, 0.1 kg where its file says none.
         density: of the object [kg/m^3], in place of the mass.
         object_friction: Coulomb coefficient of contacts in simulation; by default the object's own, else 0.6.
+        payload: whether the heaviest mass that each valid grasp lifts is measured (`quality/payload_kg`).
+        min_payload: mass that a grasp must lift to count [kg]; 0: none is wanted.
         units: of the mesh: m, cm, mm or in; guessed if not given.
         scale_to: longest side of the object [m].
         device: cpu, cuda:0 or auto.
@@ -98,6 +102,7 @@ def synthesize(
             grasps=count, want=want, budget=budget, referee=referee, method=method, seed=seed, friction=friction,
             options=of_this_machine(method, options), min_distance=min_distance, audits=0, robust=robust,
             robust_models=robust_models, mass=mass, density=density, object_friction=object_friction,
+            payload=payload, min_payload=min_payload,
         )  # fmt: skip
     except ValidationError as error:
         raise InputError(refusal(error)) from None

@@ -36,6 +36,7 @@ from worker.quality.referee.judge import judge
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lift import LiftOutcome
 from worker.quality.referee.lifting import judge_lifts, lift_key
+from worker.quality.referee.payload import payloads
 from worker.quality.referee.protocol import DIRECTIONS, Outcome
 from worker.quality.referee.robust import reaches, robust
 from worker.quality.referee.robustness import robustness
@@ -48,11 +49,12 @@ from worker.side_by_side import side_by_side
 from worker.simulation.surroundings import Scenes
 
 #: Why a grasp is not kept: its hand is no number, something of its scene is in its way, the referee dropped it, it
-#: failed the geometric gate, holds in too few models around the nominal one, or is as good as the same as one kept.
-REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "fragile", "alike")
+#: failed the geometric gate, holds in too few models around the nominal one, lifts too little, or is as good as the
+#: same as one kept.
+REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "fragile", "weak", "alike")
 #: Outcomes that are not told by the word of their rejection.
 _REJECTION_OF: Final = {
-    "no_place": "blocked", "diverged": "diverged", "fragile": "fragile", "alike": "alike",
+    "no_place": "blocked", "diverged": "diverged", "fragile": "fragile", "weak": "weak", "alike": "alike",
     **{f"gate_{name}": "gate" for name in GATES},
 }  # fmt: skip
 #: Names of the outcomes of a push and of a lift that drops a grasp.
@@ -285,6 +287,7 @@ class _Work:
         tried = int(places[count - 1]) + 1 if len(places) >= count else len(fates)
         absent = {"blocked"} if self.scenes is None else set()
         absent |= set() if self.request.robust else {"fragile"}
+        absent |= set() if self.request.min_payload else {"weak"}
         reasons = [name for name in REJECTIONS if name not in absent]
         outcomes = totals([Counter(fate for fate in fates[:tried].tolist() if fate != "kept")])
         rejected = dict.fromkeys(reasons, 0)
@@ -358,6 +361,8 @@ class _Work:
         columns["quality/valid"] = (sound & held).astype(np.uint8)
         if self.request.models:
             columns |= self._in_models(grasps, held if every else sound & held, run, seconds)
+        if self.request.measures_payload:
+            columns["quality/payload_kg"] = self._payloads(grasps, sound & held, run, seconds)
         if not every:
             wanted = sound if self.pieces is None else sound & held
             lost = np.setdiff1d(np.arange(size), rows)
@@ -367,6 +372,10 @@ class _Work:
             if self.request.robust:
                 enough = reaches(columns["quality/robust_share"], self.request.robust)
                 fates[finite[rows[wanted & ~enough]]] = "fragile"
+                wanted &= enough
+            if least := self.request.min_payload:
+                enough = columns["quality/payload_kg"] >= least
+                fates[finite[rows[wanted & ~enough]]] = "weak"
                 wanted &= enough
             grasps, columns = taken(grasps, columns, np.flatnonzero(wanted))
         return Round(grasps, columns, fates, in_scene, seconds)
@@ -427,6 +436,21 @@ class _Work:
         )  # fmt: skip
         seconds["referee"] += found.seconds
         return found.columns
+
+    def _payloads(
+        self, grasps: GraspSet, held: NDArray[np.bool_], run: Run, seconds: dict[str, float]
+    ) -> NDArray[np.float64]:
+        """(N,) payloads of those that are `held` [kg]."""
+        assert self.pieces is not None
+        began, placed = time.perf_counter(), None
+        if self.scenes is not None:
+            assert grasps.scene is not None
+            placed = self.scenes.placed(grasps.scene)
+        found = payloads(
+            self.hand, self.obj, grasps, pieces=self.pieces.result(), placed=placed, held=held, run=run.quiet()
+        )
+        seconds["referee"] += time.perf_counter() - began
+        return found
 
     def _measured(self, grasps: GraspSet, run: Run, seconds: dict[str, float]) -> Arrays:
         began = time.perf_counter()

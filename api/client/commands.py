@@ -91,6 +91,10 @@ def submit(
     mass: MassOption = None,
     density: DensityOption = None,
     object_friction: ObjectFrictionOption = None,
+    payload: Annotated[
+        bool, typer.Option("--payload", help="Measure the heaviest mass that each valid grasp lifts.")
+    ] = False,
+    min_payload: Annotated[float, typer.Option(help="Mass that a grasp must lift to count [kg]; 0: any.")] = 0.0,
     wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
     url: UrlOption = None,
     json: JsonFlag = False,
@@ -134,6 +138,8 @@ def submit(
                 "mass": mass,
                 "density": density,
                 "object_friction": object_friction,
+                "payload": payload,
+                "min_payload": min_payload,
             },
         )
         job = client.submit(request)

@@ -110,7 +110,7 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
 def _by_field(error: ValidationError) -> dict[str, str]:
     errors: dict[str, str] = {}
     for entry in error.errors():
-        # A rule over several fields has no place of its own; those that a form can break are of mass, scenes and robust.
+        # A rule over several fields has no place of its own: those that a form can break are of these.
         whole = next((name for name in ("robust", "mass") if name in entry["msg"]), "scenes")
         name = str(entry["loc"][0]) if entry["loc"] else whole
         errors.setdefault(name, words(entry))

@@ -112,6 +112,8 @@ def _judgement(request: JobRequest, batch: int) -> dict[str, object]:
         found |= {"referee": request.referee, "audits": request.audits_of(batch), "robustness": request.robustness}
     if request.models:
         found |= {"robust": [request.models, request.robust]}
+    if request.measures_payload:
+        found |= {"payload": request.min_payload}
     return found
 
 

@@ -19,7 +19,7 @@ from service.model.labels import DIGEST
 from service.model.labels import Digest as Digest
 from service.model.labels import Name as Name
 from service.model.labels import Word as Word
-from service.model.matter import FRICTION, MASS_KG, Density, Friction, Mass
+from service.model.matter import FRICTION, MASS_KG, MOST_KG, Density, Friction, Mass
 from service.model.projects import Project
 from service.model.robust import MODELS, MOST_MODELS
 from service.model.scene_kinds import has_table
@@ -145,6 +145,14 @@ class JobOptions(Model):
         0, ge=0, le=MOST_MODELS, exclude_if=lambda value: value == 0,
         description=f"models in which each valid grasp is judged too; 0: {MODELS} where a share is wanted, else none",
     )  # fmt: skip
+    payload: bool = Field(
+        False, exclude_if=lambda value: not value,
+        description="whether the heaviest mass that each valid grasp lifts is measured: some tenths of a second each",
+    )  # fmt: skip
+    min_payload: float = Field(
+        0.0, ge=0, le=MOST_KG, allow_inf_nan=False, exclude_if=lambda value: value == 0,
+        description="mass that a grasp must lift to count [kg]; 0: none is wanted. It is measured where one is",
+    )  # fmt: skip
     options: dict[
         Annotated[str, Field(max_length=40)],
         Annotated[int, Field(ge=-(2**53), le=2**53)]
@@ -236,7 +244,14 @@ class JobOptions(Model):
             raise ValueError("robustness counts verdicts: choose a referee")
         if self.models and self.referee == "none":
             raise ValueError("robust counts verdicts: choose a referee")
+        if self.measures_payload and self.referee == "none":
+            raise ValueError("payload is what the referee sees lifted: choose one")
         return self
+
+    @property
+    def measures_payload(self) -> bool:
+        """Whether the payload of each valid grasp is measured."""
+        return self.payload or self.min_payload > 0
 
     @property
     def matter(self) -> dict[str, float]:

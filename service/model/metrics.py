@@ -127,6 +127,11 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         plot="whole",
     ),
     GraspMetric(
+        "payload_kg", "kg", "heaviest mass that it lifts out of its scene, or holds under the six pushes, from the "
+        "object's own on; nan: not measured",
+        title="Payload", optional=True, indexed=Indexed.OFFERED, bounds=(0, 100), digits=2, plot="cut",
+    ),
+    GraspMetric(
         "clearance_m", "m", "least room of the hand among supports: coming, closing and lifting",
         title="Clearance in its scene", short="Clearance", optional=True, indexed=Indexed.OFFERED,
         bounds=(-1, 1), digits=4,

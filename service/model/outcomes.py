@@ -21,6 +21,7 @@ OUTCOMES: Final = {
     "gate_self_penetration": "hand too deep in itself (gate)",
     "gate_contacts": "did not oppose: fewer than two links in contact (gate)",
     "fragile": "held in too few models",
+    "weak": "lifted less than the wanted payload",
     "alike": "too similar to another",
 }
 

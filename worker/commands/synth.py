@@ -87,6 +87,12 @@ def synth(
     mass: MassOption = None,
     density: DensityOption = None,
     object_friction: ObjectFrictionOption = None,
+    payload: Annotated[
+        bool, typer.Option("--payload", help="Measure the heaviest mass that each valid grasp lifts.")
+    ] = False,
+    min_payload: Annotated[
+        float, typer.Option(help="Mass that a grasp must lift to count [kg]; 0: none is wanted.", min=0, max=100)
+    ] = 0.0,
     units: UnitsOption = None,
     scale_to: ScaleToOption = None,
     keep_largest: KeepLargestOption = False,
@@ -126,7 +132,10 @@ def synth(
         raise InputError(f"the folder {out.parent} does not exist; create it or choose another --out")
     if out.is_dir():
         raise InputError(f"{out} is a folder; name a file in it, such as --out {out / 'grasps.h5'}")
-    matter = {"mass": mass, "density": density, "object_friction": object_friction}
+    matter = {
+        "mass": mass, "density": density, "object_friction": object_friction, "payload": payload,
+        "min_payload": min_payload,
+    }  # fmt: skip
     request = _request(want, budget, referee, robust, robust_models, matter).model_copy(
         update={
             "grasps": grasps, "method": method, "seed": seed,
@@ -161,9 +170,7 @@ def synth(
         raise typer.Exit(FEWER)
 
 
-def _request(
-    want: str, budget: float, referee: str, robust: float, models: int, matter: dict[str, float | None]
-) -> JobOptions:
+def _request(want: str, budget: float, referee: str, robust: float, models: int, matter: dict[str, Any]) -> JobOptions:
     """Options of a job with these; InputError for a word that is none."""
     if want not in ("valid", "raw"):
         raise InputError(f"unknown --want {want!r}; choose valid or raw")
@@ -230,6 +237,8 @@ def _said(found: dict[str, Any]) -> str:
         )
         types = ", ".join(f"{number} {name}" for name, number in found["types"].items())
         lines.append(f"{types}; from {found['directions_used']} of {CELLS} directions")
+    if found.get("payload_kg") is not None:
+        lines.append(f"median payload {found['payload_kg']:.2f} kg")
     if "scene" in found:
         lines.append(
             f"{found['scene']}, {found['scenes']} scenes: {found['clear_share']:.0%} of the tries are clear of what "

@@ -98,6 +98,8 @@ class Synthesized:
                 "penetration_depth_mm": self._mean("penetration_depth_mm", 3),
             },
         }
+        if request.measures_payload:
+            told["payload_kg"] = self._median_payload()
         told |= self._diversity()
         if request.models:
             told |= {
@@ -119,6 +121,11 @@ class Synthesized:
             "directions_used": int((cells > 0).sum()),
             "direction_entropy_bits": round(entropy_bits(cells.tolist()), 4),
         }
+
+    def _median_payload(self) -> float | None:
+        values = np.asarray(self.arrays["quality/payload_kg"], float)
+        known = values[np.isfinite(values)]
+        return round(float(np.median(known)), 4) if len(known) else None
 
     def _mean(self, name: str, digits: int) -> float | None:
         values = self.arrays[f"quality/{name}"]

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from typer.testing import CliRunner
 
+from graspd.cli import build
 from service.model.domain import JobOptions
 from service.model.errors import MeshError
 from service.model.matter import ACCELERATION, FRICTION, MASS_KG
+from service.store.shards import read_shard
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.grasps import GraspSet, Posture
 from worker.objects.matter import as_asked
@@ -95,3 +100,18 @@ def test_what_is_said_with_a_job_goes_over_what_the_file_says() -> None:
         object_from_path("block", options={"mass": 0.4, "density": 3.0})
     with pytest.raises(MeshError, match="100 kg"):
         BOX.weighing(density=1e7)
+
+
+@pytest.mark.parametrize(("least", "kept", "outcomes"), [(0.3, 2, {}), (90.0, 0, {"weak": 2})])
+def test_a_job_counts_grasps_that_lift_the_wanted_payload(
+    tmp_path: Path, least: float, kept: int, outcomes: dict[str, int]
+) -> None:
+    words = [
+        "synth", "--hand", "barrett", "--object", "block", "--mass", "0.2", "--scene", "table", "-n", "2", "--budget",
+        "1", "--fidelity", "draft", "--seed", "3", "--min-payload", str(least), "--json", "-o", str(tmp_path / "g.h5"),
+    ]  # fmt: skip
+    told = json.loads(CliRunner().invoke(build(), words).stdout.splitlines()[-1])
+    shard = read_shard(tmp_path / "g.h5")
+    assert (told["grasps"], told["mass_kg"], shard.attributes["object_mass_kg"]) == (kept, 0.2, 0.2)
+    assert {name: told["outcomes"].get(name) for name in outcomes} == outcomes
+    assert (shard["quality/payload_kg"] >= least).all()
