@@ -15,6 +15,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
+from service.model.matter import ACCELERATION
 from service.model.transforms import compose
 from worker.files.exchange.names import plain_name
 from worker.files.exchange.robots.bundle import Bundle
@@ -23,8 +24,6 @@ from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.model import MujocoOptions, Scene, build, scene_spec
 from worker.robots.execution import POSTURES, Executions
 
-#: As the lift test pulls: a force of 1 N on 0.1 kg [m/s^2].
-GRAVITY: Final = 10.0
 #: Of the hand, the object, and all else.
 _COLOURS: Final = ("0.36 0.45 0.58 1", "0.87 0.45 0.2 1", "0.75 0.75 0.72 1")
 #: Attributes of MJCF that the specification knows by another name.
@@ -87,7 +86,7 @@ def _settle(tree: Element, found: Executions) -> None:
     if found.placed is None:
         option.set("gravity", "0 0 0")
     else:
-        option.set("gravity", f"0 0 {-GRAVITY:g}")
+        option.set("gravity", f"0 0 {-ACCELERATION:g}")
         for body in one(tree, ".//body[@name='body0']").iter("body"):
             body.set("gravcomp", "1")
     flag = option.find("flag")
