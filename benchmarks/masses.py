@@ -2,7 +2,7 @@
 
 usage: python -m benchmarks.masses DATA_DIR [--hands allegro ...] [--objects 025_mug ...] [--grasps 16] [--scenes 4]
            [--seed 1200] [--page OUT.md]
-       DATA_DIR holds hands/ and objects/; objects without a `mass_kg` in their meta.json are left out
+       DATA_DIR holds hands/ and objects/; objects without a mass in their meta.json are left out
 
 Shares are of raw candidates of fidelity standard on the faces that drops end on, planned for that mass.
 """
@@ -56,7 +56,8 @@ def main() -> None:
 def masses(data: Path) -> dict[str, float]:
     """Published masses of objects [kg]."""
     told = {meta.parent.name: json.loads(meta.read_text()) for meta in sorted((data / "objects").glob("*/meta.json"))}
-    return {name: float(meta["mass_kg"]) for name, meta in told.items() if meta.get("mass_kg")}
+    known = {name: meta.get("real", {}).get("mass_kg") for name, meta in told.items()}
+    return {name: float(mass) for name, mass in known.items() if mass}
 
 
 def lifts(given: Any, hand: str, name: str, mass: float) -> tuple[float, float]:
