@@ -46,7 +46,7 @@ from worker.run import ALONE, Run
 from worker.scenes.trial import trial_on
 from worker.scenes.verdicts import lift_level, scene_verdicts
 from worker.side_by_side import side_by_side
-from worker.simulation.surroundings import Scenes
+from worker.simulation.surroundings import Placed, Scenes
 
 #: Why a grasp is not kept: its hand is no number, something of its scene is in its way, the referee dropped it, it
 #: failed the geometric gate, holds in too few models around the nominal one, lifts too little, or is as good as the
@@ -425,30 +425,32 @@ class _Work:
     ) -> Arrays:  # fmt: skip
         """Share of the models in which those that hold do, told whole of raw grasps, and what they fail first of."""
         assert self.pieces is not None
-        wish, placed = self.request, None
-        if self.scenes is not None:
-            assert grasps.scene is not None
-            placed = self.scenes.placed(grasps.scene)
+        wish = self.request
         found = robust(
-            self.hand, self.obj, grasps, held=held, placed=placed, level=lift_level(wish.referee), models=wish.models,
-            seed=wish.seed, pieces=self.pieces.result(), wanted=wish.robust if wish.want == "valid" else 0,
-            run=run.quiet(),
+            self.hand, self.obj, grasps, held=held, placed=self._placed(grasps), level=lift_level(wish.referee),
+            models=wish.models, seed=wish.seed, pieces=self.pieces.result(),
+            wanted=wish.robust if wish.want == "valid" else 0, run=run.quiet(),
         )  # fmt: skip
         seconds["referee"] += found.seconds
         return found.columns
+
+    def _placed(self, grasps: GraspSet) -> Placed | None:
+        """The grasps' scenes; None: the object is free."""
+        if self.scenes is None:
+            return None
+        assert grasps.scene is not None
+        return self.scenes.placed(grasps.scene)
 
     def _payloads(
         self, grasps: GraspSet, held: NDArray[np.bool_], run: Run, seconds: dict[str, float]
     ) -> NDArray[np.float64]:
         """(N,) payloads of those that are `held` [kg]."""
         assert self.pieces is not None
-        began, placed = time.perf_counter(), None
-        if self.scenes is not None:
-            assert grasps.scene is not None
-            placed = self.scenes.placed(grasps.scene)
+        began = time.perf_counter()
         found = payloads(
-            self.hand, self.obj, grasps, pieces=self.pieces.result(), placed=placed, held=held, run=run.quiet()
-        )
+            self.hand, self.obj, grasps, pieces=self.pieces.result(), placed=self._placed(grasps), held=held,
+            run=run.quiet(),
+        )  # fmt: skip
         seconds["referee"] += time.perf_counter() - began
         return found
 
@@ -498,10 +500,8 @@ class _Work:
         """What the letter says of grasps."""
         assert self.pieces is not None
         run, pieces = self._run.quiet(), self.pieces.result()
-        if self.scenes is None:
+        if (placed := self._placed(grasps)) is None:
             return judge(self.hand, self.obj, grasps, level="letter", pieces=pieces, run=run).success
-        assert grasps.scene is not None
-        placed = self.scenes.placed(grasps.scene)
         return judge_lifts(self.hand, self.obj, grasps, placed, level="letter", pieces=pieces, run=run).success
 
 

@@ -33,7 +33,7 @@ from service.model.domain import AUDITS, NETWORK_METHODS, JobRequest
 from service.model.errors import InputError
 from service.model.scene_options import scene_option
 from service.model.states import AssetKind, State
-from service.store.asset_options import DensityOption, MassOption, ObjectFrictionOption
+from service.store.asset_options import DensityOption, MassOption, MinPayloadOption, ObjectFrictionOption, PayloadOption
 from service.store.asset_summary import hand_line, self_test_line
 
 app = typer.Typer(no_args_is_help=True)
@@ -91,10 +91,8 @@ def submit(
     mass: MassOption = None,
     density: DensityOption = None,
     object_friction: ObjectFrictionOption = None,
-    payload: Annotated[
-        bool, typer.Option("--payload", help="Measure the heaviest mass that each valid grasp lifts.")
-    ] = False,
-    min_payload: Annotated[float, typer.Option(help="Mass that a grasp must lift to count [kg]; 0: any.")] = 0.0,
+    payload: PayloadOption = False,
+    min_payload: MinPayloadOption = 0.0,
     wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
     url: UrlOption = None,
     json: JsonFlag = False,

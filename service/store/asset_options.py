@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final, Literal
 import typer
 
 from service.model.errors import InputError
-from service.model.matter import FRICTION, MASS_KG
+from service.model.matter import FRICTION, MASS_KG, MOST_KG
 
 PalmOption = Annotated[str | None, typer.Option("--palm", help="Link that is the palm.")]
 ApproachOption = Annotated[
@@ -63,6 +63,12 @@ _FRICTION_HELP: Final = f"Coulomb coefficient of the object's contacts in simula
 FrictionOption = Annotated[float | None, typer.Option("--friction", help=_FRICTION_HELP)]
 #: Where `--friction` is the coefficient of the metrics.
 ObjectFrictionOption = Annotated[float | None, typer.Option("--object-friction", help=_FRICTION_HELP)]
+PayloadOption = Annotated[
+    bool, typer.Option("--payload", help="Measure the heaviest mass that each valid grasp lifts.")
+]
+MinPayloadOption = Annotated[
+    float, typer.Option("--min-payload", help="Mass that a grasp must lift to count [kg]; 0: any.", min=0, max=MOST_KG)
+]
 LicenceOption = Annotated[
     str | None, typer.Option("--licence", help="Terms it may be used on, for dataset cards: CC-BY-4.0.")
 ]

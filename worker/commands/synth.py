@@ -36,7 +36,9 @@ from service.store.asset_options import (
     DensityOption,
     KeepLargestOption,
     MassOption,
+    MinPayloadOption,
     ObjectFrictionOption,
+    PayloadOption,
     ScaleToOption,
     UnitsOption,
     object_options,
@@ -87,12 +89,8 @@ def synth(
     mass: MassOption = None,
     density: DensityOption = None,
     object_friction: ObjectFrictionOption = None,
-    payload: Annotated[
-        bool, typer.Option("--payload", help="Measure the heaviest mass that each valid grasp lifts.")
-    ] = False,
-    min_payload: Annotated[
-        float, typer.Option(help="Mass that a grasp must lift to count [kg]; 0: none is wanted.", min=0, max=100)
-    ] = 0.0,
+    payload: PayloadOption = False,
+    min_payload: MinPayloadOption = 0.0,
     units: UnitsOption = None,
     scale_to: ScaleToOption = None,
     keep_largest: KeepLargestOption = False,

@@ -101,12 +101,13 @@ class ObjectModel:
             raise MeshError(
                 f"{self.name}: it would weigh {mass:.4g} kg; the most is {MOST_KG:g} kg: is its unit right?"
             )
-        return replace(self, mass=mass, friction=self.friction if friction is None else friction)
+        friction = self.friction if friction is None else friction
+        return self if (mass, friction) == (self.mass, self.friction) else replace(self, mass=mass, friction=friction)
 
     @property
     def published(self) -> ObjectModel:
         """The same with mass and friction of DexGraspBench's protocol, which are the same for all objects."""
-        return replace(self, mass=MASS_KG, friction=FRICTION)
+        return self.weighing(mass=MASS_KG, friction=FRICTION)
 
     @property
     def gyration_radius(self) -> float:

@@ -51,9 +51,9 @@ def hand_of(store: Store, message: TaskMessage) -> HandModel:
 
 def object_of(store: Store, message: TaskMessage) -> ObjectModel:
     """The object of a task, simplified as far as its fidelity allows."""
-    name, digest = message.request.object, message.object_digest
-    error = message.request.knobs.face_error_m
-    key = (store.url, AssetKind.OBJECT, name, digest, error)
+    request, digest = message.request, message.object_digest
+    name, error = request.object, request.knobs.face_error_m
+    key = (store.url, AssetKind.OBJECT, name, digest, error, request.referee == "letter", *request.matter.items())
 
     def load() -> ObjectModel:
         obj = prepared_object(store, digest, name=name, face_error_m=error)
@@ -61,9 +61,9 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
             # The same for whichever fidelity comes first.
             shown = prepared_object(store, digest, name=name, face_error_m=SHOWN_ERROR_M)
             publish_model(store, AssetKind.OBJECT, shown)
-        return obj
+        return as_asked(obj, request)
 
-    return as_asked(_cached(key, load), message.request)
+    return _cached(key, load)
 
 
 def neighbours_of(store: Store, message: TaskMessage) -> list[ObjectModel]:

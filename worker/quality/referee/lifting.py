@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import queue
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final, Literal, get_args
@@ -25,6 +23,7 @@ from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lift import Lift, LiftOutcome, LiftTrial
 from worker.quality.referee.model import DENSITY, TOUCH_ROUNDING_M, MujocoOptions
+from worker.quality.referee.threads import answers
 from worker.run import ALONE, Run
 from worker.simulation import surroundings
 from worker.simulation.surroundings import Placed
@@ -93,27 +92,18 @@ def judge_lifts(
     pieces = pieces or decompose(obj, cache=cache)
     physics = MujocoOptions().hardened() if hard else MujocoOptions()
     scene = scene_of(hand, obj, pieces, physics, placed.supports, placed.neighbours)
-    tests: queue.SimpleQueue[Lift] = queue.SimpleQueue()
-    workers = max(1, min(run.cores, len(grasps)))
-    for _ in range(workers):
-        tests.put(Lift(scene, placed))
     done, lock = 0, threading.Lock()
 
-    def work(row: int) -> LiftTrial:
+    def ask(test: Lift, row: int) -> LiftTrial:
         nonlocal done
         run.check("the referee")
-        test = tests.get()
-        try:
-            trial = test.letter(grasps, row) if level == "letter" else test.lift(grasps, row)
-        finally:
-            tests.put(test)
+        trial = test.letter(grasps, row) if level == "letter" else test.lift(grasps, row)
         with lock:
             done += 1
             run.progress(done, len(grasps), "lifts")
         return trial
 
-    with ThreadPoolExecutor(workers, thread_name_prefix="lift") as pool:
-        trials = list(pool.map(work, range(len(grasps))))
+    trials = answers(range(len(grasps)), lambda: Lift(scene, placed), ask, threads=run.cores, name="lift")
     return LiftVerdicts(
         success=np.array([t.success for t in trials], np.int8),
         outcome=np.array([t.outcome for t in trials], np.uint8),

@@ -8,9 +8,7 @@ closing anew around a heavier object changes little.
 from __future__ import annotations
 
 import copy
-import queue
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any, Final
 
@@ -28,6 +26,7 @@ from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.lift import Lift, LiftOutcome
 from worker.quality.referee.model import MujocoOptions, Scene
 from worker.quality.referee.protocol import DIRECTIONS, Outcome, Test, Trial
+from worker.quality.referee.threads import answers
 from worker.run import ALONE, Run
 from worker.simulation.surroundings import Placed
 
@@ -50,8 +49,9 @@ class _Weighed(Test):
         self.scene = replace(self.scene, mass=mass)
         model.body_mass[body] = mass
         model.body_inertia[body] = self._inertia * (mass / self._own)
-        # Inverse inertias that follow from the mass set how stiff contacts are.
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        # Inverse inertias that follow from the mass set how stiff contacts are. What this leaves in the data is put
+        # right by what comes next: a state is restored, or a grasp begun.
+        mujoco.mj_setConst(model, self.data)
 
     def _heaviest(self, holds: Callable[[float], bool]) -> float:
         """The heaviest mass [kg] that `holds` is true of, from the object's own on; nan: not even that."""
@@ -147,19 +147,13 @@ def payloads(
         return out
     around = (placed.supports, placed.neighbours) if placed is not None else ()
     scene = scene_of(hand, obj, pieces, MujocoOptions(), *around)
-    tests: queue.SimpleQueue[LiftPayload | PushPayload] = queue.SimpleQueue()
-    workers = max(1, min(run.cores, len(rows)))
-    for _ in range(workers):
-        tests.put(PushPayload(scene) if placed is None else LiftPayload(scene, placed))
 
-    def work(row: int) -> float:
+    def ask(test: LiftPayload | PushPayload, row: int) -> float:
         run.check("the referee")
-        test = tests.get()
-        try:
-            return test.payload(grasps, row)
-        finally:
-            tests.put(test)
+        return test.payload(grasps, row)
 
-    with ThreadPoolExecutor(workers, thread_name_prefix="payload") as pool:
-        out[rows] = list(pool.map(work, rows.tolist()))
+    def make() -> LiftPayload | PushPayload:
+        return PushPayload(scene) if placed is None else LiftPayload(scene, placed)
+
+    out[rows] = answers(rows.tolist(), make, ask, threads=run.cores, name="payload")
     return out
