@@ -99,7 +99,7 @@ def chosen(request: Request, assets: Assets, fields: FormData, kind: AssetKind) 
     return Chosen(refused=Refusal(f"choose a known {kind.value}, or a file"))
 
 
-def refusal(asset: AssetView) -> Refusal:
+def refusal_of(asset: AssetView) -> Refusal:
     """What the check of an asset says, with the options that it suggests as buttons.
 
     What an upload says of itself stands beside what its check found, so facts may be of any type.
@@ -191,7 +191,7 @@ def _checked(assets: Assets, asset: AssetView) -> Chosen:
         time.sleep(0.2)
         asset = assets.one(asset.kind, asset.digest)
     if asset.verdict == "refuse":
-        return Chosen(refused=refusal(asset), file=asset.name, held=asset.digest)
+        return Chosen(refused=refusal_of(asset), file=asset.name, held=asset.digest)
     return Chosen(name=asset.name)
 
 

@@ -13,13 +13,12 @@ from starlette.datastructures import FormData, UploadFile
 from api.catalog.assets import Assets
 from api.catalog.jobs import Jobs
 from api.dashboard.expected import listed
-from api.dashboard.form_uploads import FILE_FIELDS, UNITS, Chosen, choices, chosen, refusal
+from api.dashboard.form_uploads import FILE_FIELDS, UNITS, Chosen, choices, chosen, refusal_of
 from api.dashboard.rendering import render
 from api.routes.dependencies import AssetsOf, JobsOf, may_read, may_submit
 from service.model.domain import JobRequest
 from service.model.errors import InputError
-from service.model.refusals import refusal as refused_line
-from service.model.refusals import words
+from service.model.refusals import refusal, words
 from service.model.states import AssetKind
 
 router = APIRouter(include_in_schema=False)
@@ -43,7 +42,7 @@ def submit_page(request: Request, assets: AssetsOf) -> HTMLResponse:
 @router.get("/submit/refusals/{kind}/{digest}", dependencies=[Depends(may_read)])
 def refused(request: Request, kind: AssetKind, digest: str, assets: AssetsOf) -> HTMLResponse:
     """Why an upload was refused and what may be done, as a part of the form."""
-    found = refusal(assets.one(kind, digest))
+    found = refusal_of(assets.one(kind, digest))
     return render(request, "refusal.html", kind=kind.value, problem=found.problem, fixes=found.fixes)
 
 
@@ -74,7 +73,7 @@ def retry(job_id: str, jobs: JobsOf) -> RedirectResponse:
 
 def first_message(error: ValueError) -> str:
     """The first mistake of a validation, in one line."""
-    return refused_line(error) if isinstance(error, ValidationError) else str(error)
+    return refusal(error) if isinstance(error, ValidationError) else str(error)
 
 
 def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> HTMLResponse | RedirectResponse:

@@ -9,7 +9,7 @@ import numpy as np
 
 from service.model.errors import AssetError, InputError
 from worker.objects.options import ObjectOptions, parse_options
-from worker.objects.prepare import build, main_file, repaired_mesh
+from worker.objects.prepare import build, main_file, repaired_mesh, weighed
 from worker.objects.repair import Repaired
 
 #: Bound with which the prepared mesh of the report is simplified [m]: that of the standard fidelity.
@@ -55,12 +55,11 @@ def check_object(
 
 
 def _facts(mesh: Repaired, face_error_m: float, options: ObjectOptions) -> dict[str, Any]:
-    model = build(mesh, face_error_m)
+    model = weighed(build(mesh, face_error_m), options)
     away, extents = float(np.linalg.norm(mesh.centre)), np.ptp(mesh.vertices, axis=0)
     notes = list(mesh.notes)
     if away > FAR * extents.max():
         notes.append(f"its origin lies {away:.4g} m from the middle of the mesh; poses of hands are told from there")
-    model = model.weighing(mass=options.mass, density=options.density, friction=options.friction)
     return {
         "faces": len(mesh.faces),
         "prepared_faces": len(model.faces),

@@ -98,9 +98,7 @@ class ObjectModel:
         if mass is None:
             mass = self.mass if density is None else density * self.volume
         if mass > MOST_KG:
-            raise MeshError(
-                f"{self.name}: it would weigh {mass:.4g} kg; the most is {MOST_KG:g} kg: is its unit right?"
-            )
+            raise MeshError(f"the object would weigh {mass:.4g} kg; the most is {MOST_KG:g} kg: is its unit right?")
         friction = self.friction if friction is None else friction
         return self if (mass, friction) == (self.mass, self.friction) else replace(self, mass=mass, friction=friction)
 

@@ -47,7 +47,12 @@ def load_object(
     main = main_file(files, settings)
     shape = settings.model_dump_json(exclude=set(OF_MATTER))
     model = replace(_prepared(main, files[main], shape, float(face_error_m)), name=name, digest=digest)
-    return model.weighing(mass=settings.mass, density=settings.density, friction=settings.friction)
+    return weighed(model, settings)
+
+
+def weighed(model: ObjectModel, options: ObjectOptions) -> ObjectModel:
+    """The model with the mass and friction that its options say."""
+    return model.weighing(mass=options.mass, density=options.density, friction=options.friction)
 
 
 def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:
