@@ -197,6 +197,24 @@ def test_a_fix_without_its_number_asks_for_it(http: TestClient, parts: Parts, ty
     assert fields_of(again.text)["object_held"] == fields_of(page)["object_held"]
 
 
+@pytest.mark.parametrize(
+    ("suggested", "words"),
+    [
+        ({"keep_largest": True}, "Keep the largest part alone"),
+        ({"compound": True}, "Take the parts as one rigid body"),
+        ({"allow_open": True}, "Take it as it is, open"),
+        ({"root": "palm"}, "Begin the hand at palm"),
+        ({"fix": {"wrist": 0}}, "Fix wrist at 0"),
+    ],
+)
+def test_each_suggested_option_is_a_button(
+    http: TestClient, parts: Parts, suggested: dict[str, Any], words: str
+) -> None:
+    asset = uploaded(http, parts, "refuse", {"problem": "it is none", "options_suggested": [suggested]})
+    page = http.get(f"/submit/refusals/object/{asset.digest}").text
+    assert {said: json.loads(value) for said, value in fixes_of(page).items()} == {words: suggested}
+
+
 def test_facts_that_an_upload_says_of_itself_break_no_page(http: TestClient, parts: Parts) -> None:
     odd = {"units_suggested": "mm", "options_suggested": [3, {}, {"a": 1}, {"root": "<b>"}], "lengths_m": [1]}
     asset = uploaded(http, parts, "refuse", odd)
