@@ -175,7 +175,8 @@ def test_at_a_terminal_the_question_is_answered(graspd: Shell, answer: str, code
 def test_what_was_deleted_is_restored(graspd: Shell, kind: str) -> None:
     name, _ = _deletable(graspd, kind)
     group = kind.split()[:-1]
-    graspd(*kind.split(), name, "--yes")
+    gone = graspd(*kind.split(), name, "--yes")
+    assert gone.returncode == 0, gone.stderr
     done = graspd(*group, "restore", name)
     assert done.returncode == 0 and f"{name[:8]}" in done.stdout and "is restored" in done.stdout
     assert graspd(*group, "restore", name).returncode == 2, "it is not deleted any more"
