@@ -3,6 +3,7 @@ shards that no job needs any more."""
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ from service.model.clock import timestamp
 from service.model.errors import ConflictError, DamagedError, NotFoundError
 from service.model.planning import plan
 from service.model.states import AssetKind, Stage
+from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.deletion import delete_job, put_away
 from service.pipeline.pack_removal import remove_packed
@@ -112,6 +114,9 @@ class Sweeper:
                 if self._clock() > deadline:
                     return False
                 try:
+                    # The dataset was cancelled, perhaps too short a time ago for its jobs to be.
+                    with contextlib.suppress(ConflictError):
+                        job_actions.cancel(self._parts, job)
                     delete_job(self._parts, job)
                 except (ConflictError, NotFoundError) as error:
                     log.info("job %s of the deleted dataset %s stays: %s", job, dataset, error)

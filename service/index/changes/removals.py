@@ -63,8 +63,9 @@ class Removals:
         return int(within.scalar(query) or 0)
 
     def planned_only(self, ids: Sequence[str]) -> list[str]:
-        """Of these jobs, those that only a dataset's planner made: nobody submitted them by themselves."""
+        """Of these jobs, those that only a dataset's planner made, nobody by themselves, and that no dataset holds."""
         query = select(jobs.c.id).where(jobs.c.id.in_(ids), jobs.c.lane == Lane.BULK.value, jobs.c.origin.is_(None))
+        query = query.where(~exists().where(dataset_cells.c.job_id == jobs.c.id))
         with self.database.reading() as connection:
             return list(connection.scalars(query))
 

@@ -180,9 +180,11 @@ def _dataset_view(connection: Connection, row: Any) -> DatasetView:
 
 def _state(row: Any, states: dict[State, int]) -> State:
     state = job_state(state for state, count in states.items() if count)
-    if state.is_final and not row["cancelled"] and row["applied"] < row["events"]:
-        return State.QUEUED  # a retry that is not yet passed on to the jobs
-    return state
+    if row["cancelled"]:
+        # It waits for nothing more, though its jobs stop a moment later, or go on for another dataset.
+        return state if state.is_final else State.CANCELLED
+    # An event that is not yet passed on to the jobs: a retry.
+    return State.QUEUED if state.is_final and row["applied"] < row["events"] else state
 
 
 def _states(connection: Connection, row: Any) -> dict[State, int]:

@@ -149,6 +149,29 @@ def test_a_dataset_that_runs_is_in_use(parts: Parts) -> None:
         delete_dataset(parts, "d")
 
 
+def test_a_dataset_that_was_just_cancelled_can_be_deleted(parts: Parts) -> None:
+    """Before the planner has told its jobs; those end with it."""
+    actions.create(parts, DatasetRequest(name="d", hands=("gripper",), objects=("ball",)))
+    plan_all(parts)
+    assert actions.cancel(parts, "d").state is State.CANCELLED
+    delete_dataset(parts, "d")
+    Sweeper(parts).advance()
+    assert not parts.index.jobs.page().items
+
+
+def test_a_cancelled_dataset_has_ended_though_another_waits_for_its_jobs(parts: Parts) -> None:
+    for name in ("d", "other"):
+        actions.create(parts, DatasetRequest(name=name, hands=("gripper",), objects=("ball",)))
+    plan_all(parts)
+    assert actions.cancel(parts, "d").state is State.CANCELLED
+    plan_all(parts)
+    delete_dataset(parts, "d")
+    while Sweeper(parts).advance():
+        pass
+    (job,) = parts.index.jobs.page().items
+    assert job.state is State.QUEUED, "the other dataset waits for it"
+
+
 def test_a_hand_that_a_job_needs_is_in_use(parts: Parts) -> None:
     job = finished(parts)
     with pytest.raises(ConflictError, match=f"needed by job {job}"):
