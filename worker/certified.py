@@ -190,7 +190,7 @@ class _Work:
         """A thread for what need not be waited for."""
         self.pieces: Future[ConvexPieces] | None = None
         self.scenes: Scenes | None = None
-        self.tried = 0
+        self.tried = self.repeated = 0
         self._trials: Trial | None = None
         self._audits: Future[NDArray[np.int8]] | None = None
         self._kept = np.zeros((0, POINTS, 3))
@@ -208,7 +208,8 @@ class _Work:
             parts.append(self._round(0, range(count), self._run))
             return
         budget, number, valid = math.ceil(wish.budget * count), 0, 0
-        while size := next_round(count, valid, self.tried, budget):
+        # In scenes a grasp that sets out again costs as much as another grasp.
+        while size := next_round(count, valid, self.tried, budget - self.repeated):
             first = 0
             while first < size and valid < count:
                 share = min(size - first, enough(count, valid, self.tried) if self._in_parts else size)
@@ -247,6 +248,7 @@ class _Work:
             for part, one in zip(parts, found, strict=True)
         ]
         self.tried += len(rows)
+        self.repeated += sum(lane.repeated for lane in made)
         for name in self.seconds:
             self.seconds[name] += sum(lane.seconds[name] for lane in made) / len(made)
         return self._without_alike(Round.joined(made))
@@ -272,6 +274,7 @@ class _Work:
         planned = replace(planned, scene=index).moved(np.zeros(3))
         made = self._scored(planned, replace(run, lanes=None))
         made.seconds["planner"] += planned.seconds
+        made.repeated = max(0, planned.attempts - len(rows)) if placed is not None else 0
         if number == 0 and rows.start == 0:
             self._begin_audits(made)
         return made

@@ -81,6 +81,8 @@ class GraspSet:
     """(N,) the scene of each grasp; only in scenes."""
     lift: Posture | None = None
     """N squeeze postures raised against gravity; only in scenes."""
+    attempts: int = 0
+    """How often the planner set out for the whole set; 0: it does not tell."""
 
     def __len__(self) -> int:
         return len(self.grasp)

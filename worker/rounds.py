@@ -37,6 +37,8 @@ class Round:
     """In scenes: how many were clear, lifted, lifted_hard."""
     seconds: dict[str, float]
     """Wall time of planning, judging and measuring [s]."""
+    repeated: int = 0
+    """In scenes: how often its grasps set out again."""
 
     @classmethod
     def joined(cls, parts: Sequence[Round]) -> Round:
@@ -45,7 +47,7 @@ class Round:
         seconds = {name: sum(part.seconds[name] for part in parts) for name in parts[0].seconds}
         return cls(
             joined([part.grasps for part in parts]), joined_columns([part.columns for part in parts]),
-            np.concatenate([part.fates for part in parts]), in_scene, seconds,
+            np.concatenate([part.fates for part in parts]), in_scene, seconds, sum(part.repeated for part in parts),
         )  # fmt: skip
 
 

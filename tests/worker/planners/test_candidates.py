@@ -17,9 +17,10 @@ from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners import Wanted, synthesize
 from worker.planners.fast_graspd import candidates, planner
-from worker.planners.fast_graspd.candidates import Seated
+from worker.planners.fast_graspd.candidates import FIRMER, Seated
 from worker.planners.fast_graspd.planner import ATTEMPTS
 from worker.planners.fast_graspd.schedule import PULL
+from worker.quality.postures import normal_force, squeeze
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.short import SLIPS, push_trial
 from worker.run import Run
@@ -156,11 +157,33 @@ def attempts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return made
 
 
-def test_in_scenes_no_grasp_sets_out_again(scene, attempts: list[int]) -> None:
+@pytest.mark.parametrize(("score", "made"), [(0.5, 1), (1.5, 2), (9.0, 4)])
+def test_in_scenes_a_grasp_sets_out_again_while_it_fails_and_once_if_it_holds_barely(
+    scene, attempts: list[int], score: float, made: int
+) -> None:
     hand, obj, placed = scene
-    never = Wanted(4, QUICK, seed=4, placed=placed, trial=lambda grasps, _: np.full(len(grasps), 9.0))
-    synthesize(hand, obj, never, Run(threads=1))
-    assert attempts == [0] * 4
+    wanted = Wanted(4, QUICK, seed=4, placed=placed, trial=lambda grasps, _: np.full(len(grasps), score))
+    found = synthesize(hand, obj, wanted, Run(threads=1))
+    assert sorted(attempts) == sorted([*range(made)] * 4)
+    assert found.attempts == 4 * made
+
+
+@pytest.mark.parametrize(("better", "times"), [(True, FIRMER), (False, 1.0)])
+def test_a_hand_that_holds_at_the_whole_friction_only_squeezes_harder_where_that_helps(
+    scene, better: bool, times: float
+) -> None:
+    hand, obj, placed = scene
+
+    def squeezed(grasps: GraspSet, times: float) -> np.ndarray:
+        return squeeze(hand, obj, grasps.grasp, total_normal_force=times * normal_force(obj)).joint_positions
+
+    def trial(grasps: GraspSet, _: Placed) -> np.ndarray:
+        usual = np.isclose(grasps.squeeze.joint_positions, squeezed(grasps, 1.0)).all(axis=1)
+        return np.where(usual, 1.5, 0.5 if better else 1.6)
+
+    found = synthesize(hand, obj, Wanted(4, QUICK, seed=4, placed=placed, trial=trial), Run(threads=1))
+    assert np.allclose(found.squeeze.joint_positions, squeezed(found, times))
+    assert not np.allclose(squeezed(found, FIRMER), squeezed(found, 1.0)), "it is strong enough"
 
 
 def free_case(name: str):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -13,7 +13,7 @@ from worker.grasps import GraspSet, joined
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.selection import posture_of, ranked
-from worker.quality.postures import pregrasp, squeeze
+from worker.quality.postures import normal_force, pregrasp, squeeze
 from worker.simulation.state import HandState
 from worker.simulation.surroundings import Placed
 
@@ -26,6 +26,8 @@ TOGETHER: Final = 2
 HOPEFUL: Final = 0.3
 #: Score beyond which that of a grasp is as good as nothing: lost, or its way is blocked.
 POOR: Final = 7.0
+#: A hand in a scene that holds at the whole friction only is tried once more with so many times the force.
+FIRMER: Final = 2.0
 #: Score of what has none.
 HOPELESS: Final = 1e9
 
@@ -112,19 +114,47 @@ def tried(
             found = with_postures(
                 hand, obj, seated.state[rows[open_]], seated.losses[rows[open_]], where, device=device
             )  # fmt: skip
-            _try(found, seated, rows[open_], which, trial, taken)
+            score = _scores(found, seated.unsound[rows[open_]], which, trial)
+            if placed is not None:
+                _firmer(hand, obj, found, score, which, trial, device)
+            _take(found, seated, rows[open_], which, score, taken)
         left = left[~(taken.score[left] < 1.0)]
     return taken
 
 
-def _try(
-    found: GraspSet, seated: Seated, rows: NDArray[np.intp], which: NDArray[np.intp], trial: TrialOf, taken: Taken
-) -> None:
-    """One hand each (k,) of the grasps `which` (k,), as grasps."""
-    state, losses = seated.state[rows], seated.losses[rows]
-    score, sound = np.full(len(rows), HOPELESS), np.flatnonzero(~seated.unsound[rows])
+def _scores(found: GraspSet, unsound: NDArray[np.bool_], which: NDArray[np.intp], trial: TrialOf) -> Floats:
+    """(k,) what the trial says of one hand each of the grasps `which` (k,)."""
+    score, sound = np.full(len(which), HOPELESS), np.flatnonzero(~unsound)
     if len(sound):
         score[sound] = np.nan_to_num(trial(found.take(sound), which[sound]), nan=HOPELESS, posinf=HOPELESS)
+    return score
+
+
+def _firmer(
+    hand: HandModel, obj: ObjectModel, found: GraspSet, score: Floats, which: NDArray[np.intp], trial: TrialOf,
+    device: str,
+) -> None:  # fmt: skip
+    """Gives hands (k,) that hold at the whole friction only a firmer squeeze, where they hold better with it and are
+    strong enough to exert it."""
+    some = np.flatnonzero((score >= 1.0) & (score < 2.0))
+    if not len(some):
+        return
+    firm = squeeze(hand, obj, found.grasp.take(some), total_normal_force=FIRMER * normal_force(obj), device=device)
+    stronger = np.flatnonzero((firm.joint_positions != found.squeeze.joint_positions[some]).any(axis=1))
+    some, firm = some[stronger], firm.take(stronger)
+    if not len(some):
+        return
+    again = _scores(replace(found.take(some), squeeze=firm), np.zeros(len(some), bool), which[some], trial)
+    better = again < score[some]
+    found.squeeze.joint_positions[some[better]] = firm.joint_positions[better]
+    score[some[better]] = again[better]
+
+
+def _take(
+    found: GraspSet, seated: Seated, rows: NDArray[np.intp], which: NDArray[np.intp], score: Floats, taken: Taken
+) -> None:
+    """Of one hand each (k,) of the grasps `which` (k,) those that are better than what is taken."""
+    state, losses = seated.state[rows], seated.losses[rows]
     for k in np.flatnonzero(score < taken.score[which]):
         grasp = int(which[k])
         taken.grasps[grasp] = found.take(slice(k, k + 1))

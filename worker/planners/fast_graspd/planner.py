@@ -64,6 +64,9 @@ FAILED: Final = 2.0
 #: How often grasps whose hands are tried may set out again. One more attempt finds what the first ones found, so valid
 #: grasps a second hardly depend on it, and fewer grasps of a hard pair are left that hold nothing.
 ATTEMPTS: Final = 20
+#: Scores beyond which grasps in scenes set out again, at each attempt: at the first one also those that hold at the
+#: whole friction only. An attempt costs as much as another grasp of the batch.
+IN_SCENES: Final = (1.0, FAILED, FAILED)
 #: Attempts of one grasp that are made at once, at the most.
 AHEAD: Final = 4
 
@@ -83,21 +86,30 @@ class Part:
     """(n,) L_stable of each grasp's hands in the mean, every `CHUNK` iterations."""
     grasps: GraspSet | None = None
     """With the postures around them, where they were wanted or a trial needed these."""
+    attempts: Rows = field(default_factory=lambda: np.zeros(0, int))
+    """(n,) how often each set out."""
+
+    def __post_init__(self) -> None:
+        if len(self.attempts) != len(self.rows):
+            self.attempts = np.ones(len(self.rows), int)
 
     def take(self, which: NDArray[np.intp]) -> Part:
         """Some of the grasps."""
         grasps = None if self.grasps is None else self.grasps.take(which)
         curve = [one[which] for one in self.curve]
-        return Part(self.rows[which], self.state[which], self.loss[which], self.merit[which], curve, grasps)
+        parts = (self.rows[which], self.state[which], self.loss[which], self.merit[which], curve, grasps)
+        return Part(*parts, self.attempts[which])
 
     def followed_by(self, other: Part) -> Part:
         """All grasps of both."""
         curve = [np.concatenate(both) for both in zip(self.curve, other.curve, strict=True)]
         both = [part.grasps for part in (self, other) if part.grasps is not None]
-        rows, loss, merit = (
-            np.concatenate([getattr(part, name) for part in (self, other)]) for name in ("rows", "loss", "merit")
+        rows, loss, merit, attempts = (
+            np.concatenate([getattr(part, name) for part in (self, other)])
+            for name in ("rows", "loss", "merit", "attempts")
         )
-        return Part(rows, _joined_states([self.state, other.state]), loss, merit, curve, joined(both) if both else None)
+        state = _joined_states([self.state, other.state])
+        return Part(rows, state, loss, merit, curve, joined(both) if both else None, attempts)
 
 
 def plan(
@@ -168,7 +180,7 @@ def optimise(pair: Pair, batches: Batches, run: Run, *, postures: bool = False) 
         return _work(launch, begun.take(np.arange(which.start, which.stop), batches.fidelity.starts))
 
     parts = run_parts(cut(len(rows), run, least=PART), work)
-    if batches.placed is None:
+    if batches.placed is None or batches.has_trial:
         parts = [_tried_again(launch, reduce(Part.followed_by, parts), run)]
     if not postures or batches.has_trial:
         return parts
@@ -314,23 +326,27 @@ def _work(launch: _Launch, begun: _Begun) -> Part:
 
 
 def _tried_again(launch: _Launch, part: Part, run: Run) -> Part:
-    """Grasps of free objects that balance poorly, or fail their trial, set out again; the first good one stays, or else
+    """Grasps that fail their trial, or of free objects balance poorly, set out again; the first good one stays, or else
     the best.
 
     The last few would leave cores idle, and a hand of a small launch costs a third more: they make some attempts ahead.
     Those after a good one are forgotten, so a grasp is as if it had made one after the other."""
-    limit, attempts = (FAILED, ATTEMPTS) if launch.batches.has_trial else (SET_OUT_AGAIN, 1)
-    number = 1
-    while number <= attempts and len(poor := np.flatnonzero(part.merit > limit)):
-        ahead = int(np.clip(PART * run.cores // len(poor), 1, min(AHEAD, attempts + 1 - number)))
-        attempt = np.repeat(np.arange(number, number + ahead), len(poor))
+    limits = (FAILED,) * ATTEMPTS if launch.batches.has_trial else (SET_OUT_AGAIN,)
+    if launch.batches.placed is not None:
+        limits = IN_SCENES
+    done = 0
+    while done < len(limits) and len(poor := np.flatnonzero(part.merit > limits[done])):
+        ahead = int(np.clip(PART * run.cores // len(poor), 1, min(AHEAD, len(limits) - done)))
+        attempt = np.repeat(np.arange(done + 1, done + 1 + ahead), len(poor))
         again = _set_out_again(launch, np.tile(part.rows[poor], ahead), attempt, run)
-        merit, chosen = part.merit.copy(), np.arange(len(part.rows))
-        for made in np.split(np.arange(len(attempt)), ahead):
-            better = (merit[poor] > limit) & (again.merit[made] < merit[poor])
+        merit, attempts, chosen = part.merit.copy(), part.attempts.copy(), np.arange(len(part.rows))
+        for made, limit in zip(np.split(np.arange(len(attempt)), ahead), limits[done:], strict=False):
+            wanting = merit[poor] > limit
+            attempts[poor] += wanting
+            better = wanting & (again.merit[made] < merit[poor])
             chosen[poor[better]] = len(part.rows) + made[better]
             merit[poor[better]] = again.merit[made[better]]
-        part, number = part.followed_by(again).take(chosen), number + ahead
+        part, done = replace(part.followed_by(again).take(chosen), attempts=attempts), done + ahead
     return part
 
 
@@ -343,7 +359,9 @@ def _set_out_again(launch: _Launch, rows: Rows, attempt: Rows, run: Run) -> Part
         some = slice(which.start, which.stop)
         begun = _set_out(launch, rows[some], attempt[some])
         made = _work(launch, begun)
-        lost = begun.depth.reshape(len(made.rows), -1).max(axis=1) > NO_PLACE
+        # As at the first attempt: around a free object every hand needs a place, in scenes one of a grasp's.
+        deep = begun.depth.reshape(len(made.rows), -1)
+        lost = (deep.max(axis=1) if launch.batches.placed is None else deep.min(axis=1)) > NO_PLACE
         return replace(made, merit=np.where(lost, np.inf, made.merit))
 
     return reduce(Part.followed_by, run_parts(cut(len(rows), run), work))
@@ -442,4 +460,6 @@ def grasps_of(
         loss = np.concatenate([part.loss for part in parts])
         state = _joined_states([part.state for part in parts])
         grasps = with_postures(hand, obj, state, loss, placed, device=device)
-    return replace(grasps, seconds=seconds, info={"loss_curve": np.round(curve, 5).tolist(), "chunk": CHUNK})
+    attempts = int(sum(part.attempts.sum() for part in parts))
+    info = {"loss_curve": np.round(curve, 5).tolist(), "chunk": CHUNK}
+    return replace(grasps, seconds=seconds, info=info, attempts=attempts)

@@ -2,8 +2,8 @@
 
 letter: DexGraspBench's tabletop test as published: from the pregrasp, 1 N downwards, 10 cm up in 0.4 s, no hold.
 lift: the hand comes from its standoff and must touch nothing on the way, but that fingertips may touch supports, or
-press into them, as deep as the scene says; after the lift it holds for 2 s, cut short as
-the certificate's pushes are.
+press into them, as deep as the scene says; it rises smoothly in 0.8 s and holds for 2 s, cut short as the certificate's
+pushes are.
 Neighbours stand on the table as free bodies; at level lift they must not be moved 2 cm, nor toppled.
 The world of the simulation is the object frame: the scene lies under it as it stood when the object came to rest.
 """
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.matter import ACCELERATION
-from service.model.transforms import invert, quat_conjugate, quat_rotate, slerp
+from service.model.transforms import invert, quat_conjugate, quat_multiply, quat_rotate, slerp
 from worker.engines.mujoco_warnings import void
 from worker.grasps import GraspSet, Posture
 from worker.quality.referee.model import Scene, blend
@@ -45,6 +45,12 @@ LOOKS: Final = 4
 #: The open hand may be this deep in the object's convex pieces on its way [m]: they stand out from its surface, where
 #: the hand is clear, by up to this much. Supports are exact.
 OVERHANG_M: Final = 0.002
+#: Steps of the rise and their length [s], and the shares of it that they end at: minimum jerk (Flash and Hogan, "The
+#: coordination of arm movements", 1985), at most 0.9 m/s2 for 10 cm in 0.8 s. A stage of a centimetre, as published,
+#: asks the hand for 25 m/s2.
+RISING: Final = 100
+RISING_S: Final = 0.008
+SMOOTHLY: Final = np.polyval([6, -15, 10, 0, 0, 0], np.linspace(0, 1, RISING + 1)[1:])
 
 
 class LiftOutcome(IntEnum):
@@ -89,7 +95,7 @@ class Lift(Test):
         if (trial := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
             return trial
         self._close(grasps, row)
-        self._rise(grasps, row)
+        self._rise(grasps, row, np.arange(1, STAGES + 1) / STAGES, STAGE_S)
         return self._ended(trial, self._judge(Trial()))
 
     def lift(self, grasps: GraspSet, row: int) -> LiftTrial:
@@ -190,19 +196,39 @@ class Lift(Test):
         allowed = np.where(tip, self.scene.pressing[geom].max(axis=1), 0.0)
         return bool((distance < -allowed)[on_support].any() or (distance[of_hand & ~on_support] < -OVERHANG_M).any())
 
-    def _rise(self, grasps: GraspSet, row: int) -> None:
+    def _rise(self, grasps: GraspSet, row: int, path: Floats = SMOOTHLY, step_s: float = RISING_S) -> None:
         squeeze = grasps.squeeze.take(slice(row, row + 1))
         pose = squeeze.hand_pose.copy()
         pose[:, :3] += RISE_M * self._up
         raised = Posture(pose, squeeze.joint_positions)
-        for stage in range(1, STAGES + 1):
-            self.scene.command(self.data, *blend(squeeze, raised, 0, stage / STAGES))
-            self._run(STAGE_S)
+        for share in path:
+            self.scene.command(self.data, *blend(squeeze, raised, 0, float(share)))
+            self._run(step_s)
         self._goal = RISE_M * self._up
 
     def _offset(self) -> Floats:
         """(3,) of the object's frame from where it should be [m]."""
-        return np.asarray(super()._offset() - self._goal)
+        at, yielded = super()._offset(), self._yielded()
+        if yielded is not None:
+            root, turn = yielded
+            at = self.data.mocap_pos[0] + quat_rotate(quat_conjugate(turn), at - root)
+        return np.asarray(at - self._goal)
+
+    def _turned(self) -> Floats:
+        """(4,) rotation of the object since the start."""
+        turned, yielded = super()._turned(), self._yielded()
+        return turned if yielded is None else quat_multiply(quat_conjugate(yielded[1]), turned)
+
+    def _yielded(self) -> tuple[Floats, Floats] | None:
+        """Where the root is (3,), and its rotation (4,) from what was commanded; None: it is fixed.
+
+        The weld of the protocol gives way by 10 degrees under a hammer, as no arm does: an object that only follows its
+        hand has not moved in it."""
+        at = self.scene.root_qpos
+        if at < 0:
+            return None
+        root = self.data.qpos[at : at + 7]
+        return root[:3], quat_multiply(root[3:], quat_conjugate(self.data.mocap_quat[0]))
 
     def _ended(self, trial: LiftTrial, outcome: Outcome) -> LiftTrial:
         trial.steps, trial.margin = self._steps, self._excess()
