@@ -148,6 +148,15 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "N J", "f8", "rad or m", "joint", "joints of the open hand that comes, order in joint_names", optional=True
         ),
         "grasp/lift": Column("N 7", "f8", "m, 1", "object", f"squeeze posture raised by 10 cm: {_POSE}", optional=True),
+        "grasp/wrist_positions": Column(
+            "N U",
+            "f8",
+            "rad",
+            "joint",
+            "angles of the wrist above the hand's root that keep what carries the hand clear, order in attribute "
+            "wrist_joint_names",
+            optional=True,
+        ),
         "quality/lift_outcome": Column(
             "N",
             "u1",

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from service.model.transforms import IDENTITY_POSE, apply
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
+from worker.hands.mounting import wrist_positions
 from worker.hands.oppositions import oppositions_of
 from worker.simulation.obstacles import MARGIN_M
 from worker.simulation.surroundings import Surroundings
@@ -32,12 +33,15 @@ class Outlines:
     """(K, P, 3) [m]"""
     tips: NDArray[np.bool_]
     """(P,) those of fingertips."""
+    mounting: Floats
+    """(W, M, 3) outermost points of the mounting at each of its wrist positions, from the palm's centre [m]; W is 0
+    without one."""
 
     def lacks(
         self, posture: NDArray[np.intp], turn: Floats, centre: Floats, scene: Surroundings, *, room: float
     ) -> Floats:
-        """(n,) what hands lack of the distance from obstacles that they are to keep, and of `room` besides [m]; 0 or
-        more.
+        """(n,) what hands and their mountings lack of the distance from obstacles that they are to keep, and of `room`
+        besides [m]; 0 or more.
 
         Args:
             posture: (n,) which of the K.
@@ -51,7 +55,17 @@ class Outlines:
         for obstacle in scene.obstacles:
             wanted = np.where(self.tips, MARGIN_M if obstacle.tips_m is None else obstacle.tips_m, MARGIN_M) + room
             lack = np.maximum(lack, (wanted - obstacle.distance(place)).max(axis=1))
-        return lack
+        return np.maximum(lack, self._mounting_lacks(turn, centre, scene, MARGIN_M + room))
+
+    def _mounting_lacks(self, turn: Floats, centre: Floats, scene: Surroundings, wanted: float) -> Floats:
+        """(n,) what mountings at the best of their wrist positions lack of the distance `wanted` from obstacles [m]."""
+        least = np.full(len(turn), np.inf if len(self.mounting) else 0.0)
+        for points in self.mounting:
+            rows = np.flatnonzero(least > 0.0)
+            place = points @ np.swapaxes(turn[rows], -1, -2) + centre[rows, None]
+            lack = [(wanted - obstacle.distance(place)).max(axis=1) for obstacle in scene.obstacles]
+            least[rows] = np.minimum(least[rows], np.maximum.reduce([*lack, np.zeros(len(rows))]))
+        return least
 
 
 _known: LRUCache[str, Outlines] = LRUCache(16)
@@ -76,7 +90,19 @@ def _outlines(hand: HandModel, q: Floats) -> Outlines:
             far = (corners @ spread_directions(DIRECTIONS).T).argmax(axis=1)
             points.append(np.take_along_axis(corners, far[..., None], axis=1))
             tips.append(np.full(DIRECTIONS, tip))
-    return Outlines(np.concatenate(points, axis=1) - hand.palm.centre, np.concatenate(tips))
+    points_of_hand = np.concatenate(points, axis=1) - hand.palm.centre
+    return Outlines(points_of_hand, np.concatenate(tips), _mounting_outline(hand))
+
+
+def _mounting_outline(hand: HandModel) -> Floats:
+    """(W, M, 3) as `Outlines.mounting`."""
+    if (mounting := hand.mounting) is None:
+        return np.zeros((0, 0, 3))
+    wrists = wrist_positions(mounting)
+    bodies = body_poses(mounting, np.tile(IDENTITY_POSE, (len(wrists), 1)), mounting.expand(wrists))
+    corners = np.concatenate([apply(bodies[:, p.body, None], p.vertices) for p in mounting.pieces], axis=1)
+    far = (corners @ spread_directions(DIRECTIONS).T).argmax(axis=1)
+    return np.take_along_axis(corners, far[..., None], axis=1) - hand.palm.centre
 
 
 def spread_directions(count: int) -> Floats:
