@@ -1,7 +1,7 @@
 """Forearms below the table: the links above the hand's root in grasps that were planned on a table.
 
-usage: python -m benchmarks.forearm DATA_DIR [--hand shadow/shadow_hand_right.urdf] [--objects 025_mug ...] [--grasps 16]
-           [--scenes 4] [--seed 31] [--scene table] [--json OUT]
+usage: python -m benchmarks.forearm DATA_DIR [--hand shadow/shadow_hand_right.urdf] [--objects 025_mug ...]
+           [--grasps 16] [--scenes 4] [--seed 31] [--scene table] [--json OUT]
        DATA_DIR holds hands/ and objects/
 
 Candidates of each object are planned and judged as `graspd synth --want raw --threads 1` does. The vertices of the
