@@ -230,7 +230,7 @@ def _stiffness(robot: Robot, tree: Tree, options: HandOptions) -> Floats:
     """(D,) stated, else assumed."""
     stated = stated_gains(robot, tree.dof_names, options)
     values = [stated.get(dof, DEFAULT_STIFFNESS) for dof in tree.dof_names]
-    if min(values) <= 0:
+    if min(values, default=1.0) <= 0:
         raise HandError("a stiffness in asset.json is not positive")
     return np.array(values)
 

@@ -96,5 +96,5 @@ def wrist_positions(mounting: HandModel) -> Floats:
         [rest, *(rest + share * (end - rest) for share in WRIST_SHARES for end in (low, high) if end != rest)]
         for rest, low, high in zip(mounting.preshape, mounting.lower, mounting.upper, strict=True)
     ]
-    found = np.array(list(product(*angles))).reshape(-1, mounting.dofs)
+    found = np.array(list(product(*angles)), float)
     return found[np.argsort(np.linalg.norm(found - mounting.preshape, axis=1), kind="stable")]
