@@ -53,7 +53,9 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "inputs": RootAttribute("texts", "names of the shards it was made from"),
     "joint_names": RootAttribute("texts", "order of the hand's joints", _BASE),
     "wrist_joint_names": RootAttribute(
-        "texts", "joints of the wrist above the hand's root, order of `grasp/wrist_positions`; absent: none", _BASE
+        "texts",
+        "joints of the wrist above the hand's root, order of `grasp/wrist_positions`; absent: none",
+        ("base", "scene"),
     ),
     "root_link": RootAttribute("text", "link of the hand whose pose is given"),
     "mu": RootAttribute("number", "Coulomb coefficient of `quality/epsilon` and `quality/wrench_volume`", _BASE),

@@ -24,7 +24,7 @@ from worker.planners.fast_graspd.selection import posture_of
 from worker.planners.fast_graspd.starts import CLEAR, start_generator
 from worker.planners.port import Wanted
 from worker.run import ALONE
-from worker.scenes.clearance import MARGIN_M
+from worker.scenes.clearance import MARGIN_M, transfer
 from worker.scenes.kinds import rest_poses, supports_of
 from worker.scenes.verdicts import scene_verdicts
 from worker.scenes.way import plan_way
@@ -137,3 +137,23 @@ def test_free_grasps_do_not_depend_on_the_mounting(shadow: HandModel, block: Obj
         assert np.array_equal(one.hand_pose, other.hand_pose)
         assert np.array_equal(one.joint_positions, other.joint_positions)
     assert "grasp/wrist_positions" not in ours.to_columns()
+
+
+def test_grasps_carried_over_keep_their_forearms_off_the_table(
+    shadow: HandModel, table: Scenes, planned: GraspSet
+) -> None:
+    assert shadow.mounting is not None
+    both = [transfer(hand, planned.grasp, planned.pregrasp, table.object_pose) for hand in (shadow, _bare(shadow))]
+    ours, bare = both
+    assert "grasp/wrist_positions" not in bare and ours["grasp/wrist_positions"].shape == (16, 2)
+    height = [
+        lowest(shadow.mounting, pose[None], wrist)
+        for pose, wrist in zip(ours["grasp/hand_pose"], ours["grasp/wrist_positions"], strict=True)
+    ]
+    expected = np.minimum(bare["grasp/contact_table_clearance_m"], height)
+    np.testing.assert_allclose(ours["grasp/contact_table_clearance_m"], expected, atol=1e-4)
+    assert (ours["grasp/valid"] <= bare["grasp/valid"]).all() and (expected[ours["grasp/valid"] == 1] > 0).all()
+
+
+def _bare(hand: HandModel) -> HandModel:
+    return replace(hand, mounting=None)
