@@ -83,10 +83,12 @@ def _seen(
     postures = Posture(poses.reshape(-1, 7), joints.reshape(len(share) * count, -1))
     coming = np.tile(share == 0, count)
     room = obstacle_room(probe.hand, postures.take(np.flatnonzero(coming)), [scene]).reshape(count, looks)
-    least_room = room.min(axis=1)
-    if (mounting := probe.hand.mounting) is not None:
-        only = np.zeros(count, np.intp)
-        least_room = np.minimum(least_room, wrist_room(mounting, poses[:, :looks], wrist, [scene], only))
+    free = room.min(axis=1)
+    rows = np.flatnonzero(free >= MARGIN_M)
+    if (mounting := probe.hand.mounting) is not None and len(rows):
+        # A mounting is thicker than a finger: it is looked at half as often, where the hand itself is clear.
+        mounted = wrist_room(mounting, poses[rows, :looks:2], wrist[rows], [scene], np.zeros(len(rows), np.intp))
+        free[rows] = np.minimum(free[rows], mounted)
     # What is farther than this counts alike.
     reach = OBJECT_WANTED_M + 2 * NEARER_M
     gap = probe.body_gaps(postures.hand_pose, postures.joint_positions, reach=reach).reshape(count, len(share), -1)
@@ -98,4 +100,4 @@ def _seen(
             # The pregrasp itself may stand nearer than wanted: coming must not be nearer than it is.
             short = near[:, :-1].min(axis=1) - np.minimum(OBJECT_WANTED_M, near[:, -1] - NEARER_M)
             least = np.minimum(least, OBJECT_WANTED_M + short)
-    return least_room, least
+    return free, least

@@ -98,7 +98,7 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
         raised[rows, :3] += rise
         lifted = np.repeat(mine.grasp.hand_pose[:, None], WAYPOINTS, axis=1)
         lifted[..., :3] += np.linspace(0, 1, WAYPOINTS)[:, None] * rise
-        taken = np.concatenate([closing_hand.hand_pose.reshape(len(rows), -1, 7), lifted], axis=1)
+        taken = np.concatenate([closing_hand.hand_pose.reshape(len(rows), -1, 7)[:, ::4], lifted], axis=1)
         wrist[rows], mounting[rows] = mounting_room(hand, taken, [scene])
         path[rows], came[rows], coming[rows], touching[rows] = come_open(
             probe, mine.pregrasp, wide[rows], wrist[rows], scene

@@ -15,6 +15,7 @@ from worker.grasps import GraspSet
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.model import ConvexPiece, HandModel
+from worker.hands.primitives import tessellate
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
@@ -122,7 +123,8 @@ def test_a_grasp_with_its_mounting_in_the_table_is_not_clear(
     bare = plan_way(replace(shadow, mounting=None), block, planned, table.placed(planned.scene))
     assert bare.clear.any() and bare.wrist.shape == (8, 0)
     # A mounting as large as this reaches down to the table from anywhere.
-    ball = ConvexPiece(2, "sphere", (1.0,), IDENTITY_POSE, np.zeros((0, 3)), np.zeros((0, 3), np.int32), "forearm")
+    vertices, faces = tessellate("sphere", (1.0,))
+    ball = ConvexPiece(2, "sphere", (1.0,), IDENTITY_POSE, vertices, faces, "forearm")
     everywhere = replace(shadow.mounting, pieces=(ball,))
     _, columns, counts = scene_verdicts(
         replace(shadow, mounting=everywhere), block, planned, table, level="lift", pieces=None, run=ALONE

@@ -11,11 +11,11 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, apply
+from service.model.transforms import IDENTITY_POSE, apply, spread_directions
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
-from worker.hands.mounting import wrist_positions
 from worker.hands.oppositions import oppositions_of
+from worker.simulation.mounting import OUTERMOST, points_of
 from worker.simulation.obstacles import MARGIN_M
 from worker.simulation.surroundings import Surroundings
 
@@ -90,24 +90,7 @@ def _outlines(hand: HandModel, q: Floats) -> Outlines:
             far = (corners @ spread_directions(DIRECTIONS).T).argmax(axis=1)
             points.append(np.take_along_axis(corners, far[..., None], axis=1))
             tips.append(np.full(DIRECTIONS, tip))
-    points_of_hand = np.concatenate(points, axis=1) - hand.palm.centre
-    return Outlines(points_of_hand, np.concatenate(tips), _mounting_outline(hand))
-
-
-def _mounting_outline(hand: HandModel) -> Floats:
-    """(W, M, 3) as `Outlines.mounting`."""
-    if (mounting := hand.mounting) is None:
-        return np.zeros((0, 0, 3))
-    wrists = wrist_positions(mounting)
-    bodies = body_poses(mounting, np.tile(IDENTITY_POSE, (len(wrists), 1)), mounting.expand(wrists))
-    corners = np.concatenate([apply(bodies[:, p.body, None], p.vertices) for p in mounting.pieces], axis=1)
-    far = (corners @ spread_directions(DIRECTIONS).T).argmax(axis=1)
-    return np.take_along_axis(corners, far[..., None], axis=1) - hand.palm.centre
-
-
-def spread_directions(count: int) -> Floats:
-    """(count, 3) unit vectors spread evenly: a golden spiral."""
-    k = np.arange(count)
-    z = 1 - (2 * k + 1) / count
-    turn, across = np.pi * (3 - np.sqrt(5)) * k, np.sqrt(1 - z**2)
-    return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])
+    mounting = np.zeros((0, 0, 3))
+    if hand.mounting is not None:
+        mounting = points_of(hand.mounting)[:, :OUTERMOST] - hand.palm.centre
+    return Outlines(np.concatenate(points, axis=1) - hand.palm.centre, np.concatenate(tips), mounting)

@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
+from service.model.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply, spread_directions
 from worker.hands.model import HandModel
 from worker.hands.oppositions import oppositions_of
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.across import NEAR_M, Openings, Reaches, across, promising
-from worker.planners.fast_graspd.outlines import spread_directions
 from worker.planners.fast_graspd.selection import posture_of
 from worker.planners.fast_graspd.starts import CLEAR, POSTURE_NOISE, TILT, Probe
 from worker.planners.port import NoPlace
