@@ -55,7 +55,42 @@ def mounting_room(
     if mounting is None:
         return np.zeros((count, 0)), np.full(count, np.inf)
     which = np.zeros(count, np.intp) if which is None else np.asarray(which, np.intp)
-    wrists, points = wrist_positions(mounting), point_room(mounting, poses, scenes, which)
+    return _solved(mounting, poses, scenes, which, point_room(mounting, poses, scenes, which), enough)
+
+
+def mounting_lack(
+    hand: HandModel,
+    poses: Floats,
+    scenes: Sequence[Surroundings],
+    which: NDArray[np.integer[Any]],
+    *,
+    room: float = 0.0,
+    exact: bool = True,
+) -> Floats:
+    """(N,) what mountings lack of the distance that planners keep from obstacles, and of `room` besides, at root poses
+    (N, 7) and the best wrist angles [m]; 0 or more. What their points lack; `exact`: or what they lack themselves."""
+    mounting, wanted = hand.mounting, MARGIN_M + room
+    if mounting is None or not len(poses):
+        return np.zeros(len(poses))
+    poses, which = poses[:, None], np.asarray(which, np.intp)
+    points = point_room(mounting, poses, scenes, which)
+    most = points.max(axis=1)
+    rows = np.flatnonzero(exact & (most >= wanted))
+    if len(rows):
+        _, most[rows] = _solved(mounting, poses[rows], scenes, which[rows], points[rows], wanted)
+    return np.asarray(np.maximum(0.0, wanted - most))
+
+
+def _solved(
+    mounting: HandModel,
+    poses: Floats,
+    scenes: Sequence[Surroundings],
+    which: NDArray[np.intp],
+    points: Floats,
+    enough: float,
+) -> tuple[Floats, Floats]:
+    """Angles and room as `mounting_room` has them, from the room of points (N, W), which is used up."""
+    wrists, count = wrist_positions(mounting), len(poses)
     number, room, rows = np.zeros(count, np.intp), np.full(count, -np.inf), np.arange(count)
     for _ in range(min(TRIES, len(wrists))):
         hopeful = points[rows] >= enough
@@ -68,22 +103,6 @@ def mounting_room(
         if not len(rows):
             break
     return wrists[number], room
-
-
-def mounting_lack(
-    hand: HandModel,
-    poses: Floats,
-    scenes: Sequence[Surroundings],
-    which: NDArray[np.integer[Any]],
-    *,
-    room: float = 0.0,
-) -> Floats:
-    """(N,) what the points of mountings lack of the distance that planners keep from obstacles, and of `room` besides,
-    at root poses (N, 7) and the best wrist angles [m]; 0 or more."""
-    if hand.mounting is None or not len(poses):
-        return np.zeros(len(poses))
-    most = point_room(hand.mounting, poses[:, None], scenes, np.asarray(which, np.intp)).max(axis=1)
-    return np.maximum(0.0, MARGIN_M + room - most)
 
 
 def point_room(mounting: HandModel, poses: Floats, scenes: Sequence[Surroundings], which: NDArray[np.intp]) -> Floats:

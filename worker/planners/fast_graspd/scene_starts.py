@@ -185,17 +185,17 @@ def _depths(
             some = states[left * len(RETREATS) + k]
             found[left, k] = probe.depths(some)
             clear = np.flatnonzero(found[left, k] <= CLEAR)
-            lack = _mounting_lack(probe, some[clear], placed, scene[left[clear]])
+            lack = _mounting_lack(probe, some[clear], placed, scene[left[clear]], exact=True)
             found[left[clear], k] = np.maximum(found[left[clear], k], lack)
             open_[left] = found[left, k] <= CLEAR
     return found
 
 
-def _mounting_lack(probe: Probe, states: HandState, placed: Placed, scene: NDArray[np.intp]) -> Floats:
+def _mounting_lack(probe: Probe, states: HandState, placed: Placed, scene: NDArray[np.intp], *, exact: bool) -> Floats:
     """(n,) what the mountings of hands in scenes (n,) lack of their distance from obstacles and of `ROOM` [m]."""
     hand, obj = probe.model.hand.model, probe.model.obj.model
     poses = posture_of(hand, obj, states).hand_pose
-    return mounting_lack(hand, poses, placed.scenes, scene, room=ROOM)
+    return mounting_lack(hand, poses, placed.scenes, scene, room=ROOM, exact=exact)
 
 
 def _raise(drawn: _Drawn, rows: NDArray[np.intp], placed: Placed, scene: NDArray[np.intp], probe: Probe) -> Floats:
@@ -212,7 +212,7 @@ def _raise(drawn: _Drawn, rows: NDArray[np.intp], placed: Placed, scene: NDArray
     probe.depths(states[rows * repeat])
     lifted = np.zeros((len(scene), 3))
     lack = probe.data.depths.obstacles.numpy()[: len(rows)].astype(float)
-    lack = np.maximum(lack, _mounting_lack(probe, states[rows * repeat], placed, scene[rows]))
+    lack = np.maximum(lack, _mounting_lack(probe, states[rows * repeat], placed, scene[rows], exact=False))
     lifted[rows] = lack[:, None] * up[rows]
     every = (rows[:, None] * repeat + np.arange(repeat)).ravel()
     states.pivot[every] += np.repeat(lifted[rows], repeat, axis=0)
