@@ -59,8 +59,9 @@ def scene(
     result |= transfer(model, grasp, pregrasp, poses, beside)
     seconds = perf_counter() - started
     attributes: dict[str, Attribute] = {key: base.attributes[key] for key in INHERITED if key in base.attributes}
-    attributes |= {"seed": number, "device": "cpu", "seconds": round(seconds, 4)} | wrist_attributes(model)
-    attributes |= beside_attributes(others, with_ or []) | made_of(base) | {"shard_id": id_of_columns(result)}
+    attributes |= {"seed": number, "device": "cpu", "seconds": round(seconds, 4)}
+    attributes |= wrist_attributes(model) | beside_attributes(others, with_ or [])
+    attributes |= made_of(base) | {"shard_id": id_of_columns(result)}
     write_output(output, write_shard("scene", result, attributes))
     clear, total = int(result["grasp/valid"].sum()), len(result["grasp/valid"])
     reasons = count_rejections(result["grasp/rejection"])

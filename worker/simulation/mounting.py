@@ -54,8 +54,8 @@ def mounting_room(
     mounting, count = hand.mounting, len(poses)
     if mounting is None:
         return np.zeros((count, 0)), np.full(count, np.inf)
-    which = np.zeros(count, np.intp) if which is None else np.asarray(which, np.intp)
-    return _solved(mounting, poses, scenes, which, point_room(mounting, poses, scenes, which), enough)
+    scene_of = np.zeros(count, np.intp) if which is None else which.astype(np.intp)
+    return _solved(mounting, poses, scenes, scene_of, point_room(mounting, poses, scenes, scene_of), enough)
 
 
 def mounting_lack(
@@ -72,12 +72,12 @@ def mounting_lack(
     mounting, wanted = hand.mounting, MARGIN_M + room
     if mounting is None or not len(poses):
         return np.zeros(len(poses))
-    poses, which = poses[:, None], np.asarray(which, np.intp)
-    points = point_room(mounting, poses, scenes, which)
+    poses, scene_of = poses[:, None], which.astype(np.intp)
+    points = point_room(mounting, poses, scenes, scene_of)
     most = points.max(axis=1)
     rows = np.flatnonzero(exact & (most >= wanted))
     if len(rows):
-        _, most[rows] = _solved(mounting, poses[rows], scenes, which[rows], points[rows], wanted)
+        _, most[rows] = _solved(mounting, poses[rows], scenes, scene_of[rows], points[rows], wanted)
     return np.asarray(np.maximum(0.0, wanted - most))
 
 
