@@ -81,6 +81,9 @@ class GraspSet:
     """(N,) the scene of each grasp; only in scenes."""
     lift: Posture | None = None
     """N squeeze postures raised against gravity; only in scenes."""
+    wrist: Floats | None = None
+    """(N, K) angles of the wrist above the hand's root, order of `HandModel.mounting.joint_names` [rad]; only in
+    scenes, of hands that have one."""
     attempts: int = 0
     """How often the planner set out for the whole set; 0: it does not tell."""
 
@@ -102,7 +105,8 @@ class GraspSet:
         lift = None if self.lift is None else self.lift.take(rows)
         scene = None if self.scene is None else self.scene[rows]
         coming = None if self.coming is None else np.asarray(self.coming, float)[rows]
-        return GraspSet(grasp, pregrasp, squeeze, loss, self.seconds, self.info, approach, coming, scene, lift)
+        wrist = None if self.wrist is None else np.asarray(self.wrist, float)[rows]
+        return GraspSet(grasp, pregrasp, squeeze, loss, self.seconds, self.info, approach, coming, scene, lift, wrist)
 
     def moved(self, by: ArrayLike) -> GraspSet:
         """The grasps with their ways moved by a vector (3,) [m]: into a frame with its origin elsewhere."""
@@ -119,6 +123,8 @@ class GraspSet:
         columns |= {f"{name}/joint_positions": part.joint_positions for name, part in parts.items()}
         if self.scene is None or self.approach is None or self.coming is None or self.lift is None:
             return columns
+        if self.wrist is not None:
+            columns["grasp/wrist_positions"] = self.wrist
         return columns | {
             "grasp/scene_index": self.scene, "grasp/approach": self.approach,
             "grasp/approach_joint_positions": self.coming, "grasp/lift": self.lift.hand_pose,
@@ -135,6 +141,8 @@ class GraspSet:
             found.coming = np.asarray(columns["grasp/approach_joint_positions"], float)
             raised = np.asarray(columns["grasp/lift"], float)
             found.lift = Posture(raised, np.array(found.squeeze.joint_positions))
+            if "grasp/wrist_positions" in columns:
+                found.wrist = np.asarray(columns["grasp/wrist_positions"], float)
         return found
 
 
@@ -153,7 +161,9 @@ def joined(sets: Sequence[GraspSet]) -> GraspSet:
     scene = np.concatenate(numbers) if len(numbers) == len(sets) else None
     opens = [part.coming for part in sets if part.coming is not None]
     coming = np.concatenate(opens) if len(opens) == len(sets) else None
-    return GraspSet(grasp, pregrasp, squeeze, loss, seconds, dict(sets[0].info), approach, coming, scene, lift)
+    wrists = [part.wrist for part in sets if part.wrist is not None]
+    wrist = np.concatenate(wrists) if len(wrists) == len(sets) else None
+    return GraspSet(grasp, pregrasp, squeeze, loss, seconds, dict(sets[0].info), approach, coming, scene, lift, wrist)
 
 
 def joined_columns(parts: Sequence[Columns]) -> dict[str, NDArray[Any]]:

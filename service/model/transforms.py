@@ -131,3 +131,11 @@ def apply(pose: Floats, points: Floats) -> Floats:
     """Points (..., 3) of a frame expressed in its parent: rotated, then moved."""
     p = np.asarray(pose, float)
     return quat_rotate(p[..., 3:], points) + p[..., :3]
+
+
+def spread_directions(count: int) -> Floats:
+    """(count, 3) unit vectors spread evenly: a golden spiral."""
+    k = np.arange(count)
+    z = 1 - (2 * k + 1) / count
+    turn, across = np.pi * (3 - np.sqrt(5)) * k, np.sqrt(1 - z**2)
+    return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])

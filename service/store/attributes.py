@@ -52,6 +52,11 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "shard_id": RootAttribute("text", "its name in the store"),
     "inputs": RootAttribute("texts", "names of the shards it was made from"),
     "joint_names": RootAttribute("texts", "order of the hand's joints", _BASE),
+    "wrist_joint_names": RootAttribute(
+        "texts",
+        "joints of the wrist above the hand's root, order of `grasp/wrist_positions`; absent: none",
+        ("base", "scene"),
+    ),
     "root_link": RootAttribute("text", "link of the hand whose pose is given"),
     "mu": RootAttribute("number", "Coulomb coefficient of `quality/epsilon` and `quality/wrench_volume`", _BASE),
     "want": RootAttribute(

@@ -35,6 +35,18 @@ def _posture(prefix: str, what: str) -> dict[str, Column]:
     }
 
 
+def _wrist(rows: str) -> Column:
+    return Column(
+        f"{rows} U",
+        "f8",
+        "rad",
+        "joint",
+        "angles of the wrist above the hand's root that keep the links above it clear, order in attribute "
+        "wrist_joint_names",
+        optional=True,
+    )
+
+
 def _measured(*, optional: bool) -> dict[str, Column]:
     return {
         metric.path: Column(
@@ -148,6 +160,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "N J", "f8", "rad or m", "joint", "joints of the open hand that comes, order in joint_names", optional=True
         ),
         "grasp/lift": Column("N 7", "f8", "m, 1", "object", f"squeeze posture raised by 10 cm: {_POSE}", optional=True),
+        "grasp/wrist_positions": _wrist("N"),
         "quality/lift_outcome": Column(
             "N",
             "u1",
@@ -197,6 +210,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "signed distance of the hand from the neighbours' convex hulls at contact and on the way in, at most 0.1",
             optional=True,
         ),
+        "grasp/wrist_positions": _wrist("K"),
         "scene/neighbour_pose": Column(
             "S M 7",
             "f8",

@@ -11,6 +11,7 @@ import typer
 from service.cli import JsonFlag, emit, reporting_errors, write_output
 from service.store.attributes import Attribute
 from service.store.shards import read_shard, write_shard
+from worker.files.base_attributes import wrist_attributes
 from worker.files.of_shard import (
     INHERITED,
     NEIGHBOUR_FACE_ERROR_M,
@@ -59,7 +60,8 @@ def scene(
     seconds = perf_counter() - started
     attributes: dict[str, Attribute] = {key: base.attributes[key] for key in INHERITED if key in base.attributes}
     attributes |= {"seed": number, "device": "cpu", "seconds": round(seconds, 4)}
-    attributes |= beside_attributes(others, with_ or []) | made_of(base) | {"shard_id": id_of_columns(result)}
+    attributes |= wrist_attributes(model) | beside_attributes(others, with_ or [])
+    attributes |= made_of(base) | {"shard_id": id_of_columns(result)}
     write_output(output, write_shard("scene", result, attributes))
     clear, total = int(result["grasp/valid"].sum()), len(result["grasp/valid"])
     reasons = count_rejections(result["grasp/rejection"])

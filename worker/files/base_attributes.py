@@ -43,9 +43,15 @@ def base_attributes(
     if outcomes:
         said["outcomes"] = json_attribute(dict(outcomes))
     if request.in_scene:
-        said["scene"] = json_attribute(request.place.told())
+        said |= {"scene": json_attribute(request.place.told())} | wrist_attributes(hand)
     if request.models:
         said["robust"] = json_attribute({"models": request.models, "wanted": request.robust})
     if verdict_key is None:
         return said | {"verdict_level": "none"}
     return said | {"verdict_level": request.referee, "verdict_key": verdict_key}
+
+
+def wrist_attributes(hand: HandModel) -> dict[str, Attribute]:
+    """What names the columns of `grasp/wrist_positions`, which grasps in scenes have."""
+    wrist = () if hand.mounting is None else hand.mounting.joint_names
+    return {"wrist_joint_names": list(wrist)} if wrist else {}

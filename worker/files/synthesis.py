@@ -23,7 +23,7 @@ from service.store.shards import json_attribute
 from worker.certified import Certified, certified_grasps
 from worker.engines.devices import Device
 from worker.engines.joins import batches_at_once, parse_join
-from worker.files.base_attributes import base_attributes
+from worker.files.base_attributes import base_attributes, wrist_attributes
 from worker.files.of_shard import NEIGHBOUR_FACE_ERROR_M, beside_attributes
 from worker.files.origin import remembered
 from worker.grasps import joined_columns
@@ -223,7 +223,7 @@ def synthesized(
     if interrupted:
         attributes["grasps_wanted"] = request.grasps
     if poses:
-        attributes["scene"] = json_attribute(_as_stored(place, others))
+        attributes |= {"scene": json_attribute(_as_stored(place, others))} | wrist_attributes(model)
         attributes |= beside_attributes(others, [one.object for one in place.neighbours])
     made = Synthesized(arrays, attributes, batches, request, place, interrupted, seconds)
     if made.reason is not None:

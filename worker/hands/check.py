@@ -67,6 +67,7 @@ def check_hand(
         *_tendons(hand),
         *_limits(robot, settings),
         *_left_out(robot, hand, settings),
+        *_mounting(hand),
     ]
     facts["notes"] = notes
     return {"verdict": "accept", "message": "; ".join([message, *notes]), "repairs": [], "facts": facts}
@@ -106,6 +107,12 @@ def _left_out(robot: Robot, hand: HandModel, settings: HandOptions) -> list[str]
     if not above:
         return []
     return [f"{', '.join(above)} above the palm left out, poses are those of {hand.root_link!r} (--root {robot.root})"]
+
+
+def _mounting(hand: HandModel) -> list[str]:
+    """What a user must know of links above the hand's root."""
+    links = () if hand.mounting is None else dict.fromkeys(piece.link for piece in hand.mounting.pieces)
+    return [f"{', '.join(links)} above the palm kept clear in scenes"] if links else []
 
 
 def hand_facts(hand: HandModel, robot: Robot) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from worker.hands.collisions import resting_neighbours
 from worker.hands.drive import with_drive
 from worker.hands.guess import complete
 from worker.hands.model import ConvexPiece, Drag, Floats, HandModel, PalmFrame
+from worker.hands.mounting import mounting_tree
 from worker.hands.options import DEFAULT_EFFORT, DEFAULT_STIFFNESS, HandOptions, parse_options
 from worker.hands.primitives import volume
 from worker.hands.read import read_robot
@@ -76,7 +77,23 @@ def assemble(
     hand = with_drive(
         hand, stated_gains(robot, tree.dof_names, options), assumed_efforts(robot, tree.dof_names, options)
     )
-    return replace(hand, neighbours=resting_neighbours(hand))
+    mounting = _mounting(robot, options, files, main, hand, run)
+    return replace(hand, neighbours=resting_neighbours(hand), mounting=mounting)
+
+
+def _mounting(
+    robot: Robot, options: HandOptions, files: Mapping[str, bytes], main: str, hand: HandModel, run: Run
+) -> HandModel | None:
+    """The links above the hand's root; None where there are none, or their shapes cannot be read: faults above a hand
+    do not refuse it."""
+    tree = mounting_tree(robot, hand.root_link, options)
+    if tree is None:
+        return None
+    shapes = HandOptions(shapes=options.shapes)
+    try:
+        return body_model(robot, tree, shapes, files, main, name=hand.name, digest=hand.digest, run=run)
+    except HandError:
+        return None
 
 
 def _drag(robot: Robot, hand: HandModel) -> Drag:
@@ -213,7 +230,7 @@ def _stiffness(robot: Robot, tree: Tree, options: HandOptions) -> Floats:
     """(D,) stated, else assumed."""
     stated = stated_gains(robot, tree.dof_names, options)
     values = [stated.get(dof, DEFAULT_STIFFNESS) for dof in tree.dof_names]
-    if min(values) <= 0:
+    if min(values, default=1.0) <= 0:
         raise HandError("a stiffness in asset.json is not positive")
     return np.array(values)
 

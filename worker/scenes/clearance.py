@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from enum import IntEnum
 from typing import Final
 
@@ -13,8 +14,9 @@ from service.model.transforms import compose
 from worker.grasps import Posture
 from worker.hands.model import Floats, HandModel
 from worker.scenes.neighbours import Neighbours, neighbour_clearance
+from worker.simulation.mounting import mounting_room, wrist_room
 from worker.simulation.obstacles import PosedFeatures
-from worker.simulation.surroundings import CLEAR_M, UP, Obstacle
+from worker.simulation.surroundings import CLEAR_M, UP, Obstacle, Surroundings
 
 #: A grasp is kept if the hand stays at least this far above the table [m].
 MARGIN_M: Final = CLEAR_M
@@ -41,7 +43,9 @@ def transfer(
     object_pose: Floats,
     neighbours: Neighbours | None = None,
 ) -> dict[str, NDArray[np.generic]]:
-    """Every grasp in every scene, with the hand's clearance above the table.
+    """Every grasp in every scene, with the clearance of the hand and its mounting above the table.
+
+    The wrist of a mounting has the first angles that keep it off the table; neighbours do not decide them.
 
     Args:
         hand: the hand.
@@ -55,7 +59,7 @@ def transfer(
         `grasp/hand_pose` (K, 7), `grasp/table_clearance_m` (K,): lowest point of the hand at the grasp, the pregrasp
         and between them; `grasp/contact_table_clearance_m` (K,): the same at the grasp alone; `grasp/valid` (K,): 1
         where both are at least `MARGIN_M`; `grasp/rejection` (K,): a `Rejection`. With neighbours
-        also `grasp/neighbour_clearance_m` (K,).
+        also `grasp/neighbour_clearance_m` (K,), of hands on a wrist `grasp/wrist_positions` (K, U).
 
     Raises:
         InputError: grasps and pregrasps differ in number.
@@ -63,27 +67,26 @@ def transfer(
     if len(grasp) != len(pregrasp):
         raise InputError(f"{len(grasp)} grasps come with {len(pregrasp)} pregrasps; each grasp needs its own")
     poses = np.asarray(object_pose, float).reshape(-1, 7)
-    clearance = np.concatenate(
-        [np.empty((len(poses), 0, 2))]
-        + [
-            _clearance(hand, grasp.take(part), pregrasp.take(part), poses)
-            for part in np.array_split(np.arange(len(grasp)), max(1, -(-len(grasp) // _CHUNK)))
-            if len(part)
-        ],
-        axis=1,
-    )
+    joints = 0 if hand.mounting is None else hand.mounting.dofs
+    clearance, wrist = np.zeros((len(poses), len(grasp), 2)), np.zeros((len(poses), len(grasp), joints))
+    for part in np.array_split(np.arange(len(grasp)), -(-len(grasp) // _CHUNK)) if len(grasp) else ():
+        some, before = grasp.take(part), pregrasp.take(part)
+        wrist[:, part], mounted = _mounting_clearance(hand, some, before, poses)
+        clearance[:, part] = np.minimum(_clearance(hand, some, before, poses), mounted)
     scenes, grasps = len(poses), len(grasp)
     at_contact, on_the_way = clearance.reshape(-1, 2).T
     rejection = np.where(on_the_way < MARGIN_M, Rejection.TABLE_ON_APPROACH, Rejection.NONE)
     rejection[at_contact < MARGIN_M] = Rejection.TABLE_AT_CONTACT
     result: dict[str, NDArray[np.generic]] = {}
     if neighbours is not None:
-        beside = _beside(hand, grasp, pregrasp, poses, neighbours).reshape(-1, 2)
+        beside = _beside(hand, grasp, pregrasp, poses, neighbours, wrist).reshape(-1, 2)
         rejection[(rejection == Rejection.NONE) & (beside[:, 1] < MARGIN_M)] = Rejection.NEIGHBOUR_ON_APPROACH
         rejection[(rejection >= Rejection.NEIGHBOUR_AT_CONTACT) & (beside[:, 0] < MARGIN_M)] = (
             Rejection.NEIGHBOUR_AT_CONTACT
         )
         result["grasp/neighbour_clearance_m"] = beside[:, 1]
+    if joints:
+        result["grasp/wrist_positions"] = wrist.reshape(-1, joints)
     return result | {
         "grasp/base_index": np.tile(np.arange(grasps, dtype=np.int32), scenes),
         "grasp/scene_index": np.repeat(np.arange(scenes, dtype=np.int32), grasps),
@@ -115,10 +118,20 @@ def approach(grasp: Posture, pregrasp: Posture, postures: int = PATH_POSTURES) -
     return Posture(pose.reshape(-1, 7), joints.reshape(-1, joints.shape[-1]))
 
 
-def _beside(hand: HandModel, grasp: Posture, pregrasp: Posture, poses: Floats, neighbours: Neighbours) -> Floats:
-    """(S, N, 2) distance from the neighbours at contact, and the smallest on the way."""
+def _beside(
+    hand: HandModel, grasp: Posture, pregrasp: Posture, poses: Floats, neighbours: Neighbours, wrist: Floats
+) -> Floats:
+    """(S, N, 2) distance of hands, and of their mountings at wrist angles (S, N, K), from the neighbours at contact,
+    and the smallest on the way."""
     path = approach(grasp, pregrasp)
-    distance = neighbour_clearance(hand, path, poses, neighbours).reshape(len(poses), len(grasp), -1)
+    distance = neighbour_clearance(hand, path, poses, neighbours)
+    if hand.mounting is not None:
+        for s, angles in enumerate(wrist):
+            mounted = Posture(path.hand_pose, hand.mounting.expand(np.repeat(angles, PATH_POSTURES, axis=0)))
+            here = replace(neighbours, poses=np.asarray(neighbours.poses)[s : s + 1])
+            gaps = neighbour_clearance(hand.mounting, mounted, poses[s : s + 1], here)
+            distance[s] = np.minimum(distance[s], gaps[0])
+    distance = distance.reshape(len(poses), len(grasp), -1)
     return np.stack([distance[..., -1], distance.min(axis=2)], axis=-1)
 
 
@@ -128,3 +141,20 @@ def _clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: 
     on_path = np.array([features.distance(_TABLE.seen_from(pose)).min(axis=1) for pose in object_pose])
     on_path = on_path.reshape(len(object_pose), len(grasp), -1)
     return np.stack([on_path[..., -1], on_path.min(axis=2)], axis=-1)
+
+
+def _mounting_clearance(
+    hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats
+) -> tuple[Floats, Floats]:
+    """(S, N, K) wrist angles and (S, N, 2) lowest point of the mounting at contact, and anywhere on its way [m]; inf
+    without one."""
+    path = approach(grasp, pregrasp).hand_pose.reshape(len(grasp), PATH_POSTURES, 7)
+    angles, heights = [], []
+    for pose in object_pose:
+        table = [Surroundings((_TABLE.seen_from(pose),), UP)]
+        wrist, on_path = mounting_room(hand, path, table)
+        only = np.zeros(len(grasp), np.intp)
+        at_contact = on_path if hand.mounting is None else wrist_room(hand.mounting, path[:, -1:], wrist, table, only)
+        angles.append(wrist)
+        heights.append(np.stack([at_contact, on_path], axis=-1))
+    return np.array(angles), np.array(heights)

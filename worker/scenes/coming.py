@@ -13,6 +13,7 @@ from worker.grasps import Posture
 from worker.quality.contact import finger_of_body
 from worker.quality.probe import Probe
 from worker.scenes.clearance import MARGIN_M
+from worker.simulation.mounting import wrist_room
 from worker.simulation.obstacles import obstacle_room
 from worker.simulation.surroundings import STANDOFF_M, Surroundings
 
@@ -36,10 +37,11 @@ OPENNESS: Final = (1.0, 0.5, 0.0)
 
 
 def come_open(
-    probe: Probe, pregrasp: Posture, wide: Floats, scene: Surroundings
+    probe: Probe, pregrasp: Posture, wide: Floats, wrist: Floats, scene: Surroundings
 ) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
-    """Waypoints (n, W, 7), joints (n, J) of the hand that comes, its least distance from obstacles (n,) and whether it
-    touches the object (n,): wide open if it can, its fingers far from the object."""
+    """Waypoints (n, W, 7), joints (n, J) of the hand that comes, the least distance of it and its mounting, at wrist
+    angles (n, K), from obstacles (n,) and whether it touches the object (n,): wide open if it can, its fingers far from
+    the object."""
     count = len(pregrasp)
     back = -quat_rotate(pregrasp.hand_pose[:, 3:], probe.hand.palm.approach)
     best, least, touching = np.full(count, -np.inf), np.zeros(count), np.ones(count, bool)
@@ -52,7 +54,7 @@ def come_open(
             way = np.where(length > 1e-6, way / np.maximum(length, 1e-6), scene.up)
             start = pregrasp.joint_positions[open_]
             opened = start + openness * (wide[open_] - start)
-            room, gap = _seen(probe, pregrasp.take(open_), opened, way, scene)
+            room, gap = _seen(probe, pregrasp.take(open_), opened, wrist[open_], way, scene)
             score = np.minimum(room, MARGIN_M) + 0.1 * np.minimum(gap, OBJECT_WANTED_M) - (gap < OBJECT_MARGIN_M)
             better = score > best[open_]
             rows = open_[better]
@@ -68,9 +70,11 @@ def come_open(
     return poses, joints, least, touching
 
 
-def _seen(probe: Probe, pregrasp: Posture, opened: Floats, way: Floats, scene: Surroundings) -> tuple[Floats, Floats]:
-    """Least distance (n,) from obstacles of hands that come open along directions `way` (n, 3), and from the object
-    until they have closed to the pregrasp."""
+def _seen(
+    probe: Probe, pregrasp: Posture, opened: Floats, wrist: Floats, way: Floats, scene: Surroundings
+) -> tuple[Floats, Floats]:
+    """Least distance (n,) from obstacles of hands that come open along directions `way` (n, 3) on their mountings, and
+    of hands from the object until they have closed to the pregrasp."""
     count, looks = len(pregrasp), (WAYPOINTS - 1) * LOOKS + 1
     poses = np.repeat(pregrasp.hand_pose[:, None], looks + _CLOSING, axis=1)
     poses[:, :looks, :3] += np.linspace(STANDOFF_M, 0.0, looks)[:, None] * way[:, None]
@@ -79,6 +83,12 @@ def _seen(probe: Probe, pregrasp: Posture, opened: Floats, way: Floats, scene: S
     postures = Posture(poses.reshape(-1, 7), joints.reshape(len(share) * count, -1))
     coming = np.tile(share == 0, count)
     room = obstacle_room(probe.hand, postures.take(np.flatnonzero(coming)), [scene]).reshape(count, looks)
+    free = room.min(axis=1)
+    rows = np.flatnonzero(free >= MARGIN_M)
+    if (mounting := probe.hand.mounting) is not None and len(rows):
+        # A mounting is thicker than a finger: it is looked at half as often, where the hand itself is clear.
+        mounted = wrist_room(mounting, poses[rows, :looks:2], wrist[rows], [scene], np.zeros(len(rows), np.intp))
+        free[rows] = np.minimum(free[rows], mounted)
     # What is farther than this counts alike.
     reach = OBJECT_WANTED_M + 2 * NEARER_M
     gap = probe.body_gaps(postures.hand_pose, postures.joint_positions, reach=reach).reshape(count, len(share), -1)
@@ -90,4 +100,4 @@ def _seen(probe: Probe, pregrasp: Posture, opened: Floats, way: Floats, scene: S
             # The pregrasp itself may stand nearer than wanted: coming must not be nearer than it is.
             short = near[:, :-1].min(axis=1) - np.minimum(OBJECT_WANTED_M, near[:, -1] - NEARER_M)
             least = np.minimum(least, OBJECT_WANTED_M + short)
-    return room.min(axis=1), least
+    return free, least

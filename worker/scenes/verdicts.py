@@ -56,13 +56,14 @@ def scene_verdicts(
         run: told of grasps judged; asked between grasps whether to stop.
 
     Returns:
-        The grasps with `approach`, `coming` and `lift`; columns of the base shard, `quality/success` being the
+        The grasps with `approach`, `coming`, `lift` and `wrist`; columns of the base shard, `quality/success` being the
         verdict of the lift (-1: not clear); how many are clear, lift, and lift_hard.
     """
     assert grasps.scene is not None
     placed = scenes.placed(grasps.scene)
     way = plan_way(hand, obj, grasps, placed)
-    grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
+    wrist = way.wrist if way.wrist.shape[1] else None
+    grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift, wrist=wrist)
     count, clear = len(grasps), np.flatnonzero(way.clear)
     columns: Arrays = {"quality/clearance_m": np.minimum(way.least, FARTHEST_M)}
     counts = {"clear": len(clear), "lift": 0, "lift_hard": 0}

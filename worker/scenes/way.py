@@ -2,6 +2,7 @@
 
 In a scene the lift goes against gravity. Around a free object it is the way back, as the hand came.
 Distances are those of `body_room`: fingertips that may touch a support count as farther from it.
+The mounting of the hand, at wrist angles that it keeps all the way, stays clear as the hand does.
 Against half-spaces they are exact. Against boxes and neighbours' pieces they are those of the hand's features from
 the obstacle's planes: exact where a corner is nearest, else a lower bound of the features' distance.
 """
@@ -23,6 +24,7 @@ from worker.quality.postures import wide_open
 from worker.quality.probe import Probe, probe_of
 from worker.scenes.clearance import MARGIN_M, approach
 from worker.scenes.coming import LOOKS, OBJECT_MARGIN_M, WAYPOINTS, come_open
+from worker.simulation.mounting import mounting_room
 from worker.simulation.obstacles import obstacle_room
 from worker.simulation.surroundings import RISE_M, STANDOFF_M, Placed, Surroundings
 
@@ -56,11 +58,17 @@ class Way:
     """(N,) on the lift."""
     touching: NDArray[np.bool_]
     """(N,) whether the open hand touches the object on its way."""
+    wrist: Floats
+    """(N, K) angles of the wrist above the hand's root; K is 0 where it has none."""
+    mounting: Floats
+    """(N,) of the hand's mounting at the grasp, while the hand closes and on the lift; on the approach it counts as the
+    hand does."""
 
     @property
     def least(self) -> Floats:
         """(N,) least distance from obstacles anywhere on the way [m]."""
-        return np.minimum(np.minimum(self.contact, self.closing), np.minimum(self.coming, self.lifting))
+        parts = (self.contact, self.closing, self.coming, self.lifting, self.mounting)
+        return np.asarray(np.minimum.reduce(parts))
 
     @property
     def clear(self) -> NDArray[np.bool_]:
@@ -73,7 +81,8 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
     probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
     count = len(grasps)
     path = np.zeros((count, WAYPOINTS, 7))
-    contact, closing, coming, lifting = (np.full(count, np.inf) for _ in range(4))
+    contact, closing, coming, lifting, mounting = (np.full(count, np.inf) for _ in range(5))
+    wrist = np.zeros((count, 0 if hand.mounting is None else hand.mounting.dofs))
     touching = np.zeros(count, bool)
     raised = np.array(grasps.squeeze.hand_pose, float)
     wide = wide_open(hand, obj, grasps.pregrasp, placed)
@@ -83,21 +92,26 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
         if not len(rows):
             continue
         mine = grasps.take(rows)
-        between = obstacle_room(hand, approach(mine.grasp, mine.pregrasp), [scene]).reshape(len(rows), -1)
-        path[rows], came[rows], coming[rows], touching[rows] = come_open(probe, mine.pregrasp, wide[rows], scene)
-        opened = Posture(mine.pregrasp.hand_pose, came[rows])
-        before = obstacle_room(hand, approach(mine.pregrasp, opened), [scene]).reshape(len(rows), -1)
-        contact[rows], closing[rows] = between[:, -1], np.minimum(between.min(axis=1), before.min(axis=1))
+        closing_hand = approach(mine.grasp, mine.pregrasp)
+        between = obstacle_room(hand, closing_hand, [scene]).reshape(len(rows), -1)
         rise = RISE_M * scene.up
         raised[rows, :3] += rise
         lifted = np.repeat(mine.grasp.hand_pose[:, None], WAYPOINTS, axis=1)
         lifted[..., :3] += np.linspace(0, 1, WAYPOINTS)[:, None] * rise
+        taken = np.concatenate([closing_hand.hand_pose.reshape(len(rows), -1, 7)[:, ::4], lifted], axis=1)
+        wrist[rows], mounting[rows] = mounting_room(hand, taken, [scene])
+        path[rows], came[rows], coming[rows], touching[rows] = come_open(
+            probe, mine.pregrasp, wide[rows], wrist[rows], scene
+        )
+        opened = Posture(mine.pregrasp.hand_pose, came[rows])
+        before = obstacle_room(hand, approach(mine.pregrasp, opened), [scene]).reshape(len(rows), -1)
+        contact[rows], closing[rows] = between[:, -1], np.minimum(between.min(axis=1), before.min(axis=1))
         joints = np.repeat(mine.grasp.joint_positions, WAYPOINTS, axis=0)
         lifting[rows] = (
             obstacle_room(hand, Posture(lifted.reshape(-1, 7), joints), [scene]).reshape(len(rows), -1).min(axis=1)
         )
     lift = Posture(moved(raised, np.zeros(3)), np.array(grasps.squeeze.joint_positions, float))
-    return Way(moved(path, np.zeros(3)), came, lift, contact, closing, coming, lifting, touching)
+    return Way(moved(path, np.zeros(3)), came, lift, contact, closing, coming, lifting, touching, wrist, mounting)
 
 
 def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Way:
@@ -117,7 +131,8 @@ def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Way:
     raised[:, :3] += STANDOFF_M * chosen
     lift = Posture(raised, np.array(grasps.squeeze.joint_positions, float))
     endless = np.full(len(grasps), np.inf)
-    return Way(path, wide.joint_positions, lift, endless, endless, endless, endless, touching)
+    still, _ = mounting_room(hand, path[:, -1:], nowhere.scenes)
+    return Way(path, wide.joint_positions, lift, endless, endless, endless, endless, touching, still, endless)
 
 
 def _opened(probe: Probe, pregrasp: Posture, joints: Floats) -> Posture:

@@ -12,6 +12,7 @@ from service.model.messages import TaskMessage
 from service.model.states import Stage
 from service.store.attributes import Attribute
 from service.store.shards import json_attribute
+from worker.files.base_attributes import wrist_attributes
 from worker.grasps import Posture
 from worker.scenes import drop, transfer
 from worker.scenes.beside import scenes_of
@@ -73,5 +74,6 @@ def _after_grasps(message: TaskMessage, context: TaskContext) -> Output:
     grasp, pregrasp = (Posture.from_columns(base.arrays, name) for name in ("grasp", "pregrasp"))
     placed = transfer(hand, grasp, pregrasp, scenes["scene/object_pose"])
     attributes: dict[str, Attribute] = {"base_shard": message.inputs[0], "root_link": hand.root_link}
+    attributes |= wrist_attributes(hand)
     rejected = count_rejections(np.asarray(placed["grasp/rejection"], np.uint8))
     return Output({**scenes, **placed}, attributes, {"rejected": rejected})

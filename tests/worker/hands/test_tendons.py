@@ -97,7 +97,7 @@ def test_what_a_hand_does_not_have_does_not_change_its_content() -> None:
     # What is known of a hand is kept under it.
     assert content_of(After()) == content_of(Before())
     assert content_of(After(tendons=("t",))) != content_of(Before())
-    assert {f.name for f in fields(HandModel) if "told_if_set" in f.metadata} == {"tendons", "drag"}
+    assert {f.name for f in fields(HandModel) if "told_if_set" in f.metadata} == {"tendons", "drag", "mounting"}
 
 
 def test_a_shadow_urdf_has_the_tendons_that_urdf_cannot_say(shared_data: Path) -> None:

@@ -11,10 +11,11 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, apply
+from service.model.transforms import IDENTITY_POSE, apply, spread_directions
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.hands.oppositions import oppositions_of
+from worker.simulation.mounting import OUTERMOST, points_of
 from worker.simulation.obstacles import MARGIN_M
 from worker.simulation.surroundings import Surroundings
 
@@ -32,12 +33,15 @@ class Outlines:
     """(K, P, 3) [m]"""
     tips: NDArray[np.bool_]
     """(P,) those of fingertips."""
+    mounting: Floats
+    """(W, M, 3) outermost points of the mounting at each of its wrist positions, from the palm's centre [m]; W is 0
+    without one."""
 
     def lacks(
         self, posture: NDArray[np.intp], turn: Floats, centre: Floats, scene: Surroundings, *, room: float
     ) -> Floats:
-        """(n,) what hands lack of the distance from obstacles that they are to keep, and of `room` besides [m]; 0 or
-        more.
+        """(n,) what hands and their mountings lack of the distance from obstacles that they are to keep, and of `room`
+        besides [m]; 0 or more.
 
         Args:
             posture: (n,) which of the K.
@@ -51,7 +55,17 @@ class Outlines:
         for obstacle in scene.obstacles:
             wanted = np.where(self.tips, MARGIN_M if obstacle.tips_m is None else obstacle.tips_m, MARGIN_M) + room
             lack = np.maximum(lack, (wanted - obstacle.distance(place)).max(axis=1))
-        return lack
+        return np.maximum(lack, self._mounting_lacks(turn, centre, scene, MARGIN_M + room))
+
+    def _mounting_lacks(self, turn: Floats, centre: Floats, scene: Surroundings, wanted: float) -> Floats:
+        """(n,) what mountings at the best of their wrist positions lack of the distance `wanted` from obstacles [m]."""
+        least = np.full(len(turn), np.inf if len(self.mounting) else 0.0)
+        for points in self.mounting:
+            rows = np.flatnonzero(least > 0.0)
+            place = points @ np.swapaxes(turn[rows], -1, -2) + centre[rows, None]
+            lack = [(wanted - obstacle.distance(place)).max(axis=1) for obstacle in scene.obstacles]
+            least[rows] = np.minimum(least[rows], np.maximum.reduce([*lack, np.zeros(len(rows))]))
+        return least
 
 
 _known: LRUCache[str, Outlines] = LRUCache(16)
@@ -76,12 +90,7 @@ def _outlines(hand: HandModel, q: Floats) -> Outlines:
             far = (corners @ spread_directions(DIRECTIONS).T).argmax(axis=1)
             points.append(np.take_along_axis(corners, far[..., None], axis=1))
             tips.append(np.full(DIRECTIONS, tip))
-    return Outlines(np.concatenate(points, axis=1) - hand.palm.centre, np.concatenate(tips))
-
-
-def spread_directions(count: int) -> Floats:
-    """(count, 3) unit vectors spread evenly: a golden spiral."""
-    k = np.arange(count)
-    z = 1 - (2 * k + 1) / count
-    turn, across = np.pi * (3 - np.sqrt(5)) * k, np.sqrt(1 - z**2)
-    return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])
+    mounting = np.zeros((0, 0, 3))
+    if hand.mounting is not None:
+        mounting = points_of(hand.mounting)[:, :OUTERMOST] - hand.palm.centre
+    return Outlines(np.concatenate(points, axis=1) - hand.palm.centre, np.concatenate(tips), mounting)

@@ -14,15 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
+from service.model.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply, spread_directions
 from worker.hands.model import HandModel
 from worker.hands.oppositions import oppositions_of
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.across import NEAR_M, Openings, Reaches, across, promising
-from worker.planners.fast_graspd.outlines import spread_directions
+from worker.planners.fast_graspd.selection import posture_of
 from worker.planners.fast_graspd.starts import CLEAR, POSTURE_NOISE, TILT, Probe
 from worker.planners.port import NoPlace
 from worker.simulation.model import Model
+from worker.simulation.mounting import mounting_lack
 from worker.simulation.state import HandState
 from worker.simulation.surroundings import STANDOFF_M, Placed, Surroundings
 
@@ -142,7 +143,7 @@ def clear_scene_starts(
         off = _raise(drawn, np.flatnonzero(reach), placed, scene[rows], probe)
         worth = off < beside[rows, None]
         worth[~reach | (depth[rows] > CLEAR)] = True
-        found = _depths(probe, drawn.states, scene[rows], worth)
+        found = _depths(probe, drawn.states, placed, scene[rows], worth)
         # The nearest clear distance, or else the least deep.
         clear = found <= CLEAR
         pick = np.where(clear.any(axis=1), clear.argmax(axis=1), found.argmin(axis=1))
@@ -168,9 +169,11 @@ def _normal(generators: list[np.random.Generator], rows: NDArray[np.intp], dofs:
     return out
 
 
-def _depths(probe: Probe, states: HandState, scene: NDArray[np.intp], worth: NDArray[np.bool_]) -> Floats:
-    """(n, len(RETREATS)) depths [m] of hands in scenes (n,), from the farthest distance that is `worth` it
-    (n, len(RETREATS)) inwards for as long as it is clear; inf elsewhere.
+def _depths(
+    probe: Probe, states: HandState, placed: Placed, scene: NDArray[np.intp], worth: NDArray[np.bool_]
+) -> Floats:
+    """(n, len(RETREATS)) depths [m] of hands and their mountings in scenes (n,), from the farthest distance that is
+    `worth` it (n, len(RETREATS)) inwards for as long as it is clear; inf elsewhere.
 
     Most draws fail for what no retreat mends, and hardly any can be clear nearer than where it is not.
     """
@@ -179,14 +182,25 @@ def _depths(probe: Probe, states: HandState, scene: NDArray[np.intp], worth: NDA
         left = np.flatnonzero(open_ & worth[:, k])
         if len(left):
             probe.data.set_scenes(scene[left])
-            found[left, k] = probe.depths(states[left * len(RETREATS) + k])
+            some = states[left * len(RETREATS) + k]
+            found[left, k] = probe.depths(some)
+            clear = np.flatnonzero(found[left, k] <= CLEAR)
+            lack = _mounting_lack(probe, some[clear], placed, scene[left[clear]], exact=True)
+            found[left[clear], k] = np.maximum(found[left[clear], k], lack)
             open_[left] = found[left, k] <= CLEAR
     return found
 
 
+def _mounting_lack(probe: Probe, states: HandState, placed: Placed, scene: NDArray[np.intp], *, exact: bool) -> Floats:
+    """(n,) what the mountings of hands in scenes (n,) lack of their distance from obstacles and of `ROOM` [m]."""
+    hand, obj = probe.model.hand.model, probe.model.obj.model
+    poses = posture_of(hand, obj, states).hand_pose
+    return mounting_lack(hand, poses, placed.scenes, scene, room=ROOM, exact=exact)
+
+
 def _raise(drawn: _Drawn, rows: NDArray[np.intp], placed: Placed, scene: NDArray[np.intp], probe: Probe) -> Floats:
-    """Lift draws `rows` at all their distances, scenes (n,), by what the nearest lacks of its room from obstacles; how
-    far their pairs are then from between their pads (n, len(RETREATS)) [m], 0 of others.
+    """Lift draws `rows` at all their distances, scenes (n,), by what the nearest and its mounting lack of their room
+    from obstacles; how far their pairs are then from between their pads (n, len(RETREATS)) [m], 0 of others.
 
     Steps of retreat are too coarse for what lies low: fingers would end above it, not beside it.
     """
@@ -197,7 +211,9 @@ def _raise(drawn: _Drawn, rows: NDArray[np.intp], placed: Placed, scene: NDArray
     probe.data.set_scenes(scene[rows])
     probe.depths(states[rows * repeat])
     lifted = np.zeros((len(scene), 3))
-    lifted[rows] = probe.data.depths.obstacles.numpy()[: len(rows), None].astype(float) * up[rows]
+    lack = probe.data.depths.obstacles.numpy()[: len(rows)].astype(float)
+    lack = np.maximum(lack, _mounting_lack(probe, states[rows * repeat], placed, scene[rows], exact=False))
+    lifted[rows] = lack[:, None] * up[rows]
     every = (rows[:, None] * repeat + np.arange(repeat)).ravel()
     states.pivot[every] += np.repeat(lifted[rows], repeat, axis=0)
     for at, reaches in drawn.reaching:

@@ -150,7 +150,7 @@ class Probe:
     """Places hands and tells how deep they are, and how near the object; `room` as `record_placement` has it."""
 
     def __init__(self, model: Model, capacity: int, *, room: float = 0.0) -> None:
-        self.data = Data(model, capacity)
+        self.model, self.data = model, Data(model, capacity)
         self.band = model.options.band
         self._touching = record_placement(model, self.data, room=room, within=0.0)
         self._placement = record_placement(model, self.data, room=room)

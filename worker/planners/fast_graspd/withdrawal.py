@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.transforms import quat_rotate
+from worker.planners.fast_graspd.selection import posture_of
 from worker.planners.fast_graspd.starts import Probe
 from worker.quality.contact import finger_of_body
 from worker.simulation.model import Model
+from worker.simulation.mounting import mounting_lack
 from worker.simulation.state import HandState
 from worker.simulation.surroundings import RISE_M, Placed, Surroundings
 
@@ -34,8 +36,10 @@ UP: Final = (0.5, 1.0)
 
 def hindrance(model: Model, state: HandState, placed: Placed) -> Floats:
     """(n,) merit that hands lose since they cannot move straight back, or rise, in their scenes: what of them is then
-    in the object or in an obstacle."""
-    deep = _back(model, state, placed.index)
+    in the object or in an obstacle, or what of their mountings is in an obstacle already."""
+    hand, obj = model.hand.model, model.obj.model
+    mounted = mounting_lack(hand, posture_of(hand, obj, state).hand_pose, placed.scenes, placed.index)
+    deep = np.maximum(_back(model, state, placed.index), mounted)
     rows = np.flatnonzero(np.array([not _open_above(scene) for scene in placed.scenes])[placed.index])
     if len(rows):
         deep[rows] = np.maximum(deep[rows], _rising(model, state[rows], placed.take(rows)))

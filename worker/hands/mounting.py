@@ -1,0 +1,100 @@
+"""The mounting of a hand: the links above its root whose poses a grasp fixes, up to the angles of a wrist.
+
+The mounting is a kinematic tree of its own that starts at the hand's root and runs up the robot. It goes up through
+fixed joints, joints that stand still, and at most `MAX_WRIST_JOINTS` joints of a wrist: revolute ones of a limited
+range near the root. The first other joint belongs to an arm, whose links a grasp does not place.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import product
+from typing import Final
+
+import numpy as np
+
+from service.model.transforms import IDENTITY_POSE, compose, invert
+from worker.hands.model import Floats, HandModel
+from worker.hands.options import HandOptions
+from worker.hands.robot import Joint, Robot, chain_to
+from worker.hands.tree import LEAST_RANGE, Drive, Tree, joint_motion
+
+#: Most joints of a wrist, largest range of one [rad], and its largest distance from the root along the joints [m]. The
+#: last joint of an arm usually turns farther.
+MAX_WRIST_JOINTS: Final = 2
+MAX_WRIST_RANGE: Final = math.pi
+MAX_WRIST_M: Final = 0.1
+#: Candidates for a wrist joint: shares of the way from its rest angle to either limit.
+WRIST_SHARES: Final = (0.5, 1.0)
+
+
+def mounting_tree(robot: Robot, root: str, options: HandOptions) -> Tree | None:
+    """The links above the root as a tree, poses in the frame of the root link; None: none of them has a shape."""
+    names, parents, origins = [root], [-1], [IDENTITY_POSE.copy()]
+    joints: list[Joint | None] = [None]
+    links: dict[str, tuple[int, Floats]] = {}
+    pose, way = IDENTITY_POSE.copy(), 0.0
+    for joint in reversed(chain_to(robot, root)):
+        if joint.parent in options.drop:
+            break
+        value = _value(joint, options)
+        if value is None:
+            if len(names) > MAX_WRIST_JOINTS or way > MAX_WRIST_M or not _of_wrist(joint):
+                break
+            # Seen from the child, the parent turns the other way about the same axis, then stands off.
+            names.append(joint.parent)
+            parents.append(len(parents) - 1)
+            joints.append(replace(joint, axis=-joint.axis))
+            origins.append(pose)
+            pose = invert(joint.origin)
+        else:
+            pose = compose(pose, invert(compose(joint.origin, joint_motion(joint, value))))
+        way += float(np.linalg.norm(joint.origin[:3]))
+        links |= {link: (len(names) - 1, at) for link, at in _rigid(robot, joint, pose, options).items()}
+    if not any(robot.links[link].shapes for link in links):
+        return None
+    wrist = [joint for joint in joints if joint is not None]
+    moving = tuple(joint.name for joint in wrist)
+    lower, upper, velocity = np.array([(j.lower, j.upper, j.velocity) for j in wrist]).reshape(-1, 3).T
+    drives = {name: Drive(name, 1.0, 0.0) for name in moving}
+    return Tree(
+        tuple(names), tuple(parents), tuple(joints), tuple(origins), links, drives, moving, moving, lower, upper,
+        velocity, (), frozenset(),
+    )  # fmt: skip
+
+
+def _value(joint: Joint, options: HandOptions) -> float | None:
+    """Value of a joint that stands still [rad or m]; None: it moves."""
+    if joint.type == "fixed":
+        return 0.0
+    if joint.name in options.fix:
+        return options.fix[joint.name]
+    return joint.lower if joint.moves and joint.mimic is None and joint.upper - joint.lower < LEAST_RANGE else None
+
+
+def _of_wrist(joint: Joint) -> bool:
+    limited = joint.moves and joint.type == "revolute" and joint.mimic is None
+    return limited and joint.upper - joint.lower <= MAX_WRIST_RANGE
+
+
+def _rigid(robot: Robot, joint: Joint, pose: Floats, options: HandOptions) -> dict[str, Floats]:
+    """Pose of the parent of a joint, which is given, and of what fixed joints hold on it, but for the joint's child."""
+    found, stack = {joint.parent: pose}, [joint.parent]
+    while stack:
+        at = stack.pop()
+        for other in robot.joints.values():
+            if other.parent == at and other.type == "fixed" and other.child not in (joint.child, *options.drop):
+                found[other.child] = compose(found[at], other.origin)
+                stack.append(other.child)
+    return found
+
+
+def wrist_positions(mounting: HandModel) -> Floats:
+    """(W, K) candidates for the angles of the wrist's K joints, the one at rest first, then those nearest to it."""
+    angles = [
+        [rest, *(rest + share * (end - rest) for share in WRIST_SHARES for end in (low, high) if end != rest)]
+        for rest, low, high in zip(mounting.preshape, mounting.lower, mounting.upper, strict=True)
+    ]
+    found = np.array(list(product(*angles)), float)
+    return found[np.argsort(np.linalg.norm(found - mounting.preshape, axis=1), kind="stable")]
