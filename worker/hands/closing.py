@@ -14,14 +14,13 @@ from worker.hands.model import Floats, HandModel
 FAR: Final = 1.99
 #: Shares of the way from open to closed at which fingertips are looked at.
 _SHARES: Final = (0.25, 0.5, 0.75)
-#: Step with which their ways are measured, as a share of a dof's range.
-_STEP: Final = 1e-4
-#: Cosine from which on two axes of joints, or an axis and the approach, are parallel.
-_PARALLEL: Final = 0.8
+#: Cosine from which on two axes of joints, or an axis and the approach, are parallel: within 45 degrees, and 37.
+_PARALLEL: Final = 0.707
+_ABOUT: Final = 0.8
 #: A joint moves a tip if it does with this share of the most that a joint of its finger does.
 _MOVING: Final = 0.05
-#: Rates below this share of the tip's way are a tie. Joints that oppose a thumb have .28 and more, axial ones .04.
-_TIE: Final = 0.15
+#: Gains below this share of the tip's way are a tie. Joints that oppose a thumb have .35 and more.
+_TIE: Final = 0.2
 
 
 def closing_by_limits(hand: HandModel) -> Floats:
@@ -42,7 +41,7 @@ def closing_by_tips(hand: HandModel) -> Floats:
     other tips and to the palm. Another joint closes if it brings the tip to the other tips and out of the palm; one
     that turns about the approach, or as far both ways, spreads; one in line with its finger does neither.
     """
-    limits, (flexing, opposing, ways) = closing_by_limits(hand), _rates(hand)
+    limits, (flexing, opposing, ways) = closing_by_limits(hand), _gains(hand)
     opened, half = (_axes(hand, posture(hand, share)) for share in (0.0, 0.5))
     flexed, crossed, flexed_way, crossed_way = np.zeros((4, hand.dofs))
     for number, chain in enumerate(_chains(hand)):
@@ -56,7 +55,7 @@ def closing_by_tips(hand: HandModel) -> Floats:
         rate, way = (sense * flexing[dofs, number])[flexes].sum(), ways[dofs, number][flexes].sum()
         np.add.at(flexed, dofs[flexes], sense[flexes] * rate)
         np.add.at(flexed_way, dofs[flexes], way)
-        crosses = ~flexes & moving & (np.abs(opened[chain] @ hand.palm.approach) < _PARALLEL)
+        crosses = ~flexes & moving & (np.abs(opened[chain] @ hand.palm.approach) < _ABOUT)
         np.add.at(crossed, dofs[crosses], opposing[dofs[crosses], number])
         np.add.at(crossed_way, dofs[crosses], ways[dofs[crosses], number])
     bends = np.where(np.abs(flexed) > _TIE * flexed_way, np.sign(flexed), limits)
@@ -64,22 +63,28 @@ def closing_by_tips(hand: HandModel) -> Floats:
     return np.where(flexed_way > 0, bends, opposes)
 
 
-def _rates(hand: HandModel) -> tuple[Floats, Floats, Floats]:
-    """Of each dof and fingertip, each (D, T), summed over postures: how fast it brings the tip to the other tips and to
-    the palm; to the other tips and along the approach; and how fast it moves the tip [m/rad]."""
-    count, approach = len(hand.fingertips), hand.palm.approach
-    flexing, opposing, ways = np.zeros((3, hand.dofs, count))
+def _gains(hand: HandModel) -> tuple[Floats, Floats, Floats]:
+    """Of each dof and fingertip, each (D, T) [m], as the dof goes from its lower to its upper limit, summed over postures
+    of the others: how much nearer the tip comes to the other tips and to the palm; how much nearer to the other tips and
+    farther out of the palm; and the length of its way."""
+    flexing, opposing, ways = np.zeros((3, hand.dofs, len(hand.fingertips)))
     for share in _SHARES:
-        q = posture(hand, share)
-        step = _STEP * np.maximum(hand.span, 1e-6)
-        way = np.stack([tips(hand, q + e) - tips(hand, q - e) for e in np.diag(step)]) / (2 * step[:, None, None])
-        tip = tips(hand, q)
-        others = (tip.sum(axis=0) - tip) / max(count - 1, 1)
-        together = _units(others - tip) if count > 1 else np.zeros_like(tip)
-        flexing += np.einsum("dti,ti->dt", way, together + _units(hand.palm.centre - tip))
-        opposing += np.einsum("dti,ti->dt", way, together + approach)
-        ways += np.linalg.norm(way, axis=2)
+        for dof in range(hand.dofs):
+            q = np.tile(posture(hand, share), (3, 1))
+            q[:, dof] = hand.lower[dof] + np.array([0.0, 0.5, 1.0]) * hand.span[dof]
+            low, _, high = seen = np.array([tips(hand, one) for one in q])
+            nearer = _apart(low) - _apart(high)
+            to_palm = (np.linalg.norm(one - hand.palm.centre, axis=1) for one in (low, high))
+            flexing[dof] += nearer + next(to_palm) - next(to_palm)
+            opposing[dof] += nearer + (high - low) @ hand.palm.approach
+            ways[dof] += np.linalg.norm(np.diff(seen, axis=0), axis=2).sum(axis=0)
     return flexing, opposing, ways
+
+
+def _apart(tip: Floats) -> Floats:
+    """(T,) distance of each of the tips (T, 3) from the middle of the others [m]."""
+    others = (tip.sum(axis=0) - tip) / max(len(tip) - 1, 1)
+    return np.asarray(np.linalg.norm(tip - others, axis=1)) if len(tip) > 1 else np.zeros(1)
 
 
 def _chains(hand: HandModel) -> list[list[int]]:
@@ -98,10 +103,6 @@ def _chains(hand: HandModel) -> list[list[int]]:
 def _axes(hand: HandModel, q: Floats) -> Floats:
     """(B, 3) axes of all joints in the root frame."""
     return np.asarray(quat_rotate(body_poses(hand, IDENTITY_POSE, hand.expand(q))[0, :, 3:], hand.axis))
-
-
-def _units(vectors: Floats) -> Floats:
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9))
 
 
 def carriers(hand: HandModel) -> list[int]:

@@ -47,18 +47,19 @@ def complete(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
     """The hand with fingertips, closing, palm and preshape filled in: as stated, else as guessed."""
     hand = replace(hand, fingertips=_fingertips(hand, tree, options))
     stated = dict(_by_dof(hand, tree, options.closing))
-    hand = replace(hand, closing=_with(closing_by_limits(hand), stated))
+    hand = replace(hand, closing=closing_by_limits(hand))
     slide = slides(hand)
     if hand.dofs <= MAX_DOFS or slide.any():
-        hand = replace(hand, closing=_closing_seen(hand, stated))
-        if (jaws := find_jaws(hand)) is not None:
-            return _gripper(hand, jaws, tree, options)
-    hand = _with_palm(hand, tree, options)
+        seen = replace(hand, closing=_closing_seen(hand, stated))
+        if (jaws := find_jaws(seen)) is not None:
+            return _gripper(seen, jaws, tree, options)
+        # Fingertips that slide are known by the surfaces that come together.
+        hand = replace(hand, closing=np.where(slide, seen.closing, hand.closing))
     for _ in range(LOOKS):
-        # Fingertips that slide are seen by their surfaces.
-        closing = np.where(slide, hand.closing, closing_by_tips(hand))
-        hand = _with_palm(replace(hand, closing=_with(closing, stated)), tree, options)
-    return hand
+        hand = _with_palm(hand, tree, options)
+        hand = replace(hand, closing=np.where(slide, hand.closing, closing_by_tips(hand)))
+    # What is stated of one joint changes no guess of another.
+    return _with_palm(replace(hand, closing=_with(hand.closing, stated)), tree, options)
 
 
 def _with(closing: Floats, stated: Mapping[int, float]) -> Floats:
