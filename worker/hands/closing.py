@@ -44,8 +44,10 @@ def closing_by_tips(hand: HandModel) -> Floats:
     limits, (flexing, opposing, ways) = closing_by_limits(hand), _gains(hand)
     opened, half = (_axes(hand, posture(hand, share)) for share in (0.0, 0.5))
     flexed, crossed, flexed_way, crossed_way = np.zeros((4, hand.dofs))
+    seen = np.zeros(hand.dofs, bool)
     for number, chain in enumerate(_chains(hand)):
         dofs = hand.dof[chain]
+        seen[dofs] = True
         moving = ways[dofs, number] > _MOVING * ways[dofs, number].max(initial=1e-9)
         if not moving.any():
             continue
@@ -60,7 +62,8 @@ def closing_by_tips(hand: HandModel) -> Floats:
         np.add.at(crossed_way, dofs[crosses], ways[dofs[crosses], number])
     bends = np.where(np.abs(flexed) > _TIE * flexed_way, np.sign(flexed), limits)
     opposes = np.where((np.abs(crossed) > _TIE * crossed_way) & (limits != 0), np.sign(crossed), 0.0)
-    return np.where(flexed_way > 0, bends, opposes)
+    # Of a joint that leads to no fingertip the limits alone tell.
+    return np.where(seen, np.where(flexed_way > 0, bends, opposes), limits)
 
 
 def _gains(hand: HandModel) -> tuple[Floats, Floats, Floats]:
