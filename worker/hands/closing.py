@@ -45,7 +45,7 @@ def closing_by_tips(hand: HandModel) -> Floats:
     opened, half = (_axes(hand, posture(hand, share)) for share in (0.0, 0.5))
     flexed, crossed, flexed_way, crossed_way = np.zeros((4, hand.dofs))
     seen = np.zeros(hand.dofs, bool)
-    for number, chain in enumerate(_chains(hand)):
+    for number, chain in enumerate(chains_of(hand)):
         dofs = hand.dof[chain]
         seen[dofs] = True
         moving = ways[dofs, number] > _MOVING * ways[dofs, number].max(initial=1e-9)
@@ -90,7 +90,7 @@ def _apart(tip: Floats) -> Floats:
     return np.asarray(np.linalg.norm(tip - others, axis=1)) if len(tip) > 1 else np.zeros(1)
 
 
-def _chains(hand: HandModel) -> list[list[int]]:
+def chains_of(hand: HandModel) -> list[list[int]]:
     """Of each fingertip: the bodies whose joints move it, the last one first, without those that carry the palm."""
     carrying, chains = set(carriers(hand)), []
     for tip in hand.fingertips:
