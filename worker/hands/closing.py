@@ -24,7 +24,7 @@ _TIE: Final = 0.2
 
 
 def closing_by_limits(hand: HandModel) -> Floats:
-    """(D,) fingers bend far one way and little the other; what moves as far both ways spreads. A wrist closes nothing."""
+    """(D,) fingers bend far one way and little the other, what moves as far both ways spreads, a wrist closes nothing."""
     up, down = np.maximum(hand.upper, 0), np.maximum(-hand.lower, 0)
     closing = np.where(up > FAR * down, 1.0, np.where(down > FAR * up, -1.0, 0.0))
     carrying = set(carriers(hand))
@@ -67,9 +67,12 @@ def closing_by_tips(hand: HandModel) -> Floats:
 
 
 def _gains(hand: HandModel) -> tuple[Floats, Floats, Floats]:
-    """Of each dof and fingertip, each (D, T) [m], as the dof goes from its lower to its upper limit, summed over postures
-    of the others: how much nearer the tip comes to the other tips and to the palm; how much nearer to the other tips and
-    farther out of the palm; and the length of its way."""
+    """Of each dof and fingertip, as the dof goes from its lower to its upper limit.
+
+    Returns:
+        Three arrays (D, T) [m], summed over postures of the other dofs: how much nearer the tip comes to the other tips
+        and to the palm; how much nearer to the other tips and farther out of the palm; and the length of its way.
+    """
     flexing, opposing, ways = np.zeros((3, hand.dofs, len(hand.fingertips)))
     for share in _SHARES:
         for dof in range(hand.dofs):

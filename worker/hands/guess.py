@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.model.errors import HandError
 from service.model.suggestions import did_you_mean

@@ -61,8 +61,8 @@ class Best:
 
 @dataclass(frozen=True)
 class SelfTest:
-    """What came of it; `gsr` is the share of raw grasps that hold by the certificate, `table` that of `table_n` that lift
-    the objects off a table."""
+    """What came of it; `gsr` is the share of raw grasps that hold by the certificate, `table` that of `table_n`
+    grasps that lift the objects off a table."""
 
     gsr: float
     n: int
@@ -130,8 +130,8 @@ def tried_softly(hand: Callable[[], HandModel], run: Run = ALONE) -> dict[str, A
 def self_test(
     hand: HandModel, run: Run = ALONE, *, grasps: int = GRASPS, on_table: int = TABLE_GRASPS, seed: int = 0
 ) -> SelfTest:
-    """Raw grasps of a sphere, a box and a cylinder, as `JobOptions` has them by default, shared out evenly; and of these
-    as they stand on a table.
+    """Raw grasps of a sphere, a box and a cylinder, as `JobOptions` has them by default, shared out evenly; and
+    of these as they stand on a table.
 
     It has no limit of time: what a busy machine left out would be another verdict.
 
