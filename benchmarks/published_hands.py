@@ -112,10 +112,10 @@ def page(done: dict[str, Any]) -> str:
     grasps = next(iter(done.values()))["grasps"]
     return (
         "# Published hands: the self-test's verdict, and what they lift\n\n"
-        "`python -m benchmarks.published_hands DIR --data DATA`: for each hand as it is published its self-test (*free* "
-        "and *table* are the shares that hold and that lift), and beside it the share of raw grasps that lift an object "
-        f"off a table, {grasps} of each object, standard fidelity, seed {SEED}. The verdict agrees where a hand is ready and "
-        f"lifts {TABLE_READY:.0%} or more, or neither: {agreeing} of {len(done)} do.\n\n"
+        "`python -m benchmarks.published_hands DIR --data DATA`: for each hand as published its self-test (*free* "
+        "and *table*: the shares that hold and that lift), and beside it the share of raw grasps that lift an object "
+        f"off a table, {grasps} of each object, standard fidelity, seed {SEED}. The verdict agrees where a hand is "
+        f"ready and lifts {TABLE_READY:.0%} or more, or neither: {agreeing} of {len(done)} do.\n\n"
         f"| hand | from | dofs | verdict | free | table | {' | '.join(OBJECTS)} | mean | agrees | self-test [s] |\n"
         f"| --- | --- | --: | --- | --: | --: | {'--: | ' * len(OBJECTS)}--: | --- | --: |\n" + "\n".join(rows) + "\n"
     )

@@ -24,7 +24,7 @@ _TIE: Final = 0.2
 
 
 def closing_by_limits(hand: HandModel) -> Floats:
-    """(D,) fingers bend far one way and little the other, what moves as far both ways spreads, a wrist closes nothing."""
+    """(D,) fingers bend far one way and little the other; what moves as far both ways spreads; wrists close nothing."""
     up, down = np.maximum(hand.upper, 0), np.maximum(-hand.lower, 0)
     closing = np.where(up > FAR * down, 1.0, np.where(down > FAR * up, -1.0, 0.0))
     carrying = set(carriers(hand))
