@@ -70,7 +70,7 @@ def add_hand(
     licence: LicenceOption = None,
     source: SourceOption = None,
     self_test: Annotated[
-        bool, typer.Option("--self-test/--no-self-test", help="Record how many of 64 grasps of plain objects hold.")
+        bool, typer.Option("--self-test/--no-self-test", help="Record what it holds and lifts of plain objects.")
     ] = True,
     shared: SharedOption = False,
     wait: WaitOption = True,

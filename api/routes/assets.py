@@ -88,7 +88,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
         ] = "",
         self_test: Annotated[
             bool,
-            Form(description="of a hand: its check ends with 64 grasps of plain objects, some minutes of a worker"),
+            Form(description="of a hand: its check ends with 80 grasps of plain objects, some minutes of a worker"),
         ] = False,
         shared: Annotated[bool, Form(description="whether every project may use it, not only that of the key")] = False,
         rename: Annotated[

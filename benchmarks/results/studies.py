@@ -315,6 +315,12 @@ STUDIES: Final = (
         seeds=(404,),
     ),
     Study(
+        "published-hands", "the self-test's verdict, and what published hands lift", ("results/published_hands.*",),
+        ("python -m benchmarks.published_hands SOURCES --data DATA --grasps 12 --out OUT/results",),
+        ("python -m benchmarks.published_hands SOURCES --data DATA --only robotiq-2f-85 --grasps 2 --out OUT/results",),
+        IN_SCENES, seeds=(404,),
+    ),
+    Study(
         "hands-gallery", "published hands, each tried on plain objects",
         ("results/hands-gallery.json", "hands-gallery.md", "images/hands-gallery/*"),
         ("python -m benchmarks.gallery --sources SOURCES --out OUT",),

@@ -40,7 +40,7 @@ def summary(kind: AssetKind, facts: Mapping[str, Any]) -> list[str]:
 
 
 def self_test_line(facts: Mapping[str, Any]) -> str:
-    """What a hand's self-test says: `ready: 91 % hold`, or what is suspicious; empty: it was not tried."""
+    """What a hand's self-test says, `ready: 91 % hold, ...` or what is suspicious; empty: it was not tried."""
     tried = facts.get("self_test")
     return str(tried.get("says", "")) if isinstance(tried, Mapping) else ""
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from service.model.errors import AssetError, InputError
+from worker.hands.closing import chains_of
 from worker.hands.guess import approach_is_tied
 from worker.hands.jaws import jaws_of
 from worker.hands.load import assemble, assumed_efforts, main_file
@@ -64,6 +65,7 @@ def check_hand(
     notes = [
         *robot.notes,
         *tie,
+        *_open(hand),
         *_tendons(hand),
         *_limits(robot, settings),
         *_left_out(robot, hand, settings),
@@ -79,6 +81,13 @@ def _tendons(hand: HandModel) -> list[str]:
     return (
         [f"{', '.join(pairs)} on one tendon each" if len(pairs) > 1 else f"{pairs[0]} on one tendon"] if pairs else []
     )
+
+
+def _open(hand: HandModel) -> list[str]:
+    """What a user must know of fingers that no joint closes."""
+    chains = zip(hand.fingertips, chains_of(hand), strict=True)
+    still = [hand.body_names[tip] for tip, chain in chains if not hand.closing[hand.dof[chain]].any()]
+    return [f"no joint closes the finger of {', '.join(still)}: say which does with --closing JOINT=1"] if still else []
 
 
 def _tie(hand: HandModel, settings: HandOptions) -> list[str]:

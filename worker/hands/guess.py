@@ -7,11 +7,11 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.model.errors import HandError
 from service.model.suggestions import did_you_mean
 from service.model.transforms import IDENTITY_POSE, apply, compose, quat_rotate
+from worker.hands.closing import carriers, closing_by_limits, closing_by_tips, posture, tips
 from worker.hands.jaws import MAX_DOFS, Jaws, closing_by_geometry, find_jaws, sign_of, slides
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel, PalmFrame
@@ -21,11 +21,8 @@ from worker.objects.kept_arrays import recalled
 
 #: Share of the way from open to closed at which the hand approaches.
 PRESHAPE_SHARE = 0.25
-#: Fingertips that end so many times as far from each other as they began have opened; those that close end at 0.2 to
-#: 0.8 of it.
-PARTED = 1.3
-#: A finger bends so many times as far one way as the other: twice, whatever the last digits of its limits are.
-FAR = 1.99
+#: How often closing and palm, which follow from each other, are looked at.
+LOOKS = 2
 #: Fingertips whose ways across the hand sum to less than this share of their lengths close on one another: 0 of like
 #: fingers around an axis, .3 to .55 where two oppose one, .75 and more of hands with a thumb.
 OPPOSED = 0.65
@@ -35,8 +32,6 @@ LEAST_AHEAD = 0.1
 CONTRADICTING = 0.2
 #: Tips whose ways across their strongest line are less than this share of it close along that line.
 SIDEWAYS = 0.3
-#: Ways that part or bring together less than this share of the most are rounding noise.
-NOISE = 1e-3
 #: Lines this near to each other are one line, and a root axis so near to it is it [degrees].
 SAME_LINE = 1.0
 #: Lines and root axes this near to a rough direction may be what it stands for [degrees]; and to a good one.
@@ -50,22 +45,35 @@ RIM_M = 0.02
 def complete(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
     """The hand with fingertips, closing, palm and preshape filled in: as stated, else as guessed."""
     hand = replace(hand, fingertips=_fingertips(hand, tree, options))
-    hand = replace(hand, closing=_closing_by_limits(hand))
-    if hand.dofs <= MAX_DOFS or slides(hand).any():
-        hand = replace(hand, closing=_closing_seen(hand, dict(_by_dof(hand, tree, options.closing))))
-        if (jaws := find_jaws(hand)) is not None:
-            return _gripper(hand, jaws, tree, options)
-    hand = _closed_together(hand)
+    stated = dict(_by_dof(hand, tree, options.closing))
+    hand = replace(hand, closing=closing_by_limits(hand))
+    slide = slides(hand)
+    if hand.dofs <= MAX_DOFS or slide.any():
+        seen = replace(hand, closing=_closing_seen(hand, stated))
+        if (jaws := find_jaws(seen)) is not None:
+            return _gripper(seen, jaws, tree, options)
+        # Fingertips that slide are known by the surfaces that come together.
+        hand = replace(hand, closing=np.where(slide, seen.closing, hand.closing))
+    for _ in range(LOOKS):
+        hand = _with_palm(hand, tree, options)
+        hand = replace(hand, closing=np.where(slide, hand.closing, closing_by_tips(hand)))
+    # What is stated of one joint changes no guess of another.
+    return _with_palm(replace(hand, closing=_with(hand.closing, stated)), tree, options)
+
+
+def _with(closing: Floats, stated: Mapping[int, float]) -> Floats:
+    """(D,) the closing, as stated where it is."""
+    closing = closing.copy()
+    for dof, direction in stated.items():
+        closing[dof] = np.sign(direction)
+    return closing
+
+
+def _with_palm(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
+    """The hand with the preshape and the palm that follow from its closing."""
     approach = _stated_approach(hand, tree, options)
     if approach is None:
         approach = _guess_approach(hand)
-    # A dof that turns a whole finger about the approach direction spreads it; it closes nothing.
-    axes, at_base = _dof_axes(hand)
-    spread = at_base & (np.abs(axes @ approach) > 0.8)
-    closing = np.where(spread, 0.0, hand.closing)
-    for dof, direction in _by_dof(hand, tree, options.closing):
-        closing[dof] = np.sign(direction)
-    hand = replace(hand, closing=closing)
     hand = replace(hand, preshape=_preshape(hand, tree, options))
     return replace(hand, palm=_palm(hand, tree, options, approach))
 
@@ -119,10 +127,7 @@ def _closing_seen(hand: HandModel, stated: Mapping[int, float]) -> Floats:
             f"no two surfaces of the hand come together when {', '.join(hand.dof_names[:4])} moves: its fingers are "
             "missing or have no collision shapes (add them), or do not move towards each other (correct axes or limits)"
         )
-    closing = np.where((seen == 0) & ~slides(hand), hand.closing, seen)
-    for dof, direction in stated.items():
-        closing[dof] = np.sign(direction)
-    return closing
+    return _with(np.where((seen == 0) & ~slides(hand), hand.closing, seen), stated)
 
 
 def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int, ...]:
@@ -134,77 +139,6 @@ def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int,
     if kept:
         return tuple(dict.fromkeys(kept))
     return tuple(body for body in range(1, hand.bodies) if body not in set(hand.parent.tolist()))
-
-
-def _closing_by_limits(hand: HandModel) -> Floats:
-    """Fingers bend far one way and little the other; what moves as far both ways spreads. A wrist closes nothing."""
-    up, down = np.maximum(hand.upper, 0), np.maximum(-hand.lower, 0)
-    closing = np.where(up > FAR * down, 1.0, np.where(down > FAR * up, -1.0, 0.0))
-    carrying = set(_carriers(hand))
-    for body, name in zip(hand.joint_body, hand.joint_names, strict=True):
-        if body in carrying and name in hand.dof_names:
-            closing[hand.dof_names.index(name)] = 0.0
-    return closing
-
-
-def _carriers(hand: HandModel) -> list[int]:
-    """Bodies that carry all fingertips, the root first and the palm last: between them are a forearm and a wrist."""
-    if len(hand.fingertips) < 2:
-        return [0]
-    chains = []
-    for tip in hand.fingertips:
-        chain = [tip]
-        while chain[-1] > 0:
-            chain.append(int(hand.parent[chain[-1]]))
-        chains.append(chain[::-1])
-    return [same[0] for same in zip(*chains, strict=False) if len(set(same)) == 1]
-
-
-def _closed_together(hand: HandModel) -> HandModel:
-    """The hand; one whose fingertips part as it closes by its limits closes by what brings them together instead.
-
-    Limits from 0 on say nothing of a hand that is closed at 0.
-    """
-    opened, half, closed = (posture(hand, share) for share in (0.0, 0.5, 1.0))
-    if _apart(hand, closed) <= PARTED * _apart(hand, opened):
-        return hand
-    steps = np.diag(0.1 * hand.span)
-    parting = np.array([_apart(hand, half + step) - _apart(hand, half - step) for step in steps])
-    told = np.abs(parting) > NOISE * np.abs(parting).max()
-    return replace(hand, closing=np.where((hand.closing != 0) & told, -np.sign(parting), hand.closing))
-
-
-def _apart(hand: HandModel, q: Floats) -> float:
-    """Mean distance of the fingertips from their middle [m]."""
-    tips = _tips(hand, q)
-    return float(np.linalg.norm(tips - tips.mean(axis=0), axis=1).mean())
-
-
-def posture(hand: HandModel, share: float) -> Floats:
-    """(D,) posture at a share of the way from open (0) to closed (1); dofs that close nothing stay near 0."""
-    start = np.where(hand.closing < 0, hand.upper, hand.lower)
-    end = np.where(hand.closing < 0, hand.lower, hand.upper)
-    rest = np.clip(0.0, hand.lower, hand.upper)
-    return np.where(hand.closing == 0, rest, start + share * (end - start))
-
-
-def _tips(hand: HandModel, q: Floats) -> Floats:
-    """(T, 3) centres of the fingertip bodies in the root frame."""
-    poses = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0]
-    centre = {p.body: p.vertices.mean(axis=0) for p in hand.pieces}
-    return np.array([apply(poses[b], centre.get(b, np.zeros(3))) for b in hand.fingertips])
-
-
-def _dof_axes(hand: HandModel) -> tuple[Floats, NDArray[np.bool_]]:
-    """(D, 3) axis of each dof's own joint in the root frame, hand open; (D,) whether its finger starts there."""
-    poses = body_poses(hand, IDENTITY_POSE, hand.expand(posture(hand, 0.0)))[0]
-    axes, at_base, palm = np.zeros((hand.dofs, 3)), np.zeros(hand.dofs, dtype=bool), _carriers(hand)[-1]
-    for body, name in zip(hand.joint_body, hand.joint_names, strict=True):
-        if name in hand.dof_names:
-            dof = hand.dof_names.index(name)
-            axes[dof] = quat_rotate(poses[body, 3:], hand.axis[body])
-            at_base[dof] = hand.parent[body] == palm
-    return axes, at_base
 
 
 def _guess_approach(hand: HandModel) -> Floats:
@@ -237,15 +171,15 @@ def _witnessed(hand: HandModel) -> tuple[Floats, bool]:
 
 def _ways(hand: HandModel) -> Floats:
     """(T, 3) ways of the fingertips as the hand closes."""
-    return _tips(hand, posture(hand, 0.4)) - _tips(hand, posture(hand, 0.05))
+    return tips(hand, posture(hand, 0.4)) - tips(hand, posture(hand, 0.05))
 
 
 def _tips_ahead(hand: HandModel) -> Floats:
     """(3,) from the middle of the palm to that of the tips of the half-closed hand."""
-    body = _carriers(hand)[-1]
+    body = carriers(hand)[-1]
     pose = body_poses(hand, IDENTITY_POSE, hand.expand(posture(hand, 0.6)))[0, body]
     palm = [apply(pose, piece.vertices.mean(axis=0)) for piece in hand.pieces if piece.body == body]
-    return np.asarray(_tips(hand, posture(hand, 0.6)).mean(axis=0) - (np.mean(palm, axis=0) if palm else pose[:3]))
+    return np.asarray(tips(hand, posture(hand, 0.6)).mean(axis=0) - (np.mean(palm, axis=0) if palm else pose[:3]))
 
 
 def _cancelling(ways: Floats, ahead: Floats) -> float:
@@ -260,16 +194,16 @@ def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
     """Direction out of the palm of a hand whose fingers oppose each other: from where they begin to their half-closed
     tips, across the line on which they close if they do so on one; and whether that is a tie, since they lie in the
     plane in which they begin."""
-    body = _carriers(hand)[-1]
+    body = carriers(hand)[-1]
     q = posture(hand, 0.5)
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0]
-    bases, tips = poses[hand.parent == body, :3], _tips(hand, q)
-    along = tips.mean(axis=0) - bases.mean(axis=0)
+    bases, ends = poses[hand.parent == body, :3], tips(hand, q)
+    along = ends.mean(axis=0) - bases.mean(axis=0)
     spread = float(np.linalg.norm(bases - bases.mean(axis=0), axis=1).max())
     tied = bool(np.linalg.norm(along) < LEAST_AHEAD * max(spread, 1e-6))
     if tied:
         # The plane's normal is known, its side is not: one is taken, and told.
-        normal = np.linalg.svd(np.vstack([bases, tips]) - bases.mean(axis=0))[2][-1]
+        normal = np.linalg.svd(np.vstack([bases, ends]) - bases.mean(axis=0))[2][-1]
         along = normal * sign_of(normal)
     else:
         ways = _ways(hand)
@@ -376,7 +310,7 @@ def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -
     centre = through + (height - through @ approach) * approach
     if len(bases):
         # Beneath what the half-closed fingers reach over.
-        beneath = (bases.mean(axis=0) + _tips(hand, posture(hand, 0.5)).mean(axis=0)) / 2
+        beneath = (bases.mean(axis=0) + tips(hand, posture(hand, 0.5)).mean(axis=0)) / 2
         surface = _leaves(parts, beneath, approach)
         if surface is not None and surface < height - RIM_M:
             return PalmFrame(beneath + (surface - beneath @ approach) * approach, approach)

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from service.model import transforms
 from service.model.errors import HandError
 from service.model.transforms import IDENTITY_POSE, quat_rotate
-from worker.hands import guess, jaws, kinematics, primitives, surface
+from worker.hands import closing, guess, jaws, kinematics, primitives, surface
 from worker.hands import pads as pads_code
-from worker.hands.guess import posture
+from worker.hands.closing import posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
 from worker.hands.pads import Pad, fingertip_pad
@@ -99,7 +99,7 @@ def oppositions_of(hand: HandModel) -> Oppositions:
 
 def _code() -> tuple[ModuleType, ...]:
     """Whose change would change what is kept of a hand."""
-    return (sys.modules[__name__], guess, jaws, kinematics, pads_code, primitives, surface, transforms)
+    return (sys.modules[__name__], closing, guess, jaws, kinematics, pads_code, primitives, surface, transforms)
 
 
 def _oppositions(hand: HandModel) -> Oppositions:

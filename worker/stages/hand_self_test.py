@@ -1,4 +1,5 @@
-"""Does a hand hold anything: grasps of three plain objects of a size that suits it, judged by the certificate."""
+"""Does a hand hold anything: grasps of three plain objects of a size that suits it, judged free by the certificate, and
+lifted off a table."""
 
 from __future__ import annotations
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from service.model.domain import BATCH_SIZE, JobOptions
 from service.model.errors import InputError
+from service.model.scene_spec import SceneSpec
 from service.model.transforms import apply
 from worker.certified import Certified, certified_grasps
 from worker.grasps import Posture
@@ -25,10 +27,16 @@ from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object
 from worker.quality.referee.protocol import Outcome
 from worker.run import ALONE, Run
+from worker.scenes.beside import scenes_of
 
-#: Grasps in all, and the share that must hold of a hand that is ready.
+#: Free grasps in all, and the share that must hold of a hand that is ready.
 GRASPS: Final = 64
 READY: Final = 0.7
+#: Grasps in all of the objects on a table, and the share that must lift.
+TABLE_GRASPS: Final = 16
+TABLE_READY: Final = 0.6
+TABLE: Final = SceneSpec(kind="table")
+TABLE_SCENES: Final = 2
 #: Width of the objects as a share of a gripper's opening, or of the reach of a hand's fingers; and its bounds [m].
 OF_OPENING: Final = 0.55
 OF_REACH: Final = 0.5
@@ -53,12 +61,15 @@ class Best:
 
 @dataclass(frozen=True)
 class SelfTest:
-    """What came of it; `gsr` is the share of raw grasps that hold by the certificate."""
+    """What came of it; `gsr` is the share of raw grasps that hold by the certificate, `table` that of `table_n`
+    grasps that lift the objects off a table."""
 
     gsr: float
     n: int
     width_m: float
     by_object: dict[str, float]
+    table: float
+    table_n: int
     best: Best | None = None
     """None: nothing was held."""
     lost: float = 0.0
@@ -70,8 +81,13 @@ class SelfTest:
     def line(self) -> str:
         """One line for people."""
         share = f"{100 * self.gsr:.0f} % hold"
+        lifts = f"{100 * self.table:.0f} % lift off a table"
         if self.gsr >= READY:
-            return f"ready: {share}"
+            if self.table >= TABLE_READY:
+                return f"ready: {share}, {lifts}"
+            return f"suspicious: {share}, but {lifts}: look at closing, pre-shape and palm"
+        if self.table < TABLE_READY:
+            share += f", {lifts}"
         worst = min(self.by_object, key=lambda name: self.by_object[name])
         says = f"suspicious: {share}, {100 * self.by_object[worst]:.0f} % of a {worst}; "
         if self.lost > 0.5:
@@ -83,12 +99,17 @@ class SelfTest:
 
     def facts(self) -> dict[str, Any]:
         """As a check reports it."""
-        return {"gsr": self.gsr, "n": self.n, "width_m": self.width_m, "by_object": self.by_object, "says": self.line}
+        return {
+            "gsr": self.gsr, "n": self.n, "table": self.table, "table_n": self.table_n, "width_m": self.width_m,
+            "by_object": self.by_object, "says": self.line,
+        }  # fmt: skip
 
 
 def failed(reason: str, says: str = "suspicious") -> dict[str, Any]:
     """The facts of a hand that could not be tried at all."""
-    return {"gsr": 0.0, "n": 0, "width_m": 0.0, "by_object": {}, "says": f"{says}: {reason}"}
+    return {
+        "gsr": 0.0, "n": 0, "table": 0.0, "table_n": 0, "width_m": 0.0, "by_object": {}, "says": f"{says}: {reason}",
+    }  # fmt: skip
 
 
 def tried_softly(hand: Callable[[], HandModel], run: Run = ALONE) -> dict[str, Any]:
@@ -106,8 +127,11 @@ def tried_softly(hand: Callable[[], HandModel], run: Run = ALONE) -> dict[str, A
         return failed(f"the test itself failed ({type(error).__name__})", "not tried")
 
 
-def self_test(hand: HandModel, run: Run = ALONE, *, grasps: int = GRASPS, seed: int = 0) -> SelfTest:
-    """Raw grasps of a sphere, a box and a cylinder, as `JobOptions` has them by default, shared out evenly.
+def self_test(
+    hand: HandModel, run: Run = ALONE, *, grasps: int = GRASPS, on_table: int = TABLE_GRASPS, seed: int = 0
+) -> SelfTest:
+    """Raw grasps of a sphere, a box and a cylinder, as `JobOptions` has them by default, shared out evenly; and
+    of these as they stand on a table.
 
     It has no limit of time: what a busy machine left out would be another verdict.
 
@@ -115,6 +139,7 @@ def self_test(hand: HandModel, run: Run = ALONE, *, grasps: int = GRASPS, seed: 
         hand: the hand.
         run: told of the share that is done; asked often whether to stop.
         grasps: how many in all.
+        on_table: how many in all of the objects on a table.
         seed: of what is drawn.
 
     Raises:
@@ -124,11 +149,14 @@ def self_test(hand: HandModel, run: Run = ALONE, *, grasps: int = GRASPS, seed: 
     width = fitting_width(hand)
     held: dict[str, list[bool]] = {}
     lost: list[bool] = []
+    lifted: list[tuple[int, float]] = []
     best: Best | None = None
     objects = plain_objects(width)
     for number, (name, obj) in enumerate(objects.items()):
-        share = grasps // 3 + (number < grasps % 3)
-        found = _batches(hand, obj, share, seed, run.part(number / len(objects), (number + 1) / len(objects)))
+        part = run.part(number / len(objects), (number + 1) / len(objects))
+        free, standing = (count // 3 + (number < count % 3) for count in (grasps, on_table))
+        found = _batches(hand, obj, free, seed, part.part(0.0, 0.7))
+        lifted += [_lifted(hand, obj, standing, seed, part.part(0.7, 1.0))]
         held[name] = [bool(value == 1) for batch in found for value in batch.columns["quality/success"]]
         lost += [bool(one) for batch in found for one in _lost(batch)]
         better = [_best(obj, batch) for batch in found]
@@ -136,7 +164,9 @@ def self_test(hand: HandModel, run: Run = ALONE, *, grasps: int = GRASPS, seed: 
     every = [value for values in held.values() for value in values]
     by_object = {name: float(np.mean(values)) for name, values in held.items() if values}
     slack = float(np.mean(lost)) if lost else 0.0
-    return SelfTest(float(np.mean(every)), len(every), width, by_object, best, slack, _give(hand))
+    tried = sum(planned for planned, _ in lifted)
+    table = sum(planned * share for planned, share in lifted) / max(tried, 1)
+    return SelfTest(float(np.mean(every)), len(every), width, by_object, table, tried, best, slack, _give(hand))
 
 
 def _lost(batch: Certified) -> NDArray[np.bool_]:
@@ -166,6 +196,14 @@ def _batches(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: Run)
         request = JobOptions(want="raw", grasps=size, seed=seed, referee="certificate")
         found.append(certified_grasps(hand, obj, request, count=size, batch=batch, run=run))
     return found
+
+
+def _lifted(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: Run) -> tuple[int, float]:
+    """How many grasps of an object on a table were planned, and the share of them that lift it."""
+    scenes, _ = scenes_of(TABLE, obj, count=TABLE_SCENES, seed=seed)
+    request = JobOptions(want="raw", grasps=count, seed=seed, referee="certificate")
+    found = certified_grasps(hand, obj, request, count=count, scenes=scenes, run=run)
+    return found.planned, found.shares["lift_share"]
 
 
 def _best(obj: ObjectModel, found: Certified) -> Best | None:

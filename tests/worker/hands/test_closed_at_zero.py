@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.worker.hands.urdfs import joint, link, robot
-from worker.hands.guess import posture
+from worker.hands.closing import posture
 from worker.hands.kinematics import body_poses
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel

@@ -62,7 +62,7 @@ def test_a_documented_command_accepts_its_hand(command: str, folder: Path, monke
 
 
 def _untried(hand: HandModel, run: Run) -> SelfTest:
-    return SelfTest(0.9, 0, 0.04, {})
+    return SelfTest(0.9, 0, 0.04, {}, 0.8, 0)
 
 
 def test_the_page_has_its_commands_and_all_of_them_are_run() -> None:

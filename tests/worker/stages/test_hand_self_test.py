@@ -54,11 +54,19 @@ def test_objects_are_as_wide_as_suits_the_opening() -> None:
 
 
 def test_a_hand_that_drops_one_kind_of_object_is_suspicious() -> None:
-    assert SelfTest(0.91, 64, 0.04, {"box": 0.9, "sphere": 0.92}).line == "ready: 91 % hold"
-    dropped = SelfTest(0.5, 64, 0.04, {"box": 0.1, "sphere": 0.9})
+    held = SelfTest(0.91, 64, 0.04, {"box": 0.9, "sphere": 0.92}, 0.6, 16)
+    assert held.line == "ready: 91 % hold, 60 % lift off a table"
+    dropped = replace(held, gsr=0.5, by_object={"box": 0.1, "sphere": 0.9})
     assert dropped.line.startswith("suspicious: 50 % hold, 10 % of a box; most slip when pushed")
     assert "lost while it closes: look at palm" in replace(dropped, lost=0.8).line
     assert "within 0.9 mm of a fingertip's way: give less stiffness" in replace(dropped, give_m=0.9e-3).line
+
+
+def test_a_hand_that_lifts_little_off_a_table_is_suspicious_whatever_it_holds() -> None:
+    held = SelfTest(0.91, 64, 0.04, {"box": 0.9}, 0.55, 16)
+    assert held.line.startswith("suspicious: 91 % hold, but 55 % lift off a table: look at closing")
+    assert replace(held, gsr=0.5).line.startswith("suspicious: 50 % hold, 55 % lift off a table, 90 % of a box")
+    assert (held.facts()["table"], held.facts()["table_n"]) == (0.55, 16)
 
 
 def three_fingers_urdf() -> bytes:
@@ -90,7 +98,9 @@ def test_a_busy_machine_leaves_nothing_out(monkeypatch: pytest.MonkeyPatch) -> N
         return [held(count)]
 
     monkeypatch.setattr(hand_self_test, "_batches", batches)
+    monkeypatch.setattr(hand_self_test, "_lifted", lambda hand, obj, count, seed, run: (count, 0.5))
     found = tried_softly(gripper)
+    assert (found["table_n"], found["table"]) == (16, 0.5)
     assert (found["n"], sorted(found["by_object"])) == (64, ["box", "cylinder", "sphere"])
 
 
@@ -126,6 +136,7 @@ def test_a_test_that_is_stopped_has_no_verdict() -> None:
 
 @pytest.mark.slow
 def test_a_parallel_gripper_holds_what_fits() -> None:
-    found = self_test(gripper(), grasps=12)
-    assert found.n == 12
+    found = self_test(gripper(), grasps=12, on_table=6)
+    assert (found.n, found.table_n) == (12, 6)
     assert found.gsr >= 0.7
+    assert found.table >= 0.6

@@ -82,7 +82,7 @@ def test_a_hand_is_tried_if_its_record_says_so(context: TaskContext, monkeypatch
 
     def stand_in(hand: HandModel, run: Run) -> SelfTest:
         tried.append(hand.name)
-        return SelfTest(0.9, 64, 0.04, {"box": 0.9})
+        return SelfTest(0.9, 64, 0.04, {"box": 0.9}, 0.8, 16)
 
     monkeypatch.setattr(hand_self_test, "self_test", stand_in)
     files = {"asset.json": b'{"file": "gripper.urdf"}', "gripper.urdf": gripper_urdf()}
@@ -94,7 +94,7 @@ def test_a_hand_is_tried_if_its_record_says_so(context: TaskContext, monkeypatch
     ingest.run(message, context)
     found = json.loads(context.store.get(names.asset_check(AssetKind.HAND, asset.digest)))
     assert tried == ["mine"]
-    assert found["facts"]["self_test"]["says"] == "ready: 90 % hold"
+    assert found["facts"]["self_test"]["says"] == "ready: 90 % hold, 80 % lift off a table"
 
 
 def test_a_hand_that_finds_no_grasp_is_taken_and_says_why(

@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw
 from service.model.colours import hexadecimal
 from service.model.errors import InputError
 from service.model.transforms import IDENTITY_POSE, apply, compose, quat_from_matrix
-from worker.hands.guess import posture
+from worker.hands.closing import posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
 from worker.hands.pads import pads_of

@@ -1,0 +1,139 @@
+"""Which way each joint closes a hand: where its fingertips go; its limits break ties."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from service.model.transforms import IDENTITY_POSE, apply, quat_rotate
+from worker.hands.kinematics import body_poses
+from worker.hands.model import Floats, HandModel
+
+#: A finger bends so many times as far one way as the other: twice, whatever the last digits of its limits are.
+FAR: Final = 1.99
+#: Shares of the way from open to closed at which fingertips are looked at.
+_SHARES: Final = (0.25, 0.5, 0.75)
+#: Cosine from which on two axes of joints, or an axis and the approach, are parallel: within 45 degrees, and 37.
+_PARALLEL: Final = 0.707
+_ABOUT: Final = 0.8
+#: A joint moves a tip if it does with this share of the most that a joint of its finger does.
+_MOVING: Final = 0.05
+#: Gains below this share of the tip's way are a tie. Joints that oppose a thumb have .35 and more.
+_TIE: Final = 0.2
+
+
+def closing_by_limits(hand: HandModel) -> Floats:
+    """(D,) fingers bend far one way and little the other; what moves as far both ways spreads; wrists close nothing."""
+    up, down = np.maximum(hand.upper, 0), np.maximum(-hand.lower, 0)
+    closing = np.where(up > FAR * down, 1.0, np.where(down > FAR * up, -1.0, 0.0))
+    carrying = set(carriers(hand))
+    for body, name in zip(hand.joint_body, hand.joint_names, strict=True):
+        if body in carrying and name in hand.dof_names:
+            closing[hand.dof_names.index(name)] = 0.0
+    return closing
+
+
+def closing_by_tips(hand: HandModel) -> Floats:
+    """(D,) -1, 0, +1 of a hand with fingertips, palm and a first guess of its closing.
+
+    Joints of a finger that are parallel to its last one flex it, all in one sense: that which brings the tip to the
+    other tips and to the palm. Another joint closes if it brings the tip to the other tips and out of the palm; one
+    that turns about the approach, or as far both ways, spreads; one in line with its finger does neither.
+    """
+    limits, (flexing, opposing, ways) = closing_by_limits(hand), _gains(hand)
+    opened, half = (_axes(hand, posture(hand, share)) for share in (0.0, 0.5))
+    flexed, crossed, flexed_way, crossed_way = np.zeros((4, hand.dofs))
+    seen = np.zeros(hand.dofs, bool)
+    for number, chain in enumerate(chains_of(hand)):
+        dofs = hand.dof[chain]
+        seen[dofs] = True
+        moving = ways[dofs, number] > _MOVING * ways[dofs, number].max(initial=1e-9)
+        if not moving.any():
+            continue
+        along = half[chain] @ half[chain[int(np.argmax(moving))]]
+        flexes = np.abs(along) > _PARALLEL
+        sense = np.sign(along * hand.multiplier[chain])
+        rate, way = (sense * flexing[dofs, number])[flexes].sum(), ways[dofs, number][flexes].sum()
+        np.add.at(flexed, dofs[flexes], sense[flexes] * rate)
+        np.add.at(flexed_way, dofs[flexes], way)
+        crosses = ~flexes & moving & (np.abs(opened[chain] @ hand.palm.approach) < _ABOUT)
+        np.add.at(crossed, dofs[crosses], opposing[dofs[crosses], number])
+        np.add.at(crossed_way, dofs[crosses], ways[dofs[crosses], number])
+    bends = np.where(np.abs(flexed) > _TIE * flexed_way, np.sign(flexed), limits)
+    opposes = np.where((np.abs(crossed) > _TIE * crossed_way) & (limits != 0), np.sign(crossed), 0.0)
+    # Of a joint that leads to no fingertip the limits alone tell.
+    return np.where(seen, np.where(flexed_way > 0, bends, opposes), limits)
+
+
+def _gains(hand: HandModel) -> tuple[Floats, Floats, Floats]:
+    """Of each dof and fingertip, as the dof goes from its lower to its upper limit.
+
+    Returns:
+        Three arrays (D, T) [m], summed over postures of the other dofs: how much nearer the tip comes to the other tips
+        and to the palm; how much nearer to the other tips and farther out of the palm; and the length of its way.
+    """
+    flexing, opposing, ways = np.zeros((3, hand.dofs, len(hand.fingertips)))
+    for share in _SHARES:
+        for dof in range(hand.dofs):
+            q = np.tile(posture(hand, share), (3, 1))
+            q[:, dof] = hand.lower[dof] + np.array([0.0, 0.5, 1.0]) * hand.span[dof]
+            low, _, high = seen = np.array([tips(hand, one) for one in q])
+            nearer = _apart(low) - _apart(high)
+            to_palm = (np.linalg.norm(one - hand.palm.centre, axis=1) for one in (low, high))
+            flexing[dof] += nearer + next(to_palm) - next(to_palm)
+            opposing[dof] += nearer + (high - low) @ hand.palm.approach
+            ways[dof] += np.linalg.norm(np.diff(seen, axis=0), axis=2).sum(axis=0)
+    return flexing, opposing, ways
+
+
+def _apart(tip: Floats) -> Floats:
+    """(T,) distance of each of the tips (T, 3) from the middle of the others [m]."""
+    others = (tip.sum(axis=0) - tip) / max(len(tip) - 1, 1)
+    return np.asarray(np.linalg.norm(tip - others, axis=1)) if len(tip) > 1 else np.zeros(1)
+
+
+def chains_of(hand: HandModel) -> list[list[int]]:
+    """Of each fingertip: the bodies whose joints move it, the last one first, without those that carry the palm."""
+    carrying, chains = set(carriers(hand)), []
+    for tip in hand.fingertips:
+        chain, body = [], tip
+        while body > 0:
+            if body not in carrying and hand.dof[body] >= 0:
+                chain.append(body)
+            body = int(hand.parent[body])
+        chains.append(chain)
+    return chains
+
+
+def _axes(hand: HandModel, q: Floats) -> Floats:
+    """(B, 3) axes of all joints in the root frame."""
+    return np.asarray(quat_rotate(body_poses(hand, IDENTITY_POSE, hand.expand(q))[0, :, 3:], hand.axis))
+
+
+def carriers(hand: HandModel) -> list[int]:
+    """Bodies that carry all fingertips, the root first and the palm last: between them are a forearm and a wrist."""
+    if len(hand.fingertips) < 2:
+        return [0]
+    chains = []
+    for tip in hand.fingertips:
+        chain = [tip]
+        while chain[-1] > 0:
+            chain.append(int(hand.parent[chain[-1]]))
+        chains.append(chain[::-1])
+    return [same[0] for same in zip(*chains, strict=False) if len(set(same)) == 1]
+
+
+def posture(hand: HandModel, share: float) -> Floats:
+    """(D,) posture at a share of the way from open (0) to closed (1); dofs that close nothing stay near 0."""
+    start = np.where(hand.closing < 0, hand.upper, hand.lower)
+    end = np.where(hand.closing < 0, hand.lower, hand.upper)
+    rest = np.clip(0.0, hand.lower, hand.upper)
+    return np.where(hand.closing == 0, rest, start + share * (end - start))
+
+
+def tips(hand: HandModel, q: Floats) -> Floats:
+    """(T, 3) centres of the fingertip bodies in the root frame [m]."""
+    poses = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0]
+    centre = {p.body: p.vertices.mean(axis=0) for p in hand.pieces}
+    return np.array([apply(poses[b], centre.get(b, np.zeros(3))) for b in hand.fingertips])
