@@ -52,13 +52,15 @@ def test_a_tendon_moves_the_sum_and_pulls_by_its_coefficients(tmp_path: Path) ->
 
 def test_one_joint_of_a_tendon_takes_what_the_limit_of_the_other_leaves(tmp_path: Path) -> None:
     hand = load(root="palm")
-    bend, curl = (hand.dof_names.index(name) for name in ("left_bend", "left_curl"))
+    bend, curl, spread = (hand.dof_names.index(f"left_{name}") for name in ("bend", "curl", "spread"))
     upper = hand.upper.copy()
     upper[curl] = 0.1
     scene, data = scene_of(dataclasses.replace(hand, upper=upper), tmp_path)
-    aim = hand.preshape.copy()
+    begin = hand.preshape.copy()
+    begin[spread] = -0.2  # past the other finger
+    aim = begin.copy()
     aim[[bend, curl]] = 0.5, 0.8
-    scene.place(data, FAR, hand.expand(hand.preshape))
+    scene.place(data, FAR, hand.expand(begin))
     scene.command(data, FAR, hand.expand(aim))
     mujoco.mj_step(scene.model, data, nstep=1500)
     q = hand.reduce(data.qpos[scene.joint_qpos])

@@ -331,7 +331,7 @@ def _tried_again(launch: _Launch, part: Part, run: Run) -> Part:
 
     The last few would leave cores idle, and a hand of a small launch costs a third more: they make some attempts ahead.
     Those after a good one are forgotten, so a grasp is as if it had made one after the other."""
-    limits = (FAILED,) * ATTEMPTS if launch.batches.has_trial else (SET_OUT_AGAIN,)
+    limits: tuple[float, ...] = (FAILED,) * ATTEMPTS if launch.batches.has_trial else (SET_OUT_AGAIN,)
     if launch.batches.placed is not None:
         limits = IN_SCENES
     done = 0

@@ -50,7 +50,7 @@ OVERHANG_M: Final = 0.002
 #: asks the hand for 25 m/s2.
 RISING: Final = 100
 RISING_S: Final = 0.008
-SMOOTHLY: Final = np.polyval([6, -15, 10, 0, 0, 0], np.linspace(0, 1, RISING + 1)[1:])
+SMOOTHLY: Final = np.asarray(np.polyval([6, -15, 10, 0, 0, 0], np.linspace(0, 1, RISING + 1)[1:]), float)
 
 
 class LiftOutcome(IntEnum):
@@ -88,10 +88,12 @@ class Lift(Test):
         super().__init__(scene)
         self.placed = placed
         self._goal = np.zeros(3)
+        self._in_hand = True
         self._beside = placed.neighbours_of(0)
 
     def letter(self, grasps: GraspSet, row: int) -> LiftTrial:  # type: ignore[override]
-        """As published: success is read once, when the root has risen."""
+        """As published: success is read once, when the root has risen, from where the object is in the world."""
+        self._in_hand = False
         if (trial := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
             return trial
         self._close(grasps, row)
@@ -100,6 +102,7 @@ class Lift(Test):
 
     def lift(self, grasps: GraspSet, row: int) -> LiftTrial:
         """From the standoff to the end of the hold; `grasps.approach` says how the hand comes."""
+        self._in_hand = True
         if (trial := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
             return trial
         if self._touches(grasps, row):
@@ -220,12 +223,12 @@ class Lift(Test):
         return turned if yielded is None else quat_multiply(quat_conjugate(yielded[1]), turned)
 
     def _yielded(self) -> tuple[Floats, Floats] | None:
-        """Where the root is (3,), and its rotation (4,) from what was commanded; None: it is fixed.
+        """Where the root is (3,), and its rotation (4,) from what was commanded; None: it is fixed, or does not matter.
 
         The weld of the protocol gives way by 10 degrees under a hammer, as no arm does: an object that only follows its
         hand has not moved in it."""
         at = self.scene.root_qpos
-        if at < 0:
+        if at < 0 or not self._in_hand:
             return None
         root = self.data.qpos[at : at + 7]
         return root[:3], quat_multiply(root[3:], quat_conjugate(self.data.mocap_quat[0]))
