@@ -315,6 +315,19 @@ STUDIES: Final = (
         seeds=(404,),
     ),
     Study(
+        "masses", "table lifts of objects with their own masses", ("results/masses.md",),
+        ("python -m benchmarks.masses DATA --page OUT/results/masses.md",),
+        ("python -m benchmarks.masses DATA --hands barrett --objects 025_mug --grasps 2 --page OUT/results/masses.md",),
+        IN_SCENES, seeds=(1200,),
+    ),
+    Study(
+        "second-lift", "valid grasps in a lift test of its own", ("results/second_lift.md",),
+        ("python -m benchmarks.second_lift DATA --grasps 12 --page OUT/results/second_lift.md",),
+        ("python -m benchmarks.second_lift DATA --hands barrett --objects 025_mug --grasps 2 "
+         "--page OUT/results/second_lift.md",),
+        IN_SCENES, seeds=(1400,),
+    ),
+    Study(
         "published-hands", "the self-test's verdict, and what published hands lift", ("results/published_hands.*",),
         ("python -m benchmarks.published_hands SOURCES --data DATA --grasps 12 --out OUT/results",),
         ("python -m benchmarks.published_hands SOURCES --data DATA --only robotiq-2f-85 --grasps 2 --out OUT/results",),

@@ -115,7 +115,7 @@ class JobOptions(Model):
         description="whether `grasps` counts grasps that are valid (sound ones where the referee is none), or all that "
         "were tried",
     )
-    budget: float = Field(4.0, ge=1, le=100, description="grasps tried for each valid grasp wanted, at most")
+    budget: float = Field(4.0, ge=1, le=100, description="tries for each valid grasp wanted, at most")
     min_distance: float = Field(
         MIN_DISTANCE_M,
         ge=0,

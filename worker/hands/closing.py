@@ -19,6 +19,9 @@ _PARALLEL: Final = 0.707
 _ABOUT: Final = 0.8
 #: A joint moves a tip if it does with this share of the most that a joint of its finger does.
 _MOVING: Final = 0.05
+#: Limits go as far both ways if their middle is nearer to 0 than this share of the range. Such a joint is left straight:
+#: hands whose middle joints closed (Shadow's thumb, D'Claw) lifted less.
+_EVEN: Final = 0.02
 #: Gains below this share of the tip's way are a tie. Joints that oppose a thumb have .35 and more.
 _TIE: Final = 0.2
 
@@ -38,8 +41,9 @@ def closing_by_tips(hand: HandModel) -> Floats:
     """(D,) -1, 0, +1 of a hand with fingertips, palm and a first guess of its closing.
 
     Joints of a finger that are parallel to its last one flex it, all in one sense: that which brings the tip to the
-    other tips and to the palm. Another joint closes if it brings the tip to the other tips and out of the palm; one
-    that turns about the approach, or as far both ways, spreads; one in line with its finger does neither.
+    other tips and to the palm; not those whose limits go as far both ways. Another joint closes if it brings the tip to
+    the other tips and out of the palm; one that turns about the approach, or as far both ways, spreads; one in line
+    with its finger does neither.
     """
     limits, (flexing, opposing, ways) = closing_by_limits(hand), _gains(hand)
     opened, half = (_axes(hand, posture(hand, share)) for share in (0.0, 0.5))
@@ -62,6 +66,7 @@ def closing_by_tips(hand: HandModel) -> Floats:
         np.add.at(crossed_way, dofs[crosses], ways[dofs[crosses], number])
     bends = np.where(np.abs(flexed) > _TIE * flexed_way, np.sign(flexed), limits)
     opposes = np.where((np.abs(crossed) > _TIE * crossed_way) & (limits != 0), np.sign(crossed), 0.0)
+    bends[np.abs(hand.lower + hand.upper) < 2 * _EVEN * hand.span] = 0.0
     # Of a joint that leads to no fingertip the limits alone tell.
     return np.where(seen, np.where(flexed_way > 0, bends, opposes), limits)
 

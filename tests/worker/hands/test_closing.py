@@ -57,7 +57,11 @@ def closing_of(hand: HandModel) -> dict[str, int]:
 def test_a_thumb_closes_to_the_fingers_against_its_limits() -> None:
     found = closing_of(hand_of(urdf(*opposing_thumb(limit(-1.5, 0.2)))))
     assert (found["thumb_bend"], found["thumb_tip"]) == (1, 1)
-    assert closing_of(hand_of(urdf(*opposing_thumb(limit(-1.2, 1.2)))))["thumb_bend"] == 1
+    assert closing_of(hand_of(urdf(*opposing_thumb(limit(-1.2, 0.8)))))["thumb_bend"] == 1
+
+
+def test_a_joint_that_goes_as_far_both_ways_is_left_straight() -> None:
+    assert closing_of(hand_of(urdf(*opposing_thumb(limit(-1.2, 1.2)))))["thumb_bend"] == 0
 
 
 def test_a_joint_in_line_with_its_finger_closes_nothing() -> None:

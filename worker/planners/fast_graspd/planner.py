@@ -66,7 +66,7 @@ FAILED: Final = 2.0
 ATTEMPTS: Final = 20
 #: Scores beyond which grasps in scenes set out again, at each attempt: at the first one also those that hold at the
 #: whole friction only. An attempt costs as much as another grasp of the batch.
-IN_SCENES: Final = (1.0, FAILED, FAILED)
+IN_SCENES: Final = (1.0, FAILED, FAILED, FAILED, FAILED)
 #: Attempts of one grasp that are made at once, at the most.
 AHEAD: Final = 4
 
