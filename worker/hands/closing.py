@@ -19,8 +19,8 @@ _PARALLEL: Final = 0.707
 _ABOUT: Final = 0.8
 #: A joint moves a tip if it does with this share of the most that a joint of its finger does.
 _MOVING: Final = 0.05
-#: Limits go as far both ways if their middle is nearer to 0 than this share of the range. Such a joint is left straight:
-#: hands whose middle joints closed (Shadow's thumb, D'Claw) lifted less.
+#: Limits go as far both ways if their middle is nearer to 0 than this share of the range. Such a joint is left
+#: straight: hands whose middle joints closed (Shadow's thumb, D'Claw) lifted less.
 _EVEN: Final = 0.02
 #: Gains below this share of the tip's way are a tie. Joints that oppose a thumb have .35 and more.
 _TIE: Final = 0.2
