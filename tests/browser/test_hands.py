@@ -30,7 +30,7 @@ BASE = (
     '<visual><geometry><box size="0.1 0.04 0.03"/></geometry>'
     '<material name="g"><color rgba="0.2 0.3 0.7 1"/></material></visual>'
 )
-#: A claw whose finger `a` bends far one way only by its limits: graspd guesses that it closes outwards.
+#: A claw whose fingers stand to one side of its palm: graspd guesses that it faces along them, and is told otherwise.
 CLAW = robot(
     link("palm", BASE), link("a", BAR + SEEN), link("b", BAR + SEEN), link("c", BAR + SEEN),
     joint("ja", "palm", "a", origin="0.04 0 0.015", limit='<limit lower="-0.4" upper="1.4" effort="1" velocity="2"/>'),
@@ -66,7 +66,7 @@ def test_a_wrong_guess_is_seen_corrected_and_kept_as_a_hand_that_jobs_can_use(
     checked(parts, "claw")
     page.wait_for_selector(".viewer[data-state=ready]")
     assert colours(page.locator(".viewer canvas")) > 50
-    assert page.is_checked("[name='closing.0'][value='1']")
+    assert page.is_checked("[name='closing.0'][value='-1']"), "towards the other fingers, whatever its limits"
 
     # The joints move, the housing becomes glass, collision shapes take the place of what the hand looks like.
     seen = [drawn(page)]
@@ -84,8 +84,8 @@ def test_a_wrong_guess_is_seen_corrected_and_kept_as_a_hand_that_jobs_can_use(
     assert float(page.input_value("[data-close]")) == pytest.approx(1, abs=0.02)
 
     # Another way to close opens at the other end; another link says the same palm in its own numbers.
-    page.locator("[name='closing.0'][value='-1']").check()
-    assert float(page.input_value("[name='preshape.0']")) == pytest.approx(1.4 - 0.25 * 1.8)
+    page.locator("[name='closing.0'][value='1']").check()
+    assert float(page.input_value("[name='preshape.0']")) == pytest.approx(-0.4 + 0.25 * 1.8)
     page.click("[data-approach='0,0,1']")
     for axis, value in zip("xyz", ("0", "0", "15"), strict=True):
         page.fill(f"[name=centre_{axis}]", value)
@@ -106,11 +106,11 @@ def test_a_wrong_guess_is_seen_corrected_and_kept_as_a_hand_that_jobs_can_use(
     asset = parts.index.assets.get(AssetKind.HAND, "claw-right")
     files = library.load_asset_files(parts.store, AssetKind.HAND, asset.digest)
     hand = load_hand(files, name="claw-right", digest="")
-    assert hand.closing.tolist() == [-1, 1, 1] and hand.preshape.tolist() == pytest.approx([0.95, 0.5, 1.5], abs=0.01)
+    assert hand.closing.tolist() == [1, 1, 1] and hand.preshape.tolist() == pytest.approx([0.05, 0.5, 1.5], abs=0.01)
     assert [hand.body_names[tip] for tip in hand.fingertips] == ["a", "b"]
     assert hand.palm.centre.tolist() == pytest.approx([0, 0, 0.015], abs=1e-4)
     assert hand.palm.approach.tolist() == pytest.approx([0, 0, 1])
-    assert json.loads(files["asset.json"])["closing"]["ja"] == -1 and asset.facts["guessed"] in ([], ["effort"])
+    assert json.loads(files["asset.json"])["closing"]["ja"] == 1 and asset.facts["guessed"] in ([], ["effort"])
     assert not page.is_visible("text=guessed")
 
     assert page.is_visible("text=Collision shapes")
