@@ -118,7 +118,9 @@ def lift_model(hand: HandModel, mesh: trimesh.Trimesh, mass: float) -> Any:
             ratio = hand.multiplier[b] / hand.multiplier[first]
             shift = hand.offset[b] - ratio * hand.offset[first]
             poly = said([shift, ratio, 0, 0, 0])
-            ET.SubElement(equality, "joint", joint1=f"j{b}", joint2=f"j{first}", polycoef=poly)
+            # Gears and tendons give as little as the smallest time step allows.
+            stiff = {"solref": ".004 1", "solimp": ".99 .999 .001"}
+            ET.SubElement(equality, "joint", joint1=f"j{b}", joint2=f"j{first}", polycoef=poly, **stiff)
         else:
             leading[d] = b
             effort = float(hand.effort[d])
