@@ -31,15 +31,7 @@ that do at half the friction, beside the same for 0.1 kg. {grasps} candidates a 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
-    parser.add_argument("--objects", nargs="+")
-    parser.add_argument("--grasps", type=int, default=16)
-    parser.add_argument("--scenes", type=int, default=4)
-    parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--page", type=Path, help="file for the table in Markdown")
-    given = parser.parse_args()
+    given = arguments(__doc__, SEED).parse_args()
     rows = [
         "| hand | object | mass [kg] | lift | half friction | lift at 0.1 kg | half friction |",
         "|---|---|---|---|---|---|---|",
@@ -57,6 +49,19 @@ def main() -> None:
         print(rows[-1], flush=True)  # noqa: T201
     if given.page:
         given.page.write_text(HEAD.format(**vars(given)) + "\n".join(rows) + "\n")
+
+
+def arguments(description: str | None, seed: int) -> argparse.ArgumentParser:
+    """Options of a table of hands and objects with their masses."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
+    parser.add_argument("--objects", nargs="+")
+    parser.add_argument("--grasps", type=int, default=16)
+    parser.add_argument("--scenes", type=int, default=4)
+    parser.add_argument("--seed", type=int, default=seed)
+    parser.add_argument("--page", type=Path, help="file for the table in Markdown")
+    return parser
 
 
 def masses(data: Path) -> dict[str, float]:

@@ -11,8 +11,6 @@ if its object is then above 5 cm.
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
 from typing import Any, Final
 from xml.etree import ElementTree as ET
 
@@ -22,7 +20,7 @@ import numpy as np
 import trimesh
 
 from benchmarks.cells import HANDS
-from benchmarks.masses import masses
+from benchmarks.masses import arguments, masses
 from service.model.domain import JobOptions
 from service.model.scene_spec import parse_scene
 from service.model.transforms import compose
@@ -44,15 +42,8 @@ CLOSE_S, RISE_S, HOLD_S = 1.0, 1.0, 2.0
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
-    parser.add_argument("--objects", nargs="+")
-    parser.add_argument("--grasps", type=int, default=16)
-    parser.add_argument("--scenes", type=int, default=4)
-    parser.add_argument("--seed", type=int, default=SEED)
+    parser = arguments(__doc__, SEED)
     parser.add_argument("--mass", type=float, help="of every object [kg]; by default its published one")
-    parser.add_argument("--page", type=Path, help="file for the table in Markdown")
     given = parser.parse_args()
     rows = ["| hand | object | mass [kg] | valid | lifted again | share |", "|---|---|---|---|---|---|"]
     for name in given.hands:
