@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -33,6 +34,8 @@ from worker.hands.tree import Tree, build_tree, joint_type
 from worker.hands.visuals import PlacedShape, Visuals
 from worker.objects.kept_arrays import recalling
 from worker.run import ALONE, Run
+
+log = logging.getLogger(__name__)
 
 #: Mass of a link whose URDF gives none, per volume of its pieces [kg/m^3].
 DENSITY = 1000.0
@@ -92,7 +95,8 @@ def _mounting(
     shapes = HandOptions(shapes=options.shapes)
     try:
         return body_model(robot, tree, shapes, files, main, name=hand.name, digest=hand.digest, run=run)
-    except HandError:
+    except HandError as error:
+        log.warning("%s: what stands above its root is no obstacle in scenes: %s", hand.name, error)
         return None
 
 
