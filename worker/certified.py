@@ -35,7 +35,7 @@ from worker.quality.referee.first.screening import first_terms
 from worker.quality.referee.judge import judge
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lift import LiftOutcome
-from worker.quality.referee.lifting import judge_lifts, lift_key
+from worker.quality.referee.lifting import KnownLifts, judge_lifts, lift_key
 from worker.quality.referee.payload import payloads
 from worker.quality.referee.protocol import DIRECTIONS, Outcome
 from worker.quality.referee.robust import reaches, robust
@@ -192,6 +192,8 @@ class _Work:
         self.scenes: Scenes | None = None
         self.tried = self.repeated = 0
         self._trials: Trial | None = None
+        self._lifts: KnownLifts = {}
+        """What candidates were lifted by the planner's trial."""
         self._audits: Future[NDArray[np.int8]] | None = None
         self._kept = np.zeros((0, POINTS, 3))
         self.seconds: dict[str, float] = {"planner": 0.0, "referee": 0.0, "quality": 0.0}
@@ -331,7 +333,15 @@ class _Work:
         """What candidates go through, where there is a referee; the same one in all rounds."""
         if self._trials is None and self.pieces is not None:
             in_scenes = self.scenes is not None
-            self._trials = trial_on(self._run, self.hand, self.obj, self.pieces.result, in_scenes=in_scenes)
+            self._trials = trial_on(
+                self._run,
+                self.hand,
+                self.obj,
+                self.pieces.result,
+                in_scenes=in_scenes,
+                known=self._lifts,
+                level=lift_level(self.request.referee),
+            )
         return self._trials
 
     def score(self, planned: GraspSet) -> Round:
@@ -403,7 +413,7 @@ class _Work:
         began = time.perf_counter()
         grasps, columns, counts = scene_verdicts(
             self.hand, self.obj, grasps, scenes, level=lift_level(self.request.referee), pieces=pieces,
-            run=run.part(*_PARTS[:2]),
+            known=self._lifts, run=run.part(*_PARTS[:2]),
         )  # fmt: skip
         seconds["referee"] += time.perf_counter() - began
         return grasps, columns, counts

@@ -20,8 +20,10 @@ from worker.run import Run
 from worker.simulation.surroundings import Placed
 
 #: Scores (N,) of N grasps, in their scenes or around a free object (None): the smaller the better, below 1 good enough
-#: to look at no other candidate, from 2 on so bad that others are worth their time. Called by several threads at once.
-Trial = Callable[[GraspSet, Placed | None], NDArray[np.float64]]
+#: to look at no other candidate, from 2 on so bad that others are worth their time. The third argument has the score of
+#: what each would replace, inf where there is nothing: a trial may end as soon as it is not better by a class (0, 1).
+#: Called by several threads at once.
+Trial = Callable[[GraspSet, Placed | None, NDArray[np.float64]], NDArray[np.float64]]
 
 
 class NoPlace(InputError):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -14,6 +15,8 @@ from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
+from worker.quality.referee.lift import LiftOutcome
+from worker.quality.referee.lifting import KnownLifts, LiftLevel, judge_lifts
 from worker.quality.referee.short import SLIPS, ShortLifts, push_trial
 from worker.run import Run
 from worker.scenes.way import plan_way
@@ -27,45 +30,88 @@ BLOCKED: Final = 8.0
 #: Added where only the referee sees the hand touch on its way, for the object's convex pieces stand out from it:
 #: the letter does not ask for the way.
 TOUCHES: Final = 2.0
+#: What a hand that holds for the short time of a trial but does not lift is worse than one that lifts.
+FALLS: Final = 0.4
+#: Highest score of what lifts at half the friction.
+BEST: Final = 0.99
 
 
 def trial_on(
-    run: Run, hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, in_scenes: bool
-) -> Callable[[GraspSet, Placed | None], Floats] | None:
+    run: Run,
+    hand: HandModel,
+    obj: ObjectModel,
+    pieces: Callable[[], ConvexPieces],
+    *,
+    in_scenes: bool,
+    known: KnownLifts | None = None,
+    level: LiftLevel = "lift",
+) -> Callable[[GraspSet, Placed | None, Floats], Floats] | None:
     """The trial for what `run` plans on; None: the planner's own merit chooses.
 
     Around free objects a GPU plans faster than the processor tries; in scenes it waits, for all threads that there are.
     """
-    if not run.device.startswith("cuda"):
-        return lift_trial(hand, obj, pieces) if in_scenes else push_trial(hand, obj, pieces)
-    return lift_trial(hand, obj, pieces, threads=run.apart().cores) if in_scenes else None
+    threads = 1
+    if run.device.startswith("cuda"):
+        threads = run.apart().cores
+        if not in_scenes:
+            return None
+    if not in_scenes:
+        return push_trial(hand, obj, pieces)
+    return lift_trial(hand, obj, pieces, threads=threads, known=known, level=level)
 
 
 def lift_trial(
-    hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1
-) -> Callable[[GraspSet, Placed | None], Floats]:
-    """A trial as `worker.planners.Wanted` takes it: (N,) scores, below 1 for grasps that hold the object when it hangs
-    at half the friction, and below 2 at the whole of it, and whose way is clear.
+    hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1,
+    known: KnownLifts | None = None, level: LiftLevel = "lift",
+) -> Callable[[GraspSet, Placed | None, Floats], Floats]:  # fmt: skip
+    """A trial as `worker.planners.Wanted` takes it: (N,) scores, below 1 for grasps that lift the object at half the
+    friction, and below 2 at the whole of it, and whose way is clear.
+
+    What holds the hanging object for a short time is lifted as the referee does it: a squeeze may turn an object out of
+    the hand slowly at first.
 
     Args:
         hand: the hand.
         obj: the object.
         pieces: gives the object's convex pieces when they are first needed.
         threads: of one call; planners on the CPU call from as many threads as they may use.
+        known: keeps the lifts, for the referee.
+        level: of the lift test.
     """
-    lifts = ShortLifts(hand, obj, pieces, threads=threads)
+    shorts, run = ShortLifts(hand, obj, pieces, threads=threads), Run(threads=threads)
 
-    def trial(grasps: GraspSet, placed: Placed | None) -> Floats:
+    def trial(grasps: GraspSet, placed: Placed | None, beat: Floats | None = None) -> Floats:
         assert placed is not None, "a lift needs a scene"
-        score = lifts.scores(grasps, placed)
-        held = np.flatnonzero(score < SLIPS + 1.0)
-        if len(held):
-            mine, where = grasps.take(held), placed.take(held)
-            way = plan_way(hand, obj, mine, where)
-            score[held[~way.clear]] += BLOCKED
-            free = np.flatnonzero(way.clear)
-            coming = replace(mine, approach=way.approach, coming=way.open).take(free)
-            score[held[free[~lifts.come(coming, where.take(free))]]] += TOUCHES
+        beat = np.full(len(grasps), np.inf) if beat is None else beat
+        grasps = grasps.moved(np.zeros(3))
+        score = shorts.scores(grasps, placed, beat)
+        # What is as good as nothing new is not looked at.
+        held = np.flatnonzero((score < SLIPS + 1.0) & (score < beat))
+        if not len(held):
+            return score
+        mine, where = grasps.take(held), placed.take(held)
+        way = plan_way(hand, obj, mine, where)
+        score[held[~way.clear]] += BLOCKED
+        free = np.flatnonzero(way.clear)
+        coming = replace(mine, approach=way.approach, coming=way.open).take(free)
+        score[held[free]] = lifted(coming, where.take(free), score[held[free]], beat[held[free]])
         return score
+
+    def lifted(grasps: GraspSet, placed: Placed, score: Floats, beat: Floats) -> Floats:
+        """(k,) scores of hands that hold for a short time and whose way is clear."""
+        lift = partial(judge_lifts, hand, obj, level=level, pieces=pieces(), known=known, run=run)
+        out, barely = np.maximum(score, SLIPS), score >= SLIPS
+        some = np.flatnonzero(~barely)
+        hard = lift(grasps.take(some), placed.take(some), hard=True).success == 1
+        out[some[hard]] = np.minimum(score[some[hard]], BEST)
+        barely[some[~hard]] = True
+        out[barely & (beat < SLIPS + 1.0)] = beat[barely & (beat < SLIPS + 1.0)]
+        some = np.flatnonzero(~barely | (beat >= SLIPS + 1.0))
+        full = lift(grasps.take(some), placed.take(some))
+        fell = full.success != 1
+        out[some[fell]] = SLIPS + 1.0 + FALLS * np.minimum(score[some[fell]], 1.0)
+        touched = some[full.outcome == LiftOutcome.TOUCHED_ON_THE_WAY]
+        out[touched] = score[touched] + TOUCHES
+        return out
 
     return trial

@@ -1,5 +1,4 @@
-"""What grasps are worth in their scenes: are they clear, do they lift the object, at half the friction too, and hold it
-against six pushes?"""
+"""What grasps are worth in their scenes: are they clear, and do they lift the object, at half the friction too?"""
 
 from __future__ import annotations
 
@@ -13,10 +12,8 @@ from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
-from worker.quality.referee.judge import judge
 from worker.quality.referee.lift import LiftOutcome
-from worker.quality.referee.lifting import LiftLevel, judge_lifts
-from worker.quality.referee.protocol import DIRECTIONS
+from worker.quality.referee.lifting import KnownLifts, LiftLevel, judge_lifts
 from worker.run import Run
 from worker.scenes.way import plan_way
 from worker.simulation.surroundings import Scenes
@@ -40,11 +37,12 @@ def scene_verdicts(
     *,
     level: LiftLevel,
     pieces: ConvexPieces | None,
+    known: KnownLifts | None = None,
     run: Run,
 ) -> tuple[GraspSet, Arrays, dict[str, int]]:
     """Plan the way of grasps in their scenes, and judge those that are clear.
 
-    A grasp that does not lift is asked nothing more: the six pushes and half the friction are for those that do.
+    A grasp that does not lift is not lifted at half the friction.
 
     Args:
         hand: the hand.
@@ -53,6 +51,7 @@ def scene_verdicts(
         scenes: the scenes.
         level: of the lift test.
         pieces: the object's convex pieces; None: nobody judges, and grasps are only told clear or not.
+        known: see `judge_lifts`.
         run: told of grasps judged; asked between grasps whether to stop.
 
     Returns:
@@ -72,19 +71,16 @@ def scene_verdicts(
     if pieces is None:
         return grasps, columns, counts
     common: dict[str, Any] = {"pieces": pieces, "run": run}
-    lifts = judge_lifts(hand, obj, grasps.take(clear), placed.take(clear), level=level, **common)
+    lifts = judge_lifts(hand, obj, grasps.take(clear), placed.take(clear), level=level, known=known, **common)
     success[clear] = lifts.success
     outcome, margin = np.zeros(count, np.uint8), np.full(count, np.nan)
     outcome[clear], margin[clear] = lifts.outcome, lifts.margin
     lifted = clear[outcome[clear] == LiftOutcome.LIFTED]
-    hard, held = (np.full(count, -1, np.int8) for _ in range(2))
-    pushed = np.zeros((count, len(DIRECTIONS)), np.uint8)
+    hard = np.full(count, -1, np.int8)
     if len(lifted):
         hard[lifted] = judge_lifts(
-            hand, obj, grasps.take(lifted), placed.take(lifted), level=level, hard=True, **common
+            hand, obj, grasps.take(lifted), placed.take(lifted), level=level, hard=True, known=known, **common
         ).success
-        pushes = judge(hand, obj, grasps.take(lifted), **common)
-        held[lifted], pushed[lifted] = pushes.success, pushes.outcome.reshape(-1, len(DIRECTIONS))
     counts |= {"lift": len(lifted), "lift_hard": int((hard == 1).sum())}
     return (
         grasps,
@@ -92,8 +88,6 @@ def scene_verdicts(
         | {
             "quality/lift_outcome": outcome,
             "quality/lift_hard": hard,
-            "quality/pushes": held,
-            "quality/verdict_outcome": pushed,
             "quality/verdict_margin": margin,
         },
         counts,

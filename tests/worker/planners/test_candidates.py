@@ -17,7 +17,7 @@ from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners import Wanted, synthesize
 from worker.planners.fast_graspd import candidates, planner
-from worker.planners.fast_graspd.candidates import FIRMER, Seated
+from worker.planners.fast_graspd.candidates import GENTLER, Seated
 from worker.planners.fast_graspd.planner import ATTEMPTS
 from worker.planners.fast_graspd.schedule import PULL
 from worker.quality.postures import normal_force, squeeze
@@ -52,7 +52,7 @@ def taken(
     tries: list[int] = []
     seats: list[int] = []
 
-    def trial(grasps: GraspSet, which: np.ndarray) -> np.ndarray:
+    def trial(grasps: GraspSet, which: np.ndarray, beat: np.ndarray) -> np.ndarray:
         rows = grasps.stability_loss.astype(int)
         assert (which == rows // each).all()
         tries.extend(rows.tolist())
@@ -95,7 +95,7 @@ def test_of_the_seated_the_one_of_better_merit_is_tried_first(monkeypatch: pytes
 def test_what_balances_too_badly_is_not_tried_but_where_there_is_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
     bad = 2 * candidates.HOPEFUL
     merit = [[0.0, bad, bad, 0.1], [2 * bad, bad, bad, bad]]
-    rows, tries, _ = taken([[3.0, 0.1, 0.1, 0.2], [3.0, 2.0, 0.1, 0.1]], monkeypatch, merit=merit)
+    rows, tries, _ = taken([[3.0, 0.1, 0.1, 0.2], [3.0, 2.6, 0.1, 0.1]], monkeypatch, merit=merit)
     assert tries == [0, 3, 5]
     assert rows == [3, 5]
 
@@ -111,7 +111,7 @@ def test_what_is_unsound_is_taken_where_there_is_nothing_else(monkeypatch: pytes
 
 
 def test_where_none_is_good_enough_the_least_score_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert taken([[3.0, 2.0, 4.0]], monkeypatch)[:2] == ([1], [0, 1, 2])
+    assert taken([[3.0, 2.6, 4.0]], monkeypatch)[:2] == ([1], [0, 1, 2])
 
 
 def test_of_equal_scores_the_first_is_taken_and_no_score_is_the_worst(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,33 +157,31 @@ def attempts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return made
 
 
-@pytest.mark.parametrize(("score", "made"), [(0.5, 1), (1.5, 2), (9.0, 6)])
-def test_in_scenes_a_grasp_sets_out_again_while_it_fails_and_once_if_it_holds_barely(
+@pytest.mark.parametrize(("score", "made"), [(0.5, 1), (1.5, 3), (9.0, 6)])
+def test_in_scenes_a_grasp_sets_out_again_while_it_fails_and_twice_if_it_lifts_barely(
     scene, attempts: list[int], score: float, made: int
 ) -> None:
     hand, obj, placed = scene
-    wanted = Wanted(4, QUICK, seed=4, placed=placed, trial=lambda grasps, _: np.full(len(grasps), score))
+    wanted = Wanted(4, QUICK, seed=4, placed=placed, trial=lambda grasps, *_: np.full(len(grasps), score))
     found = synthesize(hand, obj, wanted, Run(threads=1))
     assert sorted(attempts) == sorted([*range(made)] * 4)
     assert found.attempts == 4 * made
 
 
-@pytest.mark.parametrize(("better", "times"), [(True, FIRMER), (False, 1.0)])
-def test_a_hand_that_holds_at_the_whole_friction_only_squeezes_harder_where_that_helps(
-    scene, better: bool, times: float
-) -> None:
+@pytest.mark.parametrize(("better", "times"), [(True, GENTLER), (False, 1.0)])
+def test_a_hand_that_nearly_lifts_squeezes_gently_where_that_helps(scene, better: bool, times: float) -> None:
     hand, obj, placed = scene
 
     def squeezed(grasps: GraspSet, times: float) -> np.ndarray:
         return squeeze(hand, obj, grasps.grasp, total_normal_force=times * normal_force(obj)).joint_positions
 
-    def trial(grasps: GraspSet, _: Placed) -> np.ndarray:
+    def trial(grasps: GraspSet, *_: object) -> np.ndarray:
         usual = np.isclose(grasps.squeeze.joint_positions, squeezed(grasps, 1.0)).all(axis=1)
         return np.where(usual, 1.5, 0.5 if better else 1.6)
 
     found = synthesize(hand, obj, Wanted(4, QUICK, seed=4, placed=placed, trial=trial), Run(threads=1))
     assert np.allclose(found.squeeze.joint_positions, squeezed(found, times))
-    assert not np.allclose(squeezed(found, FIRMER), squeezed(found, 1.0)), "it is strong enough"
+    assert not np.allclose(squeezed(found, GENTLER), squeezed(found, 1.0))
 
 
 def free_case(name: str):
@@ -248,7 +246,7 @@ def test_a_grasp_that_nobody_holds_sets_out_as_often_as_it_may_and_the_least_bad
     hand, obj, wanted, _ = free
     scores: list[float] = []
 
-    def never(grasps: GraspSet, placed: Placed | None) -> np.ndarray:
+    def never(grasps: GraspSet, placed: Placed | None, beat: np.ndarray) -> np.ndarray:
         assert placed is None
         scores.extend(9.0 - 0.1 * (len(scores) + np.arange(len(grasps))))
         return np.array(scores[-len(grasps) :])
@@ -273,7 +271,7 @@ def test_hands_are_drawn_to_a_free_object_when_they_first_set_out_and_not_again(
 
     monkeypatch.setattr(planner, "_work", watched)
     monkeypatch.setattr(planner, "ATTEMPTS", 2)
-    never = replace(wanted, count=1, trial=lambda grasps, placed: np.full(len(grasps), 9.0))
+    never = replace(wanted, count=1, trial=lambda grasps, *_: np.full(len(grasps), 9.0))
     synthesize(hand, obj, never, Run(threads=1))
     assert pulls[0] == (PULL, PULL)
     assert len(pulls) > 1
@@ -283,7 +281,7 @@ def test_hands_are_drawn_to_a_free_object_when_they_first_set_out_and_not_again(
 def test_attempts_made_ahead_give_the_grasps_of_one_after_the_other(free, monkeypatch: pytest.MonkeyPatch) -> None:
     hand, obj, wanted, _ = free
 
-    def picky(grasps: GraspSet, placed: Placed | None) -> np.ndarray:
+    def picky(grasps: GraspSet, placed: Placed | None, _: object = None) -> np.ndarray:
         """Takes two fifths of the hands, by where they are."""
         assert placed is None
         chance = np.modf(np.abs(grasps.grasp.hand_pose[:, 0]) * 1e4)[0]

@@ -43,11 +43,13 @@ def test_what_holds_at_half_the_friction_needs_twice_the_squeeze() -> None:
     assert holds < 0.05
 
 
-def test_a_hand_comes_unless_something_is_in_its_way() -> None:
-    aside = grasp(0.05, way=np.array([1.0, 0, 0]))
-    both = joined([grasp(0.05), aside])
-    placed = Placed(PLACED.supports, PLACED.object_pose, np.zeros(2, int))
-    assert ShortLifts(HAND, BOX, lambda: WHOLE).come(both, placed).tolist() == [True, False]
+def test_what_must_hold_at_half_the_friction_to_be_better_is_not_asked_of_the_whole() -> None:
+    placed = Placed(PLACED.supports, PLACED.object_pose, np.zeros(3, int))
+    grasps = joined([grasp(squeeze) for squeeze in (1.1 * LEAST, 2.4 * LEAST, 1.1 * LEAST)])
+    found = ShortLifts(HAND, BOX, lambda: WHOLE).scores(grasps, placed, np.array([1.5, 1.5, np.inf]))
+    assert found[0] == 1.5
+    assert found[1] < 0.05
+    assert SLIPS <= found[2] < SLIPS + 0.05
 
 
 def test_pads_that_start_in_the_box_are_no_candidates() -> None:

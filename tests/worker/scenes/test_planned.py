@@ -55,8 +55,8 @@ def test_fingertips_keep_what_the_scene_says_and_no_less() -> None:
     supports = tuple(replace(one, tips_m=-0.001) for one in supports_of(SceneSpec(kind="table")))
     # A thin slice of the block sticks out of the table: what holds it must reach down to there.
     sunk = np.array([[0, 0, float(-obj.vertices[:, 2].max()) + 0.012, 1, 0, 0, 0]])
-    placed = Placed(supports, sunk, np.zeros(4, int))
-    found = synthesize(hand, obj, Wanted(count=4, fidelity=QUICK, seed=4, placed=placed)).grasp
+    placed = Placed(supports, sunk, np.zeros(12, int))
+    found = synthesize(hand, obj, Wanted(count=12, fidelity=QUICK, seed=4, placed=placed)).grasp
     tips, rest = parted(hand)
     table = placed.scenes[0].obstacles[0]
     lowest = mujoco_distances(tips, found, table)

@@ -117,9 +117,9 @@ class Batches:
             for k in range(made * starts, (made + 1) * starts)
         ]
 
-    def trial(self, grasps: GraspSet, rows: Rows) -> Floats:
-        """Scores (n,) of grasps for these rows, each by the trial of its own batch; of a batch that is out every grasp
-        is good enough."""
+    def trial(self, grasps: GraspSet, rows: Rows, beat: Floats) -> Floats:
+        """Scores (n,) of grasps for these rows that have scores `beat` (n,) so far, each by the trial of its own batch;
+        of a batch that is out every grasp is good enough."""
         owners, scores = self.owner[rows], np.zeros(len(grasps))
         placed = self.placed.take(rows) if self.placed is not None else None
         for owner in distinct_values(owners):
@@ -128,7 +128,7 @@ class Batches:
                 continue
             try:
                 self._steps[owner](0, "trial")
-                scores[own] = trial(grasps.take(own), placed.take(own) if placed is not None else None)
+                scores[own] = trial(grasps.take(own), placed.take(own) if placed is not None else None, beat[own])
             except Exception as error:
                 self.put_out(owner, error)
         return scores

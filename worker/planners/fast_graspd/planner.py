@@ -64,9 +64,9 @@ FAILED: Final = 2.0
 #: How often grasps whose hands are tried may set out again. One more attempt finds what the first ones found, so valid
 #: grasps a second hardly depend on it, and fewer grasps of a hard pair are left that hold nothing.
 ATTEMPTS: Final = 20
-#: Scores beyond which grasps in scenes set out again, at each attempt: at the first one also those that hold at the
+#: Scores beyond which grasps in scenes set out again, at each attempt: at the first two also those that lift at the
 #: whole friction only. An attempt costs as much as another grasp of the batch.
-IN_SCENES: Final = (1.0, FAILED, FAILED, FAILED, FAILED)
+IN_SCENES: Final = (1.0, 1.0, FAILED, FAILED, FAILED)
 #: Attempts of one grasp that are made at once, at the most.
 AHEAD: Final = 4
 
@@ -314,8 +314,8 @@ def _work(launch: _Launch, begun: _Begun) -> Part:
     seats = _Seats(launch, rows, state, losses, curve)
     if batches.has_trial:
 
-        def trial(grasps: GraspSet, which: Rows) -> Floats:
-            return batches.trial(grasps, rows[which])
+        def trial(grasps: GraspSet, which: Rows, beat: Floats) -> Floats:
+            return batches.trial(grasps, rows[which], beat)
 
         together = 1 if placed is None else TOGETHER
         taken = tried(hand, obj, order, seats.seated, placed, trial, together=together, device=pair.hand.device)

@@ -29,6 +29,8 @@ from worker.simulation import surroundings
 from worker.simulation.surroundings import Placed
 
 LiftLevel = Literal["letter", "lift"]
+#: Lifts that were done, by `lift_of`.
+KnownLifts = dict[str, LiftTrial]
 LEVELS: Final[tuple[LiftLevel, ...]] = get_args(LiftLevel)
 #: Raise when the code of the lift test changes what it says, constants aside.
 REVISION: Final = 2
@@ -67,6 +69,7 @@ def judge_lifts(
     hard: bool = False,
     pieces: ConvexPieces | None = None,
     cache: Path | None = None,
+    known: KnownLifts | None = None,
     run: Run = ALONE,
 ) -> LiftVerdicts:
     """Lift grasps out of their scenes; see `worker.quality.referee.lift`.
@@ -80,6 +83,7 @@ def judge_lifts(
         hard: sliding friction halved, torsional friction a tenth, of supports too.
         pieces: convex pieces of the object; by default its CoACD pieces.
         cache: folder of the pieces.
+        known: lifts of this hand, object and level that are not done again; others are added.
         run: told of grasps done; asked between grasps whether to stop.
 
     Raises:
@@ -97,7 +101,12 @@ def judge_lifts(
     def ask(test: Lift, row: int) -> LiftTrial:
         nonlocal done
         run.check("the referee")
-        trial = test.letter(grasps, row) if level == "letter" else test.lift(grasps, row)
+        key = lift_of(grasps, row, placed, hard=hard) if known is not None else ""
+        trial = known.get(key) if known is not None else None
+        if trial is None:
+            trial = test.letter(grasps, row) if level == "letter" else test.lift(grasps, row)
+            if known is not None:
+                known[key] = trial
         with lock:
             done += 1
             run.progress(done, len(grasps), "lifts")
@@ -113,6 +122,16 @@ def judge_lifts(
         terms=lift_key(hand, obj, placed, level, hard, pieces=pieces),
         seconds=time.perf_counter() - began,
     )
+
+
+def lift_of(grasps: GraspSet, row: int, placed: Placed, *, hard: bool) -> str:
+    """Digest of all that a lift of one grasp depends on besides hand, object, level and fixed surroundings."""
+    number = int(placed.index[row])
+    parts = [part.take(slice(row, row + 1)) for part in (grasps.pregrasp, grasps.grasp, grasps.squeeze)]
+    numbers = [array for part in parts for array in (part.hand_pose, part.joint_positions)]
+    numbers += [array[row] for array in (grasps.approach, grasps.coming) if array is not None]
+    numbers += [placed.object_pose[number], placed.scenes[number].up, *placed.neighbours_of(number)]
+    return digest_bytes(b"".join(np.asarray(array, float).tobytes() for array in numbers) + bytes([hard]))
 
 
 def require_ways(grasps: GraspSet, placed: Placed, level: LiftLevel) -> None:

@@ -79,9 +79,9 @@ class ShortLift(Lift):
         super().__init__(scenes.half, placed)
         self._scenes = scenes
 
-    def score(self, grasps: GraspSet, row: int) -> float:
+    def score(self, grasps: GraspSet, row: int, beat: float = np.inf) -> float:
         """Displacement or rotation over its limit when the object has hung at half the friction: below 1 it would pass
-        for lifted. Else that at the whole friction, and `SLIPS`."""
+        for lifted. Else that at the whole friction, and `SLIPS`; `beat` where that is below 1 + `SLIPS` already."""
         self.scene = self._scenes.half
         if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
             return DEEP
@@ -89,8 +89,8 @@ class ShortLift(Lift):
             return LOST
         self._save()
         hung = self._hung(enough=1.0)
-        if hung < 1.0:
-            return hung
+        if hung < 1.0 or beat < SLIPS + 1.0:
+            return min(hung, beat)
         self.scene = self._scenes.whole
         self._restore()
         return SLIPS + self._hung()
@@ -109,11 +109,6 @@ class ShortLift(Lift):
                 return excess
             before = excess
         return max(excess, min(ahead, LOST / 2))
-
-    def comes(self, grasps: GraspSet, row: int) -> bool:
-        """Whether the open hand reaches its pregrasp as the lift test asks; `grasps.approach` says how it comes."""
-        self._begin(grasps, row)
-        return not self._touches(grasps, row)
 
 
 class ShortPush(Test):
@@ -191,13 +186,15 @@ class _Shorts:
 class ShortLifts(_Shorts):
     """Short lifts of grasps in their scenes."""
 
-    def scores(self, grasps: GraspSet, placed: Placed) -> Floats:
+    def scores(self, grasps: GraspSet, placed: Placed, beat: Floats | None = None) -> Floats:
         """(N,) see `ShortLift.score`."""
-        return np.array(self._each(lambda s: partial(ShortLift(s, placed).score, grasps), len(grasps), placed), float)
+        least = np.full(len(grasps), np.inf) if beat is None else beat
 
-    def come(self, grasps: GraspSet, placed: Placed) -> NDArray[np.bool_]:
-        """(N,) see `ShortLift.comes`."""
-        return np.array(self._each(lambda s: partial(ShortLift(s, placed).comes, grasps), len(grasps), placed), bool)
+        def test(scenes: Frictions) -> Callable[[int], float]:
+            short = ShortLift(scenes, placed)
+            return lambda row: short.score(grasps, row, float(least[row]))
+
+        return np.array(self._each(test, len(grasps), placed), float)
 
 
 class ShortPushes(_Shorts):
@@ -210,7 +207,7 @@ class ShortPushes(_Shorts):
 
 def push_trial(
     hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1
-) -> Callable[[GraspSet, Placed | None], Floats]:
+) -> Callable[[GraspSet, Placed | None, Floats], Floats]:
     """A trial of free grasps as `worker.planners.Wanted` takes it: (N,) scores, below 1 for grasps that hold the object
     under short pushes at half the friction, and below 2 at the whole of it.
 
@@ -221,4 +218,8 @@ def push_trial(
         threads: of one call; planners on the CPU call from as many threads as they may use.
     """
     pushes = ShortPushes(hand, obj, pieces, threads=threads)
-    return lambda grasps, placed: pushes.scores(grasps)
+
+    def trial(grasps: GraspSet, placed: Placed | None, beat: Floats | None = None) -> Floats:
+        return pushes.scores(grasps)
+
+    return trial

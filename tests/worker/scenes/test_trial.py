@@ -1,0 +1,100 @@
+"""The trial of candidates in a scene is the lift test itself, which is then not done again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.worker.quality.test_lift import BOX, HAND, PLACED, WHOLE, grasp
+from tests.worker.quality.test_short_tests import LEAST
+from worker.grasps import joined
+from worker.quality.referee.lift import Lift
+from worker.quality.referee.lifting import KnownLifts, judge_lifts
+from worker.quality.referee.short import SLIPS, ShortLifts
+from worker.scenes import trial as trials
+from worker.scenes.trial import BEST, FALLS, TOUCHES, lift_trial
+from worker.simulation.surroundings import Placed
+
+SQUEEZES = (-0.005, 1.3 * LEAST, 4 * LEAST)
+MANY = joined([grasp(squeeze) for squeeze in SQUEEZES])
+WHERE = Placed(PLACED.supports, PLACED.object_pose, np.zeros(3, int))
+
+
+@pytest.fixture
+def lifts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Grows by the row of each lift that is simulated."""
+    done: list[int] = []
+    lift = Lift.lift
+
+    def counted(self, grasps, row):
+        done.append(row)
+        return lift(self, grasps, row)
+
+    monkeypatch.setattr(Lift, "lift", counted)
+    return done
+
+
+def test_a_lift_that_is_known_is_not_simulated_again(lifts: list[int]) -> None:
+    known: KnownLifts = {}
+    first = judge_lifts(HAND, BOX, MANY, WHERE, pieces=WHOLE, known=known)
+    again = judge_lifts(HAND, BOX, MANY, WHERE, pieces=WHOLE, known=known)
+    assert len(lifts) == 3
+    assert np.array_equal(first.outcome, again.outcome)
+    assert np.array_equal(first.margin, again.margin)
+
+
+@pytest.mark.parametrize("other", ["friction", "squeeze", "scene"])
+def test_a_lift_of_anything_else_is_not_known(lifts: list[int], other: str) -> None:
+    known: KnownLifts = {}
+    judge_lifts(HAND, BOX, MANY, WHERE, pieces=WHOLE, known=known)
+    grasps, where = MANY, WHERE
+    if other == "squeeze":
+        grasps = joined([grasp(squeeze + 1e-6) for squeeze in SQUEEZES])
+    if other == "scene":
+        where = Placed(PLACED.supports, PLACED.object_pose + np.array([1e-6, 0, 0, 0, 0, 0, 0]), WHERE.index)
+    judge_lifts(HAND, BOX, grasps, where, pieces=WHOLE, hard=other == "friction", known=known)
+    assert len(lifts) == 6
+
+
+def trial_of(monkeypatch: pytest.MonkeyPatch, scores: list[float], outcomes: dict[bool, list[int]], beat=None):
+    """Scores of grasps that the short lift gives `scores`, and the lift test `outcomes` at half the friction (True) and
+    at the whole of it."""
+    count = len(scores)
+    grasps, where = MANY.take(np.zeros(count, int)), Placed(WHERE.supports, WHERE.object_pose, np.zeros(count, int))
+    grasps.stability_loss = np.arange(count, dtype=float)
+
+    def judged(hand, obj, some, placed, *, hard=False, **_):
+        rows = some.stability_loss.astype(int)
+        outcome = np.array(outcomes[hard])[rows]
+        return type("Verdicts", (), {"success": (outcome == 1).astype(int), "outcome": outcome})
+
+    def way(hand, obj, some, placed):
+        clear = np.ones(len(some), bool)
+        return type("Way", (), {"clear": clear, "approach": some.approach, "open": some.coming})
+
+    monkeypatch.setattr(ShortLifts, "scores", lambda *_: np.array(scores))
+    monkeypatch.setattr(trials, "judge_lifts", judged)
+    monkeypatch.setattr(trials, "plan_way", way)
+    return lift_trial(HAND, BOX, lambda: WHOLE)(grasps, where, np.full(count, np.inf) if beat is None else beat)
+
+
+LIFTED, TOUCHED, FELL = 1, 3, 5
+
+
+def test_a_score_is_that_of_the_lift(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = trial_of(
+        monkeypatch, [0.2, 0.3, 0.4, 1.2, 1.3, 0.5, 4.0],
+        {True: [LIFTED, FELL, FELL, FELL, FELL, TOUCHED, FELL],
+         False: [LIFTED, LIFTED, FELL, LIFTED, FELL, TOUCHED, FELL]},
+    )  # fmt: skip
+    falls = SLIPS + 1.0 + FALLS * np.array([0.4, 1.0])
+    assert found == pytest.approx([0.2, SLIPS, falls[0], 1.2, falls[1], 0.5 + TOUCHES, 4.0])
+    assert found[0] <= BEST
+
+
+def test_a_hand_that_must_lift_at_half_the_friction_to_be_better_and_does_not_is_no_better(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    outcomes = {True: [LIFTED, FELL], False: [LIFTED, LIFTED]}
+    found = trial_of(monkeypatch, [0.2, 0.3], outcomes, np.array([1.5, 1.5]))
+    assert found == pytest.approx([0.2, 1.5])
