@@ -40,6 +40,7 @@ from worker.quality.referee.payload import payloads
 from worker.quality.referee.protocol import DIRECTIONS, Outcome
 from worker.quality.referee.robust import reaches, robust
 from worker.quality.referee.robustness import robustness
+from worker.quality.referee.shake import shake_margins
 from worker.quality.table import measure
 from worker.rounds import ROUND_STRIDE, Arrays, Round, enough, lanes_of, next_round, taken
 from worker.run import ALONE, Run
@@ -366,6 +367,8 @@ class _Work:
             columns |= self._in_models(grasps, held if every else sound & held, run, seconds)
         if self.request.measures_payload:
             columns["quality/payload_kg"] = self._payloads(grasps, sound & held, run, seconds)
+        if self.request.shake:
+            columns["quality/shake_margin"] = self._shaken(grasps, sound & held, run, seconds)
         if not every:
             wanted = sound if self.pieces is None else sound & held
             lost = np.setdiff1d(np.arange(size), rows)
@@ -447,13 +450,26 @@ class _Work:
     def _payloads(
         self, grasps: GraspSet, held: NDArray[np.bool_], run: Run, seconds: dict[str, float]
     ) -> NDArray[np.float64]:
-        """(N,) payloads of those that are `held` [kg]."""
+        """(N,) payloads of those that are `held` [kg]: the object's own mass at least, which they were seen to lift."""
         assert self.pieces is not None
         began = time.perf_counter()
         found = payloads(
             self.hand, self.obj, grasps, pieces=self.pieces.result(), placed=self._placed(grasps), held=held,
             run=run.quiet(),
         )  # fmt: skip
+        seconds["referee"] += time.perf_counter() - began
+        return np.where(held & np.isnan(found), self.obj.mass, found)
+
+    def _shaken(
+        self, grasps: GraspSet, held: NDArray[np.bool_], run: Run, seconds: dict[str, float]
+    ) -> NDArray[np.float64]:
+        """(N,) margins of those that are `held`, shaken after the lift."""
+        assert self.pieces is not None
+        began, placed = time.perf_counter(), self._placed(grasps)
+        assert placed is not None, "shake goes with a scene"
+        found = shake_margins(
+            self.hand, self.obj, grasps, placed, pieces=self.pieces.result(), held=held, run=run.quiet()
+        )
         seconds["referee"] += time.perf_counter() - began
         return found
 

@@ -40,6 +40,7 @@ from service.store.asset_options import (
     ObjectFrictionOption,
     PayloadOption,
     ScaleToOption,
+    ShakeOption,
     UnitsOption,
     object_options,
 )
@@ -91,6 +92,7 @@ def synth(
     object_friction: ObjectFrictionOption = None,
     payload: PayloadOption = False,
     min_payload: MinPayloadOption = 0.0,
+    shake: ShakeOption = False,
     units: UnitsOption = None,
     scale_to: ScaleToOption = None,
     keep_largest: KeepLargestOption = False,
@@ -132,7 +134,7 @@ def synth(
         raise InputError(f"{out} is a folder; name a file in it, such as --out {out / 'grasps.h5'}")
     matter = {
         "mass": mass, "density": density, "object_friction": object_friction, "payload": payload,
-        "min_payload": min_payload,
+        "min_payload": min_payload, "shake": shake,
     }  # fmt: skip
     request = _request(want, budget, referee, robust, robust_models, matter).model_copy(
         update={
@@ -237,6 +239,8 @@ def _said(found: dict[str, Any]) -> str:
         lines.append(f"{types}; from {found['directions_used']} of {CELLS} directions")
     if found.get("payload_kg") is not None:
         lines.append(f"median payload {found['payload_kg']:.2f} kg")
+    if found.get("shake_share") is not None:
+        lines.append(f"{found['shake_share']:.0%} survive the shake")
     if "scene" in found:
         lines.append(
             f"{found['scene']}, {found['scenes']} scenes: {found['clear_share']:.0%} of the tries are clear of what "

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.diversity import CELLS, GraspType, entropy_bits
-from service.model.domain import BATCH_SIZE, JobOptions
+from service.model.domain import BATCH_SIZE, SHAKE_NEEDS_A_SCENE, JobOptions
 from service.model.errors import InputError, TaskCancelled
 from service.model.fidelity import FIDELITIES, Fidelity
 from service.model.outcomes import shortfall, totals
@@ -100,6 +100,8 @@ class Synthesized:
         }
         if request.measures_payload:
             told["payload_kg"] = self._median_payload()
+        if request.shake:
+            told["shake_share"] = self._shake_share()
         told |= self._diversity()
         if request.models:
             told |= {
@@ -126,6 +128,12 @@ class Synthesized:
         values = np.asarray(self.arrays["quality/payload_kg"], float)
         known = values[np.isfinite(values)]
         return round(float(np.median(known)), 4) if len(known) else None
+
+    def _shake_share(self) -> float | None:
+        """Of the grasps that were shaken, the share that survives."""
+        values = np.asarray(self.arrays["quality/shake_margin"], float)
+        known = values[np.isfinite(values)]
+        return round(float((known < 1).mean()), 4) if len(known) else None
 
     def _mean(self, name: str, digits: int) -> float | None:
         values = self.arrays[f"quality/{name}"]
@@ -183,6 +191,8 @@ def synthesized(
         TaskCancelled: `cancelled` answered True; with `partial`, before anything was judged.
     """
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
+    if request.shake and place.kind == "free":
+        raise InputError(SHAKE_NEEDS_A_SCENE)
     wanted = parse_join(str(join))
     options = dict(mesh or {})
     model = hand_from_path(hand)
