@@ -36,6 +36,7 @@ from worker.quality.referee.judge import judge
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lift import LiftOutcome
 from worker.quality.referee.lifting import judge_lifts, lift_key
+from worker.quality.referee.limit import LEAST, Limit, limit_of
 from worker.quality.referee.payload import payloads
 from worker.quality.referee.protocol import DIRECTIONS, Outcome
 from worker.quality.referee.robust import reaches, robust
@@ -94,6 +95,9 @@ class Certified:
     shares: dict[str, float] = field(default_factory=dict)
     """In scenes, of all that were planned: clear_share (free of obstacles at contact, on the way and in the lift),
     lift_share (and lifted), lift_hard_share (and lifted at half the friction)."""
+
+    limit: Limit | None = None
+    """What the best of the first grasps lifts, where none is kept and the weight is why."""
 
     def moved(self, by: Sequence[float]) -> Certified:
         """The same with the grasps moved by a vector (3,) [m]."""
@@ -192,6 +196,8 @@ class _Work:
         self.pieces: Future[ConvexPieces] | None = None
         self.scenes: Scenes | None = None
         self.tried = self.repeated = 0
+        self.limit: Limit | None = None
+        self._weighed = False
         self._trials: Trial | None = None
         self._audits: Future[NDArray[np.int8]] | None = None
         self._kept = np.zeros((0, POINTS, 3))
@@ -219,7 +225,22 @@ class _Work:
                 run = self._run.part(begun, begun + (1 - begun) * min(1.0, share / (count - valid)) * 0.9)
                 parts.append(self._round(number, range(first, first + share), run))
                 first, valid = first + share, valid + len(parts[-1].grasps)
+            if not valid and self._hopeless(parts):
+                return
             number += 1
+
+    def _hopeless(self, rounds: list[Round]) -> bool:
+        """Whether the first grasps, none of which is kept, show that the hand lifts far less than is wanted."""
+        planned = [grasps for part in rounds for grasps in part.planned]
+        if self._weighed or self.pieces is None or sum(map(len, planned)) < LEAST:
+            return False
+        self._weighed = True
+        every = joined(planned)
+        self.limit = limit_of(
+            self.hand, self.obj, every, wanted=max(self.obj.mass, self.request.min_payload),
+            pieces=self.pieces.result(), placed=self._placed(every), run=self._run.quiet(),
+        )  # fmt: skip
+        return self.limit is not None and self.limit.hopeless
 
     @property
     def _in_parts(self) -> bool:
@@ -276,6 +297,7 @@ class _Work:
         made = self._scored(planned, replace(run, lanes=None))
         made.seconds["planner"] += planned.seconds
         made.repeated = max(0, planned.attempts - len(rows)) if placed is not None else 0
+        made.planned = [planned]
         if number == 0 and rows.start == 0:
             self._begin_audits(made)
         return made
@@ -298,9 +320,12 @@ class _Work:
         for name, number in outcomes.items():
             rejected[_REJECTION_OF.get(name, "dropped")] += number
         grasps, columns = taken(grasps, columns, np.arange(min(count, len(grasps))))
+        if len(grasps) < count and self.repeated:
+            outcomes["repeated"] = self.repeated
         found = Certified(
-            grasps, columns, tried, rejected, outcomes, None, len(fates), self.seconds, self._shares(rounds)
-        )
+            grasps, columns, tried, rejected, outcomes, None, len(fates), self.seconds, self._shares(rounds),
+            None if len(grasps) else self.limit,
+        )  # fmt: skip
         if self.pieces is None:
             return found
         columns |= self._second_opinions(grasps, columns["quality/valid"])

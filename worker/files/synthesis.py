@@ -36,6 +36,7 @@ from worker.planners import planner
 from worker.pool.modules import MODULES
 from worker.pool.pool import Pool
 from worker.pool.size import processes_at_once
+from worker.quality.referee.limit import Limit
 from worker.run import FirstJudge, Progress, Run
 from worker.scenes.beside import scenes_of
 from worker.together import certified_batches, distinct_batches
@@ -68,11 +69,19 @@ class Synthesized:
         request = self.request
         if self.interrupted:
             return f"interrupted: {len(self.arrays['quality/valid'])} of {request.grasps} grasps were there"
-        return shortfall(
+        limit = self.limit
+        reason = shortfall(
             len(self.arrays["quality/valid"]), request.grasps, request.counted,
             sum(batch.tried for batch in self.batches), request.budget,
             totals(batch.outcomes for batch in self.batches),
+            limit.line if limit is not None and limit.hopeless else "",
         )  # fmt: skip
+        return reason if limit is None or limit.hopeless else f"{reason}; {limit.line}"
+
+    @property
+    def limit(self) -> Limit | None:
+        """What the hand lifts at best, where it is told: no grasp was found, for the weight."""
+        return None if len(self.arrays["quality/valid"]) else self.batches[0].limit
 
     def summary(self) -> dict[str, Any]:
         """What a user wants to know first, for JSON."""
@@ -102,6 +111,8 @@ class Synthesized:
             told["payload_kg"] = self._median_payload()
         if request.shake:
             told["shake_share"] = self._shake_share()
+        if self.limit is not None:
+            told["limit"] = self.limit.facts()
         told |= self._diversity()
         if request.models:
             told |= {

@@ -98,7 +98,7 @@ def test_a_busy_machine_leaves_nothing_out(monkeypatch: pytest.MonkeyPatch) -> N
         return [held(count)]
 
     monkeypatch.setattr(hand_self_test, "_batches", batches)
-    monkeypatch.setattr(hand_self_test, "_lifted", lambda hand, obj, count, seed, run: (count, 0.5))
+    monkeypatch.setattr(hand_self_test, "_lifted", lambda hand, obj, count, seed, run: (count, 0.5, None))
     found = tried_softly(gripper)
     assert (found["table_n"], found["table"]) == (16, 0.5)
     assert (found["n"], sorted(found["by_object"])) == (64, ["box", "cylinder", "sphere"])
