@@ -320,7 +320,7 @@ class _Work:
         for name, number in outcomes.items():
             rejected[_REJECTION_OF.get(name, "dropped")] += number
         grasps, columns = taken(grasps, columns, np.arange(min(count, len(grasps))))
-        if len(grasps) < count and self.repeated:
+        if self.repeated:
             outcomes["repeated"] = self.repeated
         found = Certified(
             grasps, columns, tried, rejected, outcomes, None, len(fates), self.seconds, self._shares(rounds),

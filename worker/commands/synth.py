@@ -38,7 +38,6 @@ from service.store.asset_options import (
     MassOption,
     MinPayloadOption,
     ObjectFrictionOption,
-    PayloadOption,
     ScaleToOption,
     ShakeOption,
     UnitsOption,
@@ -90,7 +89,12 @@ def synth(
     mass: MassOption = None,
     density: DensityOption = None,
     object_friction: ObjectFrictionOption = None,
-    payload: PayloadOption = False,
+    payload: Annotated[
+        bool | None,
+        typer.Option(
+            help="Measure the heaviest mass that each valid grasp lifts; default: in scenes where a mass is said."
+        ),
+    ] = None,
     min_payload: MinPayloadOption = 0.0,
     shake: ShakeOption = False,
     units: UnitsOption = None,
@@ -132,6 +136,8 @@ def synth(
         raise InputError(f"the folder {out.parent} does not exist; create it or choose another --out")
     if out.is_dir():
         raise InputError(f"{out} is a folder; name a file in it, such as --out {out / 'grasps.h5'}")
+    if payload is None:
+        payload = scene != "free" and referee != "none" and (mass is not None or density is not None)
     matter = {
         "mass": mass, "density": density, "object_friction": object_friction, "payload": payload,
         "min_payload": min_payload, "shake": shake,

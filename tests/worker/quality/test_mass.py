@@ -116,6 +116,18 @@ def test_what_is_said_with_a_job_goes_over_what_the_file_says() -> None:
         BOX.weighing(density=1e7)
 
 
+def test_whoever_says_what_the_object_weighs_is_told_what_the_grasps_lift(tmp_path: Path) -> None:
+    words = [
+        "synth", "--hand", "barrett", "--object", "block", "--scene", "table", "-n", "1", "--fidelity", "draft",
+        "--seed", "3", "--json", "-o", str(tmp_path / "g.h5"),
+    ]  # fmt: skip
+    keys = {"mass_kg", "lift_share", "lift_hard_share", "payload_kg"}
+    for more, told in ((["--mass", "0.37"], keys), (["--mass", "0.37", "--no-payload"], keys - {"payload_kg"})):
+        said = json.loads(CliRunner().invoke(build(), words + more).stdout.splitlines()[-1])
+        assert keys & said.keys() == told
+        assert said["mass_kg"] == 0.37 and said.get("payload_kg", 1.0) >= 0.37
+
+
 @pytest.mark.parametrize(("least", "kept", "outcomes"), [(0.3, 2, {}), (90.0, 0, {"weak": 2})])
 def test_a_job_counts_grasps_that_lift_the_wanted_payload(
     tmp_path: Path, least: float, kept: int, outcomes: dict[str, int]
