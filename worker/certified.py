@@ -36,7 +36,7 @@ from worker.quality.referee.judge import judge
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lift import LiftOutcome
 from worker.quality.referee.lifting import judge_lifts, lift_key
-from worker.quality.referee.limit import LEAST, Limit, limit_of
+from worker.quality.referee.limit import Limit, limit_of
 from worker.quality.referee.payload import payloads
 from worker.quality.referee.protocol import DIRECTIONS, Outcome
 from worker.quality.referee.robust import reaches, robust
@@ -97,7 +97,7 @@ class Certified:
     lift_share (and lifted), lift_hard_share (and lifted at half the friction)."""
 
     limit: Limit | None = None
-    """What the best of the first grasps lifts, where none is kept and the weight is why."""
+    """What the best of a round lifts, where none is kept and the weight is why."""
 
     def moved(self, by: Sequence[float]) -> Certified:
         """The same with the grasps moved by a vector (3,) [m]."""
@@ -197,7 +197,6 @@ class _Work:
         self.scenes: Scenes | None = None
         self.tried = self.repeated = 0
         self.limit: Limit | None = None
-        self._weighed = False
         self._trials: Trial | None = None
         self._audits: Future[NDArray[np.int8]] | None = None
         self._kept = np.zeros((0, POINTS, 3))
@@ -225,20 +224,18 @@ class _Work:
                 run = self._run.part(begun, begun + (1 - begun) * min(1.0, share / (count - valid)) * 0.9)
                 parts.append(self._round(number, range(first, first + share), run))
                 first, valid = first + share, valid + len(parts[-1].grasps)
-            if not valid and self._hopeless(parts):
+            if not valid and self._hopeless(parts[-1]):
                 return
             number += 1
 
-    def _hopeless(self, rounds: list[Round]) -> bool:
-        """Whether the first grasps, none of which is kept, show that the hand lifts far less than is wanted."""
-        planned = [grasps for part in rounds for grasps in part.planned]
-        if self._weighed or self.pieces is None or sum(map(len, planned)) < LEAST:
+    def _hopeless(self, made: Round) -> bool:
+        """Whether grasps of a round, none of which is kept, show that the hand lifts far less than is wanted."""
+        if self.limit is not None or self.pieces is None:
             return False
-        self._weighed = True
-        every = joined(planned)
+        planned = joined(made.planned)
         self.limit = limit_of(
-            self.hand, self.obj, every, wanted=max(self.obj.mass, self.request.min_payload),
-            pieces=self.pieces.result(), placed=self._placed(every), run=self._run.quiet(),
+            self.hand, self.obj, planned, wanted=max(self.obj.mass, self.request.min_payload),
+            pieces=self.pieces.result(), placed=self._placed(planned), run=self._run.quiet(),
         )  # fmt: skip
         return self.limit is not None and self.limit.hopeless
 
