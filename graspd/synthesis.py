@@ -42,6 +42,7 @@ def synthesize(
     object_friction: float | None = None,
     payload: bool = False,
     min_payload: float = 0.0,
+    shake: bool = False,
     units: str | None = None,
     scale_to: float | None = None,
     device: str = "auto",
@@ -79,6 +80,7 @@ def synthesize(
         object_friction: Coulomb coefficient of contacts in simulation; by default the object's own, else 0.6.
         payload: whether the heaviest mass that each valid grasp lifts is measured (`quality/payload_kg`).
         min_payload: mass that a grasp must lift to count [kg]; 0: none is wanted.
+        shake: whether each valid grasp, lifted, is shaken (`quality/shake_margin`); goes with a scene.
         units: of the mesh: m, cm, mm or in; guessed if not given.
         scale_to: longest side of the object [m].
         device: cpu, cuda:0 or auto.
@@ -102,7 +104,7 @@ def synthesize(
             grasps=count, want=want, budget=budget, referee=referee, method=method, seed=seed, friction=friction,
             options=of_this_machine(method, options), min_distance=min_distance, audits=0, robust=robust,
             robust_models=robust_models, mass=mass, density=density, object_friction=object_friction,
-            payload=payload, min_payload=min_payload,
+            payload=payload, min_payload=min_payload, shake=shake,
         )  # fmt: skip
     except ValidationError as error:
         raise InputError(refusal(error)) from None

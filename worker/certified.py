@@ -36,10 +36,12 @@ from worker.quality.referee.judge import judge
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lift import LiftOutcome
 from worker.quality.referee.lifting import KnownLifts, judge_lifts, lift_key
+from worker.quality.referee.limit import Limit, limit_of
 from worker.quality.referee.payload import payloads
 from worker.quality.referee.protocol import DIRECTIONS, Outcome
 from worker.quality.referee.robust import reaches, robust
 from worker.quality.referee.robustness import robustness
+from worker.quality.referee.shake import shake_margins
 from worker.quality.table import measure
 from worker.rounds import ROUND_STRIDE, Arrays, Round, enough, lanes_of, next_round, taken
 from worker.run import ALONE, Run
@@ -93,6 +95,9 @@ class Certified:
     shares: dict[str, float] = field(default_factory=dict)
     """In scenes, of all that were planned: clear_share (free of obstacles at contact, on the way and in the lift),
     lift_share (and lifted), lift_hard_share (and lifted at half the friction)."""
+
+    limit: Limit | None = None
+    """What the best of a round lifts, where none is kept and the weight is why."""
 
     def moved(self, by: Sequence[float]) -> Certified:
         """The same with the grasps moved by a vector (3,) [m]."""
@@ -191,6 +196,7 @@ class _Work:
         self.pieces: Future[ConvexPieces] | None = None
         self.scenes: Scenes | None = None
         self.tried = self.repeated = 0
+        self.limit: Limit | None = None
         self._trials: Trial | None = None
         self._lifts: KnownLifts = {}
         """What candidates were lifted by the planner's trial."""
@@ -220,7 +226,20 @@ class _Work:
                 run = self._run.part(begun, begun + (1 - begun) * min(1.0, share / (count - valid)) * 0.9)
                 parts.append(self._round(number, range(first, first + share), run))
                 first, valid = first + share, valid + len(parts[-1].grasps)
+            if not valid and self._hopeless(parts[-1]):
+                return
             number += 1
+
+    def _hopeless(self, made: Round) -> bool:
+        """Whether grasps of a round, none of which is kept, show that the hand lifts far less than is wanted."""
+        if self.limit is not None or self.pieces is None:
+            return False
+        planned = joined(made.planned)
+        self.limit = limit_of(
+            self.hand, self.obj, planned, wanted=max(self.obj.mass, self.request.min_payload),
+            pieces=self.pieces.result(), placed=self._placed(planned), run=self._run.quiet(),
+        )  # fmt: skip
+        return self.limit is not None and self.limit.hopeless
 
     @property
     def _in_parts(self) -> bool:
@@ -277,6 +296,7 @@ class _Work:
         made = self._scored(planned, replace(run, lanes=None))
         made.seconds["planner"] += planned.seconds
         made.repeated = max(0, planned.attempts - len(rows)) if placed is not None else 0
+        made.planned = [planned]
         if number == 0 and rows.start == 0:
             self._begin_audits(made)
         return made
@@ -299,9 +319,12 @@ class _Work:
         for name, number in outcomes.items():
             rejected[_REJECTION_OF.get(name, "dropped")] += number
         grasps, columns = taken(grasps, columns, np.arange(min(count, len(grasps))))
+        if self.repeated:
+            outcomes["repeated"] = self.repeated
         found = Certified(
-            grasps, columns, tried, rejected, outcomes, None, len(fates), self.seconds, self._shares(rounds)
-        )
+            grasps, columns, tried, rejected, outcomes, None, len(fates), self.seconds, self._shares(rounds),
+            None if len(grasps) else self.limit,
+        )  # fmt: skip
         if self.pieces is None:
             return found
         columns |= self._second_opinions(grasps, columns["quality/valid"])
@@ -376,6 +399,8 @@ class _Work:
             columns |= self._in_models(grasps, held if every else sound & held, run, seconds)
         if self.request.measures_payload:
             columns["quality/payload_kg"] = self._payloads(grasps, sound & held, run, seconds)
+        if self.request.shake:
+            columns["quality/shake_margin"] = self._shaken(grasps, sound & held, run, seconds)
         if not every:
             wanted = sound if self.pieces is None else sound & held
             lost = np.setdiff1d(np.arange(size), rows)
@@ -457,13 +482,26 @@ class _Work:
     def _payloads(
         self, grasps: GraspSet, held: NDArray[np.bool_], run: Run, seconds: dict[str, float]
     ) -> NDArray[np.float64]:
-        """(N,) payloads of those that are `held` [kg]."""
+        """(N,) payloads of those that are `held` [kg]: the object's own mass at least, which they were seen to lift."""
         assert self.pieces is not None
         began = time.perf_counter()
         found = payloads(
             self.hand, self.obj, grasps, pieces=self.pieces.result(), placed=self._placed(grasps), held=held,
             run=run.quiet(),
         )  # fmt: skip
+        seconds["referee"] += time.perf_counter() - began
+        return np.where(held & np.isnan(found), self.obj.mass, found)
+
+    def _shaken(
+        self, grasps: GraspSet, held: NDArray[np.bool_], run: Run, seconds: dict[str, float]
+    ) -> NDArray[np.float64]:
+        """(N,) margins of those that are `held`, shaken after the lift."""
+        assert self.pieces is not None
+        began, placed = time.perf_counter(), self._placed(grasps)
+        assert placed is not None, "shake goes with a scene"
+        found = shake_margins(
+            self.hand, self.obj, grasps, placed, pieces=self.pieces.result(), held=held, run=run.quiet()
+        )
         seconds["referee"] += time.perf_counter() - began
         return found
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Final
 
@@ -39,6 +39,8 @@ class Round:
     """Wall time of planning, judging and measuring [s]."""
     repeated: int = 0
     """In scenes: how often its grasps set out again."""
+    planned: list[GraspSet] = field(default_factory=list)
+    """All of its grasps."""
 
     @classmethod
     def joined(cls, parts: Sequence[Round]) -> Round:
@@ -48,6 +50,7 @@ class Round:
         return cls(
             joined([part.grasps for part in parts]), joined_columns([part.columns for part in parts]),
             np.concatenate([part.fates for part in parts]), in_scene, seconds, sum(part.repeated for part in parts),
+            [grasps for part in parts for grasps in part.planned],
         )  # fmt: skip
 
 

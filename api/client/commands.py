@@ -33,7 +33,14 @@ from service.model.domain import AUDITS, NETWORK_METHODS, JobRequest
 from service.model.errors import InputError
 from service.model.scene_options import scene_option
 from service.model.states import AssetKind, State
-from service.store.asset_options import DensityOption, MassOption, MinPayloadOption, ObjectFrictionOption, PayloadOption
+from service.store.asset_options import (
+    DensityOption,
+    MassOption,
+    MinPayloadOption,
+    ObjectFrictionOption,
+    PayloadOption,
+    ShakeOption,
+)
 from service.store.asset_summary import hand_line, self_test_line
 
 app = typer.Typer(no_args_is_help=True)
@@ -93,6 +100,7 @@ def submit(
     object_friction: ObjectFrictionOption = None,
     payload: PayloadOption = False,
     min_payload: MinPayloadOption = 0.0,
+    shake: ShakeOption = False,
     wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
     url: UrlOption = None,
     json: JsonFlag = False,
@@ -138,6 +146,7 @@ def submit(
                 "object_friction": object_friction,
                 "payload": payload,
                 "min_payload": min_payload,
+                "shake": shake,
             },
         )
         job = client.submit(request)

@@ -46,6 +46,8 @@ _MAKE: Final = {
     "touch": "0",
     "min_distance": "0.005",
     "robust": "0",
+    "min_payload": "0",
+    "shake": "",
     "neighbours": "",
 }
 

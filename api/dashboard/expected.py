@@ -58,7 +58,10 @@ class Expectations:
 
     def of(self, form: Mapping[str, Any]) -> list[Expected]:
         """Every offered fidelity for what a form says; without numbers where it cannot be estimated."""
-        wanted = {key: value for key, value in form.items() if key not in ("hand", "object", "fidelity")}
+        # An empty field says nothing.
+        wanted = {
+            key: value for key, value in form.items() if key not in ("hand", "object", "fidelity") and value != ""
+        }
         wanted["neighbours"] = listed(str(form.get("neighbours", "")))
         return [self._one(name, wanted, str(form["hand"]), str(form["object"])) for name in OFFERED]
 

@@ -25,11 +25,13 @@ router = APIRouter(include_in_schema=False)
 
 DEFAULTS: Final[dict[str, Any]] = {
     "hand": "allegro", "object": "mug", "grasps": 32, "fidelity": "standard", "seed": 0, "friction": 1.0,
-    "mass": "", "object_friction": "",
+    "mass": "", "object_friction": "", "min_payload": 0.0, "shake": False,
     "scene": "free", "faces": "drawn", "touch": 0.0, "neighbours": "", "scenes": 0, "views": 0, "stereo": False,
     "width": 320, "height": 240, "want": "valid", "referee": "certificate",
     "min_distance": 0.005, "robust": 0.0,
 }  # fmt: skip
+#: Fields where a rule over several of them is told, by a word of the rule.
+_WHOLE: Final = {"robust": "robust", "payload": "min_payload", "shake": "shake", "mass": "mass"}
 
 
 @router.get("/submit", dependencies=[Depends(may_read)])
@@ -82,7 +84,7 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
         for name in DEFAULTS
         if name not in ("hand", "object") and isinstance(fields.get(name), str) and fields[name] != ""
     }
-    form["stereo"] = fields.get("stereo") == "true"
+    form |= {name: fields.get(name) == "true" for name in ("stereo", "shake")}
     things = {kind: chosen(request, assets, fields, kind) for kind in FILE_FIELDS}
     # Without a default: a form that names no object gets none.
     form |= {kind.value: one.name for kind, one in things.items()}
@@ -110,7 +112,7 @@ def _by_field(error: ValidationError) -> dict[str, str]:
     errors: dict[str, str] = {}
     for entry in error.errors():
         # A rule over several fields has no place of its own: those that a form can break are of these.
-        whole = next((name for name in ("robust", "mass") if name in entry["msg"]), "scenes")
+        whole = next((field for word, field in _WHOLE.items() if word in entry["msg"]), "scenes")
         name = str(entry["loc"][0]) if entry["loc"] else whole
         errors.setdefault(name, words(entry))
     return errors

@@ -19,7 +19,7 @@ from api.routes.hand_corrections import CorrectionRequest
 from service.index.views import AssetView
 from service.model.errors import ConflictError, InputError, NotFoundError
 from service.model.states import AssetKind
-from service.store.asset_summary import hand_line, self_test_line
+from service.store.asset_summary import hand_line, limit_line, self_test_line
 from service.store.hand_corrections import MAX_ENTRIES, HandFacts
 
 PAGE_SIZE: Final = 50
@@ -100,6 +100,7 @@ def _page(
         form=form,
         guessed=guessed if isinstance(guessed, list) else [],
         self_test=self_test_line(hand.facts),
+        limit=limit_line(hand.facts),
         approaches=_APPROACHES,
     )
 

@@ -328,6 +328,16 @@ STUDIES: Final = (
         IN_SCENES, seeds=(1400,),
     ),
     Study(
+        "payload", "payload of grasps: error and price", ("results/payload.md", "results/payload-free.md"),
+        ("python -m benchmarks.payload DATA --page OUT/results/payload.md",
+         "python -m benchmarks.payload DATA --free --page OUT/results/payload-free.md"),
+        ("python -m benchmarks.payload DATA --hands barrett --objects 025_mug --grasps 2 "
+         "--page OUT/results/payload.md",
+         "python -m benchmarks.payload DATA --hands barrett --objects 025_mug --grasps 2 --free "
+         "--page OUT/results/payload-free.md"),
+        IN_SCENES, seeds=(1500,),
+    ),
+    Study(
         "published-hands", "the self-test's verdict, and what published hands lift", ("results/published_hands.*",),
         ("python -m benchmarks.published_hands SOURCES --data DATA --grasps 12 --out OUT/results",),
         ("python -m benchmarks.published_hands SOURCES --data DATA --only robotiq-2f-85 --grasps 2 --out OUT/results",),

@@ -7,12 +7,15 @@ import json
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, MutableMapping
 from contextlib import AbstractContextManager
-from typing import IO
+from typing import IO, Final
 
 from service.model.diversity import MIN_DISTANCE_M
 from service.model.domain import JobRequest
 from service.model.states import AssetKind, Stage
 from service.model.version import STAGE_REVISIONS
+
+#: Raise when payloads come out otherwise and the grasps do not.
+_PAYLOAD_REVISION: Final = 2
 
 
 def digest_bytes(data: bytes) -> str:
@@ -113,7 +116,9 @@ def _judgement(request: JobRequest, batch: int) -> dict[str, object]:
     if request.models:
         found |= {"robust": [request.models, request.robust]}
     if request.measures_payload:
-        found |= {"payload": request.min_payload}
+        found |= {"payload": [_PAYLOAD_REVISION, request.min_payload]}
+    if request.shake:
+        found |= {"shake": True}
     return found
 
 

@@ -48,6 +48,7 @@ FREE_ONLY_METHODS: Final = ("autograsp", "dfc", "graspd2022", "graspit")
 NETWORK_METHODS: Final = ("learned",)
 #: Scenes of a batch that is planned in scenes, where the request does not say how many.
 SCENES: Final = 4
+SHAKE_NEEDS_A_SCENE: Final = "shake moves what was lifted out of a scene: choose one, such as table"
 
 
 class JobOptions(Model):
@@ -147,11 +148,15 @@ class JobOptions(Model):
     )  # fmt: skip
     payload: bool = Field(
         False, exclude_if=lambda value: not value,
-        description="whether the heaviest mass that each valid grasp lifts is measured: some tenths of a second each",
+        description="whether the heaviest mass that each valid grasp lifts is measured",
     )  # fmt: skip
     min_payload: float = Field(
         0.0, ge=0, le=MOST_KG, allow_inf_nan=False, exclude_if=lambda value: value == 0,
         description="mass that a grasp must lift to count [kg]; 0: none is wanted. It is measured where one is",
+    )  # fmt: skip
+    shake: bool = Field(
+        False, exclude_if=lambda value: not value,
+        description="whether each valid grasp, lifted, is shaken: 2 cm, 3 Hz, along x and y of its scene",
     )  # fmt: skip
     options: dict[
         Annotated[str, Field(max_length=40)],
@@ -220,6 +225,12 @@ class JobOptions(Model):
         return self
 
     @model_validator(mode="after")
+    def _shaken_when_lifted(self) -> Self:
+        if self.SUBMITTED and self.shake and not self.in_scene:
+            raise ValueError(SHAKE_NEEDS_A_SCENE)
+        return self
+
+    @model_validator(mode="after")
     def _proposed_on_a_table(self) -> Self:
         if not self.SUBMITTED or self.method not in NETWORK_METHODS:
             return self
@@ -246,6 +257,8 @@ class JobOptions(Model):
             raise ValueError("robust counts verdicts: choose a referee")
         if self.measures_payload and self.referee == "none":
             raise ValueError("payload is what the referee sees lifted: choose one")
+        if self.shake and self.referee == "none":
+            raise ValueError("shake is of what the referee sees lifted: choose one")
         return self
 
     @property

@@ -7,6 +7,7 @@
     │   ├── MeshError             an object mesh that cannot be used
     │   ├── HandError             a hand description that cannot be used
     │   ├── SceneError            a scene without room, or in which no grasp can be found
+    │   ├── LoadError             a mass that is beyond what the hand lifts
     │   ├── LimitError            too large, too many: exit 2, HTTP 413
     │   └── QuotaError            the key has all it may have: exit 2, HTTP 429
     ├── UnavailableError          a part of the service does not answer: exit 1, HTTP 503
@@ -117,6 +118,12 @@ class SceneError(InputError):
     slug, title = "bad-scene", "The scene cannot be used"
 
 
+class LoadError(InputError):
+    """An object, or a wanted payload, that is heavier than anything the hand lifts."""
+
+    slug, title = "too-heavy", "The object is too heavy for the hand"
+
+
 class LimitError(InputError):
     """Larger or more than the service takes."""
 
@@ -209,7 +216,7 @@ class TaskRefused(TaskError):
 ERRORS: Final[dict[str, type[GraspdError]]] = {
     error.slug: error
     for error in (
-        InputError, NotFoundError, ConflictError, MeshError, HandError, SceneError, LimitError, QuotaError,
+        InputError, NotFoundError, ConflictError, MeshError, HandError, SceneError, LoadError, LimitError, QuotaError,
         UnavailableError, QueueUnavailable, StoreUnavailable, IndexUnavailable, IndexDamaged, RateError, BusyError,
         DamagedError, DamagedShard, TaskError, TaskCancelled, TaskRefused, GraspdError,
     )

@@ -132,6 +132,12 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="Payload", optional=True, indexed=Indexed.OFFERED, bounds=(0, 100), digits=2, plot="cut",
     ),
     GraspMetric(
+        "shake_margin", "1", "worst displacement or rotation in the hand over its limit, shaken after the lift: below "
+        "1 it survives; nan: not shaken",
+        title="Motion when shaken", short="Shaken", optional=True, indexed=Indexed.OFFERED, less_is_better=True,
+        digits=2, plot="cut",
+    ),
+    GraspMetric(
         "clearance_m", "m", "least room of the hand among supports: coming, closing and lifting",
         title="Clearance in its scene", short="Clearance", optional=True, indexed=Indexed.OFFERED,
         bounds=(-1, 1), digits=4,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import Final
 
@@ -23,6 +24,7 @@ OUTCOMES: Final = {
     "fragile": "held in too few models",
     "weak": "lifted less than the wanted payload",
     "alike": "too similar to another",
+    "repeated": "repeated attempts",
 }
 
 
@@ -42,7 +44,7 @@ def told(outcomes: Mapping[str, int]) -> str:
 
 
 def shortfall(
-    found: int, wanted: int, counted: str, tried: int, budget: float, outcomes: Mapping[str, int]
+    found: int, wanted: int, counted: str, tried: int, budget: float, outcomes: Mapping[str, int], limit: str = ""
 ) -> str | None:
     """Why fewer grasps were found than wanted, in a sentence; None where all were.
 
@@ -51,13 +53,28 @@ def shortfall(
         wanted: grasps asked for.
         counted: which grasps count: valid or sound.
         tried: candidates planned.
-        budget: candidates for each grasp wanted, at most.
-        outcomes: candidates that were not kept, by `OUTCOMES`.
+        budget: tries for each grasp wanted, at most: candidates and repeated attempts.
+        outcomes: candidates that were not kept, by `OUTCOMES`, and the repeated attempts.
+        limit: what the hand lifts at best, in place of the budget that ended.
     """
     if found >= wanted:
         return None
-    lost = told(outcomes)
-    return (
-        f"found {found:,} of {wanted:,} {counted} grasps in {tried:,} tries{': ' if lost else ''}{lost}; the budget of "
-        f"{budget:g} tries for each ended first"
-    )
+    lost, tries = told(outcomes), tried + outcomes.get("repeated", 0)
+    ended = limit or f"the budget of {budget:g} tries for each ended first"
+    return f"found {found:,} of {wanted:,} {counted} grasps in {tries:,} tries{': ' if lost else ''}{lost}; {ended}"
+
+
+def limit_told(hand: str, friction: float, grasps: int, lifts: float, bound: float, wanted: float | None = None) -> str:
+    """What a hand lifts at best, in a sentence.
+
+    Args:
+        hand: its name.
+        friction: Coulomb coefficient.
+        grasps: that were measured.
+        lifts: payload of the best of them [kg].
+        bound: that none exceeds by actuator effort and friction [kg]; inf: there is none.
+        wanted: mass that it should lift [kg]; None: nobody asked for one.
+    """
+    most = f", and at most {bound:.2g} kg by actuator effort" if math.isfinite(bound) else ""
+    less = "" if wanted is None else f"; {wanted:.3g} kg are wanted"
+    return f"{hand} lifts {lifts:.2g} kg at friction {friction:g} in the best of {grasps} grasps{most}{less}"

@@ -12,7 +12,14 @@ TASK_SCHEMA: Final = 5
 OLDEST_TASK_SCHEMA: Final = 2
 #: Fields of a request by the schema that first had them. A job that uses one needs a worker that knows it; all other
 #: jobs go to older workers too.
-SCHEMA_OF_FIELD: Final[dict[str, int]] = {"mass": 5, "density": 5, "object_friction": 5, "payload": 5, "min_payload": 5}
+SCHEMA_OF_FIELD: Final[dict[str, int]] = {
+    "mass": 5,
+    "density": 5,
+    "object_friction": 5,
+    "payload": 5,
+    "min_payload": 5,
+    "shake": 5,
+}
 #: The first schema whose workers find the shards that they read in packs too.
 SCHEMA_OF_PACKS: Final = 3
 #: The first schema whose workers fetch the network that a request's options name.

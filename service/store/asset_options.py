@@ -69,6 +69,9 @@ PayloadOption = Annotated[
 MinPayloadOption = Annotated[
     float, typer.Option("--min-payload", help="Mass that a grasp must lift to count [kg]; 0: any.", min=0, max=MOST_KG)
 ]
+ShakeOption = Annotated[
+    bool, typer.Option("--shake", help="Shake what each valid grasp lifts: 2 cm, 3 Hz, along x and y of its scene.")
+]
 LicenceOption = Annotated[
     str | None, typer.Option("--licence", help="Terms it may be used on, for dataset cards: CC-BY-4.0.")
 ]

@@ -45,6 +45,19 @@ def self_test_line(facts: Mapping[str, Any]) -> str:
     return str(tried.get("says", "")) if isinstance(tried, Mapping) else ""
 
 
+def limit_line(facts: Mapping[str, Any]) -> str:
+    """What a hand lifted at best in its self-test; empty: it was not tried, or lifted nothing."""
+    tried = facts.get("self_test")
+    limit = tried.get("limit") if isinstance(tried, Mapping) else None
+    return str(limit.get("says", "")) if isinstance(limit, Mapping) else ""
+
+
+def self_test_lines(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Both with their labels, as far as they are known."""
+    lines = [("self-test", self_test_line(facts)), ("payload", limit_line(facts))]
+    return [(label, says) for label, says in lines if says]
+
+
 def hand_line(facts: Mapping[str, Any]) -> str:
     """Whose grasps a network proposes: name and digest of the hand."""
     return f"{facts.get('hand', '')} ({str(facts.get('hand_digest', ''))[:12]})"
@@ -60,8 +73,7 @@ def _hand(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
         lines.append(("fingertips", ", ".join(facts["fingertips"])))
     if "opening_m" in facts:
         lines.append(("opening", f"{1e3 * facts['opening_m']:.1f} mm between the pads"))
-    if says := self_test_line(facts):
-        lines.append(("self-test", says))
+    lines += self_test_lines(facts)
     if "dofs" in facts:
         lines.append(("dofs", f"{len(facts['dofs'])}, driving {len(facts.get('joints', []))} joints"))
         lines += [("", _dof(name, facts)) for name in facts["dofs"]]

@@ -27,7 +27,7 @@ from service.store.asset_options import (
     XacroOption,
     hand_options,
 )
-from service.store.asset_summary import say_check
+from service.store.asset_summary import say_check, self_test_lines
 from service.store.hand_corrections import described
 from worker.hands.check import check_hand
 from worker.hands.load import files_from_path, hand_from_path, main_file
@@ -84,7 +84,8 @@ def check(
     if self_test and report["verdict"] != "refuse":
         report["self_test"] = _tried(file, options, quiet=json)
         if not json:
-            typer.echo(f"  {'self-test':<18} {report['self_test']['says']}")
+            for label, says in self_test_lines(report):
+                typer.echo(f"  {label:<18} {says}")
     if json:
         emit(report | {"closing": report["facts"].get("closing", {})})
     if report["verdict"] == "refuse":

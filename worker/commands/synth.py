@@ -38,8 +38,8 @@ from service.store.asset_options import (
     MassOption,
     MinPayloadOption,
     ObjectFrictionOption,
-    PayloadOption,
     ScaleToOption,
+    ShakeOption,
     UnitsOption,
     object_options,
 )
@@ -89,8 +89,14 @@ def synth(
     mass: MassOption = None,
     density: DensityOption = None,
     object_friction: ObjectFrictionOption = None,
-    payload: PayloadOption = False,
+    payload: Annotated[
+        bool | None,
+        typer.Option(
+            help="Measure the heaviest mass that each valid grasp lifts; default: in scenes where a mass is said."
+        ),
+    ] = None,
     min_payload: MinPayloadOption = 0.0,
+    shake: ShakeOption = False,
     units: UnitsOption = None,
     scale_to: ScaleToOption = None,
     keep_largest: KeepLargestOption = False,
@@ -130,9 +136,11 @@ def synth(
         raise InputError(f"the folder {out.parent} does not exist; create it or choose another --out")
     if out.is_dir():
         raise InputError(f"{out} is a folder; name a file in it, such as --out {out / 'grasps.h5'}")
+    if payload is None:
+        payload = scene != "free" and referee != "none" and (mass is not None or density is not None)
     matter = {
         "mass": mass, "density": density, "object_friction": object_friction, "payload": payload,
-        "min_payload": min_payload,
+        "min_payload": min_payload, "shake": shake,
     }  # fmt: skip
     request = _request(want, budget, referee, robust, robust_models, matter).model_copy(
         update={
@@ -237,6 +245,8 @@ def _said(found: dict[str, Any]) -> str:
         lines.append(f"{types}; from {found['directions_used']} of {CELLS} directions")
     if found.get("payload_kg") is not None:
         lines.append(f"median payload {found['payload_kg']:.2f} kg")
+    if found.get("shake_share") is not None:
+        lines.append(f"{found['shake_share']:.0%} survive the shake")
     if "scene" in found:
         lines.append(
             f"{found['scene']}, {found['scenes']} scenes: {found['clear_share']:.0%} of the tries are clear of what "

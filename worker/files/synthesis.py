@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.diversity import CELLS, GraspType, entropy_bits
-from service.model.domain import BATCH_SIZE, JobOptions
+from service.model.domain import BATCH_SIZE, SHAKE_NEEDS_A_SCENE, JobOptions
 from service.model.errors import InputError, TaskCancelled
 from service.model.fidelity import FIDELITIES, Fidelity
 from service.model.outcomes import shortfall, totals
@@ -36,6 +36,7 @@ from worker.planners import planner
 from worker.pool.modules import MODULES
 from worker.pool.pool import Pool
 from worker.pool.size import processes_at_once
+from worker.quality.referee.limit import Limit
 from worker.run import FirstJudge, Progress, Run
 from worker.scenes.beside import scenes_of
 from worker.together import certified_batches, distinct_batches
@@ -68,11 +69,19 @@ class Synthesized:
         request = self.request
         if self.interrupted:
             return f"interrupted: {len(self.arrays['quality/valid'])} of {request.grasps} grasps were there"
-        return shortfall(
+        limit = self.limit
+        reason = shortfall(
             len(self.arrays["quality/valid"]), request.grasps, request.counted,
             sum(batch.tried for batch in self.batches), request.budget,
             totals(batch.outcomes for batch in self.batches),
+            limit.line if limit is not None and limit.hopeless else "",
         )  # fmt: skip
+        return reason if limit is None or limit.hopeless else f"{reason}; {limit.line}"
+
+    @property
+    def limit(self) -> Limit | None:
+        """What the hand lifts at best, where it is told: no grasp was found, for the weight."""
+        return None if len(self.arrays["quality/valid"]) else self.batches[0].limit
 
     def summary(self) -> dict[str, Any]:
         """What a user wants to know first, for JSON."""
@@ -100,6 +109,10 @@ class Synthesized:
         }
         if request.measures_payload:
             told["payload_kg"] = self._median_payload()
+        if request.shake:
+            told["shake_share"] = self._shake_share()
+        if self.limit is not None:
+            told["limit"] = self.limit.facts()
         told |= self._diversity()
         if request.models:
             told |= {
@@ -126,6 +139,12 @@ class Synthesized:
         values = np.asarray(self.arrays["quality/payload_kg"], float)
         known = values[np.isfinite(values)]
         return round(float(np.median(known)), 4) if len(known) else None
+
+    def _shake_share(self) -> float | None:
+        """Of the grasps that were shaken, the share that survives."""
+        values = np.asarray(self.arrays["quality/shake_margin"], float)
+        known = values[np.isfinite(values)]
+        return round(float((known < 1).mean()), 4) if len(known) else None
 
     def _mean(self, name: str, digits: int) -> float | None:
         values = self.arrays[f"quality/{name}"]
@@ -183,6 +202,8 @@ def synthesized(
         TaskCancelled: `cancelled` answered True; with `partial`, before anything was judged.
     """
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
+    if request.shake and place.kind == "free":
+        raise InputError(SHAKE_NEEDS_A_SCENE)
     wanted = parse_join(str(join))
     options = dict(mesh or {})
     model = hand_from_path(hand)

@@ -11,7 +11,7 @@ from service.model.errors import AssetError, InputError
 from worker.hands.closing import chains_of
 from worker.hands.guess import approach_is_tied
 from worker.hands.jaws import jaws_of
-from worker.hands.load import assemble, assumed_efforts, main_file
+from worker.hands.load import assemble, assumed_efforts, main_file, mounting_of
 from worker.hands.model import HandModel
 from worker.hands.oppositions import require_opposing
 from worker.hands.options import HandOptions, parse_options
@@ -62,6 +62,7 @@ def check_hand(
     if (jaws := jaws_of(hand)) is not None:
         facts["opening_m"] = round(jaws.opening, 6)
         message += f"; opens {1e3 * jaws.opening:.0f} mm"
+    fault = "" if hand.mounting else mounting_of(robot, settings, files, main, hand)[1]
     notes = [
         *robot.notes,
         *tie,
@@ -69,7 +70,7 @@ def check_hand(
         *_tendons(hand),
         *_limits(robot, settings),
         *_left_out(robot, hand, settings),
-        *_mounting(hand),
+        *_mounting(hand, fault),
     ]
     facts["notes"] = notes
     return {"verdict": "accept", "message": "; ".join([message, *notes]), "repairs": [], "facts": facts}
@@ -118,8 +119,10 @@ def _left_out(robot: Robot, hand: HandModel, settings: HandOptions) -> list[str]
     return [f"{', '.join(above)} above the palm left out, poses are those of {hand.root_link!r} (--root {robot.root})"]
 
 
-def _mounting(hand: HandModel) -> list[str]:
-    """What a user must know of links above the hand's root."""
+def _mounting(hand: HandModel, fault: str) -> list[str]:
+    """What a user must know of links above the hand's root; `fault`: why they cannot be read."""
+    if fault:
+        return [fault]
     links = () if hand.mounting is None else dict.fromkeys(piece.link for piece in hand.mounting.pieces)
     return [f"{', '.join(links)} above the palm kept clear in scenes"] if links else []
 

@@ -80,24 +80,25 @@ def assemble(
     hand = with_drive(
         hand, stated_gains(robot, tree.dof_names, options), assumed_efforts(robot, tree.dof_names, options)
     )
-    mounting = _mounting(robot, options, files, main, hand, run)
+    mounting, fault = mounting_of(robot, options, files, main, hand, run)
+    if fault:
+        log.warning("%s: %s", name, fault)
     return replace(hand, neighbours=resting_neighbours(hand), mounting=mounting)
 
 
-def _mounting(
-    robot: Robot, options: HandOptions, files: Mapping[str, bytes], main: str, hand: HandModel, run: Run
-) -> HandModel | None:
-    """The links above the hand's root; None where there are none, or their shapes cannot be read: faults above a hand
-    do not refuse it."""
+def mounting_of(
+    robot: Robot, options: HandOptions, files: Mapping[str, bytes], main: str, hand: HandModel, run: Run = ALONE
+) -> tuple[HandModel | None, str]:
+    """The links above the hand's root, None where there are none; and why their shapes cannot be read, in words:
+    faults above a hand do not refuse it."""
     tree = mounting_tree(robot, hand.root_link, options)
     if tree is None:
-        return None
+        return None, ""
     shapes = HandOptions(shapes=options.shapes)
     try:
-        return body_model(robot, tree, shapes, files, main, name=hand.name, digest=hand.digest, run=run)
+        return body_model(robot, tree, shapes, files, main, name=hand.name, digest=hand.digest, run=run), ""
     except HandError as error:
-        log.warning("%s: what stands above its root is no obstacle in scenes: %s", hand.name, error)
-        return None
+        return None, f"what stands above {hand.root_link!r} is no obstacle in scenes: {error}"
 
 
 def _drag(robot: Robot, hand: HandModel) -> Drag:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -18,13 +18,16 @@ from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
 from service.model.transforms import apply
 from worker.certified import Certified, certified_grasps
-from worker.grasps import Posture
+from worker.grasps import Posture, joined
 from worker.hands.jaws import jaws_of
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
 from worker.hands.pads import fingertip_pad
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object
+from worker.quality.postures import squeeze
+from worker.quality.referee.decomposition import decompose
+from worker.quality.referee.limit import Limit, limit_of
 from worker.quality.referee.protocol import Outcome
 from worker.run import ALONE, Run
 from worker.scenes.beside import scenes_of
@@ -41,6 +44,8 @@ TABLE_SCENES: Final = 2
 OF_OPENING: Final = 0.55
 OF_REACH: Final = 0.5
 WIDTH_M: Final = (0.012, 0.08)
+#: Sum of normal forces of a second squeeze, for the heaviest that it lifts: its actuators give what they can [N].
+STRONG_N: Final = 1000.0
 _IDENTITY: Final = np.array([0.0, 0, 0, 1, 0, 0, 0])
 
 
@@ -76,6 +81,8 @@ class SelfTest:
     """Share of the grasps that do not hold whose object was lost while the hand closed; others slip when pushed."""
     give_m: float = math.inf
     """Way of a fingertip within which its stiffest servo goes from nothing to its limit [m]."""
+    limit: Limit | None = None
+    """What it lifts off a table with all its force; None: nothing."""
 
     @property
     def line(self) -> str:
@@ -101,7 +108,7 @@ class SelfTest:
         """As a check reports it."""
         return {
             "gsr": self.gsr, "n": self.n, "table": self.table, "table_n": self.table_n, "width_m": self.width_m,
-            "by_object": self.by_object, "says": self.line,
+            "by_object": self.by_object, "says": self.line, "limit": self.limit and self.limit.facts(),
         }  # fmt: skip
 
 
@@ -109,6 +116,7 @@ def failed(reason: str, says: str = "suspicious") -> dict[str, Any]:
     """The facts of a hand that could not be tried at all."""
     return {
         "gsr": 0.0, "n": 0, "table": 0.0, "table_n": 0, "width_m": 0.0, "by_object": {}, "says": f"{says}: {reason}",
+        "limit": None,
     }  # fmt: skip
 
 
@@ -149,7 +157,7 @@ def self_test(
     width = fitting_width(hand)
     held: dict[str, list[bool]] = {}
     lost: list[bool] = []
-    lifted: list[tuple[int, float]] = []
+    lifted: list[tuple[int, float, Limit | None]] = []
     best: Best | None = None
     objects = plain_objects(width)
     for number, (name, obj) in enumerate(objects.items()):
@@ -164,9 +172,18 @@ def self_test(
     every = [value for values in held.values() for value in values]
     by_object = {name: float(np.mean(values)) for name, values in held.items() if values}
     slack = float(np.mean(lost)) if lost else 0.0
-    tried = sum(planned for planned, _ in lifted)
-    table = sum(planned * share for planned, share in lifted) / max(tried, 1)
-    return SelfTest(float(np.mean(every)), len(every), width, by_object, table, tried, best, slack, _give(hand))
+    tried = sum(planned for planned, _, _ in lifted)
+    table = sum(planned * share for planned, share, _ in lifted) / max(tried, 1)
+    limit = _joined([limit for _, _, limit in lifted if limit is not None])
+    return SelfTest(float(np.mean(every)), len(every), width, by_object, table, tried, best, slack, _give(hand), limit)
+
+
+def _joined(limits: list[Limit]) -> Limit | None:
+    """What a hand lifts of several objects; None: nothing of any."""
+    if not limits:
+        return None
+    lifts, bound = (max(getattr(one, name) for one in limits) for name in ("lifts_kg", "bound_kg"))
+    return replace(limits[0], grasps=sum(one.grasps for one in limits), lifts_kg=lifts, bound_kg=bound)
 
 
 def _lost(batch: Certified) -> NDArray[np.bool_]:
@@ -198,12 +215,21 @@ def _batches(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: Run)
     return found
 
 
-def _lifted(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: Run) -> tuple[int, float]:
-    """How many grasps of an object on a table were planned, and the share of them that lift it."""
+def _lifted(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: Run) -> tuple[int, float, Limit | None]:
+    """How many grasps of an object on a table were planned, the share of them that lift it, and what they lift with all
+    their force."""
     scenes, _ = scenes_of(TABLE, obj, count=TABLE_SCENES, seed=seed)
     request = JobOptions(want="raw", grasps=count, seed=seed, referee="certificate")
     found = certified_grasps(hand, obj, request, count=count, scenes=scenes, run=run)
-    return found.planned, found.shares["lift_share"]
+    grasps, about = found.grasps.moved(np.negative(obj.centre)), obj.centred
+    strong = replace(grasps, squeeze=squeeze(hand, about, grasps.grasp, total_normal_force=STRONG_N))
+    both = joined([grasps, strong])
+    assert both.scene is not None
+    limit = limit_of(
+        hand, about, both, pieces=decompose(about), placed=scenes.centred(obj).placed(both.scene), least=1,
+        run=run.quiet(),
+    )  # fmt: skip
+    return found.planned, found.shares["lift_share"], limit and replace(limit, grasps=count)
 
 
 def _best(obj: ObjectModel, found: Certified) -> Best | None:

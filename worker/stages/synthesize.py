@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError, SceneError
+from service.model.errors import InputError, LoadError, SceneError
 from service.model.messages import TaskMessage
 from service.model.outcomes import told
 from service.model.states import Stage
@@ -35,6 +35,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
 
     Raises:
         SceneError: no hand can reach into the scenes, a job's first batch finds no grasp, or its method knows none.
+        LoadError: a job's first batch finds none, since the hand lifts far less.
     """
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     keep_network(context.store, message)
@@ -57,8 +58,8 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         if scenes is not None and type(error) in (InputError, NoPlace):
             raise SceneError(str(error)) from None
         raise
-    if scenes is not None and message.batch == 0:
-        _check_hope(message, found)
+    if message.batch == 0:
+        _check_hope(message, found, in_scenes=scenes is not None)
     seconds = {f"{name}_seconds": round(value, 4) for name, value in found.seconds.items()}
     shares = {name: round(value, 4) for name, value in found.shares.items()}
     info = {
@@ -100,16 +101,20 @@ def _scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: Tas
     return replace(scenes, neighbours=beside, neighbour_pose=columns["scene/neighbour_pose"])
 
 
-def _check_hope(message: TaskMessage, found: Certified) -> None:
+def _check_hope(message: TaskMessage, found: Certified, *, in_scenes: bool) -> None:
     """What the first batch does not find at all, the others of its job are not made to look for."""
-    request = message.request
+    request, limit = message.request, found.limit
     if request.want == "raw" or len(found.grasps):
         return
-    lost = told(found.outcomes)
-    raise SceneError(
-        f"none of {found.planned} grasps tried is {request.counted} in its scene ({request.place.kind}): {lost}; give "
-        f"a larger budget than {request.budget:g} tries for each grasp, or another pose, scene, hand or seed"
-    )
+    none = f"none of {found.planned} grasps tried is {request.counted}"
+    if limit is not None and limit.hopeless:
+        raise LoadError(f"{none}: {limit.line}")
+    if in_scenes:
+        raise SceneError(
+            f"{none} in its scene ({request.place.kind}): {told(found.outcomes)}; "
+            f"{limit.line + '; ' if limit is not None else ''}give "
+            f"a larger budget than {request.budget:g} tries for each grasp, or another pose, scene, hand or seed"
+        )
 
 
 def _json(info: dict[str, object]) -> dict[str, object]:

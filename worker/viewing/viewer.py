@@ -243,6 +243,10 @@ def _figures(shard: Shard, row: int) -> str:
     for name, words in verdicts.items():
         if (known := arrays.get(f"quality/{name}")) is not None and known[row] >= 0:
             rows.append((words, "holds" if known[row] else "fails"))
+    if (payload := arrays.get("quality/payload_kg")) is not None and np.isfinite(payload[row]):
+        rows.append(("payload", f"{float(payload[row]):.2f} kg"))
+    if (shaken := arrays.get("quality/shake_margin")) is not None and np.isfinite(shaken[row]):
+        rows.append(("shaken", "holds" if shaken[row] < 1 else "fails"))
     if (clearance := arrays.get("quality/clearance_m")) is not None:
         rows.append(("nearest to the scene", f"{1e3 * float(clearance[row]):.1f} mm"))
     return "\n".join(["| | |", "| --- | --- |", *(f"| {name} | {value} |" for name, value in rows)])

@@ -12,7 +12,7 @@ from sqlalchemy import ColumnElement, Connection, exists, func, literal, select,
 from service.index.database import chunks
 from service.index.outgoing import note_ends
 from service.index.tables import attempts, jobs, notes, tasks
-from service.model.errors import SceneError
+from service.model.errors import LoadError, SceneError
 from service.model.planning import TaskFacts, batch_ready, batch_states, job_state
 from service.model.states import State
 
@@ -87,14 +87,14 @@ def _settle_tasks(connection: Connection, touched: Mapping[str, Collection[int] 
 
 
 def _hopeless() -> ColumnElement[bool]:
-    """Whether the first batch of a job ended because of its scenes."""
+    """Whether the first batch of a job ended because of its scenes, or of the weight."""
     last = (attempts.c.task_id == tasks.c.id) & (attempts.c.number == tasks.c.last_attempt)
     failed = (tasks.c.done.is_(False), tasks.c.exhausted.is_(True), tasks.c.last_attempt > tasks.c.retried_upto)
     first = (tasks.c.job_id == jobs.c.id, tasks.c.batch == 0)
     return (
         exists()
         .select_from(tasks.join(attempts, last))
-        .where(*first, *failed, attempts.c.kind == SceneError.__name__)
+        .where(*first, *failed, attempts.c.kind.in_([SceneError.__name__, LoadError.__name__]))
         .correlate(jobs)
         .label("hopeless")
     )

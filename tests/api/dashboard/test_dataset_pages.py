@@ -175,3 +175,17 @@ def test_a_dataset_and_a_job_ask_for_robust_grasps(http: TestClient, parts: Part
     assert parts.index.jobs.page().items[0].request.robust == 0.75
     refused = http.post("/submit", data={"hand": "allegro", "object": "mug", "robust": "0.75", "referee": "none"})
     assert refused.status_code == 422 and "choose a referee" in refused.text
+
+
+def test_a_dataset_and_a_job_ask_for_a_payload_and_a_shake(http: TestClient, parts: Parts) -> None:
+    asked = {"min_payload": "0.5", "shake": "true", "scene": "table"}
+    form = {"name": "heavy", "grasps": "32", "hands": ["allegro"], "objects": ["mug"], **asked}
+    assert "heavy" in http.post("/datasets", data=form).text
+    http.post("/submit", data={"hand": "allegro", "object": "mug", **asked})
+    job = parts.index.jobs.page().items[0].request
+    for options in (parts.index.datasets.get("heavy").options, job):
+        assert (options.min_payload, options.shake) == (0.5, True)
+    refused = http.post("/submit", data={"hand": "allegro", "object": "mug", "shake": "true"})
+    assert refused.status_code == 422 and "lifted out of a scene" in refused.text
+    refused = http.post("/submit", data={"hand": "allegro", "object": "mug", "min_payload": "1", "referee": "none"})
+    assert refused.status_code == 422 and "payload is what the referee sees lifted" in refused.text

@@ -14,6 +14,7 @@ from service.index.database import Database
 from service.index.queries.jobs import Jobs
 from service.index.queries.overview import Overview
 from service.model.errors import IndexUnavailable, QueueUnavailable
+from service.model.fidelity import OFFERED
 from service.model.planning import plan
 from service.model.states import State
 from service.pipeline.backends import Parts
@@ -235,3 +236,9 @@ def test_what_came_with_the_service_was_not_added(http: TestClient) -> None:
     for path in ("/hands", "/hands/allegro"):
         page = http.get(path).text
         assert "built in" in page and "<time" not in page and "added" not in page.lower().replace("<th>added</th>", "")
+
+
+@pytest.mark.parametrize("said", [{}, {"mass": "0.4", "min_payload": "0.5"}])
+def test_the_form_tells_what_each_fidelity_costs_whatever_is_left_empty(http: TestClient, said: dict[str, str]) -> None:
+    page = http.get("/submit", params=said).text
+    assert page.count("on one worker") == len(OFFERED)

@@ -53,12 +53,13 @@ def test_scenes_are_made_before_grasps_and_told_in_that_order(parts: Parts) -> N
     assert ready == [(0, Stage.SYNTHESIZE)], "the other batch's scenes are queued already"
 
 
-def test_a_job_ends_when_its_first_batch_finds_nothing_in_its_scenes(parts: Parts) -> None:
+@pytest.mark.parametrize("kind", ["SceneError", "LoadError"])
+def test_a_job_ends_when_its_first_batch_finds_nothing_in_its_scenes(parts: Parts, kind: str) -> None:
     job = submit(parts, grasps=128)
     for batch in range(2):
         make(parts, job, Stage.SCENE, batch)
     make(parts, job, Stage.SYNTHESIZE, 1)
-    fail(parts, job, 0, "SceneError")
+    fail(parts, job, 0, kind)
     ended = parts.index.jobs.get(job.id)
     assert (ended.state, ended.reason) == (State.FAILED, "none of 128 grasps tried is valid in its scene")
     found = states(parts, job)

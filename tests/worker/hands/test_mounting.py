@@ -11,6 +11,7 @@ import pytest
 from service.model.transforms import IDENTITY_POSE, apply, invert
 from tests.worker.hands.test_roots import BOX, gripper, humanoid
 from tests.worker.hands.urdfs import joint, link, robot
+from worker.hands.check import check_hand
 from worker.hands.kinematics import body_poses
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
@@ -92,10 +93,15 @@ def test_a_stated_angle_holds_a_wrist_and_a_dropped_link_ends_it() -> None:
     assert links_of(loaded(with_wrist(), root="hub", drop=["forearm"])) == {"wrist"}
 
 
-def test_what_is_wrong_with_shapes_above_a_hand_does_not_refuse_it() -> None:
-    lost = '<collision><geometry><mesh filename="lost.stl"/></geometry></collision>'
-    hand = loaded(with_wrist(forearm=lost))
+def test_what_is_wrong_with_shapes_above_a_hand_is_told_and_does_not_refuse_it() -> None:
+    lost = with_wrist(forearm='<collision><geometry><mesh filename="lost.stl"/></geometry></collision>')
+    hand = loaded(lost)
     assert hand.mounting is None and hand.dofs == 2
+    report = check_hand({"r.urdf": lost}, "r")
+    (note,) = (note for note in report["facts"]["notes"] if "no obstacle in scenes" in note)
+    assert "what stands above 'hub'" in note and "lost.stl" in note
+    assert report["verdict"] == "accept" and note in report["message"]
+    assert "no obstacle in scenes" not in check_hand({"r.urdf": with_wrist()}, "r")["message"]
 
 
 def test_a_hand_without_links_above_its_root_has_no_mounting() -> None:

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from service.model.errors import InputError, TaskCancelled
+from service.model.states import AssetKind
+from service.store.asset_summary import summary
 from tests.worker.hands.grippers import OPENING, gripper
 from tests.worker.hands.urdfs import joint, link, robot
 from worker.certified import Certified
@@ -18,6 +20,7 @@ from worker.hands.jaws import jaws_of
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
+from worker.quality.referee.limit import Limit
 from worker.run import Run
 from worker.stages import hand_self_test
 from worker.stages.hand_self_test import (
@@ -69,6 +72,20 @@ def test_a_hand_that_lifts_little_off_a_table_is_suspicious_whatever_it_holds() 
     assert (held.facts()["table"], held.facts()["table_n"]) == (0.55, 16)
 
 
+def test_what_a_hand_lifts_at_best_is_a_line_of_its_check() -> None:
+    limit = Limit("claw", 0.6, 16, 1.44, 4.53)
+    held = SelfTest(0.91, 64, 0.04, {"box": 0.9}, 0.8, 16, limit=limit)
+    facts = held.facts()
+    assert (facts["limit"]["lifts_kg"], facts["limit"]["bound_kg"]) == (1.44, 4.53)
+    assert summary(AssetKind.HAND, {"self_test": facts}) == [
+        "self-test          ready: 91 % hold, 80 % lift off a table",
+        "payload            claw lifts 1.4 kg at friction 0.6 in the best of 16 grasps, and at most 4.5 kg by actuator "
+        "effort",
+    ]
+    assert replace(limit, bound_kg=np.inf).facts()["bound_kg"] is None
+    assert len(summary(AssetKind.HAND, {"self_test": replace(held, limit=None).facts()})) == 1
+
+
 def three_fingers_urdf() -> bytes:
     fingers = [
         part
@@ -98,7 +115,7 @@ def test_a_busy_machine_leaves_nothing_out(monkeypatch: pytest.MonkeyPatch) -> N
         return [held(count)]
 
     monkeypatch.setattr(hand_self_test, "_batches", batches)
-    monkeypatch.setattr(hand_self_test, "_lifted", lambda hand, obj, count, seed, run: (count, 0.5))
+    monkeypatch.setattr(hand_self_test, "_lifted", lambda hand, obj, count, seed, run: (count, 0.5, None))
     found = tried_softly(gripper)
     assert (found["table_n"], found["table"]) == (16, 0.5)
     assert (found["n"], sorted(found["by_object"])) == (64, ["box", "cylinder", "sphere"])
@@ -140,3 +157,5 @@ def test_a_parallel_gripper_holds_what_fits() -> None:
     assert (found.n, found.table_n) == (12, 6)
     assert found.gsr >= 0.7
     assert found.table >= 0.6
+    assert found.limit is not None and 0.1 < found.limit.lifts_kg <= found.limit.bound_kg
+    assert found.limit.grasps == 6

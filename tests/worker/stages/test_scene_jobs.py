@@ -182,6 +182,20 @@ def test_a_scene_without_a_way_in_fails_the_job_and_says_so(table: Bench) -> Non
     assert (attempt.kind, attempt.last) == ("SceneError", True), "it is not tried again"
 
 
+@pytest.mark.parametrize("scene", ["table", "free"])
+def test_a_payload_out_of_reach_fails_the_job_with_what_the_hand_lifts(table: Bench, scene: str) -> None:
+    bench = Bench(table.store)
+    wanted = {"scene": scene, "scenes": 0, "views": 0, "grasps": 8, "budget": 4, "min_payload": 90}
+    kind, words = bench.run(**TABLE | wanted)
+    assert kind is EventKind.FAILED
+    assert re.search(
+        r"none of 8 grasps tried is valid: barrett lifts [\d.]+ kg at friction .*; 90 kg are wanted", words
+    )
+    task = list(plan(bench.job))[-1]
+    attempt = read_record(AttemptRecord, table.store, names.attempt(task.id, 1))
+    assert (attempt.kind, attempt.last) == ("LoadError", True), "it is not tried again"
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

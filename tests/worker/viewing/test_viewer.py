@@ -122,6 +122,16 @@ def test_only_valid_grasps_are_shown_where_that_is_chosen(viewer):
     assert viewer.row == 1
 
 
+def test_what_a_grasp_lifts_and_whether_it_survives_the_shake_is_told() -> None:
+    from worker.viewing.viewer import _figures
+
+    found = {"quality/payload_kg": np.array([np.nan, 0.8, 1.5]), "quality/shake_margin": np.array([np.nan, 0.2, 1.0])}
+    shard = Shard("base", {}, {**arrays(2), **found})
+    plain, good, bad = (_figures(shard, row) for row in range(GRASPS))
+    assert "payload" not in plain and "shaken" not in plain
+    assert "| payload | 0.80 kg |" in good and "| shaken | holds |" in good and "| shaken | fails |" in bad
+
+
 def test_dots_are_where_the_hand_is_near_the_object(viewer):
     viewer.slider.value = 0
     viewer.show()

@@ -27,7 +27,7 @@ from worker.quality.referee.compiled import scene_of
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.lift import Lift, LiftOutcome
 from worker.quality.referee.model import MujocoOptions, Scene
-from worker.quality.referee.protocol import HOLD_S, STAGE_S, Outcome, Test
+from worker.quality.referee.protocol import LOST, STAGE_S, Outcome, Test
 from worker.simulation.surroundings import Placed
 
 Floats = NDArray[np.float64]
@@ -49,9 +49,7 @@ PUSHED: Final = 2
 #: Pull while the object hangs, and of a push, in its weights.
 HANGS: Final = 1.3
 PULL: Final = 2.0
-#: An object whose present rate brings it in the time of the whole test to so much of a limit hangs still; what has
-#: passed a limit by so much is lost.
-STILL: Final = 0.5
+#: What has passed a limit by so much is lost.
 GONE: Final = 1.5
 #: Where a free object is pushed: no direction is farther from all of them than 71 degrees.
 CORNERS: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
@@ -59,8 +57,7 @@ CORNERS: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / 
 AWAY_M: Final = 10.0
 #: Added to the score of what holds at the whole friction only.
 SLIPS: Final = 1.0
-#: Score of what is lost while closing, and of what starts too deep.
-LOST: Final = 10.0
+#: Score of what starts too deep.
 DEEP: Final = 20.0
 
 
@@ -100,15 +97,7 @@ class ShortLift(Lift):
         now if that is `enough`."""
         self.data.mocap_pos[1] = self._scene_pose[:3] - AWAY_M * self._up
         self.data.xfrc_applied[self.scene.object_body, :3] = -HANGS * self.scene.push * self._up
-        before = self._excess()
-        for stage in range(1, HANGING + 1):
-            self._run(STAGE_S)
-            excess = LOST if void(self.data) else self._excess()
-            ahead = excess + max(0.0, excess - before) * (HOLD_S / STAGE_S - stage)
-            if excess >= enough or (stage > 1 and ahead < STILL):
-                return excess
-            before = excess
-        return max(excess, min(ahead, LOST / 2))
+        return self._ahead(HANGING, enough)
 
 
 class ShortPush(Test):

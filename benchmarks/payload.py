@@ -1,0 +1,187 @@
+"""Error and price of a grasp's payload against whole lifts of ever other masses, and how far its bound is above it.
+
+usage: python -m benchmarks.payload DATA_DIR [--hands allegro ...] [--objects 025_mug ...] [--grasps 8] [--scenes 4]
+           [--seed 1500] [--free] [--page OUT.md]
+       DATA_DIR holds hands/ and objects/; free: objects are pushed six ways instead of lifted off a table
+
+Grasps are valid for objects of their published masses. The whole lift rises and holds as the referee's, or holds under
+each push, for each mass of a bisection to 3 %. The bound is the largest load capacity of a pair's grasps over the
+largest payload of them, squeezed with 50 to 1000 N.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.cells import HANDS
+from benchmarks.masses import arguments, masses
+from service.model.domain import JobOptions
+from service.model.fidelity import FIDELITIES
+from service.model.scene_spec import parse_scene
+from worker.certified import Certified, certified_grasps
+from worker.grasps import GraspSet, joined
+from worker.hands.load import hand_from_path
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.objects.prepare import object_from_path
+from worker.quality.postures import squeeze
+from worker.quality.referee.compiled import scene_of
+from worker.quality.referee.decomposition import decompose
+from worker.quality.referee.lift import LiftOutcome
+from worker.quality.referee.limit import limit_of
+from worker.quality.referee.model import MujocoOptions
+from worker.quality.referee.payload import LIFTING, LiftPayload, PushPayload
+from worker.quality.referee.protocol import DIRECTIONS, Outcome, Trial
+from worker.scenes.beside import scenes_of
+from worker.simulation.surroundings import Placed
+
+SEED: Final = 1500
+#: Sums of normal forces [N].
+FORCES_N: Final = (100.0, 200.0, 400.0, 1000.0)
+OBJECTS: Final = ("005_tomato_soup_can", "006_mustard_bottle", "025_mug", "061_foam_brick")
+HEAD: Final = """# Payload of grasps: error and price
+
+`python -m benchmarks.payload DATA{option}`: the payload of valid grasps over that by whole tests of each mass, and CPU
+time a grasp of both. The last column is of the pair where it is least: the largest load capacity of its grasps over
+the largest payload of them, squeezed as planned and with 100 to 1000 N. {grasps} grasps wanted a pair, {objects},
+seed {seed}.
+
+"""
+Floats = NDArray[np.float64]
+
+
+class WholeLifts(LiftPayload):
+    """Payload by the referee's rise and hold."""
+
+    def payload(self, grasps: GraspSet, row: int) -> float:
+        self._weigh(self._own)
+        if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED or not self._close(grasps, row, give_up=True):
+            return float("nan")
+        self._save()
+
+        def bears(mass: float) -> bool:
+            self._weigh(mass)
+            self._restore()
+            self._goal = np.zeros(3)
+            self.data.xfrc_applied[self.scene.object_body, :3] = -self.scene.push * self._up
+            self._rise(grasps, row)
+            trial = Trial()
+            return self._judge(trial) is Outcome.HELD and self._hold(trial) is Outcome.HELD
+
+        return self._heaviest(bears, self._own)
+
+
+class WholePushes(PushPayload):
+    """Payload by the referee's pushes."""
+
+    def payload(self, grasps: GraspSet, row: int) -> float:
+        self._weigh(self._own)
+        if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION or not self._close(grasps, row, give_up=True):
+            return float("nan")
+        self._save()
+
+        def bears(mass: float) -> bool:
+            self._weigh(mass)
+            for direction in range(len(DIRECTIONS)):
+                self._restore()
+                self._push(direction)
+                if self._hold(Trial()) is not Outcome.HELD:
+                    return False
+            return True
+
+        return self._heaviest(bears, self._own)
+
+
+def main() -> None:
+    parser = arguments(__doc__, SEED)
+    parser.add_argument("--free", action="store_true")
+    parser.set_defaults(grasps=8, objects=list(OBJECTS))
+    given = parser.parse_args()
+    rows = [
+        "| hand | grasps | median ratio | median error | error of nine in ten | CPU ms | of whole tests | bound |",
+        "|---|--:|--:|--:|--:|--:|--:|--:|",
+    ]
+    for name in given.hands:
+        hand = hand_from_path(str(given.data / "hands" / HANDS[name]))
+        found = [of_pair(given, hand, obj, mass) for obj, mass in masses(given.data).items() if obj in given.objects]
+        ratio, milliseconds, whole = (np.concatenate(part) for part in zip(*(one[:3] for one in found), strict=True))
+        error = np.abs(ratio - 1)
+        rows.append(
+            f"| {name} | {len(ratio)} | {np.median(ratio):.2f} | {np.median(error):.2f} | "
+            f"{np.percentile(error, 90):.2f} | {milliseconds.mean():.0f} | {whole.mean():.0f} | "
+            f"{min(one[3] for one in found):.1f} |"
+        )
+        print(rows[-1], flush=True)  # noqa: T201
+    if given.page:
+        told = {"option": " --free" if given.free else "", "grasps": given.grasps, "seed": given.seed}
+        given.page.write_text(HEAD.format(objects=", ".join(given.objects), **told) + "\n".join(rows) + "\n")
+
+
+def of_pair(given: Any, hand: HandModel, name: str, mass: float) -> tuple[Floats, Floats, Floats, float]:
+    """Of each valid grasp of a pair: ratio of the payload to that by whole tests, and CPU time of both [ms]; and the
+    bound of all of them over the largest payload."""
+    grasps, obj, placed = valid_grasps(given, hand, given.data / "objects" / name / "clean.stl", mass)
+    around = (placed.supports,) if placed is not None else ()
+    # Where the root is not fixed the weld gives way, and the object with its hand.
+    whole = LIFTING if placed is None else MujocoOptions()
+    scenes = [scene_of(hand, obj, decompose(obj), physics, *around) for physics in (LIFTING, whole)]
+    tests: list[LiftPayload | PushPayload]
+    if placed is None:
+        tests = [PushPayload(scenes[0]), WholePushes(scenes[1])]
+    else:
+        tests = [LiftPayload(scenes[0], placed), WholeLifts(scenes[1], placed)]
+    kilograms, milliseconds = np.empty((2, len(grasps))), np.empty((2, len(grasps)))
+    for row in range(len(grasps)):
+        for k, test in enumerate(tests):
+            began = time.process_time()
+            kilograms[k, row] = test.payload(grasps, row)
+            milliseconds[k, row] = 1e3 * (time.process_time() - began)
+    # Told are valid grasps: what they lift at least is the object.
+    kilograms = np.nan_to_num(kilograms, nan=obj.mass)
+    strongest = limit_of(
+        hand,
+        obj,
+        squeezed(hand, obj, grasps),
+        pieces=decompose(obj),
+        placed=placed and placed.take(every(grasps)),
+        least=1,
+    )
+    bound = strongest.bound_kg / strongest.lifts_kg if strongest is not None else float("nan")
+    return kilograms[0] / kilograms[1], milliseconds[0], milliseconds[1], bound
+
+
+def squeezed(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> GraspSet:
+    """Grasps as they are, then with the squeezes of `FORCES_N`."""
+    stronger = [squeeze(hand, obj, grasps.grasp, total_normal_force=force) for force in FORCES_N]
+    return joined([grasps, *(replace(grasps, squeeze=one) for one in stronger)])
+
+
+def every(grasps: GraspSet) -> NDArray[np.intp]:
+    """Rows of `squeezed`."""
+    return np.tile(np.arange(len(grasps)), 1 + len(FORCES_N))
+
+
+def valid_grasps(
+    given: Any, hand: HandModel, mesh: Path, mass: float
+) -> tuple[GraspSet, ObjectModel, Placed | None]:  # fmt: skip
+    """Grasps of an object about its centre, and their scenes; None: the object is free."""
+    obj = object_from_path(str(mesh), face_error_m=FIDELITIES["standard"].face_error_m).weighing(mass=mass)
+    request = JobOptions(grasps=given.grasps, audits=0, seed=given.seed)
+    scenes = None
+    if not given.free:
+        scenes, _ = scenes_of(parse_scene("table"), obj, [], count=given.scenes, seed=given.seed)
+    made: Certified = certified_grasps(hand, obj, request, count=given.grasps, scenes=scenes)
+    grasps = made.grasps.moved(np.negative(obj.centre))
+    if scenes is None or grasps.scene is None:
+        return grasps, obj.centred, None
+    return grasps, obj.centred, scenes.centred(obj).placed(grasps.scene)
+
+
+if __name__ == "__main__":
+    main()
