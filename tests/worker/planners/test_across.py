@@ -156,9 +156,9 @@ def test_outlines_tell_how_far_a_hand_must_rise(block, barrett, tips_m) -> None:
     wanted = np.where(tip & (tips_m is not None), 0.0, MARGIN_M) + 0.006
     lack = np.maximum(0.0, (wanted - room).max(axis=1))
     # Points of the hand itself: never more than it lacks. 26 degrees beside a direction in which a point is outermost,
-    # a tenth of the hand's 15 cm may stand out farther.
+    # a tenth of the hand's 18 cm may stand out farther.
     assert (told <= lack + 1e-9).all() and (lack > 0.02).any()
-    assert (lack - told).max() < 0.015 and (lack - told).mean() < 0.002
+    assert (lack - told).max() < 0.018 and (lack - told).mean() < 0.002
 
 
 def test_draws_that_need_not_rise_come_first_in_their_order(block, barrett) -> None:
