@@ -68,11 +68,13 @@ class Synthesized:
         request = self.request
         if self.interrupted:
             return f"interrupted: {len(self.arrays['quality/valid'])} of {request.grasps} grasps were there"
-        return shortfall(
+        lack = shortfall(
             len(self.arrays["quality/valid"]), request.grasps, request.counted,
             sum(batch.tried for batch in self.batches), request.budget,
             totals(batch.outcomes for batch in self.batches),
         )  # fmt: skip
+        narrow = self.batches[0].narrow
+        return f"{lack}; {narrow}" if lack and narrow else lack
 
     def summary(self) -> dict[str, Any]:
         """What a user wants to know first, for JSON."""

@@ -105,7 +105,7 @@ def _check_hope(message: TaskMessage, found: Certified) -> None:
     request = message.request
     if request.want == "raw" or len(found.grasps):
         return
-    lost = told(found.outcomes)
+    lost = told(found.outcomes) + (f"; {found.narrow}" if found.narrow else "")
     raise SceneError(
         f"none of {found.planned} grasps tried is {request.counted} in its scene ({request.place.kind}): {lost}; give "
         f"a larger budget than {request.budget:g} tries for each grasp, or another pose, scene, hand or seed"

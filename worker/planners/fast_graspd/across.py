@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from worker.hands.model import HandModel
 from worker.hands.oppositions import Oppositions, oppositions_of
+from worker.hands.pads import thinnest_fingertip
 from worker.hands.pinches import pinches_of
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.outlines import outlines_of
@@ -125,7 +126,10 @@ class Openings:
     condition for a grasp between opposed fingers from above or from the side."""
 
     @classmethod
-    def of(cls, known: Oppositions, obj: ObjectModel, scene: Surroundings, *, upright: bool = False) -> Openings:
+    def of(
+        cls, known: Oppositions, obj: ObjectModel, scene: Surroundings, *, tip: float = 0.0, upright: bool = False
+    ) -> Openings:
+        """`tip`: thickness of the fingertips that must fit beside a pair [m]; `upright` as the field."""
         pairs = crossings_of(obj)
         level = np.abs(pairs.axis @ scene.up) < STEEP
         fits = pairs.width + 2 * ROOM_M[0] <= known.widest
@@ -142,7 +146,7 @@ class Openings:
         for obstacle in scene.obstacles:
             for end in pairs.ends():
                 room = np.minimum(room, obstacle.distance(end))
-        easy = room >= MARGIN_M
+        easy = (room >= MARGIN_M) & (room_beside(pairs, scene, tip) >= 0.0)
         chance *= np.where(level, 1.0, SELDOM) * np.where(easy, 1.0, SELDOM) * fits
         within_reach = bool((fits & easy & level).any())
         return cls(pairs, np.cumsum(chance) / chance.sum(), known, scene.up, upright, within_reach)
@@ -151,8 +155,21 @@ class Openings:
     def in_scene(cls, hand: HandModel, obj: ObjectModel, scene: Surroundings) -> Openings:
         """The same between the pads, or of what lies flat between the ends of fingertips that rest beside it."""
         ends = pinches_of(hand, float(np.ptp(obj.hull_vertices @ scene.up)))
-        flat = cls.of(ends, obj, scene, upright=True)
-        return flat if len(flat.sums) else cls.of(oppositions_of(hand), obj, scene)
+        tip = thinnest_fingertip(hand)
+        flat = cls.of(ends, obj, scene, tip=tip, upright=True)
+        return flat if len(flat.sums) else cls.of(oppositions_of(hand), obj, scene, tip=tip)
+
+
+def room_beside(pairs: Crossings, scene: Surroundings, width: float) -> Floats:
+    """(P,) least distance of balls of a diameter beside the ends of pairs from walls and neighbours, not from what the
+    object stands on [m]."""
+    out = np.full(len(pairs), np.inf)
+    for obstacle in scene.obstacles:
+        if not len(obstacle.corners) and float(obstacle.planes[0, :3] @ scene.up) > STEEP:
+            continue
+        for end, side in zip(pairs.ends(), (-0.5, 0.5), strict=True):
+            out = np.minimum(out, obstacle.distance(end + side * width * pairs.axis) - 0.5 * width)
+    return out
 
 
 @dataclass(frozen=True)
