@@ -38,6 +38,7 @@ from worker.pool.pool import Pool
 from worker.pool.size import processes_at_once
 from worker.run import FirstJudge, Progress, Run
 from worker.scenes.beside import scenes_of
+from worker.scenes.rest import rolling_poses
 from worker.together import certified_batches, distinct_batches
 
 Arrays = dict[str, NDArray[Any]]
@@ -61,6 +62,8 @@ class Synthesized:
     """Whether it was stopped before the end."""
     seconds: float
     """Wall time, without the reading of the files [s]."""
+    rolling: int = 0
+    """Scenes in which the object may roll, see `rolling_poses`."""
 
     @property
     def reason(self) -> str | None:
@@ -111,6 +114,7 @@ class Synthesized:
             }  # fmt: skip
         if self.place.kind != "free":
             told |= {"scene": self.place.kind, "scenes": len(self.arrays["scene/object_pose"])} | self._shares()
+            told["rolling_scenes"] = self.rolling
         return told
 
     def _diversity(self) -> dict[str, Any]:
@@ -227,7 +231,8 @@ def synthesized(
     if poses:
         attributes |= {"scene": json_attribute(_as_stored(place, others))} | wrist_attributes(model)
         attributes |= beside_attributes(others, [one.object for one in place.neighbours])
-    made = Synthesized(arrays, attributes, batches, request, place, interrupted, seconds)
+    rolling = rolling_poses(thing, poses["scene/object_pose"]) if poses and place.target is None else 0
+    made = Synthesized(arrays, attributes, batches, request, place, interrupted, seconds, rolling)
     if made.reason is not None:
         attributes["reason"] = made.reason
     return made
