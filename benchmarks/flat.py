@@ -66,7 +66,7 @@ def main() -> None:
     parser.add_argument("--page", type=Path, help="file for the table in Markdown")
     parser.add_argument("--keep", type=Path, help="folder for the grasps")
     given = parser.parse_args()
-    rows = ["| hand | thing | clear | lift | half friction | s |", "|---|---|---|---|---|---|"]
+    rows = ["| hand | thing | clear | lift | half friction |", "|---|---|---|---|---|"]
     with tempfile.TemporaryDirectory() as folder:
         for hand in given.hands:
             for name in given.things:
@@ -74,7 +74,7 @@ def main() -> None:
                 things()[name].export(mesh)
                 told = lifts(given, hand, name, mesh)
                 shares = (told["clear_share"], told["lift_share"], told["lift_hard_share"])
-                rows.append(f"| {hand} | {name} | {' | '.join(f'{s:.2f}' for s in shares)} | {told['seconds']:.0f} |")
+                rows.append(f"| {hand} | {name} | {' | '.join(f'{s:.2f}' for s in shares)} |")
                 print(rows[-1], flush=True)  # noqa: T201
     if given.page:
         given.page.write_text(HEAD.format(**vars(given)) + "\n".join(rows) + "\n")
