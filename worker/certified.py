@@ -27,6 +27,7 @@ from worker.hands.model import HandModel
 from worker.hands.oppositions import require_opposing
 from worker.objects.model import ObjectModel
 from worker.planners import NoPlace, Trial, Wanted, fitting_pairs, method, synthesize
+from worker.planners.fast_graspd.gaps import why_narrow
 from worker.quality.diversity import POINTS, distinct, hand_points
 from worker.quality.gate import GATES, failed_gate, passes
 from worker.quality.referee.decomposition import ConvexPieces, decompose
@@ -95,6 +96,8 @@ class Certified:
     shares: dict[str, float] = field(default_factory=dict)
     """In scenes, of all that were planned: clear_share (free of obstacles at contact, on the way and in the lift),
     lift_share (and lifted), lift_hard_share (and lifted at half the friction)."""
+    narrow: str | None = None
+    """In scenes where nothing is valid the geometric reason, see `why_narrow`."""
 
     limit: Limit | None = None
     """What the best of a round lifts, where none is kept and the weight is why."""
@@ -263,7 +266,8 @@ class _Work:
 
         found = side_by_side(parts, lane, run, size=len)
         if len(refused := [one for one in found if isinstance(one, NoPlace)]) == len(found):
-            raise refused[0]
+            why = self._narrow()
+            raise NoPlace(f"{refused[0]}: {why}") if why else refused[0]
         made = [
             self._lane(number, part, begun, True, run.quiet()) if isinstance(one, NoPlace) else one
             for part, one in zip(parts, found, strict=True)
@@ -323,12 +327,18 @@ class _Work:
             outcomes["repeated"] = self.repeated
         found = Certified(
             grasps, columns, tried, rejected, outcomes, None, len(fates), self.seconds, self._shares(rounds),
-            None if len(grasps) else self.limit,
+            limit=None if len(grasps) else self.limit,
         )  # fmt: skip
         if self.pieces is None:
             return found
         columns |= self._second_opinions(grasps, columns["quality/valid"])
-        return replace(found, columns=columns, verdict_key=self._key(self.pieces.result()))
+        narrow = None if columns["quality/valid"].any() else self._narrow()
+        return replace(found, columns=columns, verdict_key=self._key(self.pieces.result()), narrow=narrow)
+
+    def _narrow(self) -> str | None:
+        if self.scenes is None:
+            return None
+        return why_narrow(self.hand, self.obj, self.scenes.placed(np.zeros(0, int)).scenes)
 
     def _key(self, pieces: ConvexPieces) -> str:
         if self.scenes is None:

@@ -321,6 +321,25 @@ STUDIES: Final = (
         IN_SCENES, seeds=(1200,),
     ),
     Study(
+        "flat", "table lifts of flat and thin things", ("results/flat.md",),
+        ("python -m benchmarks.flat DATA --page OUT/results/flat.md",),
+        ("python -m benchmarks.flat DATA --hands barrett --things 60x60x10 --grasps 2 --page OUT/results/flat.md",),
+        IN_SCENES, seeds=(1300,),
+    ),
+    Study(
+        "corners", "lifts beside walls and among neighbours", ("results/corners.md",),
+        ("python -m benchmarks.corners DATA --hands barrett --grasps 8 --page OUT/results/corners.md",),
+        ("python -m benchmarks.corners DATA --hands barrett --places wall --gaps 10 --grasps 2 "
+         "--page OUT/results/corners.md",),
+        IN_SCENES, seeds=(1400,),
+    ),
+    Study(
+        "rolling", "rest poses that topple or roll", ("results/rolling.md",),
+        ("python -m benchmarks.rolling DATA --page OUT/results/rolling.md",),
+        ("python -m benchmarks.rolling DATA --objects 025_mug --variants 2 --page OUT/results/rolling.md",),
+        IN_SCENES, seeds=(5,),
+    ),
+    Study(
         "second-lift", "valid grasps in a lift test of its own", ("results/second_lift.md",),
         ("python -m benchmarks.second_lift DATA --grasps 12 --page OUT/results/second_lift.md",),
         ("python -m benchmarks.second_lift DATA --hands barrett --objects 025_mug --grasps 2 "

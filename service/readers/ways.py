@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +78,13 @@ def point_at(way: Sequence[Waypoint], place: float) -> Waypoint:
     name = a.name if share == 0 else b.name if share == 1 else ""
     pose = np.concatenate([mix(a.hand_pose[:3], b.hand_pose[:3]), turn])
     return Waypoint(name, pose, mix(a.joint_positions, b.joint_positions), mix(a.carried, b.carried))
+
+
+def wrists_of(shard: Shard, rows: NDArray[np.integer[Any]]) -> Floats | None:
+    """(N, U) angles of the wrist above the hand's root at grasps in scenes; None: the shard has none."""
+    if "grasp/wrist_positions" not in shard.arrays:
+        return None
+    return np.asarray(shard["grasp/wrist_positions"], float)[rows]
 
 
 def scene_spec_of(shard: Shard) -> SceneSpec | None:

@@ -11,7 +11,7 @@ from PIL import Image
 
 from service.model.scene_kinds import supports_in
 from service.model.scene_spec import SceneSpec
-from service.readers.ways import Waypoint, scene_spec_of, way_of
+from service.readers.ways import Waypoint, scene_spec_of, way_of, wrists_of
 from service.store.shards import Shard
 from worker.files.of_shard import neighbours_of_shard
 from worker.grasps import Posture
@@ -101,7 +101,7 @@ def around_of(shard: Shard, rows: NDArray[np.intp]) -> Around:
         return Around()
     poses = np.asarray(shard["scene/object_pose"], float)
     index = np.asarray(shard["grasp/scene_index"], np.intp)[rows]
-    return Around(supports_in(spec), poses, index, neighbours_of_shard(shard, []))
+    return Around(supports_in(spec), poses, index, neighbours_of_shard(shard, []), wrists_of(shard, rows))
 
 
 def _scene_of(shard: Shard) -> SceneSpec | None:

@@ -16,7 +16,7 @@ from service.cli import JsonFlag, emit, plain_console, reporting_errors, write_o
 from service.model.errors import InputError
 from service.model.scene_kinds import supports_in
 from service.model.transforms import compose
-from service.readers.ways import scene_spec_of
+from service.readers.ways import scene_spec_of, wrists_of
 from service.store import standing
 from service.store.shards import Shard, read_shard, write_shard
 from worker.commands.grasp_animation import GraspAnimation
@@ -194,8 +194,9 @@ def _drawn_in(base: Shard, hand: str | None) -> DrawnHand | None:
         return None
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
     return DrawnHand(
-        hand_of_shard(base, hand), rows, compose(np.asarray(base["scene/object_pose"], float), poses), joints
-    )
+        hand_of_shard(base, hand), rows, compose(np.asarray(base["scene/object_pose"], float), poses), joints,
+        wrists_of(base, rows),
+    )  # fmt: skip
 
 
 def _drawn(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand | None:
@@ -212,7 +213,8 @@ def _drawn(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand 
             f"{base_file} has fewer grasps than the scenes were made of; give the base shard they come from"
         )
     joints = np.asarray(base["grasp/joint_positions"], float)[source]
-    return DrawnHand(model, rows, np.asarray(scene["grasp/hand_pose"], float)[rows], joints)
+    poses = np.asarray(scene["grasp/hand_pose"], float)[rows]
+    return DrawnHand(model, rows, poses, joints, wrists_of(scene, rows))
 
 
 def _show(bar: Progress, task: TaskID, done: float, total: float, message: str) -> None:

@@ -25,6 +25,7 @@ from worker.grasps import Posture
 from worker.objects.prepare import object_from_path
 from worker.scenes.clearance import count_rejections, transfer
 from worker.scenes.neighbours import Neighbours, drop_together
+from worker.scenes.rest import rolling_note, rolling_poses
 from worker.scenes.simulate import drop
 
 app = typer.Typer(add_completion=False)
@@ -64,13 +65,17 @@ def scene(
     attributes |= made_of(base) | {"shard_id": id_of_columns(result)}
     write_output(output, write_shard("scene", result, attributes))
     clear, total = int(result["grasp/valid"].sum()), len(result["grasp/valid"])
+    rolling = rolling_poses(obj, poses)
     reasons = count_rejections(result["grasp/rejection"])
     if json:
         emit(
             {"file": str(output), "scenes": scenes, "grasps": total, "clear": clear, "rejected": reasons}
+            | {"rolling_scenes": rolling}
             | {"seconds": round(seconds, 2)}
         )
         return
     typer.echo(f"{output}: {scenes} scenes, {clear} of {total} grasps stay clear, {seconds:.1f} s")
     if any(reasons.values()):
         typer.echo("too near: " + ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in reasons.items() if n))
+    if (note := rolling_note(rolling, scenes)) is not None:
+        typer.echo(note)

@@ -50,6 +50,7 @@ from worker.planners import PLANNERS
 from worker.planners.registry import of_this_machine, parsed_options
 from worker.quality.referee.key import Level
 from worker.run import Progress as Report
+from worker.scenes.rest import rolling_note
 
 app = typer.Typer()
 #: Exit code of a run that found fewer grasps than it was asked for.
@@ -252,6 +253,7 @@ def _said(found: dict[str, Any]) -> str:
             f"{found['scene']}, {found['scenes']} scenes: {found['clear_share']:.0%} of the tries are clear of what "
             f"stands there, {found['lift_share']:.0%} lift, {found['lift_hard_share']:.0%} at half the friction"
         )
+        lines += [note for note in [rolling_note(found["rolling_scenes"], found["scenes"])] if note]
     if found["reason"] is not None:
         lines.append(found["reason"])
     return "\n".join(lines)

@@ -39,6 +39,7 @@ from worker.pool.size import processes_at_once
 from worker.quality.referee.limit import Limit
 from worker.run import FirstJudge, Progress, Run
 from worker.scenes.beside import scenes_of
+from worker.scenes.rest import rolling_poses
 from worker.together import certified_batches, distinct_batches
 
 Arrays = dict[str, NDArray[Any]]
@@ -62,6 +63,8 @@ class Synthesized:
     """Whether it was stopped before the end."""
     seconds: float
     """Wall time, without the reading of the files [s]."""
+    rolling: int = 0
+    """Scenes in which the object may roll, see `rolling_poses`."""
 
     @property
     def reason(self) -> str | None:
@@ -69,14 +72,16 @@ class Synthesized:
         request = self.request
         if self.interrupted:
             return f"interrupted: {len(self.arrays['quality/valid'])} of {request.grasps} grasps were there"
-        limit = self.limit
+        limit, narrow = self.limit, self.batches[0].narrow
         reason = shortfall(
             len(self.arrays["quality/valid"]), request.grasps, request.counted,
             sum(batch.tried for batch in self.batches), request.budget,
             totals(batch.outcomes for batch in self.batches),
             limit.line if limit is not None and limit.hopeless else "",
         )  # fmt: skip
-        return reason if limit is None or limit.hopeless else f"{reason}; {limit.line}"
+        if limit is not None and not limit.hopeless:
+            reason = f"{reason}; {limit.line}"
+        return f"{reason}; {narrow}" if reason and narrow else reason
 
     @property
     def limit(self) -> Limit | None:
@@ -122,6 +127,7 @@ class Synthesized:
             }  # fmt: skip
         if self.place.kind != "free":
             told |= {"scene": self.place.kind, "scenes": len(self.arrays["scene/object_pose"])} | self._shares()
+            told["rolling_scenes"] = self.rolling
         return told
 
     def _diversity(self) -> dict[str, Any]:
@@ -246,7 +252,8 @@ def synthesized(
     if poses:
         attributes |= {"scene": json_attribute(_as_stored(place, others))} | wrist_attributes(model)
         attributes |= beside_attributes(others, [one.object for one in place.neighbours])
-    made = Synthesized(arrays, attributes, batches, request, place, interrupted, seconds)
+    rolling = rolling_poses(thing, poses["scene/object_pose"]) if poses and place.target is None else 0
+    made = Synthesized(arrays, attributes, batches, request, place, interrupted, seconds, rolling)
     if made.reason is not None:
         attributes["reason"] = made.reason
     return made

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, Final
@@ -78,9 +78,10 @@ class Oppositions:
         """The greatest width [m]; 0 for a hand that cannot oppose its fingers."""
         return float(self.width[-1]) if len(self) else 0.0
 
-    def none(self) -> Oppositions:
-        """None of them."""
-        return Oppositions(self.q[:0], self.axis[:0], self.middle[:0], self.width[:0])
+    @classmethod
+    def of_none(cls, hand: HandModel) -> Oppositions:
+        """No posture of a hand."""
+        return cls(np.zeros((0, hand.dofs)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
 
 _known: LRUCache[str, Oppositions] = LRUCache(16)
@@ -104,24 +105,32 @@ def _code() -> tuple[ModuleType, ...]:
 
 def _oppositions(hand: HandModel) -> Oppositions:
     if len(hand.fingertips) < 2:
-        return Oppositions(np.zeros((0, hand.dofs)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+        return Oppositions.of_none(hand)
+    one = opposed_finger(hand)
     pads = [fingertip_pad(hand, body) for body in hand.fingertips]
-    tried = []
-    for one in range(len(pads)):
-        seen = _Seen.of(hand, pads, one, _postures(hand, one, POSTURES))
-        tried.append((float(np.sort(seen.cost(seen.width))[: POSTURES // 4].mean()), one))
-    one = min(tried)[1]
-    q = _postures(hand, one, CROWD * POSTURES)
+    q = random_postures(hand, one, CROWD * POSTURES)
     seen = _Seen.of(hand, pads, one, q)
     # Of postures about as wide the best, which then climbs.
     order = np.argsort(seen.width, kind="stable").reshape(POSTURES, CROWD)
     q = q[order[np.arange(POSTURES), seen.cost(seen.width)[order].argmin(axis=1)]]
-    q, seen = _climbed(hand, pads, one, q, np.linspace(THINNEST_M, np.quantile(seen.width, 0.98), POSTURES))
+    wanted = np.linspace(THINNEST_M, np.quantile(seen.width, 0.98), POSTURES)
+    q = climbed(hand, one, q, lambda tried: _Seen.of(hand, pads, one, tried).cost(wanted))
+    seen = _Seen.of(hand, pads, one, q)
     good = np.flatnonzero(
         (seen.facing > FACING) & (seen.square < SQUARE) & (seen.width > THINNEST_M) & (seen.ahead > AHEAD_M)
     )
     good = good[np.argsort(seen.width[good], kind="stable")]
     return Oppositions(q[good], seen.axis[good], seen.middle[good], seen.width[good])
+
+
+def opposed_finger(hand: HandModel) -> int:
+    """The fingertip that opposes the others best, as a rule the thumb's."""
+    pads = [fingertip_pad(hand, body) for body in hand.fingertips]
+    tried = []
+    for one in range(len(pads)):
+        seen = _Seen.of(hand, pads, one, random_postures(hand, one, POSTURES))
+        tried.append((float(np.sort(seen.cost(seen.width))[: POSTURES // 4].mean()), one))
+    return min(tried)[1]
 
 
 @dataclass(frozen=True)
@@ -162,23 +171,23 @@ class _Seen:
         return np.asarray(-3 * np.minimum(self.facing, 0.95) + np.abs(self.width - wanted) / WIDTH_M + near + aside)
 
 
-def _climbed(hand: HandModel, pads: list[Pad], one: int, q: Floats, wanted: Floats) -> tuple[Floats, _Seen]:
-    """Postures that random steps, ever smaller, made better, each for its width."""
+def climbed(hand: HandModel, one: int, q: Floats, cost: Callable[[Floats], Floats]) -> Floats:
+    """Postures (N, D) that random steps, ever smaller, made better by their `cost` (N,)."""
     rng = np.random.default_rng(one)
     finger, rank = _ranks(hand)
-    best = _Seen.of(hand, pads, one, q).cost(wanted)
+    best = cost(q)
     for step in np.geomspace(0.3, 0.03, CLIMBS):
         together = np.where(hand.closing != 0, rng.standard_normal((len(q), rank.max() + 1))[:, rank], 0.0)
         noise = np.where(finger == one, rng.standard_normal((len(q), hand.dofs)), together)
         noise = noise * (rng.random(noise.shape) < 0.6)
         tried = np.clip(q + step * hand.span * noise, hand.lower, hand.upper)
-        cost = _Seen.of(hand, pads, one, tried).cost(wanted)
-        better = cost < best
-        q[better], best[better] = tried[better], cost[better]
-    return q, _Seen.of(hand, pads, one, q)
+        found = cost(tried)
+        better = found < best
+        q[better], best[better] = tried[better], found[better]
+    return q
 
 
-def _postures(hand: HandModel, one: int, count: int) -> Floats:
+def random_postures(hand: HandModel, one: int, count: int) -> Floats:
     """(count, D): all dofs of one finger by themselves; the joints of the others close alike, rank by rank."""
     rng = np.random.default_rng(one)
     finger, rank = _ranks(hand)

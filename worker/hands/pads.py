@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, quat_conjugate, quat_rotate
+from service.model.transforms import IDENTITY_POSE, quat_conjugate, quat_rotate, spread_directions
 from worker.hands.jaws import jaws_of
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
@@ -18,6 +18,8 @@ from worker.hands.surface import sample_surface
 PAD: Final = 0.5
 #: Least cosine of a pad's normals with its motion.
 _AHEAD: Final = 0.7
+#: Directions in which a fingertip is measured.
+_DIRECTIONS: Final = 256
 #: Points of the hand's surface that pads are made of.
 _POINTS: Final = 1000
 
@@ -71,6 +73,15 @@ def fingertip_pad(hand: HandModel, tip: int) -> Pad:
             return Pad(tip, place.mean(axis=0), ahead, place)
     look = normal[chosen].mean(axis=0)
     return Pad(tip, place[chosen].mean(axis=0), look / max(float(np.linalg.norm(look)), 1e-9), place[chosen])
+
+
+def thinnest_fingertip(hand: HandModel) -> float:
+    """Least width of a fingertip in any direction [m]; 0 where one has no shape."""
+    ways, tips = spread_directions(_DIRECTIONS), []
+    for tip in hand.fingertips:
+        corners = [piece.vertices for piece in hand.pieces if piece.body == tip]
+        tips.append(float(np.ptp(np.concatenate(corners) @ ways.T, axis=0).min()) if corners else 0.0)
+    return min(tips, default=0.0)
 
 
 def _moved_ahead(hand: HandModel, tip: int, driven: int, place: Floats, normal: Floats) -> NDArray[np.bool_]:

@@ -40,8 +40,9 @@ CLOSING_M: Final = 0.009
 #: of what is held, for forces at the edge of their cones slip as soon as a contact is not quite where it was thought.
 TOTAL_NORMAL_FORCE: Final = 50.0
 FRICTION: Final = 0.3
-#: The same over the object's weight, at least.
-OF_WEIGHT: Final = 10.0
+#: The same over the object's weight, at least and at most: 50 N push what is light and flat from between fingertips,
+#: which bear against its upper edges. At 0.1 kg the most is 50 N.
+OF_WEIGHT: Final = (10.0, 50.0)
 
 
 def pregrasp(
@@ -127,7 +128,8 @@ def hold_forces(
 
 def normal_force(obj: ObjectModel) -> float:
     """Sum of the contact forces' normal components with which an object is held [N]."""
-    return max(TOTAL_NORMAL_FORCE, OF_WEIGHT * ACCELERATION * obj.mass)
+    least, most = (times * ACCELERATION * obj.mass for times in OF_WEIGHT)
+    return min(max(TOTAL_NORMAL_FORCE, least), most)
 
 
 def touching_links(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.int32]:

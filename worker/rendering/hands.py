@@ -37,12 +37,19 @@ class DrawnHand:
     """(S, 7) root link in the table frame; ignored where there is no grasp."""
     joint_positions: Floats
     """(S, J)"""
+    wrist: Floats | None = None
+    """(S, U) angles of the wrist with which the links above the hand's root are drawn; None: they are not."""
 
     def body_poses(self) -> Floats:
         """(S, B, 7) poses of the drawn bodies in the table frame."""
-        bodies = np.array(body_poses(self.hand, self.hand_pose, self.joint_positions))
+        bodies = drawn_poses(self.hand, self.hand_pose, self.joint_positions, self.wrist)
         bodies[self.grasp < 0] = [0, 0, _AWAY_M, 1, 0, 0, 0]
-        return bodies[:, drawn_bodies(self.hand)]
+        return bodies
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The drawn solids."""
+        return drawn_parts(self.hand, mounted=self.wrist is not None)
 
 
 @dataclass(frozen=True)
@@ -63,6 +70,20 @@ def hand_parts(hand: HandModel) -> tuple[Part, ...]:
         if hand.content not in _parts:
             _parts[hand.content] = tuple(_drawn(hand))
         return _parts[hand.content]
+
+
+def drawn_parts(hand: HandModel, *, mounted: bool) -> tuple[Part, ...]:
+    """What is drawn of a hand, and if it is `mounted` of the links above its root, whose bodies are numbered anew."""
+    above = hand.mounting if mounted else None
+    return hand_parts(hand) + (() if above is None else hand_parts(above))
+
+
+def drawn_poses(hand: HandModel, hand_pose: Floats, joint_positions: Floats, wrist: Floats | None) -> Floats:
+    """(N, P, 7) poses of `drawn_parts` of N hands, mounted at wrist angles (N, U) where they are given."""
+    poses = [body_poses(hand, hand_pose, joint_positions)[:, drawn_bodies(hand)]]
+    if wrist is not None and (above := hand.mounting) is not None:
+        poses.append(body_poses(above, hand_pose, above.expand(wrist))[:, drawn_bodies(above)])
+    return np.concatenate(poses, axis=1)
 
 
 def without_visuals(hand: HandModel) -> HandModel:

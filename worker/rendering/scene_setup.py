@@ -15,7 +15,7 @@ from service.model.transforms import apply
 from worker.objects.model import Floats, ObjectModel
 from worker.rendering.camera_file import SAMPLED, GivenCameras
 from worker.rendering.cameras import intrinsics, narrow_field, sample_hemisphere, stereo_pair
-from worker.rendering.hands import DrawnHand, hand_looks, hand_solids
+from worker.rendering.hands import DrawnHand
 from worker.rendering.palette import lamp, object_look, table_look
 from worker.rendering.scenery import Box, Look, Pictures, Shot, Solid
 from worker.rendering.standing import TABLE, Supports, seen_share, slab_poses, slabs
@@ -119,9 +119,9 @@ class Setting:
 
     def shoot_with(self, drawn: DrawnHand, run: Run) -> Pictures:
         """The same pictures with a hand in them."""
-        key = (*self._key(), drawn.hand.content, run.device)
-        stage = _kept(key, lambda: [*self._solids(), *hand_solids(drawn.hand)], run.device)
-        shown = hand_looks(drawn.hand)
+        key = (*self._key(), drawn.hand.content, drawn.wrist is not None, run.device)
+        stage = _kept(key, lambda: [*self._solids(), *(part.solid for part in drawn.parts)], run.device)
+        shown = [part.look for part in drawn.parts]
         stage.place(
             np.concatenate([self._poses, drawn.body_poses()], axis=1), [[*looks, *shown] for looks in self.looks]
         )

@@ -194,7 +194,8 @@ class _Heap:
             laid = lay_flat(self.faces[k], face, pose)
             middle = laid[:3] + quat_rotate(laid[3:], obj.centre_of_mass)
             lift = abs(float(middle[2] - (pose[:3] + quat_rotate(pose[3:], obj.centre_of_mass))[2]))
-            if angle > MAX_SETTLE_ANGLE or lift > MAX_LIFT or np.hypot(*middle[:2]) > (NEIGHBOUR_REACH if k else REACH):
+            away = np.hypot(*middle[:2]) > (NEIGHBOUR_REACH if k else REACH)
+            if away or angle > MAX_SETTLE_ANGLE or lift > MAX_LIFT or self.faces[k].topples(face):
                 return None
             flat.append(laid)
             first = face if k == 0 else first

@@ -24,6 +24,10 @@ COPLANAR_ANGLE = np.radians(0.05)
 STABILITY_MARGIN = 1e-4
 #: Resting faces whose normals differ by less than this count as one: scanned flat bottoms fall into many facets [rad].
 SAME_FACE_ANGLE = np.radians(2.0)
+#: By which the surface may be other than it is: that of convex pieces, a real thing's [m].
+CHANGE_M = 1e-3
+#: A pose that may turn farther than this under such a change rolls [rad].
+ROLLS = np.radians(20.0)
 
 
 @dataclass(frozen=True)
@@ -36,11 +40,54 @@ class RestingFaces:
     """(C,) normal . x of the face's plane [m]."""
     successor: Ints
     """(C,) the face the object tips to when put down on this one; the face itself where it is stable."""
+    height: Floats
+    """(C,) of the centre of mass above each face [m]."""
+    sides: Ints
+    """(E, 2) a face, and the one across one of its edges."""
+    margin: Floats
+    """(E,) distance of the centre of mass, seen from above, inside that edge [m]."""
+    width: Floats
+    """(E,) of the face, across that edge [m]."""
 
     @property
     def stable(self) -> Ints:
         """Indices of the faces the object can stand on."""
         return np.flatnonzero(self.successor == np.arange(len(self.successor))).astype(np.int32)
+
+    def looseness(self, face: int) -> tuple[float, float]:
+        """How far an object that stands on a face may turn [rad], and its centre of mass sink [m], when its surface
+        changes by `CHANGE_M`: over edges across which the tilt of a face by that much brings the centre of mass."""
+        from scipy.sparse import csr_array  # slow to load
+        from scipy.sparse.csgraph import breadth_first_order
+
+        here, there = self.sides.T
+        crossed = self.margin <= self.height[here] * CHANGE_M / self.width
+        count = len(self.normal)
+        graph = csr_array((np.ones(int(crossed.sum())), (here[crossed], there[crossed])), shape=(count, count))
+        reached = breadth_first_order(graph, face, return_predecessors=False)
+        cosine = float((self.normal[reached] @ self.normal[face]).min())
+        return float(np.arccos(np.clip(cosine, -1.0, 1.0))), float(self.height[face] - self.height[reached].min())
+
+    def topples(self, face: int) -> bool:
+        """Whether a change of the surface by `CHANGE_M` lets the object fall to a lower face."""
+        return self.looseness(face)[1] > CHANGE_M
+
+
+def rolling_poses(obj: ObjectModel, poses: Floats) -> int:
+    """How many of the rest poses (S, 7) on a table a change of the object's surface by `CHANGE_M` may turn farther than
+    `ROLLS`: those of round things."""
+    faces = resting_faces(obj.centred)
+    return sum(faces.looseness(settle(faces, pose[3:])[0])[0] > ROLLS for pose in np.asarray(poses, float))
+
+
+def rolling_note(rolling: int, scenes: int) -> str | None:
+    """What to say of scenes in which the object may roll; None where there are none."""
+    if not rolling:
+        return None
+    return (
+        f"in {rolling} of {scenes} scenes the object lies on a round side: {1e3 * CHANGE_M:.0f} mm of change of its "
+        f"surface may roll it by more than {np.degrees(ROLLS):.0f} degrees"
+    )
 
 
 def resting_faces(obj: ObjectModel) -> RestingFaces:
@@ -62,7 +109,13 @@ def resting_faces(obj: ObjectModel) -> RestingFaces:
     normal = weighted / length
     offset = np.full(count, -np.inf)
     np.maximum.at(offset, np.repeat(label, 3), _support(normal[np.repeat(label, 3)], mesh.vertices[mesh.faces.ravel()]))
-    return RestingFaces(normal, offset, _successors(mesh, label, normal, obj.centre_of_mass))
+    sides, margin, width = _edges(mesh, label, normal, obj.centre_of_mass)
+    successor = np.arange(count, dtype=np.int32)
+    farthest = np.full(count, STABILITY_MARGIN * float(np.linalg.norm(mesh.extents)))
+    for (here, there), overhang in zip(sides.tolist(), (-margin).tolist(), strict=True):
+        if overhang > farthest[here]:
+            farthest[here], successor[here] = overhang, there
+    return RestingFaces(normal, offset, successor, offset - normal @ obj.centre_of_mass, sides, margin, width)
 
 
 def _support(normals: Floats, points: Floats) -> Floats:
@@ -78,12 +131,12 @@ def _merge_coplanar(mesh: trimesh.Trimesh) -> Ints:
     return np.asarray(label, np.int32)
 
 
-def _successors(mesh: trimesh.Trimesh, label: Ints, normal: Floats, centre: Floats) -> Ints:
-    """The neighbour across the edge over which the centre of mass lies farthest outside; itself where inside."""
-    tolerance = STABILITY_MARGIN * float(np.linalg.norm(mesh.extents))
-    successor = np.arange(len(normal))
-    farthest = np.full(len(normal), tolerance)
+def _edges(mesh: trimesh.Trimesh, label: Ints, normal: Floats, centre: Floats) -> tuple[Ints, Floats, Floats]:
+    """Each edge of each flat face: the face and the one across it (E, 2), how far inside it a point projects (E,), and
+    the face's extent across it (E,) [m]."""
     edges, pairs = mesh.face_adjacency_edges, mesh.face_adjacency
+    corners = [np.unique(mesh.faces[label == face]) for face in range(int(label.max()) + 1)]
+    sides, margins, widths = [], [], []
     for side in (0, 1):
         here, there = label[pairs[:, side]], label[pairs[:, 1 - side]]
         start, end = mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]]
@@ -91,11 +144,12 @@ def _successors(mesh: trimesh.Trimesh, label: Ints, normal: Floats, centre: Floa
         outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-30)
         opposite = mesh.triangles_center[pairs[:, side]]
         outward *= -np.sign(np.einsum("ij,ij->i", outward, opposite - start))[:, None]
-        overhang = np.einsum("ij,ij->i", outward, centre - start)
-        for k in np.flatnonzero(here != there):
-            if overhang[k] > farthest[here[k]]:
-                farthest[here[k]], successor[here[k]] = overhang[k], there[k]
-    return successor.astype(np.int32)
+        between = np.flatnonzero(here != there)
+        inside = [((start[k] - mesh.vertices[corners[here[k]]]) @ outward[k]).max() for k in between]
+        sides.append(np.stack([here, there], axis=1)[between])
+        margins.append(np.einsum("ij,ij->i", outward, start - centre)[between])
+        widths.append(np.maximum(inside, 1e-9))
+    return np.concatenate(sides).astype(np.int32), np.concatenate(margins), np.concatenate(widths)
 
 
 def settle(faces: RestingFaces, quaternion: Floats) -> tuple[int, float]:

@@ -85,8 +85,8 @@ class _Table:
 def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     """Let an object fall onto a table until it rests, `count` times.
 
-    Drops that time out, roll away or do not stand on a face that holds the centre of mass are redone with a new
-    sample. Scene i depends on the object, the seed and i alone.
+    Drops that time out, roll away or do not stand on a face that holds the centre of mass, were the surface other by
+    a millimetre, too, are redone with a new sample. Scene i depends on the object, the seed and i alone.
 
     Args:
         obj: the object.
@@ -189,7 +189,7 @@ def _redo_until_rest(table: _Table, name: str, key: tuple[int, int]) -> Rest:
 
 
 def _drop_once(table: _Table, rng: np.random.Generator) -> Rest | None:
-    """One drop; None if it timed out, rolled away or stands on no face."""
+    """One drop; None if it timed out, rolled away, or stands on no face or on one that it topples from."""
     quaternion = rng.normal(size=4)
     quaternion /= np.linalg.norm(quaternion)
     lowest = float(quat_rotate(quaternion, table.hull)[:, 2].min())
@@ -203,7 +203,7 @@ def _drop_once(table: _Table, rng: np.random.Generator) -> Rest | None:
         return None
     quaternion = data.qpos[3:] / np.linalg.norm(data.qpos[3:])
     face, angle = settle(table.faces, quaternion)
-    if angle > MAX_SETTLE_ANGLE:
+    if angle > MAX_SETTLE_ANGLE or table.faces.topples(face):
         return None
     pose = lay_flat(table.faces, face, np.concatenate([data.qpos[:3], quaternion]))
     away = float(np.hypot(*(pose[:3] + quat_rotate(pose[3:], table.centre))[:2]))

@@ -8,6 +8,7 @@ from service.model.messages import TaskMessage
 from service.model.scene_kinds import supports_in
 from service.model.states import Stage
 from service.model.transforms import compose
+from service.readers.ways import wrists_of
 from service.store import standing
 from service.store.attributes import Attribute
 from service.store.shards import Shard, json_attribute
@@ -67,5 +68,5 @@ def _drawn(base: Shard, message: TaskMessage, context: TaskContext) -> DrawnHand
     poses = np.asarray(base["scene/object_pose"], float)
     return DrawnHand(
         hand, rows, compose(poses, np.asarray(base["grasp/hand_pose"], float)[rows]),
-        np.asarray(base["grasp/joint_positions"], float)[rows],
+        np.asarray(base["grasp/joint_positions"], float)[rows], wrists_of(base, rows),
     )  # fmt: skip

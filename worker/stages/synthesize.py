@@ -110,9 +110,9 @@ def _check_hope(message: TaskMessage, found: Certified, *, in_scenes: bool) -> N
     if limit is not None and limit.hopeless:
         raise LoadError(f"{none}: {limit.line}")
     if in_scenes:
+        lost = "; ".join(filter(None, [told(found.outcomes), found.narrow, limit.line if limit is not None else ""]))
         raise SceneError(
-            f"{none} in its scene ({request.place.kind}): {told(found.outcomes)}; "
-            f"{limit.line + '; ' if limit is not None else ''}give "
+            f"{none} in its scene ({request.place.kind}): {lost}; give "
             f"a larger budget than {request.budget:g} tries for each grasp, or another pose, scene, hand or seed"
         )
 

@@ -8,7 +8,7 @@ import pytest
 from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
 from service.model.transforms import quat_from_axis_angle
-from service.readers.ways import Waypoint, point_at, scene_spec_of, stop_places, way_of
+from service.readers.ways import Waypoint, point_at, scene_spec_of, stop_places, way_of, wrists_of
 from service.store.shards import Shard, json_attribute
 
 WAYPOINTS = 4
@@ -80,3 +80,10 @@ def test_a_shard_says_its_scene_or_none_and_nonsense_is_refused():
     assert scene_spec_of(Shard("base", {"scene": json_attribute(spec.model_dump(mode="json"))}, {})) == spec
     with pytest.raises(InputError, match="says no scene"):
         scene_spec_of(Shard("base", {"scene": '{"kind": "moon"}'}, {}))
+
+
+def test_wrists_are_those_of_the_rows_asked_for():
+    one = shard(in_scene=True)
+    assert wrists_of(one, np.array([0])) is None
+    one.arrays["grasp/wrist_positions"] = np.array([[0.1, 0.2], [0.3, 0.4]])
+    assert np.array_equal(wrists_of(one, np.array([1, 1])), [[0.3, 0.4]] * 2)

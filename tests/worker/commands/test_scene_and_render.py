@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 
 from service.model.scene_spec import SceneSpec
 from service.store.shards import json_attribute, read_shard, write_shard
-from worker.commands import grasp_sheet
+from worker.commands import grasp_sheet, render
 from worker.commands.exchange import app as exchange
 from worker.commands.grasp_animation import AFTER_S, BEFORE_S
 from worker.commands.render import app as rendering
@@ -260,3 +260,16 @@ def test_another_neighbour_than_the_shards_is_refused(base):
     result = CliRunner().invoke(rendering, arguments)
     assert result.exit_code == 2
     assert "neighbour 'mug' has digest" in result.output
+
+
+def test_hands_of_grasps_in_scenes_are_drawn_with_their_wrists(base: Path):
+    shard, wrist = read_shard(base), 0.1 * np.arange(2.0 * GRASPS).reshape(GRASPS, 2)
+    shard.arrays.update({
+        "scene/object_pose": np.tile([0.0, 0, 0, 1, 0, 0, 0], (GRASPS, 1)), "grasp/scene_index": np.arange(GRASPS),
+        "grasp/wrist_positions": wrist,
+    })  # fmt: skip
+    shard.attributes["scene"] = json_attribute({"kind": "table"})
+    around, drawn = grasp_sheet.around_of(shard, np.array([2, 0])), render._drawn_in(shard, None)
+    assert np.array_equal(around.wrist, wrist[[2, 0]])
+    assert drawn is not None
+    assert np.array_equal(drawn.wrist, wrist)

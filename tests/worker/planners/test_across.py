@@ -6,15 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from service.model.fidelity import resolve_fidelity
 from service.model.transforms import apply, quat_from_matrix, quat_rotate
+from tests.worker.models import object_from_mesh
 from tests.worker.simulation.rigs import ball
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.oppositions import oppositions_of
 from worker.hands.pads import pads_of
+from worker.hands.pinches import pinches_of
 from worker.objects.prepare import object_from_path
 from worker.planners.fast_graspd.across import ACROSS, NEAR_M, Openings, across, crossings_of, promising
 from worker.planners.fast_graspd.outlines import outlines_of
@@ -71,6 +74,18 @@ def test_what_a_hand_cannot_span_or_reach_is_told(block, barrett) -> None:
     opening = Openings.of(known, wide, lying(wide))
     assert not opening.within_reach
     assert not len(opening.sums)
+
+
+def test_hands_reach_across_what_lies_flat_with_the_ends_of_their_fingertips_from_above(barrett) -> None:
+    flat = object_from_mesh(trimesh.creation.box([0.06, 0.06, 0.01]))
+    scene, standing = lying(flat), Surroundings((Obstacle.half_space([1.0, 0, 0], -0.03),), np.array([1.0, 0, 0]))
+    opening = Openings.in_scene(barrett, flat, scene)
+    assert len(opening.known) == len(pinches_of(barrett, 0.01)) > 0
+    assert len(Openings.in_scene(barrett, flat, standing).known) == len(oppositions_of(barrett))
+    found = across(barrett, flat, opening, np.random.default_rng(1).random((60, 6)), free_ways(scene, flat))
+    line = np.einsum("nij,nj->ni", found.turn, opening.known.axis[found.posture])
+    assert np.abs(line @ UP).max() < 1e-6
+    assert (found.away @ UP).min() > 0.6
 
 
 def test_hands_hold_the_middle_between_their_fingers_and_come_from_a_free_way(block, barrett) -> None:
@@ -147,7 +162,7 @@ def test_outlines_tell_how_far_a_hand_must_rise(block, barrett, tips_m) -> None:
     scene = Surroundings((table,), UP)
     found = across(barrett, block, opening, uniform, ways)
     centre = found.pivot + block.centre_of_mass
-    told = outlines_of(barrett).lacks(found.posture, found.turn, centre, scene, room=0.006)
+    told = outlines_of(barrett, oppositions_of(barrett)).lacks(found.posture, found.turn, centre, scene, room=0.006)
     root = centre - np.einsum("nij,j->ni", found.turn, barrett.palm.centre)
     q = found.q(barrett, np.zeros((60, barrett.dofs)))
     posture = Posture(np.concatenate([root, quat_from_matrix(found.turn)], axis=1), barrett.expand(q))

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 import trimesh
 
+from service.model.matter import ACCELERATION
 from service.model.transforms import quat_multiply, quat_rotate
 from tests.worker.models import object_from_mesh
 from tests.worker.quality.helpers import pad_hand, posture
 from worker.grasps import GraspSet, Posture
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.lift import Lift, LiftOutcome
+from worker.quality.referee.lifting import lift_key
 from worker.quality.referee.model import MujocoOptions, build
 from worker.simulation.obstacles import obstacle_distances
 from worker.simulation.surroundings import Neighbour, Obstacle, Placed
@@ -130,9 +132,9 @@ def test_a_box_whose_mesh_has_its_origin_elsewhere_stands_still_and_is_lifted_al
     assert moved < 5e-4 and turned < 1e-3
 
 
-def beside(place: tuple[float, float], size: tuple[float, float, float]) -> Lift:
+def beside(place: tuple[float, float], size: tuple[float, float, float], mass: float = 0.1) -> Lift:
     """The test with a neighbour that stands on the table at `place`, as seen from the box's middle."""
-    other = object_from_mesh(trimesh.creation.box(size))
+    other = object_from_mesh(trimesh.creation.box(size)).weighing(mass=mass)
     neighbour = Neighbour(other, (other.hull_vertices,), (), 0.0)
     pose = np.array([[[*place, size[2] / 2, 1.0, 0, 0, 0]]])
     placed = dataclasses.replace(PLACED, neighbours=(neighbour,), neighbour_pose=pose)
@@ -150,6 +152,17 @@ def test_a_hand_that_comes_through_a_neighbour_has_touched_it() -> None:
     size = (0.2, 0.02, 0.2)
     assert beside((0.0, -0.09), size).lift(coming, 0).outcome is LiftOutcome.TOUCHED_ON_THE_WAY
     assert beside((0.0, 0.09), size).lift(coming, 0).outcome is LiftOutcome.LIFTED
+
+
+def test_a_neighbour_has_its_own_mass_which_moves_the_key_of_lifts() -> None:
+    light, heavy = (beside((0.0, 0.3), (0.05, 0.05, 0.1), mass) for mass in (0.05, 2.0))
+    for test, mass in ((light, 0.05), (heavy, 2.0)):
+        test._begin(grasp(0.05), 0)
+        (free,) = test.scene.neighbours
+        assert free.mass == pytest.approx(mass)
+        assert np.linalg.norm(test.data.xfrc_applied[free.body]) == pytest.approx(ACCELERATION * mass)
+    keys = [lift_key(HAND, BOX, test.placed, "lift", False, pieces=WHOLE) for test in (light, heavy)]
+    assert keys[0] != keys[1]
 
 
 def test_a_neighbour_that_leans_has_toppled() -> None:

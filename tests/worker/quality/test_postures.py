@@ -16,7 +16,7 @@ from worker.hands.jacobian import generalized_forces
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.quality.opening import CLEARANCE_M, JAM_M, PALM_CLEARANCE_M
-from worker.quality.postures import hold_forces, pregrasp, squeeze
+from worker.quality.postures import hold_forces, normal_force, pregrasp, squeeze
 from worker.quality.probe import Probe
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
@@ -169,3 +169,8 @@ def test_a_finger_opens_no_farther_than_its_neighbour_lets_it() -> None:
     assert 0.0005 < opened[0] <= 0.002 + JAM_M
     free = (CLOSED.joint_positions - pregrasp(PLATES, BOX, CLOSED).joint_positions)[0]
     assert free[0] == pytest.approx(0.004)
+
+
+def test_what_is_light_is_held_more_gently_and_what_is_heavy_more_firmly() -> None:
+    forces = [normal_force(dataclasses.replace(BOX, mass=mass)) for mass in (0.02, 0.1, 0.5, 1.0)]
+    assert forces == pytest.approx([10.0, 50.0, 50.0, 100.0])

@@ -12,6 +12,8 @@ from PIL import Image
 from service.model.scene_spec import Box, HalfSpace
 from service.readers.ways import Waypoint
 from tests.worker.models import object_from_mesh, two_finger_hand
+from worker.hands.kinematics import body_poses
+from worker.rendering.hands import DrawnHand, drawn_bodies
 from worker.rendering.pages.way_pictures import Around, way_pictures
 
 HAND = two_finger_hand()
@@ -82,3 +84,24 @@ def test_each_grasp_stands_in_its_own_scene(block):
     alone = way_pictures(HAND, block, [[at("grasp")]], Around((HalfSpace(),), turned), (48, 48), samples=2)[0, 0, 0]
     np.testing.assert_array_equal(second, alone)
     assert (first != second).any()
+
+
+def test_links_above_the_root_are_drawn_at_the_angles_of_the_wrist(block):
+    # A copy of the hand behind its root serves as a forearm with two wrist joints.
+    back = np.array([0, 0, -0.12])
+    forearm = replace(HAND, pieces=tuple(replace(p, vertices=p.vertices + back) for p in HAND.pieces))
+    mounted, around = replace(HAND, mounting=forearm), Around((HalfSpace(),), REST)
+
+    def picture(hand, wrist) -> np.ndarray:
+        where = replace(around, wrist=wrist if wrist is None else np.array([wrist]))
+        return way_pictures(hand, block, [[at("grasp")]], where, (48, 48), whole=True, samples=2)[0, 0, 0].astype(int)
+
+    bare, straight, bent = picture(mounted, None), picture(mounted, [0.0, 0.0]), picture(mounted, [0.9, 0.9])
+    assert np.array_equal(bare, picture(HAND, None))
+    assert (np.abs(straight - bare).max(axis=-1) > 40).sum() > 30
+    assert (np.abs(straight - bent).max(axis=-1) > 40).sum() > 5
+    drawn = DrawnHand(mounted, np.array([0, -1]), np.stack([DOWN] * 2), np.zeros((2, 2)), np.array([[0.9, 0.9]] * 2))
+    own, above = drawn.body_poses(), body_poses(forearm, DOWN[None], np.array([[0.9, 0.9]]))[0]
+    assert len(drawn.parts) == own.shape[1] == 2 * len(drawn_bodies(HAND))
+    assert own[0, len(drawn_bodies(HAND)) :] == pytest.approx(above[drawn_bodies(forearm)])
+    assert (own[1, :, 2] < -10).all()

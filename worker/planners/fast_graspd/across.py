@@ -7,7 +7,7 @@ force-closure grasps", 1988). They are found by comparing samples of the surface
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from worker.hands.model import HandModel
 from worker.hands.oppositions import Oppositions, oppositions_of
+from worker.hands.pads import thinnest_fingertip
+from worker.hands.pinches import pinches_of
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.outlines import outlines_of
 from worker.simulation.obstacles import MARGIN_M
@@ -41,6 +43,8 @@ SELDOM: Final = 0.1
 NEAR_M: Final = 0.008
 #: Hands whose draws are compared at once: more only take memory.
 AT_ONCE: Final = 256
+#: How upright hands come to what lies flat (cosine).
+UPRIGHT: Final = 0.9
 #: Noise of the posture as a share of each joint's range, ways that are compared, and differences of width that postures
 #: are taken from [m].
 NOISE: Final = 0.03
@@ -112,16 +116,30 @@ class Openings:
     pairs: Crossings
     sums: Floats
     """(P,) cumulative chance; empty: there is nothing."""
+    known: Oppositions
+    """The hand's postures."""
+    up: Floats
+    """(3,) against gravity, object frame."""
+    upright: bool
+    """Whether the hand comes from above and takes hold of level pairs alone."""
     within_reach: bool
     """Whether a pair lies nearly level, clear of the obstacles, and is no wider than the hand opens: the geometric
     condition for a grasp between opposed fingers from above or from the side."""
 
     @classmethod
-    def of(cls, known: Oppositions, obj: ObjectModel, scene: Surroundings) -> Openings:
+    def of(
+        cls, known: Oppositions, obj: ObjectModel, scene: Surroundings, *, tip: float = 0.0, upright: bool = False
+    ) -> Openings:
+        """`tip`: thickness of the fingertips that must fit beside a pair [m]; `upright` as the field."""
         pairs = crossings_of(obj)
+        level = np.abs(pairs.axis @ scene.up) < STEEP
         fits = pairs.width + 2 * ROOM_M[0] <= known.widest
+        if upright:
+            flat = pairs.axis - (pairs.axis @ scene.up)[:, None] * scene.up
+            length = np.linalg.norm(flat, axis=1, keepdims=True)
+            pairs, fits = replace(pairs, axis=flat / np.maximum(length, 1e-9)), fits & level
         if not fits.any():
-            return cls(pairs, np.zeros(0), False)
+            return cls(pairs, np.zeros(0), known, scene.up, upright, False)
         aside = pairs.middle - obj.centre_of_mass
         aside = aside - (aside @ scene.up)[:, None] * scene.up
         chance = np.exp(-((np.linalg.norm(aside, axis=1) / BESIDE_M) ** 2)) + FAR
@@ -129,18 +147,39 @@ class Openings:
         for obstacle in scene.obstacles:
             for end in pairs.ends():
                 room = np.minimum(room, obstacle.distance(end))
-        easy = room >= MARGIN_M
-        level = np.abs(pairs.axis @ scene.up) < STEEP
+        easy = (room >= MARGIN_M) & (room_beside(pairs, scene, tip) >= 0.0)
         chance *= np.where(level, 1.0, SELDOM) * np.where(easy, 1.0, SELDOM) * fits
-        return cls(pairs, np.cumsum(chance) / chance.sum(), bool((fits & easy & level).any()))
+        within_reach = bool((fits & easy & level).any())
+        return cls(pairs, np.cumsum(chance) / chance.sum(), known, scene.up, upright, within_reach)
+
+    @classmethod
+    def in_scene(cls, hand: HandModel, obj: ObjectModel, scene: Surroundings) -> Openings:
+        """The same between the pads, or of what lies flat between the ends of fingertips that rest beside it."""
+        ends = pinches_of(hand, float(np.ptp(obj.hull_vertices @ scene.up)))
+        tip = thinnest_fingertip(hand)
+        flat = cls.of(ends, obj, scene, tip=tip, upright=True)
+        return flat if len(flat.sums) else cls.of(oppositions_of(hand), obj, scene, tip=tip)
+
+
+def room_beside(pairs: Crossings, scene: Surroundings, width: float) -> Floats:
+    """(P,) least distance of balls of a diameter beside the ends of pairs from walls and neighbours, not from what the
+    object stands on [m]."""
+    out = np.full(len(pairs), np.inf)
+    for obstacle in scene.obstacles:
+        if not len(obstacle.corners) and float(obstacle.planes[0, :3] @ scene.up) > STEEP:
+            continue
+        for end, side in zip(pairs.ends(), (-0.5, 0.5), strict=True):
+            out = np.minimum(out, obstacle.distance(end + side * width * pairs.axis) - 0.5 * width)
+    return out
 
 
 @dataclass(frozen=True)
 class Reaches:
     """n hands that reach across the object."""
 
+    known: Oppositions
     posture: NDArray[np.intp]
-    """(n,) which of the hand's opposed postures."""
+    """(n,) which of these."""
     pivot: Floats
     """(n, 3) palm centres from the object's centre of mass [m]."""
     turn: Floats
@@ -152,7 +191,7 @@ class Reaches:
 
     def q(self, hand: HandModel, normal: Floats) -> Floats:
         """Dofs (n, D) with the noise `normal` (n, D), normally distributed."""
-        known = oppositions_of(hand).q[self.posture]
+        known = self.known.q[self.posture]
         return np.clip(known + NOISE * hand.span * normal, hand.lower, hand.upper)
 
     def beside(self, moved: Floats) -> Floats:
@@ -174,7 +213,9 @@ def across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats
         uniform: (n, 6) random numbers.
         ways: (K, 3) free directions away from the object.
     """
-    known = oppositions_of(hand)
+    known = opening.known
+    if opening.upright and (upright := ways @ opening.up > UPRIGHT).any():
+        ways = ways[upright]
     pair = np.minimum(np.searchsorted(opening.sums, uniform[:, 0]), len(opening.sums) - 1)
     axis = opening.pairs.axis[pair] * np.where(uniform[:, 1] < 0.5, 1.0, -1.0)[:, None]
     width = opening.pairs.width[pair] + 2 * (ROOM_M[0] + (ROOM_M[1] - ROOM_M[0]) * uniform[:, 2])
@@ -192,7 +233,7 @@ def across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats
     # Between holding with the fingertips and with the palm against the object.
     deep = np.maximum(np.einsum("ni,ni->n", reach, palm), 0.0) * uniform[:, 5]
     pivot = opening.pairs.middle[pair] - np.einsum("nij,nj->ni", turn, reach) - deep[:, None] * away
-    return Reaches(posture, pivot - obj.centre_of_mass, turn, away, deep)
+    return Reaches(known, posture, pivot - obj.centre_of_mass, turn, away, deep)
 
 
 def promising(
@@ -213,7 +254,7 @@ def promising(
         keep: at most C.
     """
     count, draws, _ = uniform.shape
-    outlines, off = outlines_of(hand), np.zeros((count, draws))
+    outlines, off = outlines_of(hand, opening.known), np.zeros((count, draws))
     for rows in np.array_split(np.arange(count), 1 + count // AT_ONCE):
         found = across(hand, obj, opening, uniform[rows].reshape(-1, 6), ways)
         lack = outlines.lacks(found.posture, found.turn, found.pivot + obj.centre_of_mass, scene, room=room)

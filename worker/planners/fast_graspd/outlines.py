@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from service.model.transforms import IDENTITY_POSE, apply, spread_directions
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
-from worker.hands.oppositions import oppositions_of
+from worker.hands.oppositions import Oppositions
 from worker.simulation.mounting import OUTERMOST, points_of
 from worker.simulation.obstacles import MARGIN_M
 from worker.simulation.surroundings import Surroundings
@@ -68,16 +68,17 @@ class Outlines:
         return least
 
 
-_known: LRUCache[str, Outlines] = LRUCache(16)
+_known: LRUCache[tuple[str, bytes], Outlines] = LRUCache(16)
 _lock = threading.Lock()
 
 
-def outlines_of(hand: HandModel) -> Outlines:
-    """The outlines of a hand's opposed postures, from memory where they are known."""
+def outlines_of(hand: HandModel, postures: Oppositions) -> Outlines:
+    """The outlines of opposed postures of a hand, from memory where they are known."""
+    key = (hand.content, postures.q.tobytes())
     with _lock:
-        if hand.content not in _known:
-            _known[hand.content] = _outlines(hand, oppositions_of(hand).q)
-        return _known[hand.content]
+        if key not in _known:
+            _known[key] = _outlines(hand, postures.q)
+        return _known[key]
 
 
 def _outlines(hand: HandModel, q: Floats) -> Outlines:

@@ -107,9 +107,9 @@ def size_to_pads(hand: HandModel, width: Floats) -> Size | None:
 def _postures(hand: HandModel, width: Floats, size: Size | None) -> Oppositions:
     """The postures for pairs of places of the widths (P,): none if none holds one."""
     if size == "wide" and width.min() + 2 * ROOM_M[0] > widest_span(hand):
-        return oppositions_of(hand).none()
+        return Oppositions.of_none(hand)
     known = oppositions_of(hand) if size is None else spans_of(hand, size)
-    return known if (width + 2 * ROOM_M[0] <= known.widest).any() else known.none()
+    return known if (width + 2 * ROOM_M[0] <= known.widest).any() else Oppositions.of_none(hand)
 
 
 def _grips(hand: HandModel, obj: ObjectModel, known: Oppositions, device: str, *, deep: float) -> Any:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from service.model.errors import InputError
 from service.model.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply, spread_directions
 from worker.hands.model import HandModel
-from worker.hands.oppositions import oppositions_of
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.across import NEAR_M, Openings, Reaches, across, promising
 from worker.planners.fast_graspd.selection import posture_of
@@ -116,8 +115,7 @@ def clear_scene_starts(
     hand, obj = model.hand.model, model.obj.model
     probe = Probe(model, len(generators), room=ROOM)
     used = set(placed.index.tolist())
-    known = oppositions_of(hand)
-    openings = {s: Openings.of(known, obj, scene) for s, scene in enumerate(placed.scenes) if s in used}
+    openings = {s: Openings.in_scene(hand, obj, scene) for s, scene in enumerate(placed.scenes) if s in used}
     scene = np.repeat(placed.index, each)
     reaching = np.arange(len(scene)) % each % EVERY < REACHING
     reaching &= np.array([len(openings[s].sums) > 0 for s in scene.tolist()], bool)

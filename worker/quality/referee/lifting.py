@@ -22,7 +22,7 @@ from worker.quality.referee.compiled import scene_of
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lift import Lift, LiftOutcome, LiftTrial
-from worker.quality.referee.model import DENSITY, TOUCH_ROUNDING_M, MujocoOptions
+from worker.quality.referee.model import TOUCH_ROUNDING_M, MujocoOptions
 from worker.quality.referee.threads import answers
 from worker.run import ALONE, Run
 from worker.simulation import surroundings
@@ -158,5 +158,6 @@ def lift_key(
         terms.append([TOUCH_ROUNDING_M, *(support.tips_m for support in placed.supports)])
     if placed.neighbours:
         corners = b"".join(np.round(piece, 9).tobytes() for one in placed.neighbours for piece in one.pieces)
-        terms += [digest_bytes(corners), [DENSITY, protocol.NEIGHBOUR_MOVED_M, protocol.NEIGHBOUR_TILTED]]
+        masses = [one.obj.mass for one in placed.neighbours]
+        terms += [digest_bytes(corners), [*masses, protocol.NEIGHBOUR_MOVED_M, protocol.NEIGHBOUR_TILTED]]
     return digest_json(terms)

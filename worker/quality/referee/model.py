@@ -25,8 +25,6 @@ from worker.simulation.surroundings import CLEAR_M, Neighbour, Obstacle
 
 Floats = NDArray[np.float64]
 
-#: Of neighbours [kg/m^3].
-DENSITY: Final = 500.0
 #: Sliding and torsional friction; `hard` scales them by `HARD`.
 FRICTION: Final = (SLIDING, 0.02)
 HARD: Final = (0.5, 0.1)
@@ -219,7 +217,7 @@ def scene_spec(
     if supports:
         _add_supports(spec, supports, friction)
     for k, one in enumerate(neighbours):
-        add_object(spec, one.obj, one.pieces, friction, DENSITY * one.obj.volume, name=f"neighbour{k}")
+        add_object(spec, one.obj, one.pieces, friction, one.obj.mass, name=f"neighbour{k}")
     return spec
 
 

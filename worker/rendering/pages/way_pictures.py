@@ -19,7 +19,7 @@ from worker.hands.model import HandModel
 from worker.objects.frames import to_centre
 from worker.objects.model import Floats, ObjectModel
 from worker.rendering.cameras import intrinsics, look_at
-from worker.rendering.hands import drawn_bodies, hand_looks, hand_solids
+from worker.rendering.hands import drawn_bodies, drawn_parts, drawn_poses
 from worker.rendering.pages.pictures import (
     FIELD_OF_VIEW,
     FLOOR,
@@ -68,6 +68,8 @@ class Around:
     index: NDArray[np.intp] | None = None
     """(N,) scene of each grasp; None: all in the first."""
     neighbours: Neighbours | None = None
+    wrist: Floats | None = None
+    """(N, U) angles of the wrist with which the links above the hand's root are drawn; None: they are not."""
 
     def centred(self, obj: ObjectModel) -> Around:
         """The same with `obj`, which they are of, and the neighbours about their middles."""
@@ -130,10 +132,10 @@ class _Stage:
         self.lamp = TOWARD_LAMP
         self.boxes = slabs(around.supports) or [Box(FLOOR_SIZE)]
         objects = [Solid(o.vertices, o.faces, o.corner_normals) for o in (obj, *self.others)]
-        self.tracer = Tracer([*self.boxes, *objects, *hand_solids(hand)], run.device)
+        parts = drawn_parts(hand, mounted=around.wrist is not None)
+        self.tracer = Tracer([*self.boxes, *objects, *(part.solid for part in parts)], run.device)
         planes = [_TABLE if isinstance(s, HalfSpace) else _WALL for s in around.supports] or [FLOOR]
-        bodies = hand_looks(hand)
-        self.looks = [*planes, OBJECT_LOOK, *(_BESIDE for _ in self.others), *bodies]
+        self.looks = [*planes, OBJECT_LOOK, *(_BESIDE for _ in self.others), *(part.look for part in parts)]
 
     def shoot(
         self, number: int, way: Sequence[Waypoint], size: tuple[int, int], sides: int, samples: int
@@ -142,14 +144,16 @@ class _Stage:
         scene = self.around.scene(number)
         rest = np.asarray(self.around.object_pose[scene], float)
         roots = compose(rest, moved(np.stack([point.hand_pose for point in way]), -self.centre))
-        bodies = body_poses(self.hand, roots, np.stack([point.joint_positions for point in way]))
+        joints, wrist = np.stack([point.joint_positions for point in way]), self.around.wrist
+        bodies = body_poses(self.hand, roots, joints)
+        drawn = drawn_poses(self.hand, roots, joints, None if wrist is None else np.tile(wrist[number], (len(way), 1)))
         things = np.stack([compose(rest, np.append(point.carried, IDENTITY_POSE[3:])) for point in way])
         solid = np.stack([apply(pose, self.obj.hull_vertices) for pose in things])
         points = np.concatenate([solid, hand_points(self.hand, bodies)], axis=1)
         middles = 0.5 * (solid.min(axis=1) + solid.max(axis=1))
         reach = float(np.linalg.norm(solid - middles[:, None], axis=2).max()) + self.near_m
         near = points[np.linalg.norm(points - middles[:, None], axis=2) < reach]
-        self._place(scene, things, bodies, float(points[..., 2].min()), middles[0])
+        self._place(scene, things, drawn, float(points[..., 2].min()), middles[0])
         above = middles[0] + np.array([0, 0, _HIGH_M])
         covered = seen_share(self.around.supports, above, middles[:1]) < 1
         self.lamp = _UNDER_A_BOARD if covered else TOWARD_LAMP
@@ -162,7 +166,7 @@ class _Stage:
             pictures.append(self.tracer.shoot(shot, self.run.quiet()).rgb)
         return np.stack(pictures)
 
-    def _place(self, scene: int, things: Floats, bodies: Floats, lowest: float, middle: Floats) -> None:
+    def _place(self, scene: int, things: Floats, drawn: Floats, lowest: float, middle: Floats) -> None:
         if self.around.supports:
             standing = slab_poses(self.around.supports, middle, 0.0)
         else:
@@ -171,9 +175,7 @@ class _Stage:
         still = np.concatenate([standing, things[0][None], beside])
         poses = np.tile(still, (self.frames, 1, 1))
         poses[:, len(standing)] = things
-        self.tracer.place(
-            np.concatenate([poses, bodies[:, drawn_bodies(self.hand)]], axis=1), [self.looks] * self.frames
-        )
+        self.tracer.place(np.concatenate([poses, drawn], axis=1), [self.looks] * self.frames)
 
     def _shot(
         self, world: NDArray[np.intp], cameras: Floats, k: Floats, size: tuple[int, int], angle: float, samples: int
@@ -200,7 +202,10 @@ class _Stage:
         glance = self._shot(np.full(len(sides), world), cameras, k, (_GLANCE, _GLANCE), first, 1)
         seen = self.tracer.shoot(replace(glance, shaded=False), self.run.quiet()).shape
         thing = len(self.boxes)
-        shares = [(seen == thing).sum(axis=(1, 2)), (seen > thing + len(self.others)).sum(axis=(1, 2))]
+        first_of_hand = thing + 1 + len(self.others)
+        # A forearm may be out of sight.
+        fingers = (seen >= first_of_hand) & (seen < first_of_hand + len(drawn_bodies(self.hand)))
+        shares = [(seen == thing).sum(axis=(1, 2)), fingers.sum(axis=(1, 2))]
         score = sum(np.sqrt(share / max(1, share.max())) for share in shares)
         across = np.array([abs(np.cos(a - first)) * np.cos(h) for a, h in sides])
         order = np.argsort(-(score + 0.15 * across), kind="stable")

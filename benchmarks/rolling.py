@@ -1,0 +1,103 @@
+"""Rest poses that roll or topple under 1 mm of change: what geometry says, and a simulation of changed convex pieces.
+
+usage: python -m benchmarks.rolling DATA_DIR [--objects 011_banana ...] [--variants 8] [--page OUT.md]
+       DATA_DIR holds objects/
+
+Every stable face that at least 3 % of drops end on if none is left out. Simulated: the physics of the lift test without
+a hand, for as long as a hand closes, with the object's own pieces and with pieces whose corners moved by up to 1 mm.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+from unittest.mock import patch
+
+import mujoco
+import numpy as np
+
+from service.model.transforms import quat_conjugate, quat_multiply, quat_rotate
+from worker.objects.model import Floats, ObjectModel
+from worker.objects.prepare import object_from_path
+from worker.quality.referee.decomposition import decompose
+from worker.quality.referee.model import FRICTION, MujocoOptions, add_object
+from worker.scenes import simulate
+from worker.scenes.rest import CHANGE_M, RestingFaces, lay_flat, resting_faces, settle
+
+SEED, DROPS, SECONDS = 5, 64, 0.8
+HEAD: Final = """# Rest poses that roll or topple
+
+`python -m benchmarks.rolling DATA`: per object the resting faces that {drops} drops end on, the largest turn that 1 mm
+of change of the surface allows by geometry, what becomes of them, and the largest turn in simulation with the object's
+own convex pieces and with {variants} changes of them by up to 1 mm.
+
+"""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--objects", nargs="+")
+    parser.add_argument("--variants", type=int, default=8)
+    parser.add_argument("--page", type=Path, help="file for the table in Markdown")
+    given = parser.parse_args()
+    rows = [
+        "| object | drops | turn by geometry [deg] | pose | own pieces [deg] | changed [deg] |",
+        "|---|--:|--:|---|--:|--:|",
+    ]
+    for mesh in sorted((given.data / "objects").glob("*/clean.stl")):
+        name = mesh.parent.name
+        if not given.objects or name in given.objects:
+            rows += [
+                f"| {name} | {row} |" for row in poses_of(object_from_path(mesh, face_error_m=5e-4), given.variants)
+            ]
+            print("\n".join(row for row in rows if name in row), flush=True)  # noqa: T201
+    if given.page:
+        given.page.write_text(HEAD.format(variants=given.variants, drops=DROPS) + "\n".join(rows) + "\n")
+
+
+def poses_of(obj: ObjectModel, variants: int) -> list[str]:
+    """Cells of each resting face, the most frequent first."""
+    faces = resting_faces(obj)
+    with patch.object(RestingFaces, "topples", lambda self, face: False):
+        drops = simulate.drop(obj, count=DROPS, seed=SEED)["scene/object_pose"]
+    found = np.array([settle(faces, pose[3:])[0] for pose in drops])
+    cells = []
+    for face, count in sorted(zip(*np.unique(found, return_counts=True), strict=True), key=lambda one: -one[1]):
+        turn, _ = faces.looseness(int(face))
+        pose = lay_flat(faces, int(face), np.array([0.0, 0, 0, 1, 0, 0, 0]))
+        angles = np.degrees(turns(obj, pose, variants))
+        word = "left out" if faces.topples(int(face)) else "kept"
+        cells.append(f"{count} | {np.degrees(turn):.0f} | {word} | {angles[0]:.1f} | {angles[1:].max():.1f}")
+    return cells
+
+
+def turns(obj: ObjectModel, pose: Floats, variants: int) -> Floats:
+    """(1 + variants,) angles by which an object turns by itself at a pose (7,) on a table [rad]."""
+    pieces, rng = decompose(obj).vertices, np.random.default_rng(0)
+    changed = [[p + CHANGE_M * rng.uniform(-1, 1, p.shape) / np.sqrt(3) for p in pieces] for _ in range(variants)]
+    return np.array([turn(obj, some, pose) for some in (pieces, *changed)])
+
+
+def turn(obj: ObjectModel, pieces: Sequence[Floats], pose: Floats) -> float:
+    """The angle with these pieces [rad]."""
+    physics, friction, spec = MujocoOptions(), [*FRICTION, 1e-4], mujoco.MjSpec()
+    option: Any = spec.option
+    option.timestep, option.impratio, option.noslip_iterations = physics.timestep, 10.0, physics.noslip_iterations
+    option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtCone.mjCONE_ELLIPTIC
+    add_object(spec, obj, pieces, friction, obj.mass)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1], condim=4, friction=friction)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    lowest = min(float((quat_rotate(pose[3:], part) + pose[:3])[:, 2].min()) for part in pieces)
+    data.qpos[:3] = pose[:3] + quat_rotate(pose[3:], obj.centre_of_mass) - [0, 0, lowest]
+    data.qpos[3:] = pose[3:]
+    mujoco.mj_step(model, data, nstep=round(SECONDS / physics.timestep))
+    turned = quat_multiply(data.qpos[3:], quat_conjugate(pose[3:]))
+    return float(2 * np.arctan2(np.linalg.norm(turned[1:]), abs(turned[0])))
+
+
+if __name__ == "__main__":
+    main()

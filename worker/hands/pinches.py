@@ -1,0 +1,190 @@
+"""Postures for what lies flat on a support: the ends of opposed fingertips rest on a plane and face each other.
+
+The pads of `worker.hands.oppositions` are farther from the ends of the fingertips than a flat object is high. These
+postures are found in the same way, from the surface within the object's height of the plane.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from cachetools import LRUCache
+from numpy.typing import NDArray
+
+from service.model import transforms
+from service.model.transforms import IDENTITY_POSE, quat_rotate
+from worker.hands import closing, kinematics, oppositions, primitives, surface
+from worker.hands.kinematics import body_poses
+from worker.hands.model import Floats, HandModel, SurfacePoints
+from worker.hands.oppositions import Oppositions, climbed, opposed_finger, random_postures
+from worker.hands.surface import farthest_points, sample_surface
+from worker.objects.kept_arrays import arrays_kept_or_made
+
+#: Heights of objects that have postures of their own [m]; what is higher reaches the pads.
+HEIGHTS_M: Final = (0.005, 0.008, 0.012, 0.018)
+#: Postures that are wanted, from so many times as many, and random steps that make them better.
+POSTURES: Final = 120
+CROWD: Final = 20
+#: Fewer postures of a height than these are none.
+FEW: Final = 8
+#: Widths [m].
+WIDTHS_M: Final = (0.004, 0.12)
+#: Points of each fingertip and of each other body, of so many of the hand.
+_TIP_POINTS: Final = 120
+_OTHER_POINTS: Final = 20
+_DENSE: Final = 8000
+#: A fingertip that ends farther above the plane than this share of the height misses the object; what that and a
+#: difference of width cost is counted in these lengths [m].
+REACHES: Final = 0.4
+SHORT_M: Final = 0.004
+WIDTH_M: Final = 0.02
+#: Least height of the rest of the hand above the plane [m].
+OVER_M: Final = 0.008
+#: How well the ends face each other (cosine), and how little the palm looks along the line between them (cosine).
+FACING: Final = 0.8
+SQUARE: Final = 0.7
+
+
+def pinches_of(hand: HandModel, height: float) -> Oppositions:
+    """Postures for an object of this height [m], from memory or this machine's cache where they are known; none where
+    it reaches the pads, or the hand has one finger.
+
+    The palm's approach without its part along `axis` points at the plane. `middle` is half the height above it.
+    """
+    known = [h for h in HEIGHTS_M if h >= height]
+    if not known or len(hand.fingertips) < 2:
+        return Oppositions.of_none(hand)
+    key = (hand.content, str(known[0]))
+    with _lock:
+        if key not in _known:
+            code = (sys.modules[__name__], closing, kinematics, oppositions, primitives, surface, transforms)
+            _known[key] = Oppositions(
+                **arrays_kept_or_made("pinches", key, code, lambda: vars(_pinches(hand, known[0])))
+            )
+        return _known[key]
+
+
+_known: LRUCache[tuple[str, str], Oppositions] = LRUCache(16)
+_lock = threading.Lock()
+
+
+def _pinches(hand: HandModel, height: float) -> Oppositions:
+    one, look = opposed_finger(hand), _Look.of(hand, height)
+    q = random_postures(hand, one, CROWD * POSTURES)
+    wanted = np.linspace(*WIDTHS_M, POSTURES)
+    cost = look.at(q, one).cost(np.repeat(wanted, CROWD))
+    q = q[np.arange(POSTURES) * CROWD + cost.reshape(POSTURES, CROWD).argmin(axis=1)]
+    q = climbed(hand, one, q, lambda tried: look.at(tried, one).cost(wanted))
+    seen = look.at(q, one)
+    good = np.flatnonzero(
+        (seen.short < 1.0) & (seen.facing > FACING) & (seen.square < SQUARE) & (seen.over > OVER_M)
+        & (seen.width > WIDTHS_M[0])
+    )  # fmt: skip
+    good = good[np.argsort(seen.width[good], kind="stable")] if len(good) >= FEW else good[:0]
+    return Oppositions(q[good], seen.axis[good], seen.middle[good], seen.width[good])
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Where the ends of the fingertips of N postures are."""
+
+    axis: Floats
+    middle: Floats
+    width: Floats
+    short: Floats
+    """(N,) how far above the plane the one finger ends, or the others do in the mean, over what reaches the object."""
+    facing: Floats
+    """(N,) cosine of the surface within the height against the line between the ends, the worse side's."""
+    square: Floats
+    over: Floats
+    """(N,) height of the rest of the hand above the plane [m]."""
+
+    def cost(self, wanted: Floats) -> Floats:
+        """(N,) how far from a pinch of the widths `wanted` (N,)."""
+        short = np.maximum(0.0, self.short - 0.5)
+        low = np.maximum(0.0, OVER_M + 0.005 - self.over) / WIDTH_M
+        aside = 2 * np.maximum(0.0, self.square - 0.9 * SQUARE)
+        return np.asarray(
+            2 * short - 2 * np.minimum(self.facing, 0.95) + np.abs(self.width - wanted) / WIDTH_M + low + aside
+        )
+
+
+@dataclass(frozen=True)
+class _Look:
+    """The surface of a hand as points of its fingertips and of the rest."""
+
+    hand: HandModel
+    height: float
+    tips: Floats
+    """(F, V, 3) body frame [m]."""
+    normals: Floats
+    """(F, V, 3)"""
+    others: Floats
+    """(V, 3)"""
+    body: NDArray[np.intp]
+    """(V,) of the others."""
+
+    @classmethod
+    def of(cls, hand: HandModel, height: float) -> _Look:
+        points = sample_surface(hand, _DENSE)
+        tips = [_spread(points, tip, _TIP_POINTS) for tip in hand.fingertips]
+        mine = np.stack([np.resize(some, _TIP_POINTS) for some in tips])
+        others = np.setdiff1d(points.body, hand.fingertips).tolist()
+        rest = np.concatenate([_spread(points, body, _OTHER_POINTS) for body in others])
+        return cls(
+            hand, height, points.position[mine], points.normal[mine], points.position[rest],
+            points.body[rest].astype(np.intp),
+        )  # fmt: skip
+
+    def at(self, q: Floats, one: int) -> _Seen:
+        """What postures (N, D) pinch between the finger `one` and the others."""
+        hand, others = self.hand, [f for f in range(len(self.tips)) if f != one]
+        bodies = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))
+        tips = bodies[:, list(hand.fingertips), None]
+        place = quat_rotate(tips[..., 3:], self.tips) + tips[..., :3]
+        normal = quat_rotate(tips[..., 3:], self.normals)
+        down, axis, ends = np.tile(hand.palm.approach, (len(q), 1)), np.zeros((len(q), 3)), np.zeros((len(q), 0))
+        # The plane depends on which points are lowest, and these on the plane.
+        for _ in range(3):
+            low = np.einsum("nfvi,ni->nfv", place, down).argmax(axis=2)
+            end = np.take_along_axis(place, low[..., None, None], axis=2)[:, :, 0]
+            axis = _unit(end[:, others].mean(axis=1) - end[:, one])
+            down = _unit(hand.palm.approach - (axis @ hand.palm.approach)[:, None] * axis)
+        depth = np.einsum("nfvi,ni->nfv", place, down)
+        ends = depth.max(axis=2)
+        plane = ends.max(axis=1)
+        above = (plane[:, None] - ends) / (REACHES * self.height)
+        short = np.maximum(above[:, one], np.minimum(above[:, others], 2.0).mean(axis=1))
+        sign = np.where(np.arange(len(self.tips)) == one, 1.0, -1.0)[None, :, None]
+        along = sign * np.einsum("nfvi,ni->nfv", place, axis)
+        looks = sign * np.einsum("nfvi,ni->nfv", normal, axis)
+        within = plane[:, None, None] - depth <= self.height
+        inner = np.where(within, along, -np.inf).max(axis=2)
+        inner = np.where(np.isfinite(inner), inner, np.take_along_axis(along, low[..., None], axis=2)[..., 0])
+        face = np.where(within, looks, -1.0).max(axis=2)
+        counts = np.maximum(above[:, others] < 1.0, 1e-6)
+        far = (inner[:, others] * counts).sum(axis=1) / counts.sum(axis=1)
+        facing = np.minimum(face[:, one], (face[:, others] * counts).sum(axis=1) / counts.sum(axis=1))
+        width = -far - inner[:, one]
+        across = np.cross(down, axis)
+        middle = (
+            0.5 * (inner[:, one] - far)[:, None] * axis + (plane - 0.5 * self.height)[:, None] * down
+            + np.einsum("ni,ni->n", end[:, one] + end[:, others].mean(axis=1), across)[:, None] * 0.5 * across
+        )  # fmt: skip
+        rest = bodies[:, self.body]
+        lowest = np.einsum("nvi,ni->nv", quat_rotate(rest[..., 3:], self.others) + rest[..., :3], down).max(axis=1)
+        return _Seen(axis, middle, width, short, facing, np.abs(axis @ hand.palm.approach), plane - lowest)
+
+
+def _spread(points: SurfacePoints, body: int, count: int) -> NDArray[np.intp]:
+    """Rows of at most `count` points of a body that lie far from one another."""
+    mine = np.flatnonzero(points.body == body)
+    return mine[farthest_points(points.position[mine], min(count, len(mine)))]
+
+
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9))
