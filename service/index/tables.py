@@ -1,6 +1,6 @@
 """Tables of the index. `LIVE_COLUMNS` hold the present moment (progress, queue marks); the rest follows from the store.
 
-A change here needs a migration in `migrations/versions`; a test compares the two. Metrics of grasps need none: see
+A change here needs another `REVISION` in `database`; a test holds the two together. Metrics of grasps need none: see
 `metric_columns`.
 """
 

@@ -149,6 +149,8 @@ def rebuild(
 ) -> None:
     """Make the rows of the index anew from the store, and be the service that works on it from now on.
 
+    An index of another version of graspd gets the tables of this one.
+
     With --check exit code 1: they differ, or a shard is damaged.
     """
     from service.index.rebuild import differences
@@ -157,7 +159,7 @@ def rebuild(
     from service.pipeline.identity import identify_if_redis_answers
     from service.pipeline.scrub import scan
 
-    parts = Parts.open(load_settings(data_dir=data_dir), patience=0, make=False)
+    parts = Parts.open(load_settings(data_dir=data_dir), patience=0, make=False, anew=not check)
     store, index = parts.store, parts.index
 
     def make() -> dict[str, int]:
@@ -165,7 +167,8 @@ def rebuild(
         return fill(index, store)
 
     try:
-        found = differences(index, store)
+        was = index.database.was
+        found = [f"the index was of revision {was}; it has other tables now"] if was else differences(index, store)
         if check:
             found += [
                 f"{wrong.key}: {wrong.what}" for _, wrong in scan(store, names.SHARDS, names.PACKS) if wrong is not None
@@ -207,23 +210,6 @@ def export(
     else:
         for name, count in rows.items():
             typer.echo(f"{output / name}.parquet  {count} rows")
-
-
-@index_app.command(epilog="graspd index downgrade 0003")
-@reporting_errors
-def downgrade(
-    revision: Annotated[str, typer.Argument(help="Revision of the older graspd: the newest of its migrations.")],
-    data_dir: DataDir = None,
-    json: JsonFlag = False,
-) -> None:
-    """Take the index back to an earlier schema, before an older graspd is installed. Stop the service first."""
-    from service.index.database import downgrade as take_back
-
-    take_back(load_settings(data_dir=data_dir).resolved_index_url, revision)
-    if json:
-        emit({"revision": revision})
-    else:
-        typer.echo(f"the index has revision {revision}; the next start of this graspd would bring it forward again")
 
 
 @index_app.command(epilog="graspd index path")

@@ -13,7 +13,7 @@ MODULES = sorted(
     + ".".join(path.relative_to(Path(service.__file__).parent).with_suffix("").parts).removesuffix(".__init__")
     for path in Path(service.__file__).parent.rglob("*.py")
     # The readers' module for torch is for those who have it.
-    if "migrations" not in path.parts and path.name not in ("__init__.py", "torch_data.py")
+    if path.name not in ("__init__.py", "torch_data.py")
 )
 
 
