@@ -1,13 +1,13 @@
 """How many workers keepers serve: real Redis, PostgreSQL, store and keepers, and workers that do no work.
 
-usage: python -m benchmarks.fleet [--workers 64 512 4096] [--keepers 1 2 4] [--seconds 20] [--tasks 6000] [--pack 1]
+usage: python -m benchmarks.fleet [--workers 64 512 4096] [--keepers 1 2 4] [--seconds 20] [--tasks 6000]
                                   [--sqlite] [--s3] [--json FILE]
 
 For each number of workers and of keepers, two runs. First all workers hold tasks that end at --rate a second in all,
 beat and tell their progress: how old is the oldest event that is not in the index, and how long does it take to read
 all leases? Then their tasks take no time: how many a second come through keepers and index? Everything shares this
 machine, the workers too; the processor time of each part is counted beside its clock, and that of the busiest keeper.
-With --pack so many shards that end together are one object of the store. What the workers do is in
+What the workers do is in
 `benchmarks.fleet_workers`.
 """
 
@@ -73,7 +73,7 @@ class Result:
     events: float
     """Events of the second run for a task."""
     objects: float
-    """Objects that the keeper reads of the store for a task: manifests, or packs."""
+    """Objects that the keeper reads of the store for a task: manifests."""
 
 
 class Machine:
@@ -140,7 +140,7 @@ def machine(*, sqlite: bool, s3: bool, keepers: int = 1) -> Iterator[Machine]:
             bucket = stack.enter_context(S3Server())
             os.environ.update(bucket.environment)
             options["store_url"] = f"{bucket.url}/fleet"
-        settings = Settings(**options)
+        settings = Settings(**options, task_s=0)
         redis = _started(stack, server_command(settings), {})
         parts = Parts.open(settings)
         stack.callback(parts.close)
@@ -160,10 +160,10 @@ def _kept(parts: Parts) -> list[Keeping]:
 
 
 @contextmanager
-def fleet(settings: Settings, workers: int, task_s: float, pack: int = 1) -> Iterator[None]:
+def fleet(settings: Settings, workers: int, task_s: float) -> Iterator[None]:
     """Workers that live for the block."""
     with ExitStack() as stack:
-        command = [sys.executable, "-m", "benchmarks.fleet_workers", str(workers), str(task_s), str(pack)]
+        command = [sys.executable, "-m", "benchmarks.fleet_workers", str(workers), str(task_s)]
         _started(stack, command, environment(settings))
         yield
 
@@ -181,7 +181,7 @@ def measure(workers: int, keepers: int, given: argparse.Namespace) -> Result:
     with machine(sqlite=given.sqlite, s3=given.s3, keepers=keepers) as at:
         task_s = workers / given.rate
         at.submit(workers + int(given.rate * (given.seconds + task_s + 30)))
-        with fleet(at.settings, workers, task_s, given.pack):
+        with fleet(at.settings, workers, task_s):
             held = at.queue.connection
             lists = [f"rq:wip:{lane.value}-synthesize" for lane in Lane]
             _wait(lambda: sum(held.zcard(name) for name in lists) >= 0.9 * workers, "all workers hold a task")
@@ -191,7 +191,7 @@ def measure(workers: int, keepers: int, given: argparse.Namespace) -> Result:
         at.submit(given.tasks)
         before = at.cpu()
         begun = time.perf_counter()
-        with fleet(at.settings, workers, 0.0, given.pack):
+        with fleet(at.settings, workers, 0.0):
             _wait(
                 lambda: _finished(at.parts) >= given.tasks,
                 "all tasks are in the index",
@@ -201,7 +201,7 @@ def measure(workers: int, keepers: int, given: argparse.Namespace) -> Result:
             spent = {name: 1000 * (used - before[name]) / given.tasks for name, used in at.cpu().items()}
             streams = streams_kept(at.queue.connection)
             events = sum(at.queue.connection.xinfo_stream(name)["entries-added"] for name in streams)
-            objects = sum(1 for folder in (names.SHARDS, names.PACKS) for _ in at.parts.store.list(folder))
+            objects = sum(1 for _ in at.parts.store.list(names.SHARDS))
     of_keepers = [used for name, used in spent.items() if name.startswith("keeper")]
     return Result(
         workers=workers,
@@ -272,7 +272,6 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0, help="how long the lag is watched")
     parser.add_argument("--rate", type=float, default=100.0, help="tasks that end a second while it is watched")
     parser.add_argument("--tasks", type=int, default=6000, help="tasks of the second run")
-    parser.add_argument("--pack", type=int, default=1, help="shards that are put as one object; 1: each by itself")
     parser.add_argument("--sqlite", action="store_true", help="the index in a file instead of PostgreSQL")
     parser.add_argument("--s3", action="store_true", help="the store on an S3 server instead of files")
     parser.add_argument("--json", type=Path, help="keep the figures there")

@@ -32,36 +32,49 @@ def certified_batches(
     request: JobOptions,
     *,
     sizes: Sequence[int],
+    first: int = 0,
     join: int = 1,
-    scenes: Scenes | None = None,
+    scenes: Scenes | Sequence[Scenes] | None = None,
     pieces: Callable[[ObjectModel], ConvexPieces] = decompose,
     run: Run = ALONE,
     partial: bool = False,
+    checked: Callable[[int, Certified], None] | None = None,
 ) -> list[Certified]:
-    """The first batches of a job; see `certified_grasps`, which makes the same of each.
+    """Batches of a job that follow each other; see `certified_grasps`, which makes the same of each.
 
     Args:
         hand: the hand.
         obj: the object.
         request: see `certified_grasps`.
         sizes: grasps wanted of each batch.
+        first: number of the first batch within its job.
         join: batches whose grasps are planned in one launch; 1: one batch after the other.
-        scenes: see `certified_grasps`.
-        pieces: gives the object's convex pieces.
+        scenes: see `certified_grasps`; those of all batches, or of each.
+        pieces: gives the object's convex pieces; asked once.
         run: told of the grasps that are done.
         partial: if it is stopped, the batches that were judged before are the result, the last one maybe in part.
+        checked: called with the number of each batch as it is made, and with what came of it; may raise.
 
     Raises:
         Exception: what became of the first batch that failed; the others are stopped.
     """
     shares = Shares(sizes, run.progress)
+    known: list[ConvexPieces] = []
+
+    def pieces_once(prepared: ObjectModel) -> ConvexPieces:
+        if not known:
+            known.append(pieces(prepared))
+        return known[0]
 
     def batch(number: int, own: Run) -> Certified:
         own = replace(own, progress=shares.of(number))
+        where = scenes if scenes is None or isinstance(scenes, Scenes) else scenes[number]
         made = certified_grasps(
-            hand, obj, request, count=sizes[number], batch=number, scenes=scenes, pieces=pieces, run=own,
+            hand, obj, request, count=sizes[number], batch=first + number, scenes=where, pieces=pieces_once, run=own,
             partial=partial,
         )  # fmt: skip
+        if checked is not None:
+            checked(first + number, made)
         own.progress(1.0, 1.0, "done")
         return made
 
@@ -72,7 +85,7 @@ def certified_batches(
                 found[number] = batch(number, run)
         else:
             if request.referee != "none":
-                pieces(obj.centred)  # once, and not by every batch at the same time
+                pieces_once(obj.centred)  # not by every batch at the same time
             _together(batch, len(sizes), join, run, found)
     except TaskCancelled:
         if not partial or not found:

@@ -42,8 +42,9 @@ from service.pipeline.routes import Routes
 from service.pipeline.scrubber import Scrubber
 from service.pipeline.sharing import PART
 from service.pipeline.sweeper import Sweeper
-from service.queue.port import READS_PACKS, Event, EventKind, part_of
+from service.queue.port import Event, EventKind, part_of
 from service.store.library import publish_builtins, stored_assets
+from service.store.packs import take_apart
 
 log = logging.getLogger(__name__)
 #: Events of one round: a second's work. Those behind them wait for the next round, which follows at once.
@@ -236,6 +237,9 @@ class Keeper:
 
     def _start(self) -> None:
         publish_builtins(self._parts.store)
+        for manifest in take_apart(self._parts.store):
+            self._alive.touch()
+            self._indexer.made(manifest)
         complete_if_new(self._parts.index, self._parts.store)
         made = self._parts.index.notes.completeness()
         # What was left out may have been mended since.
@@ -292,8 +296,8 @@ class Keeper:
 
     def _announce(self) -> None:
         seconds = 5 * self._parts.settings.keeper_interval_s + 5
-        for part in (READS_PACKS, *(part_of(PART, shard) for shard in self._shards.held)):
-            self._parts.queue.announce(part, seconds)
+        for shard in self._shards.held:
+            self._parts.queue.announce(part_of(PART, shard), seconds)
 
     def _look_after_queue(self) -> None:
         # While Redis can be read but not written, as on a full disk, no worker can give a sign of life: then this fails

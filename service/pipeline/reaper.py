@@ -10,7 +10,7 @@ from typing import Final
 
 from service.model import names
 from service.model.clock import timestamp
-from service.model.errors import DamagedError, UnavailableError
+from service.model.errors import DamagedError, NotFoundError, UnavailableError
 from service.model.keeper_shards import ALL_SHARDS, KeeperShards
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.planning import ingest_id
@@ -19,7 +19,8 @@ from service.model.states import AssetKind, Stage
 from service.pipeline.backends import Parts
 from service.pipeline.indexer import Indexer
 from service.queue.port import Holder, Lease
-from service.store.packs import Finder
+from service.store.manifests import load_manifest
+from service.store.packs import take_apart
 from service.store.records import put_record, read_record, task_attempts
 from service.store.seals import put_document
 
@@ -87,9 +88,11 @@ class Reaper:
 
     def _recover(self, missing: list[str]) -> None:
         """Make good a lost event from the store; what the store knows nothing of is queued again."""
-        again, finder = [], Finder(self._parts.store)
-        for task, (stage, shard, pair) in self._parts.index.feed.outputs(missing).items():
-            if self._find(task, Stage(stage), shard, pair, finder):
+        again = []
+        for made in take_apart(self._parts.store) if missing else ():  # of a worker of 0.2, in a rolling upgrade
+            self._indexer.made(made)
+        for task, (stage, shard) in self._parts.index.feed.outputs(missing).items():
+            if self._find(task, Stage(stage), shard):
                 continue
             known = self._parts.index.jobs.task(task).attempt
             try:
@@ -105,16 +108,16 @@ class Reaper:
             log.warning("%d tasks were lost from the queue and are queued again", len(again))
             self._indexer.tell(self._parts.index.live.set_waiting(again))
 
-    def _find(self, task_id: str, stage: Stage, shard: str, pair: tuple[str, str], finder: Finder) -> bool:
+    def _find(self, task_id: str, stage: Stage, shard: str) -> bool:
         """Index a shard that is there; one whose manifest is damaged fails its task, since it cannot be made again.
 
         Returns:
             whether it is there.
         """
         try:
-            if (made := finder.manifest(stage, shard, pair)) is None:
-                return False
-            self._indexer.made(made)
+            self._indexer.made(load_manifest(self._parts.store, stage, shard))
+        except NotFoundError:
+            return False
         except DamagedError as error:
             self._fail(task_id, stage, error)
         return True
@@ -161,8 +164,7 @@ class Reaper:
         self._parts.queue.release(lease)
 
     def _lose_task(self, worker: str, message: TaskMessage) -> None:
-        pair = (message.hand_digest, message.object_digest)
-        if self._find(message.task_id, message.stage, message.output, pair, Finder(self._parts.store)):
+        if self._find(message.task_id, message.stage, message.output):
             return
         attempt = AttemptRecord(
             task_id=message.task_id,

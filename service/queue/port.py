@@ -24,10 +24,6 @@ Message = TaskMessage | IngestMessage
 BULK_EVERY: Final = 4
 
 
-#: What a keeper announces that reads packs: while none does, as an older one, workers put each shard by itself.
-READS_PACKS: Final = "reads-packs"
-
-
 def part_of(part: str, shard: int) -> str:
     """Name under which the keeper of a shard announces itself."""
     return part if shard == 0 else f"{part}:{shard}"
@@ -44,8 +40,6 @@ class EventKind(StrEnum):
 
     STARTED = "started"
     FINISHED = "finished"
-    PACKED = "packed"
-    """Several stages finished whose shards lie in one object, `pack`; told in place of `finished` of each."""
     FAILED = "failed"
     """An attempt ended in an error and is recorded in the store."""
     DEFERRED = "deferred"
@@ -61,7 +55,7 @@ class EventKind(StrEnum):
     @property
     def ends_attempt(self) -> bool:
         """Whether nobody works on the task after it."""
-        return self not in (EventKind.STARTED, EventKind.PACKED, EventKind.LEFT, EventKind.JOB)
+        return self not in (EventKind.STARTED, EventKind.LEFT, EventKind.JOB)
 
 
 def _cut(value: object) -> object:
@@ -88,9 +82,6 @@ class Event(Model):
     seconds: Amount = 0.0
     output: Annotated[str, Field(pattern=r"^([a-z]{1,10}/)?[A-Za-z0-9_-]{0,64}$")] = ""
     """Shard id of a finished stage; kind and digest (`hand/...`) of a finished check."""
-
-    pack: Annotated[str, Field(pattern=r"^(packs/[0-9a-f]{32}/[0-9a-f]{32}\.pack)?$")] = ""
-    """Object that holds the shard of a finished stage beside others."""
 
     # A newer worker may say more than an older keeper knows.
     model_config = ConfigDict(frozen=True, extra="ignore")

@@ -158,21 +158,22 @@ def rebuild(
     from service.pipeline.backends import Parts
     from service.pipeline.identity import identify_if_redis_answers
     from service.pipeline.scrub import scan
+    from service.store.packs import take_apart
 
     parts = Parts.open(load_settings(data_dir=data_dir), patience=0, make=False, anew=not check)
     store, index = parts.store, parts.index
 
     def make() -> dict[str, int]:
         identify_if_redis_answers(parts, take_over=True)
+        for _ in take_apart(store):
+            pass
         return fill(index, store)
 
     try:
         was = index.database.was
         found = [f"the index was of revision {was}; it has other tables now"] if was else differences(index, store)
         if check:
-            found += [
-                f"{wrong.key}: {wrong.what}" for _, wrong in scan(store, names.SHARDS, names.PACKS) if wrong is not None
-            ]
+            found += [f"{wrong.key}: {wrong.what}" for _, wrong in scan(store, names.SHARDS) if wrong is not None]
         counts: dict[str, int] = {} if check else make()
     except IndexDamaged:
         if check:

@@ -81,8 +81,9 @@ def index_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
 
 @pytest.fixture
 def parts(tmp_path: Path) -> Iterator[Parts]:
-    """A service without processes: memory store, SQLite index, memory queue, a hand `gripper` and an object `ball`."""
-    settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0)
+    """A service without processes: memory store, SQLite index, memory queue, a hand `gripper` and an object `ball`;
+    each batch is a task."""
+    settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0, task_s=0.0)
     index = empty_index(settings.resolved_index_url)
     made = Parts(settings, open_store("memory://"), index, MemoryQueue())
     add_assets(made)

@@ -80,7 +80,7 @@ class Feed:
         """The first tasks of one job that may be queued; at a time, or none of them heeding its back-off."""
         due = () if now is None else (_due(tasks.c.not_before, now),)
         query = (
-            select(tasks, jobs.c.request, jobs.c.revisions, jobs.c.origin, jobs.c.hand_digest, jobs.c.object_digest)
+            select(tasks, *(jobs.c[name] for name in _OF_THE_JOB))
             .join(jobs, jobs.c.id == tasks.c.job_id)
             .where(tasks.c.job_id == job_id, *_WAITING, *due)
             .order_by(tasks.c.batch)
@@ -113,15 +113,14 @@ class Feed:
             checks = {(AssetKind(kind), digest) for kind, digest in connection.execute(of_checks)}
             return set(connection.scalars(of_tasks)), checks
 
-    def outputs(self, task_ids: Collection[str]) -> dict[str, tuple[str, str, tuple[str, str]]]:
-        """Stage and shard id of tasks, with the digests of hand and object."""
-        of_job = (jobs.c.hand_digest, jobs.c.object_digest)
-        query = select(tasks.c.id, tasks.c.stage, tasks.c.shard_id, *of_job).join(jobs, jobs.c.id == tasks.c.job_id)
+    def outputs(self, task_ids: Collection[str]) -> dict[str, tuple[str, str]]:
+        """Stage and shard id of tasks."""
+        query = select(tasks.c.id, tasks.c.stage, tasks.c.shard_id)
         with self.database.reading() as connection:
             return {
-                task: (stage, shard, (hand, obj))
+                task: (stage, shard)
                 for some in chunks(list(task_ids))
-                for task, stage, shard, hand, obj in connection.execute(query.where(tasks.c.id.in_(some)))
+                for task, stage, shard in connection.execute(query.where(tasks.c.id.in_(some)))
             }
 
     def cancelled(self, task_ids: Collection[str]) -> set[str]:
@@ -153,6 +152,7 @@ class Feed:
             return list(connection.scalars(query))
 
 
+_OF_THE_JOB = ("request", "revisions", "span", "origin", "hand_digest", "object_digest")
 _WAITING = (tasks.c.ready.is_(True), tasks.c.queued.is_(False))
 
 
@@ -164,11 +164,7 @@ def _due(not_before: Column[float], now: float) -> ColumnElement[bool]:
 def _record(row: Any) -> JobRecord:
     return JobRecord(
         id=row["job_id"],
-        request=row["request"],
-        revisions=row["revisions"],
-        origin=row["origin"],
-        hand_digest=row["hand_digest"],
-        object_digest=row["object_digest"],
+        **{name: row[name] for name in _OF_THE_JOB},
         lane=row["lane"],
         created=row["created"],
     )

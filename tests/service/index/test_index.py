@@ -49,7 +49,7 @@ def index(index_url: str) -> Iterator[Index]:
 @pytest.fixture
 def parts(tmp_path: Path, index: Index, index_url: str) -> Parts:
     """A service without processes on an index of each kind: a hand `gripper` and an object `ball`."""
-    settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0, index_url=SecretStr(index_url))
+    settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0, task_s=0.0, index_url=SecretStr(index_url))
     made = Parts(settings, open_store("memory://"), index, MemoryQueue())
     add_assets(made)
     return made

@@ -125,7 +125,7 @@ def one_beat(connection: Any, name: str, hold: Hold | None = None) -> list[str]:
     """Of a worker; returns why its task must stop."""
     said: list[str] = []
     pulse = Pulse(connection, place_of(name, 6), tell=lambda word, entry: said.append(word), end_worker=said.append)
-    pulse.take({"beat": asdict(beat_of(name)), "holds": [hold.told()] if hold else []})
+    pulse.take({"beat": asdict(beat_of(name)), "hold": hold.told() if hold else None})
     pulse.tick()
     return said
 
