@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Final, Literal
 from pydantic import Field, SecretStr, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from service.model.keeper_shards import MOST_SHARDS
-
 if TYPE_CHECKING:
     from sqlalchemy import URL
 
 
 #: Variables that no setting follows any more, with what to do instead.
-GONE: Final = {"GRASPD_SHARD_PACK": "a task makes one shard of all its batches; unset it, and see GRASPD_TASK_S"}
+GONE: Final = {
+    "GRASPD_SHARD_PACK": "a task makes one shard of all its batches; unset it, and see GRASPD_TASK_S",
+    "GRASPD_KEEPER_SHARDS": "one keeper leads and the others stand by; unset it",
+}
 
 
 class Settings(BaseSettings):
@@ -96,10 +97,6 @@ class Settings(BaseSettings):
         max_length=200,
         description="of a keeper: started again under the same name, it leads without a wait; unset: a fresh one",
     )
-    keeper_shards: int = Field(
-        1, ge=1, le=MOST_SHARDS,
-        description="of all keepers: shards that they share their work in, so that as many can work at once",
-    )  # fmt: skip
     task_attempts: int = Field(3, ge=1, le=20, description="attempts of a task before its job fails")
     task_s: float = Field(
         30.0, ge=0, description="how long a task of a larger job should last by what was measured [s]; 0: one batch"

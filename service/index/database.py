@@ -20,7 +20,6 @@ from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlche
 from service.index.metric_columns import add_missing
 from service.index.sqlite_file import Identity, SqliteFile
 from service.index.tables import metadata
-from service.index.write_turns import Concerns, take_turn
 from service.model.errors import IndexDamaged, IndexUnavailable, InputError
 
 log = logging.getLogger(__name__)
@@ -33,6 +32,8 @@ REVISION_TABLE: Final = "alembic_version"
 _BUSY_TIMEOUT_S: Final = 20.0
 #: Key of PostgreSQL's advisory lock that lets one process make tables at a time: the letters "grsp".
 _TABLES_LOCK: Final = 0x67727370
+#: Of the one that lets one process write at a time; it ends with its transaction: the letters "grsq".
+_TURN_LOCK: Final = 0x67727371
 #: What SQLAlchemy raises for a URL.
 UNUSABLE: Final = (ArgumentError, NoSuchModuleError, ModuleNotFoundError, ValueError)
 #: Codes of SQLite for a file whose content makes no sense.
@@ -78,15 +79,11 @@ class Database:
             yield connection
 
     @contextmanager
-    def writing(self, within: Connection | None = None, *, concerns: Concerns | None = None) -> Iterator[Connection]:
+    def writing(self, within: Connection | None = None) -> Iterator[Connection]:
         """A transaction, or part of the one given: all of it is kept or nothing. Writers take turns, on every database.
 
         States are derived from facts that are read in the same transaction: two of these at once would each miss what
         the other brings.
-
-        Args:
-            concerns: finds the jobs of which it changes tasks and states, and nothing of others. On PostgreSQL it then
-                need not wait for writers that concern others.
         """
         if within is not None:
             yield within
@@ -97,7 +94,7 @@ class Database:
                 connection.exec_driver_sql("BEGIN IMMEDIATE")
             else:
                 connection.exec_driver_sql(f"SET LOCAL lock_timeout = '{_BUSY_TIMEOUT_S:g}s'")
-                take_turn(connection, concerns)
+                connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _TURN_LOCK})
             yield connection
             connection.commit()
 

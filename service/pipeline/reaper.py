@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Callable, Collection
 from typing import Final
@@ -11,7 +10,6 @@ from typing import Final
 from service.model import names
 from service.model.clock import timestamp
 from service.model.errors import DamagedError, NotFoundError, UnavailableError
-from service.model.keeper_shards import ALL_SHARDS, KeeperShards
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.planning import ingest_id
 from service.model.records import AttemptRecord
@@ -32,17 +30,8 @@ LOST_AFTER_S: Final = 3.0
 class Reaper:
     """Watches leases by whether they change, on this process's own monotonic clock: set clocks do not matter."""
 
-    def __init__(
-        self,
-        parts: Parts,
-        indexer: Indexer,
-        shards: KeeperShards = ALL_SHARDS,
-        *,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        """`shards` are those of the jobs whose tasks it looks after."""
+    def __init__(self, parts: Parts, indexer: Indexer, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._parts = parts
-        self._shards = shards
         self._indexer = indexer
         self._clock = clock
         self._beats: dict[str, tuple[str, float]] = {}
@@ -62,19 +51,15 @@ class Reaper:
             silence = silence + looked if beat == lease.beat else 0.0
             if silence <= lease_s:
                 beats[lease.key] = (lease.beat, silence)
-            elif self._shards.has(_job_of(holder := self._parts.queue.holder(lease))):
-                self._lose(lease, holder)
-                lost.append(lease)
             else:
-                # Another keeper's: it is not looked at again unless it gives a sign of life.
-                beats[lease.key] = (lease.beat, -math.inf)
+                self._lose(lease, self._parts.queue.holder(lease))
+                lost.append(lease)
         self._beats = beats
         return lost
 
     def find_missing(self, present: Collection[str]) -> list[str]:
         """Ids of tasks that the index believes in the queue, but that are neither there nor with a worker."""
-        tasks, checks = self._parts.index.feed.believed_queued(self._shards)
-        checks = checks if self._shards.leads else set()
+        tasks, checks = self._parts.index.feed.believed_queued()
         believed = tasks | {ingest_id(kind, digest) for kind, digest in checks}
         now = self._clock()
         self._missing = {task: self._missing.get(task, now) for task in believed - set(present)}
@@ -197,8 +182,3 @@ class Reaper:
             self._indexer.checked(message.kind, message.digest)
         else:
             self._parts.index.live.add_asset_attempt(message.digest, message.attempt, not_before=0.0)
-
-
-def _job_of(holder: Holder) -> str:
-    """Job of a held task; "" for what is of none, such as a check or what somebody made up."""
-    return holder.message.job_id if isinstance(holder.message, TaskMessage) else ""

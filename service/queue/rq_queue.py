@@ -8,31 +8,32 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any, Final
 
 from redis import Redis
-from redis.exceptions import RedisError
+from redis.exceptions import LockError, RedisError, ResponseError
 
 from service.model.ability import need_of
 from service.model.errors import QueueUnavailable
-from service.model.keeper_shards import ALL_SHARDS, KeeperShards
 from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
-from service.queue import entries, shares
+from service.queue import entries
 from service.queue.adding import Appender
 from service.queue.address import redis_url
 from service.queue.allowed import AllowedJob
 from service.queue.at_scrape import QueueNow, read_queue
 from service.queue.connection import connect
 from service.queue.lists import LISTS, known_lists, place_of, queue_name, without_takers
-from service.queue.port import Event, Holder, Keeping, Lease, Message, Report, Share, part_of
+from service.queue.port import Event, Holder, Lease, Message, Report
 from service.queue.reports import REPORTS, drop_reports, put_report, read_reports
-from service.queue.streams import EVENTS, NUMBER, EventReader, put_event, put_into, readable, streams_kept
+from service.queue.streams import EVENTS, EventReader, put_event, readable
 from service.settings import Settings
 
 WORKERS: Final = "graspd:workers"
+#: Lease of the keeper that leads. A graspd of 0.2 takes and keeps the same one: so the two give way to each other.
+LEAD: Final = "graspd:lead:keeper"
 #: Sums for Prometheus, a few hundred fields.
 METRICS: Final = "graspd:metrics"
 _SERVICE: Final = "graspd:service"
@@ -48,6 +49,8 @@ class RqQueue:
         self.connection: Any = connection
         self._appender = Appender(connection)
         self._reader = EventReader(connection)
+        self._leases: dict[str, Any] = {}
+        """Locks of those who lead, or want to, through this connection."""
 
     def ping(self) -> float:
         start = time.perf_counter()
@@ -145,36 +148,26 @@ class RqQueue:
                     pipe.hdel(REPORTS, event.task_id)
             pipe.execute()
 
-    def hand_on(self, events: Iterable[tuple[int, Event]]) -> None:
-        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
-            for shard, event in events:
-                put_into(pipe, shard, event)
-            pipe.execute()
-
     def report(self, task_id: str, report: Report) -> float:
         with _mapped():
             return put_report(self.connection, task_id, report, WORKERS)
 
-    def reports(self, shards: KeeperShards = ALL_SHARDS) -> dict[str, Report]:
+    def reports(self) -> dict[str, Report]:
         with _mapped():
-            return read_reports(self.connection, shards)
+            return read_reports(self.connection)
 
     def forget_reports(self, task_ids: Collection[str]) -> None:
         with _mapped():
             drop_reports(self.connection, task_ids)
 
-    def consume(self, *, limit: int, wait_s: float, shards: Collection[int] = (0,)) -> list[tuple[str, Event]]:
+    def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         with _mapped():
-            return self._reader.read(shards, limit=limit, wait_s=wait_s)
+            return self._reader.read(limit=limit, wait_s=wait_s)
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
         if event_ids:
             with _mapped():
                 self._reader.acknowledge(event_ids)
-
-    def left_over(self, number: int) -> list[int]:
-        with _mapped():
-            return self._reader.left_over(number)
 
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         with _mapped():
@@ -198,21 +191,30 @@ class RqQueue:
         with _mapped():
             self.connection.set(_SERVICE, identity, nx=not instead)
 
-    def take_share(self, holder: str, seconds: float, *, number: int, before: Collection[int] = ()) -> Share:
+    def lead(self, holder: str, seconds: float) -> bool:
         with _mapped():
-            return shares.take_share(self.connection, holder, seconds, number, before)
+            new = self.connection.lock(LEAD, timeout=seconds, thread_local=False)
+            lease = self._leases.setdefault(holder, new)
+            lease.timeout = seconds
+            try:
+                if lease.owned():
+                    return bool(lease.reacquire())
+                self.resign(holder)  # what a process of the same name left when it ended
+                if lease.acquire(blocking=False, token=holder):
+                    return True
+                if self.connection.ttl(LEAD) == -1:  # nobody's: a lease has an end
+                    self.connection.delete(LEAD)
+            except LockError:
+                pass
+            except ResponseError as error:
+                if not entries.is_wrong_type(error):
+                    raise
+                self.connection.delete(LEAD)
+            return False
 
-    def resign(self, holder: str, shards: Collection[int]) -> None:
-        with _mapped():
-            shares.give_back(self.connection, holder, shards)
-
-    def leave(self, holder: str, *, number: int) -> None:
-        with _mapped():
-            shares.leave(self.connection, holder, number)
-
-    def keepers(self, part: str) -> list[Keeping]:
-        with _mapped():
-            return shares.read_keepers(self.connection, lambda shard: _part_key(part_of(part, shard)))
+    def resign(self, holder: str) -> None:
+        with _mapped(), suppress(LockError):
+            self.connection.lock(LEAD).do_release(holder)
 
     def now(self, *, lease_s: float) -> QueueNow:
         with _mapped():
@@ -239,8 +241,7 @@ class RqQueue:
     def tidy(self) -> None:
         # RQ's registries of workers and failures are emptied by its own maintenance, which is off.
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
-            streams = streams_kept(self.connection)
-            entries.sweep(self.connection, [*_KINDS, *((name, "stream") for name in streams)], streams)
+            entries.sweep(self.connection, _KINDS, (EVENTS,))
             lists = known_lists(self.connection)
             entries.sweep(self.connection, _kinds(lists))
             known = list(self.connection.smembers(WORKERS))
@@ -296,8 +297,8 @@ def _part_key(part: str) -> str:
 
 #: Names of a fixed number, each with its type in Redis.
 _KINDS: Final = (
-    (NUMBER, "string"),
-    (shares.KEEPERS, "zset"),
+    (EVENTS, "stream"),
+    (LEAD, "string"),
     (WORKERS, "set"),
     (METRICS, "hash"),
     (REPORTS, "hash"),

@@ -79,8 +79,7 @@ def keeper(
     check: Annotated[bool, typer.Option("--check", help="Start none; exit code 1 says that none lives.")] = False,
     data_dir: DataDir = None,
 ) -> None:
-    """Reaper, delayed retries and indexer. Several share the work and take over from each other; `graspd up` starts
-    one."""
+    """Reaper, delayed retries and indexer. Of several one leads and the others stand by; `graspd up` starts one."""
     settings = load_settings(data_dir=data_dir)
     log_to_stderr(settings, "keeper")
     keep_private(settings)
@@ -91,26 +90,24 @@ def keeper(
 
 
 def _run_keeper(settings: Settings, stop: threading.Event) -> None:
-    """Keep the shards of the work that are this keeper's; from the start where they become others."""
+    """Lead, or stand by; from the start again where another led meanwhile."""
     from service.pipeline.backends import Parts
     from service.pipeline.keeper import Keeper
-    from service.pipeline.sharing import Sharing
+    from service.pipeline.leading import Leadership
     from service.queue.rq_queue import open_queue
 
     alive = HeartbeatFile(settings.heartbeat_file)
     queue = open_queue(settings, patience=0)
-    sharing = Sharing(
-        queue, number=settings.keeper_shards, lease_s=settings.lease_s, alive=alive, name=settings.keeper_name
-    )
+    leadership = Leadership(queue, lease_s=settings.lease_s, alive=alive, name=settings.keeper_name)
     try:
         # A keeper of another service must not even wait: it would be a standby that all take for their own.
         _identify(settings, stop, alive)
-        while (shards := sharing.wait(stop)) is not None:
-            with sharing.held(stop) as over:
+        while leadership.wait(stop):
+            with leadership.held(stop) as over:
                 # What an earlier keeper took in and did not finish comes again to a fresh one.
                 parts = Parts.open(settings)
                 try:
-                    Keeper(parts, shards).run(over)
+                    Keeper(parts).run(over)
                 finally:
                     parts.close()
     finally:
@@ -232,12 +229,12 @@ def _check_rooms(workers: int) -> None:
 
 def check_keeper(settings: Settings) -> None:
     """UnavailableError if no keeper gave a sign of life lately."""
-    from service.pipeline.sharing import is_kept
+    from service.pipeline.leading import PART
     from service.queue.rq_queue import open_queue
 
     queue = open_queue(settings, patience=0)
     try:
-        if not is_kept(queue):
+        if not queue.announced(PART):
             raise UnavailableError("no keeper gave a sign of life lately; start `graspd keeper`")
     finally:
         queue.close()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Final
 
 from sqlalchemy import Connection, delete, select, update
@@ -66,10 +65,8 @@ class Changes:
         Returns:
             the states of the jobs concerned.
         """
-        # In one order, so that writers that bring the same shards, of jobs that are gone, do not wait in a ring.
-        made = sorted(manifests, key=lambda manifest: manifest.shard_id)
-        with self.database.writing(within, concerns=partial(self._jobs_of, made)) as connection:
-            return self._add_manifests(connection, made)
+        with self.database.writing(within) as connection:
+            return self._add_manifests(connection, list(manifests))
 
     def add_manifest(self, manifest: ShardManifest) -> dict[str, State]:
         """One shard."""
@@ -146,12 +143,6 @@ class Changes:
             for job, batch in connection.execute(done):
                 touched[job].add(batch)
         return settle_batches(connection, touched)
-
-    def _jobs_of(self, manifests: Sequence[ShardManifest], connection: Connection) -> set[str]:
-        found: set[str] = set()
-        for some in chunks([manifest.shard_id for manifest in manifests]):
-            found |= set(connection.scalars(select(tasks.c.job_id).where(tasks.c.shard_id.in_(some)).distinct()))
-        return found
 
     def _askers(self, connection: Connection, ids: Sequence[str]) -> dict[str, str]:
         """Project of the first job that asked for each shard, where it has one."""
