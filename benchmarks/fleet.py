@@ -32,10 +32,12 @@ from sqlalchemy import func, select
 from benchmarks.service_load import cpu_s, say
 from service.index.tables import tasks
 from service.model import names
-from service.model.states import Lane, State
+from service.model.states import Lane, Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.leading import PART
+from service.queue.lists import queue_name
+from service.queue.rq_keys import held_key
 from service.queue.rq_queue import RqQueue
 from service.queue.streams import EVENTS
 from service.run.embedded import server_command
@@ -166,7 +168,7 @@ def measure(workers: int, given: argparse.Namespace) -> Result:
         at.submit(workers + int(given.rate * (given.seconds + task_s + 30)))
         with fleet(at.settings, workers, task_s):
             held = at.queue.connection
-            lists = [f"rq:wip:{lane.value}-synthesize" for lane in Lane]
+            lists = [held_key(queue_name(lane, Stage.SYNTHESIZE)) for lane in Lane]
             _wait(lambda: sum(held.zcard(name) for name in lists) >= 0.9 * workers, "all workers hold a task")
             time.sleep(given.seconds / 2)
             lags, sweeps = _looks(at, given.seconds)

@@ -33,6 +33,7 @@ from service.queue.lists import queue_name
 from service.queue.port import Event, EventKind, Report
 from service.queue.rates import beat_every_s, report_every_s
 from service.queue.reports import REPORTS
+from service.queue.rq_keys import execution_keys, held_key, job_key, list_key
 from service.queue.rq_queue import WORKERS, RqQueue, cancel_key, open_queue, worker_key
 from service.queue.streams import put_event
 from service.settings import Settings
@@ -57,7 +58,7 @@ class Held:
 
     @property
     def job_key(self) -> str:
-        return f"rq:job:{self.entry.partition(':')[0]}"
+        return job_key(self.entry.partition(":")[0])
 
 
 class Fleet:
@@ -96,18 +97,18 @@ class Fleet:
             due.append(self._held.pop(heapq.heappop(self._ends)[1]))
         list(self._pool.map(self._publish, (held.message for held in due)))
         for held in due:
-            pipe.zrem(f"rq:wip:{held.queue}", held.entry)
-            pipe.delete(f"rq:execution:{held.entry}", f"rq:executions:{held.entry.partition(':')[0]}", held.job_key)
+            pipe.zrem(held_key(held.queue), held.entry)
+            pipe.delete(*execution_keys(held.entry), held.job_key)
             self._say(pipe, held, EventKind.FINISHED, seconds=self._task_s, output=held.message["output"])
             self._idle.append(held.worker)
 
     def _take(self, pipe: Any, now: float) -> None:
         for queue in _QUEUES:
-            if not self._idle or not (jobs := self._connection.lpop(f"rq:queue:{queue}", len(self._idle))):
+            if not self._idle or not (jobs := self._connection.lpop(list_key(queue), len(self._idle))):
                 continue
             with self._connection.pipeline(transaction=False) as read:
                 for job in jobs:
-                    read.hget(b"rq:job:" + job, "data")
+                    read.hget(job_key(job.decode()), "data")
                 found = read.execute()
             for job, data in zip(jobs, found, strict=True):
                 if data is not None:
@@ -121,11 +122,11 @@ class Fleet:
         self._held[held.worker] = held
         heapq.heappush(self._ends, (held.ends, held.worker))
         heapq.heappush(self._news, (now + random.random() * self._report_s, held.worker))
-        execution = f"rq:execution:{held.entry}"
+        execution, executions = execution_keys(held.entry)
         pipe.hset(execution, mapping={"id": held.entry, "last_heartbeat": time.time(), "worker_name": held.worker})
         pipe.expire(execution, LEASE_KEPT_S)
-        pipe.zadd(f"rq:executions:{job}", {held.entry: time.time() + LEASE_KEPT_S})
-        pipe.zadd(f"rq:wip:{queue}", {held.entry: time.time() + LEASE_KEPT_S})
+        pipe.zadd(executions, {held.entry: time.time() + LEASE_KEPT_S})
+        pipe.zadd(held_key(queue), {held.entry: time.time() + LEASE_KEPT_S})
         pipe.hset(held.job_key, mapping={"status": "started", "worker_name": held.worker})
         self._say(pipe, held, EventKind.STARTED)
 
@@ -138,10 +139,10 @@ class Fleet:
             pipe.sadd(WORKERS, name)
             pipe.scard(WORKERS)
             if held is not None:
-                pipe.zadd(f"rq:wip:{held.queue}", {held.entry: time.time() + LEASE_KEPT_S}, xx=True)
-                pipe.expire(f"rq:execution:{held.entry}", LEASE_KEPT_S)
-                pipe.expire(f"rq:executions:{held.entry.partition(':')[0]}", LEASE_KEPT_S)
-                pipe.zscore(f"rq:wip:{held.queue}", held.entry)
+                pipe.zadd(held_key(held.queue), {held.entry: time.time() + LEASE_KEPT_S}, xx=True)
+                for key in execution_keys(held.entry):
+                    pipe.expire(key, LEASE_KEPT_S)
+                pipe.zscore(held_key(held.queue), held.entry)
                 pipe.exists(cancel_key(held.message["task_id"]))
 
     def _tell_due(self, pipe: Any, now: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -18,6 +19,13 @@ MODULES = sorted(
 
 
 HEAVY = {"warp", "trimesh", "mujoco", "scipy", "newton", "torch", "worker", "api"}
+
+
+def test_no_line_spells_a_key_of_rq() -> None:
+    """RQ itself says where it keeps what: `service.queue.rq_keys` asks it."""
+    root = Path(service.__file__).parents[1]
+    files = [file for room in ("service", "worker", "api", "graspd") for file in (root / room).rglob("*.py")]
+    assert [str(file) for file in files if re.search(r"""["']rq:""", file.read_text())] == []
 
 
 def test_the_shared_floor_is_light() -> None:

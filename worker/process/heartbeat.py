@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from service.model.worker_beat import WorkerBeat
+from service.queue.rq_keys import execution_keys
 from service.queue.rq_queue import WORKERS, cancel_key, worker_key
 from service.queue.streams import EVENTS, EVENTS_KEPT
 from worker.stages.context import StopReason, TaskContext
@@ -46,6 +47,7 @@ class Hold:
             "entry": self.entry,
             "registry": self.registry,
             "cancel": cancel_key(self.task_id),
+            "kept": execution_keys(self.entry),
             "seconds": self.timeout_s,
         }
 

@@ -232,9 +232,6 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
     def unsubscribe(self) -> None:
         """There is no channel."""
 
-    def procline(self, message: str) -> None:
-        """The process keeps its name."""
-
 
 def _raw(job: Any) -> Mapping[str, Any]:
     try:

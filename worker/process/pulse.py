@@ -45,8 +45,8 @@ class Pulse:
 
     `place` names the keys (`worker`, `workers`, `events`), `events_kept`, `lease_s`, and the file `alive`, if there is
     one. What the worker is at: `beat` is what its registration says; `limit` names a piece of work that must end (`id`,
-    `seconds`); `hold` is the lease of a task (`entry`, the keys `registry` and `cancel`, and `seconds`, in which the
-    task must end), if there is one.
+    `seconds`); `hold` is the lease of a task (`entry`, the keys `registry` and `cancel`, two that are `kept`, and
+    `seconds`, in which the task must end), if there is one.
     """
 
     def __init__(
@@ -87,8 +87,8 @@ class Pulse:
             if hold:
                 # Nothing is made that is not there: the task may be done, or taken away, by now.
                 pipe.zadd(hold["registry"], {hold["entry"]: time.time() + LEASE_KEPT_S}, xx=True)
-                pipe.expire(f"rq:execution:{hold['entry']}", LEASE_KEPT_S)
-                pipe.expire(f"rq:executions:{hold['entry'].partition(':')[0]}", LEASE_KEPT_S)
+                for key in hold["kept"]:
+                    pipe.expire(key, LEASE_KEPT_S)
                 pipe.zscore(hold["registry"], hold["entry"])
                 pipe.exists(hold["cancel"])
             results = pipe.execute()

@@ -223,7 +223,7 @@ def test_each_task_has_a_time_of_its_own() -> None:
     )
 
     def hold(entry: str) -> dict[str, Any]:
-        return {"entry": entry, "registry": "r", "cancel": "c", "seconds": 10.0}
+        return {"entry": entry, "registry": "r", "cancel": "c", "kept": [], "seconds": 10.0}
 
     pulse.take({"beat": asdict(beat_of("busy")), "hold": hold("a-1:x")})
     now[0] = 6.0
