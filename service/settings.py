@@ -99,7 +99,7 @@ class Settings(BaseSettings):
     )
     task_attempts: int = Field(3, ge=1, le=20, description="attempts of a task before its job fails")
     task_s: float = Field(
-        30.0, ge=0, description="how long a task of a larger job should last by what was measured [s]; 0: one batch"
+        60.0, ge=0, description="how long a task of a larger job should last by what was measured [s]; 0: one batch"
     )
     task_timeout_s: float = Field(1800.0, gt=0, description="longest run of one task [s]")
     worker_max_tasks: int = Field(

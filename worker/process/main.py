@@ -53,6 +53,8 @@ _PATIENCE: Final = 60
 #: RQ waits this long for a task before it looks after itself [s]: its `worker_ttl` less 15.
 _WORKER_TTL_S: Final = 20
 _REFUSED_PAUSE_S: Final = 0.5
+#: Longest wait between two attempts to reach Redis [s].
+_LONGEST_RETRY_S: Final = 2.0
 
 
 class _NoAlarm(BaseDeathPenalty):  # type: ignore[misc]
@@ -69,10 +71,6 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
     """RQ's in-process worker without RQ's maintenance, command channel, alarm and retries: the keeper does all that."""
 
     death_penalty_class = _NoAlarm
-    queue_class = AllowedQueue
-    job_class = AllowedJob
-    max_connection_wait_time = 2.0
-    log_result_lifespan = False
 
     def __init__(
         self,
@@ -91,8 +89,11 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             connection=queue.connection,
             serializer=JSONSerializer,
             worker_ttl=_WORKER_TTL_S,
+            queue_class=AllowedQueue,
+            job_class=AllowedJob,
+            log_job_description=False,
         )
-        self.log_job_description = False
+        self.max_connection_wait_time = _LONGEST_RETRY_S
         self._queue = queue
         self._runner = runner
         self._heart = heart

@@ -34,8 +34,8 @@ from worker.stages.output import shard_of
 
 @pytest.fixture
 def parts(parts: Parts) -> Parts:
-    """A service whose tasks last as long as they do by default."""
-    return replace(parts, settings=Settings(data_dir=parts.settings.data_dir, retry_backoff_s=0.0))
+    """A service whose tasks last half a minute."""
+    return replace(parts, settings=parts.settings.model_copy(update={"task_s": 30.0}))
 
 
 def worker(name: str = "w", *, device: str = "cpu", schemas: tuple[int, int] = (2, TASK_SCHEMA)) -> WorkerBeat:
@@ -89,6 +89,9 @@ def test_a_task_of_a_larger_job_lasts_about_as_long_as_the_settings_say(parts: P
 
 def test_a_job_of_ten_thousand_grasps_makes_few_objects(parts: Parts) -> None:
     here(parts, worker())
+    usual = replace(parts, settings=Settings(data_dir=parts.settings.data_dir))
+    on_two_cores = job_actions.prepare(usual, request(grasps=10_000), lane=Lane.BULK)
+    assert 2 * len(list(plan(on_two_cores))) == 80
     measured(parts, 0.1)
     job = job_actions.prepare(parts, request(grasps=10_000), lane=Lane.BULK)
     assert 2 * len(list(plan(job))) <= 12
