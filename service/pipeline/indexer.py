@@ -26,8 +26,10 @@ from service.store.records import read_record
 log = logging.getLogger(__name__)
 _REMEMBERED_JOBS: Final = 10_000
 _REMEMBERED_TASKS: Final = 100_000
-#: Shards indexed in one transaction: others who write wait for it, a fraction of a second.
-_SHARDS_AT_ONCE: Final = 200
+#: Batches indexed in one transaction: others who write wait for it, a fraction of a second.
+_BATCHES_AT_ONCE: Final = 200
+#: Manifests in memory at once, of up to 64 batches each.
+_MANIFESTS_AT_ONCE: Final = 32
 _READERS: Final = 8
 
 _NEEDS_STORE: Final = frozenset({EventKind.FINISHED, EventKind.FAILED})
@@ -71,8 +73,7 @@ class Indexer:
                     continue
                 waiting.append(place)
         self._start(started)
-        for first in range(0, len(finished), _SHARDS_AT_ONCE):
-            waiting += self._finish(events, finished[first : first + _SHARDS_AT_ONCE])
+        waiting += self._finish(events, finished)
         if left:
             self._parts.index.live.forget_workers(left)
         return sorted(waiting)
@@ -87,19 +88,28 @@ class Indexer:
     def _finish(self, events: Sequence[Event], places: Sequence[int]) -> list[int]:
         """Index what was made; returns the places of the events whose manifests the store does not give."""
         made, waiting = list[ShardManifest](), []
-        for place, found in zip(places, self._readers.map(self._load, (events[at] for at in places)), strict=True):
+        for place, found in self._loaded(events, places):
             if isinstance(found, ShardManifest):
                 self._deferrals.pop(events[place].task_id, None)
                 made.append(found)
+                if sum(manifest.batches for manifest in made) >= _BATCHES_AT_ONCE:
+                    self._index(made)
+                    made = []
             elif isinstance(found, StoreUnavailable):
                 waiting.append(place)
             else:
                 log.error("the end of task %s is left out", events[place].task_id, exc_info=found)
         if waiting:
             log.warning("the store does not answer, and %d events wait for it", len(waiting))
-        for first in range(0, len(made), _SHARDS_AT_ONCE):
-            self._index(made[first : first + _SHARDS_AT_ONCE])
+        self._index(made)
         return waiting
+
+    def _loaded(
+        self, events: Sequence[Event], places: Sequence[int]
+    ) -> Iterator[tuple[int, ShardManifest | Exception]]:
+        for first in range(0, len(places), _MANIFESTS_AT_ONCE):
+            some = places[first : first + _MANIFESTS_AT_ONCE]
+            yield from zip(some, self._readers.map(self._load, [events[place] for place in some]), strict=True)
 
     def _load(self, event: Event) -> ShardManifest | Exception:
         """The manifest of what was made. Many are read at once: most of the time the store is waited for."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from service.index.changes.records import Changes
 from service.index.rebuild import differences
 from service.model.clock import timestamp
 from service.model.planning import message_of, plan
@@ -24,7 +26,7 @@ from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.ranges import TaskRanges, span_of
 from service.settings import Settings
 from service.store.library import publish_asset
-from service.store.manifests import publish_shard
+from service.store.manifests import ShardManifest, publish_shard
 from tests.fakes import OBJECT_FILES, fake_stages, request
 from tests.planning import plan_all
 from tests.service.pipeline.test_keeper import Bench
@@ -174,3 +176,23 @@ def test_a_job_of_ranges_goes_through_its_stages_and_the_index_is_the_store(part
         (s, b) for s in (Stage.SYNTHESIZE, Stage.SCENE) for b in (0, 4)
     }
     assert differences(parts.index, parts.store) == []
+
+
+def test_shards_of_many_batches_enter_the_index_in_short_turns(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench(parts)
+    bench.keeper.round()
+    record = job_actions.prepare(parts, request(grasps=32 * 64 * 5), lane=Lane.BULK)
+    job, _ = job_actions.enter(parts, record.model_copy(update={"span": 64}))
+    turns: list[int] = []
+    add = Changes.add_manifests
+
+    def counted(self: Changes, manifests: list[ShardManifest], **options: Any) -> dict[str, State]:
+        turns.append(sum(manifest.batches for manifest in manifests))
+        return add(self, manifests, **options)
+
+    monkeypatch.setattr(Changes, "add_manifests", counted)
+    while (delivery := bench.queue.take("w")) is not None:
+        bench.do(delivery)
+    bench.pass_time(1)
+    assert parts.index.jobs.get(job.id).state is State.SUCCEEDED
+    assert turns == [256, 64]
