@@ -18,6 +18,7 @@ from worker.meeting import Meeting
 from worker.objects.model import ObjectModel
 from worker.quality.diversity import distinct, hand_points
 from worker.quality.referee.decomposition import ConvexPieces, decompose
+from worker.rounds import taken
 from worker.run import ALONE, Run
 from worker.side_by_side import Shares, in_threads
 from worker.simulation.surroundings import Scenes
@@ -39,6 +40,7 @@ def certified_batches(
     run: Run = ALONE,
     partial: bool = False,
     checked: Callable[[int, Certified], None] | None = None,
+    empty_on: tuple[type[Exception], ...] = (),
 ) -> list[Certified]:
     """Batches of a job that follow each other; see `certified_grasps`, which makes the same of each.
 
@@ -54,6 +56,7 @@ def certified_batches(
         run: told of the grasps that are done.
         partial: if it is stopped, the batches that were judged before are the result, the last one maybe in part.
         checked: called with the number of each batch as it is made, and with what came of it; may raise.
+        empty_on: where one of these becomes of a batch, it has no grasps; not of a job's first batch, nor of all.
 
     Raises:
         Exception: what became of the first batch that failed; the others are stopped.
@@ -66,19 +69,27 @@ def certified_batches(
             known.append(pieces(prepared))
         return known[0]
 
-    def batch(number: int, own: Run) -> Certified:
+    refused: list[Exception] = []
+
+    def batch(number: int, own: Run) -> Certified | None:
         own = replace(own, progress=shares.of(number))
         where = scenes if scenes is None or isinstance(scenes, Scenes) else scenes[number]
-        made = certified_grasps(
-            hand, obj, request, count=sizes[number], batch=first + number, scenes=where, pieces=pieces_once, run=own,
-            partial=partial,
-        )  # fmt: skip
+        try:
+            made = certified_grasps(
+                hand, obj, request, count=sizes[number], batch=first + number, scenes=where, pieces=pieces_once,
+                run=own, partial=partial,
+            )  # fmt: skip
+        except empty_on as error:
+            if first + number == 0:
+                raise
+            refused.append(error)
+            return None
         if checked is not None:
             checked(first + number, made)
         own.progress(1.0, 1.0, "done")
         return made
 
-    found: dict[int, Certified] = {}
+    found: dict[int, Certified | None] = {}
     try:
         if join == 1 or len(sizes) == 1:
             for number in range(len(sizes)):
@@ -90,7 +101,17 @@ def certified_batches(
     except TaskCancelled:
         if not partial or not found:
             raise
-    return [found[number] for number in sorted(found)]
+    made = [one for number in sorted(found) if (one := found[number]) is not None]
+    if not made:
+        raise refused[0]
+    return [one or _nothing(made[0]) for _, one in sorted(found.items())]
+
+
+def _nothing(like: Certified) -> Certified:
+    """A batch without grasps, and nothing tried."""
+    grasps, columns = taken(like.grasps, like.columns, np.zeros(0, int))
+    zeros = (dict.fromkeys(counts, 0.0) for counts in (like.seconds, like.shares))
+    return Certified(grasps, columns, 0, dict.fromkeys(like.rejected, 0), {}, like.verdict_key, 0, *zeros)
 
 
 def distinct_batches(
@@ -127,7 +148,7 @@ def distinct_batches(
 
 
 def _together(
-    work: Callable[[int, Run], Certified], count: int, join: int, run: Run, found: dict[int, Certified]
+    work: Callable[[int, Run], Certified | None], count: int, join: int, run: Run, found: dict[int, Certified | None]
 ) -> None:
     """Puts each batch under its number as soon as it is made."""
     members = min(count, PER_LAUNCH * join)

@@ -57,6 +57,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
             pieces=lambda prepared: pieces_of(context.store, prepared),
             run=context.run,
             checked=partial(_check_hope, message) if scenes else None,
+            empty_on=(NoPlace,) if scenes else (),
         )
     except InputError as error:
         # Of hand and object there are errors of their own; what is left is that no hand finds a way in.

@@ -22,6 +22,8 @@ from service.store.manifests import load_manifest, load_shard
 from service.store.records import put_record
 from service.store.shards import Shard
 from service.store.store import Store, open_store
+from worker import certified
+from worker.planners import NoPlace
 from worker.process.runner import Runner
 from worker.stages import scene, synthesize
 from worker.stages.context import StopReason, TaskContext
@@ -130,3 +132,28 @@ def test_a_range_tells_how_far_it_is_and_stops_where_it_is_told_to() -> None:
             synthesize.run(message, context)
             assert told == sorted(told)
             assert any(0 < share < 0.5 for share in told) and any(0.5 < share < 1 for share in told)
+
+
+@pytest.mark.parametrize(("refused", "rows"), [({1}, f"[{SIZE}, 0, 1]"), ({0}, ""), ({0, 1, 2}, "")])
+def test_a_batch_whose_scenes_leave_no_place_has_no_grasps_but_for_the_first_of_a_job(
+    monkeypatch: pytest.MonkeyPatch, refused: set[int], rows: str
+) -> None:
+    """As where none is found within the budget: the grasps of the other batches stay."""
+    whole = certified.certified_grasps
+
+    def some(*given: Any, batch: int, **options: Any) -> Any:
+        if batch in refused:
+            raise NoPlace("no hand finds a way in")
+        return whole(*given, batch=batch, **options)
+
+    monkeypatch.setattr("worker.together.certified_grasps", some)
+    asked = {"grasps": 2 * SIZE + 1, "scene": "table", "scenes": 2, "budget": 20}
+    if not rows:
+        with pytest.raises(AssertionError, match="no hand finds a way in"):
+            made(open_store("memory://"), 3, **asked)
+        return
+    _, (_, (_, base, manifest)) = made(open_store("memory://"), 3, **asked)
+    assert base.attributes["batch_rows"] == rows
+    assert set(base["grasp/scene_index"]) <= {0, 1, 4, 5}, "the scenes of the batch are there, and empty"
+    assert len(base["scene/object_pose"]) == 6
+    assert manifest.count == SIZE + 1
