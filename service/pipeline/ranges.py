@@ -19,6 +19,8 @@ from service.pipeline.rates import Rates, tries
 
 #: Finished tasks that tell how long a batch takes.
 _LOOKED_AT: Final = 64
+#: Workers that are expected where none is there: a service may start them once a task waits.
+_EXPECTED: Final = 8
 #: How long what is known of workers and rates counts [s].
 _KNOWN_S: Final = 10.0
 
@@ -58,7 +60,8 @@ class TaskRanges:
         if job.lane is Lane.INTERACTIVE and not (able and all(one.device.startswith("cuda") for one in able)):
             return job
         by_time = int(wanted_s / max(1e-3, self._batch_s(job.request, {one.device for one in able}) or wanted_s))
-        return job.model_copy(update={"span": span_of(batches, by_time, -(-len(able) // among))})
+        workers = -(-(len(able) or _EXPECTED) // among)
+        return job.model_copy(update={"span": span_of(batches, by_time, workers)})
 
     def _batch_s(self, request: JobRequest, devices: set[str]) -> float:
         """How long one of its batches takes [s]."""

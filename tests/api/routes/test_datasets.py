@@ -153,7 +153,7 @@ def test_a_snapshot_is_made_once_and_names_checksums(http: TestClient, parts: Pa
     assert http.post("/v1/datasets/kitchen/snapshots").status_code == 409
     finish_cells(parts, http, 2)
     taken = http.post("/v1/datasets/kitchen/snapshots")
-    assert taken.status_code == 201 and taken.json()["shards"] == 2 and not taken.json()["complete"]
+    assert taken.status_code == 201 and taken.json()["shards"] == 4 and not taken.json()["complete"]
     assert http.post("/v1/datasets/kitchen/snapshots").status_code == 200
     assert http.get("/v1/datasets/kitchen/snapshots").json()["items"] == [taken.json()]
     whole = http.get(taken.headers["Location"]).json()

@@ -107,6 +107,8 @@ def test_workers_share_a_job_fairly(parts: Parts) -> None:
     assert span(parts, 32 * 16) == 4
     here(parts, worker("a"), worker("b"))
     assert span(parts, 32 * 16) == 8
+    here(parts)
+    assert span(parts, 32 * 16) == 2, "a fleet may start once tasks wait"
 
 
 @pytest.mark.parametrize(("cells", "tasks"), [(1, 4), (2, 2), (8, 1)])
