@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
@@ -13,7 +13,6 @@ from service.index.at_scrape import IndexNow
 from service.pipeline.series import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S
 from service.pipeline.tally import parse_field
 from service.queue.at_scrape import QueueNow
-from service.queue.port import Keeping
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 
@@ -59,7 +58,7 @@ class Snapshot:
             if seconds is not None:
                 self._set("graspd_part_latency_seconds", part, value=seconds)
 
-    def add_queue(self, queue: QueueNow, keepers: Sequence[Keeping]) -> None:
+    def add_queue(self, queue: QueueNow, *, is_kept: bool) -> None:
         for (lane, stage), depth in queue.depth.items():
             self._set("graspd_queue_depth", lane, stage, value=depth)
             oldest = queue.oldest_s.get((lane, stage), 0.0)
@@ -70,9 +69,7 @@ class Snapshot:
             self._set("graspd_workers", state, value=states.count(state))
         for name, pulse in queue.workers.items():
             self._set("graspd_worker_lease_age_seconds", name, pulse.device, value=pulse.lease_age_s)
-        self._set("graspd_keeper_up", value=float(all(one.works for one in keepers)))
-        for one in keepers:
-            self._set("graspd_keeper_shard_up", one.shard, one.holder, value=float(one.works))
+        self._set("graspd_keeper_up", value=float(is_kept))
 
     def add_index(self, index: IndexNow) -> None:
         for state, count in index.jobs.items():

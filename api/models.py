@@ -22,9 +22,9 @@ class StageStatus(StageProgress):
     """How far one stage of a job is, and when it will end."""
 
     state: State
-    progress: float = Field(ge=0, le=1, description="share done; running batches count by their own progress")
-    message: str = Field("", description="what a running batch does now, or why one waits")
-    rate_per_s: float | None = Field(None, description="batches per second over the present workers")
+    progress: float = Field(ge=0, le=1, description="share done; running tasks count by their own progress")
+    message: str = Field("", description="what a running task does now, or why one waits")
+    rate_per_s: float | None = Field(None, description="tasks per second over the present workers")
     eta_s: float | None = Field(None, description="expected time until the stage ends [s]")
 
 

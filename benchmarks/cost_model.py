@@ -34,7 +34,7 @@ class Work:
     days: float = 7.0
     """Time to make them in [days]."""
     batch: int = 32
-    """Grasps of a task."""
+    """Grasps of a batch."""
     scenes: int = 2
     """Scenes of a batch."""
     views: int = 3
@@ -43,8 +43,8 @@ class Work:
     """Pictures of a placement: 2 is stereo."""
     job: int = 3200
     """Grasps of a job."""
-    pack: int = 1
-    """Base shards that are put as one object."""
+    span: int = 1
+    """Batches of a task; 1 with pictures."""
 
     @property
     def batches(self) -> int:
@@ -155,12 +155,11 @@ def estimate(work: Work, measured: Measured, prices: Prices, *, cores_per_worker
     seconds = work.days * _DAY_S
     cores = math.ceil(core_s / seconds)
     workers = math.ceil(cores / cores_per_worker)
-    tasks = work.batches * work.stages
+    tasks = math.ceil(work.batches / work.span) * work.stages
     jobs = math.ceil(work.grasps / work.job)
     rate = tasks / seconds
-    # A shard and its manifest for each task, or a pack for several batches; a record for each job.
-    base = 2 * work.batches if work.pack == 1 else math.ceil(work.batches / work.pack)
-    objects = base + 2 * (tasks - work.batches) + jobs
+    # A shard and its manifest for each task; a record for each job.
+    objects = 2 * tasks + jobs
     size = (
         work.grasps * measured.base_bytes_per_grasp
         + scenes * measured.scene_bytes

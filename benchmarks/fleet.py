@@ -1,13 +1,13 @@
-"""How many workers keepers serve: real Redis, PostgreSQL, store and keepers, and workers that do no work.
+"""How many workers a keeper serves: real Redis, PostgreSQL, store and keeper, and workers that do no work.
 
-usage: python -m benchmarks.fleet [--workers 64 512 4096] [--keepers 1 2 4] [--seconds 20] [--tasks 6000] [--pack 1]
+usage: python -m benchmarks.fleet [--workers 64 512 4096] [--seconds 20] [--tasks 6000]
                                   [--sqlite] [--s3] [--json FILE]
 
-For each number of workers and of keepers, two runs. First all workers hold tasks that end at --rate a second in all,
+For each number of workers two runs. First all workers hold tasks that end at --rate a second in all,
 beat and tell their progress: how old is the oldest event that is not in the index, and how long does it take to read
-all leases? Then their tasks take no time: how many a second come through keepers and index? Everything shares this
-machine, the workers too; the processor time of each part is counted beside its clock, and that of the busiest keeper.
-With --pack so many shards that end together are one object of the store. What the workers do is in
+all leases? Then their tasks take no time: how many a second come through keeper and index? Everything shares this
+machine, the workers too; the processor time of each part is counted beside its clock.
+What the workers do is in
 `benchmarks.fleet_workers`.
 """
 
@@ -24,7 +24,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
-from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
@@ -33,13 +32,14 @@ from sqlalchemy import func, select
 from benchmarks.service_load import cpu_s, say
 from service.index.tables import tasks
 from service.model import names
-from service.model.states import Lane, State
+from service.model.states import Lane, Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
-from service.pipeline.sharing import PART
-from service.queue.port import Keeping
+from service.pipeline.leading import PART
+from service.queue.lists import queue_name
+from service.queue.rq_keys import held_key
 from service.queue.rq_queue import RqQueue
-from service.queue.streams import streams_kept
+from service.queue.streams import EVENTS
 from service.run.embedded import server_command
 from service.settings import Settings
 from tests.fakes import add_assets, request
@@ -57,7 +57,6 @@ class Result:
     """What one number of workers came to."""
 
     workers: int
-    keepers: int
     lag_s: float
     """Age of the oldest event that was not in the index: 95th of 100 looks."""
     worst_lag_s: float
@@ -65,15 +64,13 @@ class Result:
     """Median time in which all leases are read."""
     tasks_per_s: float
     keeper_ms: float
-    """Processor time of all keepers for a task."""
-    busiest_ms: float
-    """That of the keeper with most of it: so many tasks a second are a core of it."""
+    """Processor time of the keeper for a task."""
     database_ms: float
     redis_ms: float
     events: float
     """Events of the second run for a task."""
     objects: float
-    """Objects that the keeper reads of the store for a task: manifests, or packs."""
+    """Objects that the keeper reads of the store for a task: manifests."""
 
 
 class Machine:
@@ -102,17 +99,14 @@ class Machine:
 
     def lag_s(self) -> float:
         """Age of the oldest event that its keeper has not acknowledged."""
-        return max(map(self._lag_of, streams_kept(self.queue.connection)))
-
-    def _lag_of(self, stream: str) -> float:
         connection = self.queue.connection
-        groups = connection.xinfo_groups(stream)
+        groups = connection.xinfo_groups(EVENTS)
         if not groups:
             return 0.0
-        pending = connection.xpending(stream, groups[0]["name"])
+        pending = connection.xpending(EVENTS, groups[0]["name"])
         oldest = pending["min"]
         if oldest is None:
-            after = connection.xrange(stream, b"(" + groups[0]["last-delivered-id"], count=1)
+            after = connection.xrange(EVENTS, b"(" + groups[0]["last-delivered-id"], count=1)
             oldest = after[0][0] if after else None
         seconds, micros = connection.time()
         return 0.0 if oldest is None else max(0.0, seconds + micros / 1e6 - int(oldest.split(b"-")[0]) / 1000)
@@ -125,12 +119,11 @@ class Machine:
 
 
 @contextmanager
-def machine(*, sqlite: bool, s3: bool, keepers: int = 1) -> Iterator[Machine]:
-    """A service of real processes that ends with the block; each keeper has one shard of the work."""
+def machine(*, sqlite: bool, s3: bool) -> Iterator[Machine]:
+    """A service of real processes that ends with the block."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="graspd-fleet-")))
         options: dict[str, Any] = {"data_dir": folder, "log_level": "WARNING", "scrub_mb_per_s": 0.0, "lease_s": 20.0}
-        options["keeper_shards"] = keepers
         pids = {}
         if not sqlite:
             server = stack.enter_context(PostgresServer())
@@ -140,30 +133,22 @@ def machine(*, sqlite: bool, s3: bool, keepers: int = 1) -> Iterator[Machine]:
             bucket = stack.enter_context(S3Server())
             os.environ.update(bucket.environment)
             options["store_url"] = f"{bucket.url}/fleet"
-        settings = Settings(**options)
+        settings = Settings(**options, task_s=0)
         redis = _started(stack, server_command(settings), {})
         parts = Parts.open(settings)
         stack.callback(parts.close)
         _wait(lambda: _answers(parts), "Redis answers")
         add_assets(parts)
-        for number in range(keepers):
-            command = [sys.executable, "-m", "graspd", "keeper"]
-            pids[f"keeper-{number}"] = _started(stack, command, environment(settings))
-        _wait(lambda: len({one.holder for one in _kept(parts)}) == keepers, "every shard has a keeper of its own")
+        pids["keeper"] = _started(stack, [sys.executable, "-m", "graspd", "keeper"], environment(settings))
+        _wait(lambda: parts.queue.announced(PART), "a keeper works")
         yield Machine(settings, parts, pids | {"redis": redis})
 
 
-def _kept(parts: Parts) -> list[Keeping]:
-    """Shards that are kept; none as long as one of them is not."""
-    shards = parts.queue.keepers(PART)
-    return shards if all(one.works and one.holder for one in shards) else []
-
-
 @contextmanager
-def fleet(settings: Settings, workers: int, task_s: float, pack: int = 1) -> Iterator[None]:
+def fleet(settings: Settings, workers: int, task_s: float) -> Iterator[None]:
     """Workers that live for the block."""
     with ExitStack() as stack:
-        command = [sys.executable, "-m", "benchmarks.fleet_workers", str(workers), str(task_s), str(pack)]
+        command = [sys.executable, "-m", "benchmarks.fleet_workers", str(workers), str(task_s)]
         _started(stack, command, environment(settings))
         yield
 
@@ -176,22 +161,22 @@ def environment(settings: Settings) -> dict[str, str]:
     return {f"GRASPD_{name.upper()}": value for name, value in plain.items()}
 
 
-def measure(workers: int, keepers: int, given: argparse.Namespace) -> Result:
-    """Both runs with one number of workers and of keepers."""
-    with machine(sqlite=given.sqlite, s3=given.s3, keepers=keepers) as at:
+def measure(workers: int, given: argparse.Namespace) -> Result:
+    """Both runs with one number of workers."""
+    with machine(sqlite=given.sqlite, s3=given.s3) as at:
         task_s = workers / given.rate
         at.submit(workers + int(given.rate * (given.seconds + task_s + 30)))
-        with fleet(at.settings, workers, task_s, given.pack):
+        with fleet(at.settings, workers, task_s):
             held = at.queue.connection
-            lists = [f"rq:wip:{lane.value}-synthesize" for lane in Lane]
+            lists = [held_key(queue_name(lane, Stage.SYNTHESIZE)) for lane in Lane]
             _wait(lambda: sum(held.zcard(name) for name in lists) >= 0.9 * workers, "all workers hold a task")
             time.sleep(given.seconds / 2)
             lags, sweeps = _looks(at, given.seconds)
-    with machine(sqlite=given.sqlite, s3=given.s3, keepers=keepers) as at:
+    with machine(sqlite=given.sqlite, s3=given.s3) as at:
         at.submit(given.tasks)
         before = at.cpu()
         begun = time.perf_counter()
-        with fleet(at.settings, workers, 0.0, given.pack):
+        with fleet(at.settings, workers, 0.0):
             _wait(
                 lambda: _finished(at.parts) >= given.tasks,
                 "all tasks are in the index",
@@ -199,19 +184,15 @@ def measure(workers: int, keepers: int, given: argparse.Namespace) -> Result:
             )
             seconds = time.perf_counter() - begun
             spent = {name: 1000 * (used - before[name]) / given.tasks for name, used in at.cpu().items()}
-            streams = streams_kept(at.queue.connection)
-            events = sum(at.queue.connection.xinfo_stream(name)["entries-added"] for name in streams)
-            objects = sum(1 for folder in (names.SHARDS, names.PACKS) for _ in at.parts.store.list(folder))
-    of_keepers = [used for name, used in spent.items() if name.startswith("keeper")]
+            events = at.queue.connection.xinfo_stream(EVENTS)["entries-added"]
+            objects = sum(1 for _ in at.parts.store.list(names.SHARDS))
     return Result(
         workers=workers,
-        keepers=keepers,
         lag_s=statistics.quantiles(lags, n=20)[-1],
         worst_lag_s=max(lags),
         sweep_ms=1000 * statistics.median(sweeps),
         tasks_per_s=given.tasks / seconds,
-        keeper_ms=sum(of_keepers),
-        busiest_ms=max(of_keepers),
+        keeper_ms=spent["keeper"],
         database_ms=spent.get("database", 0.0),
         redis_ms=spent["redis"],
         events=events / given.tasks,
@@ -268,25 +249,23 @@ def _tree_cpu(pid: int) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--workers", type=int, nargs="+", default=[64, 512, 4096])
-    parser.add_argument("--keepers", type=int, nargs="+", default=[1])
     parser.add_argument("--seconds", type=float, default=20.0, help="how long the lag is watched")
     parser.add_argument("--rate", type=float, default=100.0, help="tasks that end a second while it is watched")
     parser.add_argument("--tasks", type=int, default=6000, help="tasks of the second run")
-    parser.add_argument("--pack", type=int, default=1, help="shards that are put as one object; 1: each by itself")
     parser.add_argument("--sqlite", action="store_true", help="the index in a file instead of PostgreSQL")
     parser.add_argument("--s3", action="store_true", help="the store on an S3 server instead of files")
     parser.add_argument("--json", type=Path, help="keep the figures there")
     given = parser.parse_args()
-    say("| workers | keepers | lag of events, p95 | worst | lease sweep | tasks/s "
-        "| keepers, of a task | the busiest | database | Redis | events | objects |")  # fmt: skip
-    say(f"|{' --: |' * 12}")
+    say("| workers | lag of events, p95 | worst | lease sweep | tasks/s "
+        "| keeper, of a task | database | Redis | events | objects |")  # fmt: skip
+    say(f"|{' --: |' * 10}")
     results = []
-    for workers, keepers in product(given.workers, given.keepers):
-        one = measure(workers, keepers, given)
+    for workers in given.workers:
+        one = measure(workers, given)
         results.append(one)
         say(
-            f"| {workers:,} | {keepers} | {one.lag_s:.2f} s | {one.worst_lag_s:.2f} s | {one.sweep_ms:.0f} ms "
-            f"| {one.tasks_per_s:.0f} | {one.keeper_ms:.1f} ms | {one.busiest_ms:.1f} ms | {one.database_ms:.1f} ms "
+            f"| {workers:,} | {one.lag_s:.2f} s | {one.worst_lag_s:.2f} s | {one.sweep_ms:.0f} ms "
+            f"| {one.tasks_per_s:.0f} | {one.keeper_ms:.1f} ms | {one.database_ms:.1f} ms "
             f"| {one.redis_ms:.1f} ms | {one.events:.2f} | {one.objects:.3f} |"
         )
     if given.json:

@@ -1,12 +1,11 @@
 """N workers in one process that do no work: Redis sees from them what it sees from real ones, at the same rates.
 
-usage: python -m benchmarks.fleet_workers WORKERS TASK_S [PACK]      (settings from the environment)
+usage: python -m benchmarks.fleet_workers WORKERS TASK_S      (settings from the environment)
 
 A worker that holds a task beats, tells its progress, and after `TASK_S` seconds puts the manifest of its shard and says
 that it finished. Manifests are those of one true shard under other names; the shard's own file, which no keeper reads,
-is not put. With `PACK` tasks that end together put up to so many shards as one object, files too. Commands of many
-workers share a pipeline: a thousand interpreters do not fit a machine that is to be measured, and Redis is asked
-as much.
+is not put. Commands of many workers share a pipeline: a thousand interpreters do not fit a machine that is to be
+measured, and Redis is asked as much.
 """
 
 from __future__ import annotations
@@ -34,11 +33,10 @@ from service.queue.lists import queue_name
 from service.queue.port import Event, EventKind, Report
 from service.queue.rates import beat_every_s, report_every_s
 from service.queue.reports import REPORTS
+from service.queue.rq_keys import execution_keys, held_key, job_key, list_key
 from service.queue.rq_queue import WORKERS, RqQueue, cancel_key, open_queue, worker_key
 from service.queue.streams import put_event
 from service.settings import Settings
-from service.store.manifests import ShardManifest
-from service.store.packs import put_pack
 from service.store.store import Store, open_store
 from tests.fakes import make_shard
 from worker.process.pulse import LEASE_KEPT_S
@@ -60,16 +58,14 @@ class Held:
 
     @property
     def job_key(self) -> str:
-        return f"rq:job:{self.entry.partition(':')[0]}"
+        return job_key(self.entry.partition(":")[0])
 
 
 class Fleet:
     """Workers that take tasks from Redis and end them after a while."""
 
-    def __init__(
-        self, queue: RqQueue, store: Store, *, workers: int, task_s: float, lease_s: float, pack: int = 1
-    ) -> None:
-        self._queue, self._store, self._connection, self._pack = queue, store, queue.connection, pack
+    def __init__(self, queue: RqQueue, store: Store, *, workers: int, task_s: float, lease_s: float) -> None:
+        self._queue, self._store, self._connection = queue, store, queue.connection
         self._task_s, self._lease_s = task_s, lease_s
         self._beat_s, self._report_s = beat_every_s(workers, lease_s), report_every_s(workers)
         self._idle = deque(f"fake-{number:05d}" for number in range(workers))
@@ -79,7 +75,7 @@ class Fleet:
         self._beats = [(now + random.random() * self._beat_s, name) for name in self._idle]
         heapq.heapify(self._beats)
         self._news: list[tuple[float, str]] = []
-        self._template, self._file = "", b""
+        self._template = ""
         self._names: tuple[str, ...] = ()
         self._pool = ThreadPoolExecutor(8)
         self._first = True
@@ -99,28 +95,20 @@ class Fleet:
         due = []
         while self._ends and self._ends[0][0] <= now:
             due.append(self._held.pop(heapq.heappop(self._ends)[1]))
-        together = [due[at : at + self._pack] for at in range(0, len(due), self._pack)] if self._pack > 1 else []
-        keys = list(self._pool.map(self._publish_pack, together))
-        if self._pack == 1:
-            list(self._pool.map(self._publish, (held.message for held in due)))
+        list(self._pool.map(self._publish, (held.message for held in due)))
         for held in due:
-            pipe.zrem(f"rq:wip:{held.queue}", held.entry)
-            pipe.delete(f"rq:execution:{held.entry}", f"rq:executions:{held.entry.partition(':')[0]}", held.job_key)
-            if self._pack == 1:
-                self._say(pipe, held, EventKind.FINISHED, seconds=self._task_s, output=held.message["output"])
+            pipe.zrem(held_key(held.queue), held.entry)
+            pipe.delete(*execution_keys(held.entry), held.job_key)
+            self._say(pipe, held, EventKind.FINISHED, seconds=self._task_s, output=held.message["output"])
             self._idle.append(held.worker)
-        for key, packed in zip(keys, together, strict=True):
-            job = packed[-1].message["job_id"]
-            put_event(pipe, Event(kind=EventKind.PACKED, at=timestamp(), job_id=job, worker="fleet", pack=key))
-            pipe.hdel(REPORTS, *(held.message["task_id"] for held in packed))
 
     def _take(self, pipe: Any, now: float) -> None:
         for queue in _QUEUES:
-            if not self._idle or not (jobs := self._connection.lpop(f"rq:queue:{queue}", len(self._idle))):
+            if not self._idle or not (jobs := self._connection.lpop(list_key(queue), len(self._idle))):
                 continue
             with self._connection.pipeline(transaction=False) as read:
                 for job in jobs:
-                    read.hget(b"rq:job:" + job, "data")
+                    read.hget(job_key(job.decode()), "data")
                 found = read.execute()
             for job, data in zip(jobs, found, strict=True):
                 if data is not None:
@@ -134,11 +122,11 @@ class Fleet:
         self._held[held.worker] = held
         heapq.heappush(self._ends, (held.ends, held.worker))
         heapq.heappush(self._news, (now + random.random() * self._report_s, held.worker))
-        execution = f"rq:execution:{held.entry}"
+        execution, executions = execution_keys(held.entry)
         pipe.hset(execution, mapping={"id": held.entry, "last_heartbeat": time.time(), "worker_name": held.worker})
         pipe.expire(execution, LEASE_KEPT_S)
-        pipe.zadd(f"rq:executions:{job}", {held.entry: time.time() + LEASE_KEPT_S})
-        pipe.zadd(f"rq:wip:{queue}", {held.entry: time.time() + LEASE_KEPT_S})
+        pipe.zadd(executions, {held.entry: time.time() + LEASE_KEPT_S})
+        pipe.zadd(held_key(queue), {held.entry: time.time() + LEASE_KEPT_S})
         pipe.hset(held.job_key, mapping={"status": "started", "worker_name": held.worker})
         self._say(pipe, held, EventKind.STARTED)
 
@@ -151,10 +139,10 @@ class Fleet:
             pipe.sadd(WORKERS, name)
             pipe.scard(WORKERS)
             if held is not None:
-                pipe.zadd(f"rq:wip:{held.queue}", {held.entry: time.time() + LEASE_KEPT_S}, xx=True)
-                pipe.expire(f"rq:execution:{held.entry}", LEASE_KEPT_S)
-                pipe.expire(f"rq:executions:{held.entry.partition(':')[0]}", LEASE_KEPT_S)
-                pipe.zscore(f"rq:wip:{held.queue}", held.entry)
+                pipe.zadd(held_key(held.queue), {held.entry: time.time() + LEASE_KEPT_S}, xx=True)
+                for key in execution_keys(held.entry):
+                    pipe.expire(key, LEASE_KEPT_S)
+                pipe.zscore(held_key(held.queue), held.entry)
                 pipe.exists(cancel_key(held.message["task_id"]))
 
     def _tell_due(self, pipe: Any, now: float) -> None:
@@ -187,16 +175,10 @@ class Fleet:
         """Put the manifest of a task's shard."""
         self._store.put(names.shard_manifest(Stage.SYNTHESIZE, message["output"]), self._manifest(message).encode())
 
-    def _publish_pack(self, together: list[Held]) -> str:
-        """Put the shards of several tasks as one object; its key."""
-        manifests = [ShardManifest.model_validate_json(self._manifest(held.message)) for held in together]
-        return put_pack(self._store, [(manifest, self._file) for manifest in manifests])
-
     def _manifest(self, message: dict[str, Any]) -> str:
         if not self._template:
             task, elsewhere = TaskMessage.model_validate(message), open_store("memory://")
             manifest = make_shard(elsewhere, task)
-            self._file = elsewhere.get(manifest.key)
             self._names = (task.output, f'"batch":{task.batch},', f'"seed":{task.request.seed},')
             self._template = manifest.model_dump_json()
         output, batch, seed = self._names
@@ -213,11 +195,11 @@ def _beat(name: str, held: Held | None) -> dict[str, Any]:
 
 
 def main() -> None:
-    workers, task_s, pack = int(sys.argv[1]), float(sys.argv[2]), int([*sys.argv, "1"][3])
+    workers, task_s = int(sys.argv[1]), float(sys.argv[2])
     settings = Settings()
     fleet = Fleet(
         open_queue(settings), open_store(settings.resolved_store_url), workers=workers, task_s=task_s,
-        lease_s=settings.lease_s, pack=pack,
+        lease_s=settings.lease_s,
     )  # fmt: skip
     ended: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, _: ended.append(number))

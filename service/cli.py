@@ -180,8 +180,10 @@ def emit(value: BaseModel | dict[str, Any]) -> None:
 
 def load_settings(**overrides: Any) -> Settings:
     """Settings of the environment, with those options of a command that were given; InputError for a bad value."""
-    from service.settings import Settings
+    from service.settings import GONE, Settings
 
+    if gone := [f"{name} is gone: {GONE[name]}" for name in sorted(GONE) if os.environ.get(name)]:
+        raise InputError("; ".join(gone))
     try:
         return Settings(**{name: value for name, value in overrides.items() if value is not None})
     except ValidationError as error:

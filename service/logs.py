@@ -24,8 +24,8 @@ from service.settings import Settings
 SUBJECTS: Final = ("request", "key", "job", "task", "attempt", "worker")
 _bound: ContextVar[Mapping[str, Any]] = ContextVar("bound", default=MappingProxyType({}))
 _ORDINARY: Final = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "about", "taskName"}
-#: Alembic tells of every migration check, RQ of every idle poll, httpx of every request.
-_TALKATIVE: Final = ("alembic", "rq.worker", "rq.job", "rq.queue", "httpx")
+#: RQ tells of every idle poll, httpx of every request.
+_TALKATIVE: Final = ("rq.worker", "rq.job", "rq.queue", "httpx")
 
 
 @contextmanager

@@ -5,15 +5,20 @@ from __future__ import annotations
 import re
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from pydantic import Field, SecretStr, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from service.model.keeper_shards import MOST_SHARDS
-
 if TYPE_CHECKING:
     from sqlalchemy import URL
+
+
+#: Variables that no setting follows any more, with what to do instead.
+GONE: Final = {
+    "GRASPD_SHARD_PACK": "a task makes one shard of all its batches; unset it, and see GRASPD_TASK_S",
+    "GRASPD_KEEPER_SHARDS": "one keeper leads and the others stand by; unset it",
+}
 
 
 class Settings(BaseSettings):
@@ -83,10 +88,7 @@ class Settings(BaseSettings):
     join: str = Field(
         "auto",
         pattern=r"^(auto|[1-9][0-9]{0,3})$",
-        description="batches of one pair that a worker plans in one launch; auto: what fills its GPU, on a CPU 1",
-    )
-    shard_pack: int = Field(
-        8, ge=0, description="so many shards of a worker that end together are put as one object; 0: each by itself"
+        description="batches of a task that a worker plans in one launch; auto: what fills its GPU, on a CPU 1",
     )
     lease_s: float = Field(6.0, gt=0.5, description="a worker silent for this long has lost its task [s]")
     keeper_interval_s: float = Field(1.0, gt=0, description="pause between two rounds of the keeper [s]")
@@ -95,11 +97,10 @@ class Settings(BaseSettings):
         max_length=200,
         description="of a keeper: started again under the same name, it leads without a wait; unset: a fresh one",
     )
-    keeper_shards: int = Field(
-        1, ge=1, le=MOST_SHARDS,
-        description="of all keepers: shards that they share their work in, so that as many can work at once",
-    )  # fmt: skip
     task_attempts: int = Field(3, ge=1, le=20, description="attempts of a task before its job fails")
+    task_s: float = Field(
+        60.0, ge=0, description="how long a task of a larger job should last by what was measured [s]; 0: one batch"
+    )
     task_timeout_s: float = Field(1800.0, gt=0, description="longest run of one task [s]")
     worker_max_tasks: int = Field(
         0, ge=0, description="tasks after which a worker makes room for a fresh one; 0: never"

@@ -21,15 +21,14 @@ from service.model.planning import message_of, plan
 from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane, Stage
 from service.pipeline.backends import Parts
-from service.store import packs
 from service.store.library import publish_asset
-from service.store.manifests import ShardManifest, publish_shard
-from service.store.packs import find_manifest
+from service.store.manifests import ShardManifest, load_shard, publish_shard
 from service.store.seals import put_document
 from service.store.store import Store
 from worker.process.selfcheck import EngineError
 from worker.stages.context import TaskContext
 from worker.stages.output import Output, shard_of
+from worker.stages.ranges import base_rows, batches_of, joined
 
 HAND_FILES = {"asset.json": b'{"file": "hand.urdf"}', "hand.urdf": b"<robot name='fake'/>"}
 OBJECT_FILES = {"asset.json": b'{"file": "ball.stl"}', "ball.stl": b"solid ball\nendsolid ball\n"}
@@ -39,6 +38,10 @@ _POSE = np.array([[0.0, 0, 0, 1, 0, 0, 0]])
 def fake_synthesize(message: TaskMessage, context: TaskContext) -> Output:
     """A base shard whose numbers follow from seed and batch, as real ones do."""
     _pretend_to_work(context)
+    return joined(message, [_batch_of_grasps(batch, context) for batch in batches_of(message)])
+
+
+def _batch_of_grasps(message: TaskMessage, context: TaskContext) -> Output:
     n, t = message.count, 3
     rng = np.random.default_rng([message.request.seed, message.batch])
     postures: dict[str, Any] = {}
@@ -68,12 +71,17 @@ def fake_synthesize(message: TaskMessage, context: TaskContext) -> Output:
 def fake_scene(message: TaskMessage, context: TaskContext) -> Output:
     """A scene shard of as many rows as a real one would have."""
     _pretend_to_work(context)
+    parts = batches_of(message)
+    if message.request.in_scene:
+        return joined(message, [_scenes_of_batch(part) for part in parts])
+    rows = base_rows(load_shard(context.store, Stage.SYNTHESIZE, message.inputs[0]), message)
+    return joined(message, [_scenes_of_batch(part) for part in parts], base_rows=rows)
+
+
+def _scenes_of_batch(message: TaskMessage) -> Output:
     scenes, rows = message.request.scenes, message.request.scenes * message.count
     if message.request.in_scene:
         rows = 0
-    else:
-        pair = (message.hand_digest, message.object_digest)
-        assert find_manifest(context.store, Stage.SYNTHESIZE, message.inputs[0], pair) is not None
     return Output(
         {
             "scene/object_pose": np.repeat(_POSE, scenes, axis=0),
@@ -91,11 +99,6 @@ def fake_scene(message: TaskMessage, context: TaskContext) -> Output:
 def fake_stages() -> dict[Stage, Any]:
     """The stage table of these."""
     return {Stage.SYNTHESIZE: fake_synthesize, Stage.SCENE: fake_scene}
-
-
-def alike_batches(message: TaskMessage) -> str | None:
-    """What `worker.stages.alike` says, without an engine."""
-    return message.object_digest if message.stage is Stage.SYNTHESIZE and message.attempt == 1 else None
 
 
 def make_shard(store: Store, message: TaskMessage, *, worker: str = "w") -> ShardManifest:
@@ -145,22 +148,18 @@ def _pretend_to_work(context: TaskContext) -> None:
         time.sleep(0.01)
 
 
-def _die_after_a_pack(once: Path) -> None:
-    """Let this worker wait long for the shards of a pack, and be killed when it has put it, if no other one was."""
-    from service.queue.rq_queue import RqQueue
-    from worker.process import surroundings
-    from worker.stages import packing
+def _die_untold(once: Path) -> None:
+    """Let this worker be killed when it has put a shard, and before it says so, if no other one was."""
+    from worker.process import runner
 
-    def put_pack(*shards: Any) -> str:
-        key = packs.put_pack(*shards)
+    def publish(*shard: Any) -> bool:
+        is_new = publish_shard(*shard)
         if not once.exists():
-            once.write_text(key)
+            once.write_text(shard[1].shard_id)
             os.kill(os.getpid(), 9)
-        return key
+        return is_new
 
-    surroundings.WAIT_S, packing.put_pack = 600.0, put_pack  # type: ignore[misc]
-    # A keeper that is slow to say that it reads packs does so all the same.
-    RqQueue.announced = lambda *_: True  # type: ignore[method-assign]
+    runner.publish_shard = publish  # type: ignore[attr-defined]
 
 
 def main() -> None:
@@ -168,8 +167,8 @@ def main() -> None:
 
     FAKE_POISON names a batch that kills its worker, FAKE_LEAK_MB is memory that each task keeps, FAKE_LOCK_S is how
     long each task holds the interpreter lock; while there is a file FAKE_HOLD no task ends, and while there is a file
-    FAKE_BROKEN nothing works. With FAKE_PACKED the worker that puts the first pack is killed at once; a file of that
-    name says so. Of the options of `graspd worker` it takes `--burst` and `--idle`.
+    FAKE_BROKEN nothing works. With FAKE_DIE_UNTOLD the worker that puts the first shard is killed before it tells; a
+    file of that name says so. Of the options of `graspd worker` it takes `--burst` and `--idle`.
     """
     from service.cli import log_to_stderr
     from service.settings import Settings
@@ -196,16 +195,14 @@ def main() -> None:
         leaked.append(b"1" * (2**20 * int(os.environ.get("FAKE_LEAK_MB", "0"))))
         return fake_synthesize(message, context)
 
-    if once := os.environ.get("FAKE_PACKED"):
-        _die_after_a_pack(Path(once))
+    if once := os.environ.get("FAKE_DIE_UNTOLD"):
+        _die_untold(Path(once))
     options = argparse.ArgumentParser()
     options.add_argument("--burst", action="store_true")
     options.add_argument("--idle", type=int, default=0)
     wanted, _ = options.parse_known_args()
     table |= {Stage.SYNTHESIZE: synthesize}
-    ended_well = run_worker(
-        settings, table=table, check=check, alike=alike_batches, burst=wanted.burst, idle_s=wanted.idle
-    )
+    ended_well = run_worker(settings, table=table, check=check, burst=wanted.burst, idle_s=wanted.idle)
     sys.exit(0 if ended_well else 1)
 
 

@@ -1,4 +1,4 @@
-"""Empty indexes in milliseconds: the migrations run once a process, and their outcome is copied or used again."""
+"""Empty indexes in milliseconds: tables are made once a process, and copied or used again."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ def empty_index(url: str | URL) -> Index:
     parsed = make_url(url)
     if parsed.get_backend_name() == "sqlite" and not (file := Path(str(parsed.database))).exists():
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(_migrated())
+        file.write_bytes(_made())
     return Index(url)
 
 
 @cache
-def _migrated() -> bytes:
+def _made() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "index.sqlite"
         Index(sqlite_url(file)).close()
         return file.read_bytes()
 
 
-class MigratedSchemas:
+class EmptySchemas:
     """Schemas of a PostgreSQL with the empty tables of an index. One that was given back is emptied and lent again once
     nobody is connected to it any more; who changes tables, and not only rows, takes `server.database()`."""
 
@@ -74,5 +74,5 @@ class MigratedSchemas:
         url = self._server.database()
         Index(url).close()
         written = connection.scalars(_WRITTEN, {"schema": schema_of(url)}).all()
-        assert not written, f"migrations put rows into {written}: to empty these would lose them"
+        assert not written, f"a new index has rows in {written}: to empty these would lose them"
         return url

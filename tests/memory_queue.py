@@ -5,24 +5,20 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from service.model.keeper_shards import ALL_SHARDS, KeeperShards, shard_of
 from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
 from service.queue.at_scrape import QueueNow, WorkerPulse
 from service.queue.port import (
     Event,
     Holder,
-    Keeping,
     Lease,
     Message,
     Report,
-    Share,
     lane_order,
-    part_of,
 )
 
 
@@ -44,17 +40,15 @@ class MemoryQueue:
     _lanes: dict[Lane, list[Message]] = field(default_factory=lambda: {lane: [] for lane in Lane})
     _held: dict[str, Delivery] = field(default_factory=dict)
     _cancelled: set[str] = field(default_factory=set)
-    _streams: dict[int, list[Event]] = field(default_factory=lambda: defaultdict(list))
+    _stream: list[Event] = field(default_factory=list)
     _workers: dict[str, WorkerBeat] = field(default_factory=dict)
     _announced: dict[str, float] = field(default_factory=dict)
     _service: str | None = None
-    _leases: dict[int, tuple[str, float]] = field(default_factory=dict)
-    _keepers: dict[tuple[int, str], float] = field(default_factory=dict)
-    _number: int = 1
+    _lease: tuple[str, float] = ("", 0.0)
     _reports: dict[str, Report] = field(default_factory=dict)
     _sums: dict[str, float] = field(default_factory=dict)
     _taken: Counter[str] = field(default_factory=Counter)
-    _read: Counter[int] = field(default_factory=Counter)
+    _read: int = 0
     _acknowledged: set[str] = field(default_factory=set)
     _numbers: itertools.count[int] = field(default_factory=itertools.count)
     _changed: threading.Condition = field(default_factory=threading.Condition)
@@ -105,56 +99,41 @@ class MemoryQueue:
     def publish(self, *events: Event) -> None:
         with self._changed:
             for event in events:
-                self._streams[shard_of(event.job_id, self._number)].append(event)
+                self._stream.append(event)
             self.forget_reports([event.task_id for event in events if event.kind.ends_attempt])
-            self._changed.notify_all()
-
-    def hand_on(self, events: Iterable[tuple[int, Event]]) -> None:
-        with self._changed:
-            for shard, event in events:
-                self._streams[shard].append(event)
             self._changed.notify_all()
 
     def report(self, task_id: str, report: Report) -> float:
         self._reports[task_id] = report
         return 0.0
 
-    def reports(self, shards: KeeperShards = ALL_SHARDS) -> dict[str, Report]:
-        return {task: report for task, report in self._reports.items() if shards.has(task)}
+    def reports(self) -> dict[str, Report]:
+        return dict(self._reports)
 
     def forget_reports(self, task_ids: Collection[str]) -> None:
         for task in task_ids:
             self._reports.pop(task, None)
 
-    def consume(self, *, limit: int, wait_s: float, shards: Collection[int] = (0,)) -> list[tuple[str, Event]]:
+    def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         with self._changed:
-            self._changed.wait_for(lambda: any(self._unread(shard) for shard in shards), timeout=wait_s)
-            found = [one for shard in shards for one in self._unread(shard)][:limit]
-            for event_id, _ in found:
-                self._read[int(event_id.partition("/")[0])] += 1
-            return found
-
-    def _unread(self, shard: int) -> list[tuple[str, Event]]:
-        return [(f"{shard}/{i + 1}", e) for i, e in enumerate(self._streams[shard]) if i >= self._read[shard]]
+            self._changed.wait_for(lambda: len(self._stream) > self._read, timeout=wait_s)
+            found = self._stream[self._read : self._read + limit]
+            first, self._read = self._read, self._read + len(found)
+            return [(str(first + i + 1), event) for i, event in enumerate(found)]
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
         self._acknowledged |= set(event_ids)
 
-    def left_over(self, number: int) -> list[int]:
-        return [shard for shard in list(self._streams) if shard >= number and self._unread(shard)]
-
     def restart_consumer(self) -> None:
         """What a new keeper sees: everything that was not acknowledged."""
-        for shard, events in self._streams.items():
-            left = (i for i in range(len(events)) if f"{shard}/{i + 1}" not in self._acknowledged)
-            self._read[shard] = next(left, len(events))
+        left = (i for i in range(len(self._stream)) if str(i + 1) not in self._acknowledged)
+        self._read = next(left, len(self._stream))
 
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         with self._changed:
-            events = self._streams[0]
-            start = len(events) if after == "$" else int(after)
-            self._changed.wait_for(lambda: len(events) > start, timeout=wait_s)
-            return [(str(i + 1), e) for i, e in enumerate(events) if i >= start][:limit]
+            start = len(self._stream) if after == "$" else int(after)
+            self._changed.wait_for(lambda: len(self._stream) > start, timeout=wait_s)
+            return [(str(i + 1), e) for i, e in enumerate(self._stream) if i >= start][:limit]
 
     def announce(self, part: str, seconds: float) -> None:
         self._announced[part] = self.clock() + seconds
@@ -169,40 +148,18 @@ class MemoryQueue:
         if instead or self._service is None:
             self._service = identity
 
-    def take_share(self, holder: str, seconds: float, *, number: int, before: Collection[int] = ()) -> Share:
+    def lead(self, holder: str, seconds: float) -> bool:
         with self._changed:
             now = self.clock()
-            self._leases = {shard: held for shard, held in self._leases.items() if held[1] > now}
-            self._keepers = {one: until for one, until in self._keepers.items() if until > now}
-            self._keepers[number, holder] = now + seconds
-            if self._number != number:
-                if self._leases.get(0, (holder, now))[0] != holder:
-                    return Share(self._number)
-                self._number = number
-            holds = Counter(by for shard, (by, _) in self._leases.items() if shard < number)
-            others = sorted((name for of, name in self._keepers if of == number), key=lambda name: (-holds[name], name))
-            fair = number // len(others) + (others.index(holder) < number % len(others))
-            held = {shard for shard, (by, _) in self._leases.items() if by == holder and shard < number}
-            free = [shard for shard in (*sorted(before), *range(number)) if shard not in self._leases]
-            held |= set(list(dict.fromkeys(free))[: max(0, fair - len(held))])
-            self._leases |= dict.fromkeys(held, (holder, now + seconds))
-            return Share(number, fair, frozenset(held))
+            if self._lease[0] != holder and self._lease[1] > now:
+                return False
+            self._lease = (holder, now + seconds)
+            return True
 
-    def resign(self, holder: str, shards: Collection[int]) -> None:
+    def resign(self, holder: str) -> None:
         with self._changed:
-            for shard in shards:
-                if self._leases.get(shard, ("", 0.0))[0] == holder:
-                    del self._leases[shard]
-
-    def leave(self, holder: str, *, number: int) -> None:
-        with self._changed:
-            self._keepers.pop((number, holder), None)
-
-    def keepers(self, part: str) -> list[Keeping]:
-        return [
-            Keeping(shard, self._leases.get(shard, ("", 0.0))[0], self.announced(part_of(part, shard)))
-            for shard in range(self._number)
-        ]
+            if self._lease[0] == holder:
+                self._lease = ("", 0.0)
 
     def now(self, *, lease_s: float) -> QueueNow:
         running = Counter((Lane.BULK, held.message.stage) for held in self._held.values())

@@ -98,7 +98,6 @@ class Certified:
     lift_share (and lifted), lift_hard_share (and lifted at half the friction)."""
     narrow: str | None = None
     """In scenes where nothing is valid the geometric reason, see `why_narrow`."""
-
     limit: Limit | None = None
     """What the best of a round lifts, where none is kept and the weight is why."""
 

@@ -105,10 +105,6 @@ class Meeting:
             raise seat.result
         return seat.result
 
-    def alone(self, work: Callable[[], Any], *, cancelled: Callable[[], bool] = lambda: False) -> Any:
-        """Work of one member that needs the device and is like no other's; raises as `ask` does."""
-        return self.ask(object(), None, lambda _: [work()], size=1, cancelled=cancelled)
-
     def _serve(self) -> None:
         while (group := self._next()) is not None:
             began = self._clock()

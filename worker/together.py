@@ -18,6 +18,7 @@ from worker.meeting import Meeting
 from worker.objects.model import ObjectModel
 from worker.quality.diversity import distinct, hand_points
 from worker.quality.referee.decomposition import ConvexPieces, decompose
+from worker.rounds import taken
 from worker.run import ALONE, Run
 from worker.side_by_side import Shares, in_threads
 from worker.simulation.surroundings import Scenes
@@ -32,52 +33,85 @@ def certified_batches(
     request: JobOptions,
     *,
     sizes: Sequence[int],
+    first: int = 0,
     join: int = 1,
-    scenes: Scenes | None = None,
+    scenes: Scenes | Sequence[Scenes] | None = None,
     pieces: Callable[[ObjectModel], ConvexPieces] = decompose,
     run: Run = ALONE,
     partial: bool = False,
+    checked: Callable[[int, Certified], None] | None = None,
+    empty_on: tuple[type[Exception], ...] = (),
 ) -> list[Certified]:
-    """The first batches of a job; see `certified_grasps`, which makes the same of each.
+    """Batches of a job that follow each other; see `certified_grasps`, which makes the same of each.
 
     Args:
         hand: the hand.
         obj: the object.
         request: see `certified_grasps`.
         sizes: grasps wanted of each batch.
+        first: number of the first batch within its job.
         join: batches whose grasps are planned in one launch; 1: one batch after the other.
-        scenes: see `certified_grasps`.
-        pieces: gives the object's convex pieces.
+        scenes: see `certified_grasps`; those of all batches, or of each.
+        pieces: gives the object's convex pieces; asked once.
         run: told of the grasps that are done.
         partial: if it is stopped, the batches that were judged before are the result, the last one maybe in part.
+        checked: called with the number of each batch as it is made, and with what came of it; may raise.
+        empty_on: where one of these becomes of a batch, it has no grasps; not of a job's first batch, nor of all.
 
     Raises:
         Exception: what became of the first batch that failed; the others are stopped.
     """
     shares = Shares(sizes, run.progress)
+    known: list[ConvexPieces] = []
 
-    def batch(number: int, own: Run) -> Certified:
+    def pieces_once(prepared: ObjectModel) -> ConvexPieces:
+        if not known:
+            known.append(pieces(prepared))
+        return known[0]
+
+    refused: list[Exception] = []
+
+    def batch(number: int, own: Run) -> Certified | None:
         own = replace(own, progress=shares.of(number))
-        made = certified_grasps(
-            hand, obj, request, count=sizes[number], batch=number, scenes=scenes, pieces=pieces, run=own,
-            partial=partial,
-        )  # fmt: skip
+        where = scenes if scenes is None or isinstance(scenes, Scenes) else scenes[number]
+        try:
+            made = certified_grasps(
+                hand, obj, request, count=sizes[number], batch=first + number, scenes=where, pieces=pieces_once,
+                run=own, partial=partial,
+            )  # fmt: skip
+        except empty_on as error:
+            if first + number == 0:
+                raise
+            refused.append(error)
+            return None
+        if checked is not None:
+            checked(first + number, made)
         own.progress(1.0, 1.0, "done")
         return made
 
-    found: dict[int, Certified] = {}
+    found: dict[int, Certified | None] = {}
     try:
         if join == 1 or len(sizes) == 1:
             for number in range(len(sizes)):
                 found[number] = batch(number, run)
         else:
             if request.referee != "none":
-                pieces(obj.centred)  # once, and not by every batch at the same time
+                pieces_once(obj.centred)  # not by every batch at the same time
             _together(batch, len(sizes), join, run, found)
     except TaskCancelled:
         if not partial or not found:
             raise
-    return [found[number] for number in sorted(found)]
+    made = [one for number in sorted(found) if (one := found[number]) is not None]
+    if not made:
+        raise refused[0]
+    return [one or _nothing(made[0]) for _, one in sorted(found.items())]
+
+
+def _nothing(like: Certified) -> Certified:
+    """A batch without grasps, and nothing tried."""
+    grasps, columns = taken(like.grasps, like.columns, np.zeros(0, int))
+    seconds, shares = (dict.fromkeys(counts, 0.0) for counts in (like.seconds, like.shares))
+    return Certified(grasps, columns, 0, dict.fromkeys(like.rejected, 0), {}, like.verdict_key, 0, seconds, shares)
 
 
 def distinct_batches(
@@ -114,7 +148,7 @@ def distinct_batches(
 
 
 def _together(
-    work: Callable[[int, Run], Certified], count: int, join: int, run: Run, found: dict[int, Certified]
+    work: Callable[[int, Run], Certified | None], count: int, join: int, run: Run, found: dict[int, Certified | None]
 ) -> None:
     """Puts each batch under its number as soon as it is made."""
     members = min(count, PER_LAUNCH * join)

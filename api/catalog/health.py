@@ -11,7 +11,7 @@ from api.models import Health, Part
 from service.model.errors import BusyError, GraspdError, StoreUnavailable, UnavailableError
 from service.pipeline.backends import Parts
 from service.pipeline.identity import check_queue
-from service.pipeline.sharing import is_kept
+from service.pipeline.leading import PART
 
 #: The parts are asked anew at most this often [s].
 KEPT_S: Final = 2.0
@@ -80,7 +80,7 @@ class Probes:
     def _others(self) -> tuple[bool, int]:
         try:
             fit = [beat for beat in self._parts.queue.workers() if beat.state != "quarantined"]
-            return is_kept(self._parts.queue), len(fit)
+            return self._parts.queue.announced(PART), len(fit)
         except UnavailableError:
             return False, 0
 

@@ -22,9 +22,8 @@ from service.model.errors import NotFoundError, UnavailableError
 from service.model.projects import Reach
 from service.model.states import Lane, Stage
 from service.pipeline.backends import Parts
-from service.pipeline.sharing import PART
+from service.pipeline.leading import PART
 from service.queue.at_scrape import QueueNow
-from service.queue.port import Keeping
 
 _DAMAGE_SHOWN: Final = 5
 _JOBS_WATCHED: Final = 20
@@ -62,13 +61,6 @@ class Overview:
             )
             for worker in known
         ]
-
-    def keepers(self) -> list[Keeping]:
-        """Who holds each shard of the keepers' work; none while Redis is away."""
-        try:
-            return self._parts.queue.keepers(PART)
-        except UnavailableError:
-            return []
 
     def task_of(self, worker: Worker) -> TaskView | None:
         """What a worker does; a check of an upload is no task of the index."""
@@ -118,7 +110,7 @@ class Overview:
         found.add_parts({name: _seconds(part) for name, part in parts.items()})
         with contextlib.suppress(UnavailableError):
             queue = self._parts.queue
-            found.add_queue(self._queue_now(), queue.keepers(PART))
+            found.add_queue(self._queue_now(), is_kept=queue.announced(PART))
             found.add_sums(queue.counted())
         with contextlib.suppress(UnavailableError):
             found.add_index(read_index(self._parts.index.database))

@@ -168,7 +168,7 @@ def _print_job(job: JobDetail, url: str) -> None:
         console.print(f"reason: {job.reason}", soft_wrap=True)
     if job.note and job.note != job.reason:
         console.print(f"note: {job.note}")
-    table = plain_table("stage", "state", "batches", "progress", "worker time", "left")
+    table = plain_table("stage", "state", "tasks", "progress", "worker time", "left")
     for stage in job.stages:
         done = f"{stage.succeeded} of {stage.tasks}"
         table.add_row(

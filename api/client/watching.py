@@ -67,7 +67,7 @@ class JobDisplay:
 
     def _draw(self, stage: StageStatus, job: Job) -> None:
         if stage.stage not in self._bars:
-            scale, unit = (job.requested / stage.tasks, "grasps") if stage.stage is Stage.SYNTHESIZE else (1, "batches")
+            scale, unit = (job.requested / stage.tasks, "grasps") if stage.stage is Stage.SYNTHESIZE else (1, "tasks")
             self._bars[stage.stage] = self._progress.add_task(
                 stage.stage.value, total=stage.tasks, start=False, message="", scale=scale, unit=unit
             )
@@ -101,4 +101,4 @@ def _rate_words(stage: StageStatus, job: Job, pace: float) -> str:
     """Speed in the unit of the stage; `pace` is the share of the stage per second."""
     if stage.stage is Stage.SYNTHESIZE:
         return f"{metric(job.requested * pace)} grasps/s"
-    return f"{metric(stage.tasks * pace)} batches/s"
+    return f"{metric(stage.tasks * pace)} tasks/s"

@@ -19,7 +19,6 @@ from service.index.dataset_views import DatasetView
 from service.index.views import WorkerView
 from service.model.errors import UnavailableError
 from service.model.states import State
-from service.queue.port import Keeping
 
 PAGE_SIZE: Final = 25
 _LOST_SHOWN: Final = timedelta(minutes=10)
@@ -79,14 +78,7 @@ def workers_page(request: Request, overview: OverviewOf) -> HTMLResponse:
         alive=sum(worker.state != "lost" for worker in workers),
         stages=stage_depths(overview),
         damage=overview.damage(),
-        keepers=_by_holder(overview.keepers()),
     )
-
-
-def _by_holder(shards: list[Keeping]) -> dict[str, list[Keeping]]:
-    """Keepers that share the work, each with its shards; none where one does it all."""
-    holders = sorted({one.holder for one in shards}) if len(shards) > 1 else []
-    return {holder: [one for one in shards if one.holder == holder] for holder in holders}
 
 
 @router.get("/chart", dependencies=[Depends(may_read)])

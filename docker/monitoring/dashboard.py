@@ -77,14 +77,8 @@ ROWS: dict[str, list[tuple[str, str, int, dict[str, str]]]] = {
             12,
             {"{{stage}}": "max by (stage) (rate(graspd_shard_bytes_total[$__rate_interval]))"},
         ),
-        ("Latency of the parts", "s", 8, {"{{part}}": "max by (part) (graspd_part_latency_seconds)"}),
-        ("Parts that answer", "bool_yes_no", 8, {"{{part}}": "min by (part) (graspd_part_up)"}),
-        (
-            "Shards of each keeper",
-            "short",
-            8,
-            {"{{keeper}}": "sum by (keeper) (max by (shard, keeper) (graspd_keeper_shard_up))"},
-        ),
+        ("Latency of the parts", "s", 12, {"{{part}}": "max by (part) (graspd_part_latency_seconds)"}),
+        ("Parts that answer", "bool_yes_no", 12, {"{{part}}": "min by (part) (graspd_part_up)"}),
         (
             "Requests a second",
             "reqps",

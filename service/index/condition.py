@@ -1,4 +1,4 @@
-"""How an index stands, seen from outside: nothing is made, migrated or moved aside, as opening it would."""
+"""How an index stands, seen from outside: nothing is made or moved aside, as opening it would."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Final
 
 from sqlalchemy import URL, make_url, text
 
-from service.index.database import UNUSABLE, connect_postgres, mapped, newest_revision, unusable
+from service.index.database import REVISION, REVISION_TABLE, UNUSABLE, connect_postgres, mapped, revision_of, unusable
 from service.model.errors import IndexDamaged, IndexUnavailable
 
 _TIMEOUT_S: Final = 5.0
@@ -62,16 +62,13 @@ def _look_at_file(path: Path) -> IndexCondition | None:
             if said != "ok":
                 raise IndexDamaged(f"the index {path} is damaged: {said}")
             tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-            rows = (
-                connection.execute("SELECT version_num FROM alembic_version").fetchall()
-                if "alembic_version" in tables
-                else []
-            )
+            query = f"SELECT version_num FROM {REVISION_TABLE}"
+            rows = connection.execute(query).fetchall() if REVISION_TABLE in tables else []
     except sqlite3.DatabaseError as error:
         if getattr(error, "sqlite_errorcode", 0) & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
             raise IndexDamaged(f"the index {path} is damaged: {error}") from None
         raise IndexUnavailable(f"the index {path} cannot be read: {error}") from None
-    return IndexCondition(f"SQLite {sqlite3.sqlite_version}", rows[0][0] if rows else "", newest_revision())
+    return IndexCondition(f"SQLite {sqlite3.sqlite_version}", rows[0][0] if rows else "", REVISION)
 
 
 def _look_at_postgres(url: str | URL) -> IndexCondition:
@@ -82,11 +79,10 @@ def _look_at_postgres(url: str | URL) -> IndexCondition:
             def ask(question: str) -> str:
                 return str(connection.scalar(text(question)))
 
-            found = ask("SELECT to_regclass('alembic_version') IS NOT NULL") == "True"
             return IndexCondition(
                 f"PostgreSQL {ask('SHOW server_version')}",
-                ask("SELECT version_num FROM alembic_version") if found else "",
-                newest_revision(),
+                revision_of(connection),
+                REVISION,
                 (int(ask("SELECT count(*) FROM pg_stat_activity")), int(ask("SHOW max_connections"))),
                 ask("SELECT pg_is_in_recovery()") == "False"
                 and ask("SELECT has_schema_privilege(current_schema(), 'CREATE')") == "True",

@@ -1,4 +1,7 @@
-"""Connection to the index database: SQLite in WAL mode or PostgreSQL, migrated to the present schema when opened."""
+"""Connection to the index database: SQLite in WAL mode or PostgreSQL, whose tables are made when it is first opened.
+
+There are no migrations: the index follows from the store. `graspd index rebuild` makes one of another revision anew.
+"""
 
 from __future__ import annotations
 
@@ -8,31 +11,29 @@ import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from functools import cache
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from alembic import command
-from alembic.config import Config
-from alembic.migration import MigrationContext
-from alembic.script import ScriptDirectory
-from alembic.util import CommandError
-from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, text
+from sqlalchemy import URL, Connection, Engine, MetaData, create_engine, event, inspect, make_url, text
 from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlchemyError
 
 from service.index.metric_columns import add_missing
 from service.index.sqlite_file import Identity, SqliteFile
-from service.index.write_turns import Concerns, take_turn
+from service.index.tables import metadata
 from service.model.errors import IndexDamaged, IndexUnavailable, InputError
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
-#: Folder of the revisions of the schema.
-MIGRATIONS: Final = Path(__file__).parent / "migrations"
+#: Revision of `service.index.tables`: another number for every change of them but for new metrics.
+REVISION: Final = "0020"
+#: Table that names the revision. A graspd of 0.2 reads it, and refuses an index of a revision that it does not know.
+REVISION_TABLE: Final = "alembic_version"
 #: A job of a million grasps is one transaction of a few seconds; others wait for it.
 _BUSY_TIMEOUT_S: Final = 20.0
-#: Key of PostgreSQL's advisory lock that lets one process migrate at a time: the letters "grsp".
-_MIGRATION_LOCK: Final = 0x67727370
+#: Key of PostgreSQL's advisory lock that lets one process make tables at a time: the letters "grsp".
+_TABLES_LOCK: Final = 0x67727370
+#: Of the one that lets one process write at a time; it ends with its transaction: the letters "grsq".
+_TURN_LOCK: Final = 0x67727371
 #: What SQLAlchemy raises for a URL.
 UNUSABLE: Final = (ArgumentError, NoSuchModuleError, ModuleNotFoundError, ValueError)
 #: Codes of SQLite for a file whose content makes no sense.
@@ -42,14 +43,21 @@ _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 class Database:
     """An engine, with reads and writes as context managers."""
 
-    def __init__(self, url: str | URL) -> None:
-        """Connect and migrate.
+    def __init__(self, url: str | URL, *, anew: bool = False) -> None:
+        """Connect, and make the tables of an empty database.
+
+        Args:
+            url: an SQLAlchemy URL.
+            anew: drop the tables of another revision and make those of this one; the rows are to follow.
 
         Raises:
             InputError: the URL names no known database.
-            IndexUnavailable: the database does not answer or cannot be written.
+            IndexUnavailable: the database does not answer, cannot be written, or is of another revision.
         """
         self._url = url
+        self._anew = anew
+        self.was = ""
+        """Revision of the tables that were dropped, if any were."""
         self._file = _file_of(url)
         self._write_lock = threading.Lock()
         self._opening = threading.Lock()
@@ -71,15 +79,11 @@ class Database:
             yield connection
 
     @contextmanager
-    def writing(self, within: Connection | None = None, *, concerns: Concerns | None = None) -> Iterator[Connection]:
+    def writing(self, within: Connection | None = None) -> Iterator[Connection]:
         """A transaction, or part of the one given: all of it is kept or nothing. Writers take turns, on every database.
 
         States are derived from facts that are read in the same transaction: two of these at once would each miss what
         the other brings.
-
-        Args:
-            concerns: finds the jobs of which it changes tasks and states, and nothing of others. On PostgreSQL it then
-                need not wait for writers that concern others.
         """
         if within is not None:
             yield within
@@ -90,7 +94,7 @@ class Database:
                 connection.exec_driver_sql("BEGIN IMMEDIATE")
             else:
                 connection.exec_driver_sql(f"SET LOCAL lock_timeout = '{_BUSY_TIMEOUT_S:g}s'")
-                take_turn(connection, concerns)
+                connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _TURN_LOCK})
             yield connection
             connection.commit()
 
@@ -112,12 +116,12 @@ class Database:
             self._present()
 
     def _open(self) -> Engine:
-        """An engine on the present file, which is made and migrated if need be."""
+        """An engine on the present file, which is made if need be."""
         engine = _engine(self._url)
         try:
             with mapped(), self._file.opening() if self._file is not None else nullcontext():
                 self._note_identity()
-                _migrate(engine)
+                self.was = _make_tables(engine, anew=self._anew) or self.was
                 self._note_identity()
         except BaseException:
             engine.dispose()
@@ -189,7 +193,7 @@ def unusable(error: Exception) -> InputError:
 
 
 def connect_postgres(url: str | URL) -> Engine:
-    """An engine that refuses a database whose encoding is not UTF-8, and migrates nothing."""
+    """An engine that refuses a database whose encoding is not UTF-8, and makes no tables."""
     engine = create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10)
 
     # Before SQLAlchemy looks at the connection: it cannot read what a database of SQL_ASCII says, which comes as bytes.
@@ -224,67 +228,57 @@ def _sqlite_engine(url: str | URL, database: str | None) -> Engine:
     return engine
 
 
-def downgrade(url: str | URL, revision: str) -> None:
-    """Take the schema back to an earlier revision, before an older graspd is installed that knows no later one.
-
-    Raises:
-        InputError: there is no such revision, or it is later than the schema's.
-    """
-    engine = _engine(url)
-    try:
-        with mapped(), _migrating(engine) as config:
-            command.downgrade(config, revision)
-    except CommandError as error:
-        raise InputError(f"the index cannot go back to revision {revision!r}: {_line(error)}") from None
-    finally:
-        engine.dispose()
-
-
-@cache
-def newest_revision() -> str:
-    """The schema that this graspd makes."""
-    return str(ScriptDirectory.from_config(_config()).get_current_head())
-
-
-def _config() -> Config:
-    config = Config()
-    config.set_main_option("script_location", str(MIGRATIONS))
-    return config
+def _make_tables(engine: Engine, *, anew: bool) -> str:
+    """Make what is not there; the revision of what was dropped for it, else ""."""
+    dropped = ""
+    with _making(engine) as connection:
+        found = revision_of(connection)
+        if found and found != REVISION:
+            if not anew:
+                raise IndexUnavailable(_of_another_revision(found))
+            there = MetaData()
+            there.reflect(connection)
+            there.drop_all(connection)
+            found, dropped = "", found
+        if not found:
+            metadata.create_all(connection)
+            connection.exec_driver_sql(f"CREATE TABLE {REVISION_TABLE} (version_num VARCHAR(32) NOT NULL)")
+            connection.execute(text(f"INSERT INTO {REVISION_TABLE} VALUES (:revision)"), {"revision": REVISION})
+        if added := add_missing(connection):
+            log.info("the index has new columns of grasps: %s", ", ".join(added))
+    return dropped
 
 
-def _migrate(engine: Engine) -> None:
-    try:
-        with _migrating(engine) as config:
-            connection = config.attributes["connection"]
-            # Alembic reads every revision to find that there is nothing to do.
-            if MigrationContext.configure(connection).get_current_heads() != (newest_revision(),):
-                command.upgrade(config, "head")
-            if added := add_missing(connection):
-                log.info("the index has new columns of grasps: %s", ", ".join(added))
-    except CommandError as error:
-        raise IndexUnavailable(
-            f"the index was made by another version of graspd ({_line(error)}); use that version, or run its "
-            "`graspd index downgrade`, or delete the index: it is made again from the store"
-        ) from None
+def revision_of(connection: Connection) -> str:
+    """Revision of the tables of a database; "" where it has none yet."""
+    if not inspect(connection).has_table(REVISION_TABLE):
+        return ""
+    return str(connection.scalar(text(f"SELECT version_num FROM {REVISION_TABLE}")) or "")
+
+
+def _of_another_revision(found: str) -> str:
+    if found > REVISION:
+        return (
+            f"the index was made by a newer graspd (revision {found}, here {REVISION}); use that, or delete the index"
+        )
+    return f"the index is of an older graspd (revision {found}, here {REVISION}); run `graspd index rebuild`"
 
 
 @contextmanager
-def _migrating(engine: Engine) -> Iterator[Config]:
-    """Alembic's configuration while no other process migrates; all of a migration is kept or nothing."""
+def _making(engine: Engine) -> Iterator[Connection]:
+    """A transaction while no other process makes tables; all of it is kept or nothing."""
     with engine.connect() as connection:
         if connection.dialect.name == "postgresql":
-            connection.execute(text("SELECT pg_advisory_lock(:key)"), {"key": _MIGRATION_LOCK})
+            connection.execute(text("SELECT pg_advisory_lock(:key)"), {"key": _TABLES_LOCK})
         else:
             connection.exec_driver_sql("BEGIN IMMEDIATE")
         try:
-            config = _config()
-            config.attributes["connection"] = connection
-            yield config
+            yield connection
             connection.commit()
         finally:
             if connection.dialect.name == "postgresql":
                 connection.rollback()  # what broke off, or the lock could not be given back
-                connection.execute(text("SELECT pg_advisory_unlock(:key)"), {"key": _MIGRATION_LOCK})
+                connection.execute(text("SELECT pg_advisory_unlock(:key)"), {"key": _TABLES_LOCK})
                 connection.commit()
 
 

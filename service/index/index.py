@@ -35,9 +35,9 @@ class Index:
     NotFoundError.
     """
 
-    def __init__(self, url: str | URL) -> None:
-        """Connect and migrate: see `Database` for errors."""
-        self.database = database = Database(url)
+    def __init__(self, url: str | URL, *, anew: bool = False) -> None:
+        """Connect: see `Database`, also for errors."""
+        self.database = database = Database(url, anew=anew)
         # What is read.
         self.jobs = Jobs(database)
         self.grasps = Grasps(database)

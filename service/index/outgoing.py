@@ -14,7 +14,6 @@ from service.index.database import Database
 from service.index.dataset_tables import datasets
 from service.index.event_tables import deliveries, ends, webhooks
 from service.index.views import DeliveryView, EndView, WebhookView
-from service.index.write_turns import take_turn_of_ends
 from service.model.clock import timestamp
 from service.model.errors import NotFoundError
 from service.model.projects import EVERYTHING, Reach
@@ -41,7 +40,6 @@ def note_ends(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
     anew are behind those that readers have seen.
     """
     if rows:
-        take_turn_of_ends(connection)
         last = connection.scalar(select(func.max(ends.c.seq))) or 0
         first = max(int(last) + 1, int(time.time() * 1000))
         numbered = [{"seq": first + place, "at": timestamp(), **row} for place, row in enumerate(rows)]

@@ -29,7 +29,6 @@ from service.store.deletions import pending
 from service.store.library import load_asset, load_check, stored_assets
 from service.store.manifests import ShardManifest
 from service.store.marks import newest_mark
-from service.store.packs import Pack, packs_below, read_manifests
 from service.store.records import parse_record
 from service.store.store import Store
 
@@ -114,22 +113,6 @@ class _Rebuild:
         for key, data in self._read(names.SHARDS, lambda key: key.endswith(".json")):
             with self._each(key, "shards"):
                 self._index.write.add_manifests([parse_record(ShardManifest, data, key)], within=self._connection)
-        for key, pack in packs_below(self._store):
-            with self._each(key):
-                self._packed(pack)
-
-    def _packed(self, pack: Pack | DamagedError) -> None:
-        if isinstance(pack, DamagedError):
-            raise pack
-        try:
-            found = read_manifests(self._store, pack)
-        except NotFoundError:
-            return  # removed since it was listed
-        for shard, made in zip(pack.living, found, strict=True):
-            with self._each(pack.place(shard), "shards"):
-                if isinstance(made, DamagedError):
-                    raise made
-                self._index.write.add_manifests([made], within=self._connection)
 
     def datasets(self) -> None:
         """Datasets with what users did to them, snapshots, sets of objects."""

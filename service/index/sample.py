@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Final
 
@@ -18,7 +18,7 @@ from service.model.errors import DamagedError, NotFoundError
 from service.model.records import JobRecord
 from service.model.states import Stage
 from service.store.deletions import pending
-from service.store.packs import manifest_at, pack_at
+from service.store.manifests import load_manifest
 from service.store.records import read_record
 from service.store.store import Store
 
@@ -33,8 +33,6 @@ class Sample:
 
     shards: tuple[tuple[Stage, str], ...]
     jobs: tuple[str, ...]
-    packed: Mapping[str, str] = field(default_factory=dict)
-    """Where those of these shards lie that were drawn from packs."""
 
 
 def draw(index: Index, store: Store, *, size: int = _SIZE) -> Sample:
@@ -44,11 +42,9 @@ def draw(index: Index, store: Store, *, size: int = _SIZE) -> Sample:
         chosen |= {(stage, shard) for shard in _rows(index, shards, size, shards.c.kind == kind)}
         found = (key.rpartition("/")[2] for key in _keys(store, f"{names.SHARDS}/{kind}") if key.endswith(".json"))
         chosen |= {(stage, name.removesuffix(".json")) for name in islice(found, size)}
-    packed = _packed(store, size)
-    chosen |= {(stage, shard) for stage, shard, _ in packed}
     records = (key.split("/")[1] for key in _keys(store, names.JOBS) if key.endswith("/job.json"))
     some = sorted(_rows(index, jobs, size)) + sorted(set(islice(records, size)))
-    return Sample(tuple(sorted(chosen)), tuple(some), {shard: place for _, shard, place in packed})
+    return Sample(tuple(sorted(chosen)), tuple(some))
 
 
 def compare(index: Index, store: Store, sample: Sample) -> list[str]:
@@ -56,13 +52,12 @@ def compare(index: Index, store: Store, sample: Sample) -> list[str]:
     gone = {name for what, name in pending(store) if what == "job"}
     with index.database.reading() as connection:
         ids = [shard for _, shard in sample.shards]
-        query = select(shards.c.id, shards.c.sha256, shards.c["count"], shards.c.valid, shards.c.key)
+        query = select(shards.c.id, shards.c.sha256, shards.c["count"], shards.c.valid)
         found_rows = connection.execute(query.where(shards.c.id.in_(ids))).all()
-        rows = {shard: (sha256, count, valid) for shard, sha256, count, valid, _ in found_rows}
-        places = dict(sample.packed) | {shard: place for shard, *_, place in found_rows}
+        rows = {shard: (sha256, count, valid) for shard, sha256, count, valid in found_rows}
         known = set(connection.scalars(select(jobs.c.id).where(jobs.c.id.in_(sample.jobs))))
     with ThreadPoolExecutor(_READERS) as pool:
-        manifests = list(pool.map(lambda one: _manifest(store, one[0], one[1], places.get(one[1], "")), sample.shards))
+        manifests = list(pool.map(lambda one: _manifest(store, *one), sample.shards))
         stored = dict(zip(sample.jobs, pool.map(lambda job: _has_job(store, job), sample.jobs), strict=True))
     found = []
     for (_, shard), said in zip(sample.shards, manifests, strict=True):
@@ -91,21 +86,6 @@ def _rows(index: Index, table: Table, size: int, *conditions: Any) -> list[str]:
         return found if len(found) == size else list(connection.scalars(query))
 
 
-def _packed(store: Store, size: int) -> list[tuple[Stage, str, str]]:
-    """Stage, id and place of shards in packs from a random one on."""
-    found: list[tuple[Stage, str, str]] = []
-    for key in _keys(store, names.PACKS):
-        if len(found) >= size:
-            break
-        if key.endswith(".pack"):
-            try:
-                pack = pack_at(store, key)
-            except (NotFoundError, DamagedError):
-                continue
-            found += [(shard.stage, shard.id, pack.place(shard)) for shard in pack.living]
-    return found[:size]
-
-
 def _keys(store: Store, prefix: str) -> Iterator[str]:
     """Keys of a folder from a random one on, then those before it."""
     start = f"{prefix}/{secrets.token_hex(8)}"
@@ -116,9 +96,9 @@ def _keys(store: Store, prefix: str) -> Iterator[str]:
             yield entry.key
 
 
-def _manifest(store: Store, stage: Stage, shard: str, place: str) -> tuple[str, int, int] | None:
+def _manifest(store: Store, stage: Stage, shard: str) -> tuple[str, int, int] | None:
     try:
-        found = manifest_at(store, place, stage, shard)
+        found = load_manifest(store, stage, shard)
     except (NotFoundError, DamagedError):
         # A damaged one is for the scrub to tell; the index leaves it out.
         return None

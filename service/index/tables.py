@@ -1,6 +1,6 @@
 """Tables of the index. `LIVE_COLUMNS` hold the present moment (progress, queue marks); the rest follows from the store.
 
-A change here needs a migration in `migrations/versions`; a test compares the two. Metrics of grasps need none: see
+A change here needs another `REVISION` in `database`; a test holds the two together. Metrics of grasps need none: see
 `metric_columns`.
 """
 
@@ -43,6 +43,8 @@ jobs: Final = Table(
     Column("owner", String(64), nullable=False, server_default=""),
     Column("project", String(32), nullable=False, server_default=""),
     Column("cancelled", Boolean, nullable=False),
+    # Batches of each of its tasks.
+    Column("span", Integer, nullable=False),
     Column("created", String(32), nullable=False),
     Column("finished", String(32)),
     Column("reason", Text),
@@ -132,6 +134,7 @@ shards: Final = Table(
     Column("hand_digest", String(32), nullable=False),
     Column("object_digest", String(32), nullable=False),
     Column("batch", Integer, nullable=False),
+    Column("batches", Integer, nullable=False, server_default="1"),
     Column("seed", Integer, nullable=False),
     Column("inputs", JSON, nullable=False),
     Column("device", String(64), nullable=False),

@@ -10,8 +10,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
+from service.model import names
 from service.model.clock import timestamp
 from service.model.digests import digest_json
 from service.model.domain import Digest, JobOptions, JobRequest, Name
@@ -102,6 +103,13 @@ class SnapshotShard(Record):
     hand: Name
     object: Name
     batch: int
+
+    @field_validator("key")
+    @classmethod
+    def _taken_apart(cls, key: str, info: ValidationInfo) -> str:
+        # A snapshot of 0.2 may name a stretch of a pack; its shards have files of their own since.
+        stages = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
+        return names.shard_file(stages[info.data["kind"]], info.data["id"]) if "@" in key else key
 
 
 class Snapshot(Record):

@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from typing import IO, Final
 
 from service.model.diversity import MIN_DISTANCE_M
-from service.model.domain import JobRequest
+from service.model.domain import JobRequest, batches_of
 from service.model.states import AssetKind, Stage
 from service.model.version import STAGE_REVISIONS
 
@@ -92,7 +92,7 @@ def shard_id(
             "friction": request.friction,
             **({"options": request.options} if request.options else {}),
             **({"matter": request.matter} if request.matter else {}),
-            **_judgement(request, batch),
+            **_judgement(request, range(batch, batch + batches_of(count))),
         }
     elif stage is Stage.SCENE:
         inputs_of |= {"scenes": request.scenes}
@@ -104,15 +104,19 @@ def shard_id(
     return digest_json(inputs_of)
 
 
-def _judgement(request: JobRequest, batch: int) -> dict[str, object]:
-    """What decides which grasps of a batch are kept, and what is known of them."""
+def _judgement(request: JobRequest, batches: range) -> dict[str, object]:
+    """What decides which grasps of some batches are kept, and what is known of them."""
     found: dict[str, object] = {}
     if request.want == "valid":
         found |= {"want": request.want, "budget": request.budget}
         # Its default is part of the stage's revision.
         found |= {} if request.min_distance == MIN_DISTANCE_M else {"min_distance": request.min_distance}
     if request.referee != "none":
-        found |= {"referee": request.referee, "audits": request.audits_of(batch), "robustness": request.robustness}
+        found |= {
+            "referee": request.referee,
+            "audits": sum(map(request.audits_of, batches)),
+            "robustness": request.robustness,
+        }
     if request.models:
         found |= {"robust": [request.models, request.robust]}
     if request.measures_payload:

@@ -33,6 +33,7 @@ from service.model.scene_options import (
 from service.model.scene_spec import LEAST_TOUCH, MOST_NEIGHBOURS, MOST_TOUCH, TOUCH, SceneSpec
 from service.model.states import AssetKind
 
+#: Grasps of a batch: the unit of seeds and of the planner's launches.
 BATCH_SIZE: Final = 32
 #: What pictures can show besides colour, depth and segmentation, in the order in which shards and digests name them.
 EXTRA_CHANNELS: Final = ("distance", "normals", "occlusion")
@@ -357,6 +358,11 @@ class JobRequest(JobOptions):
 
     hand: Name = Field(description="name of a hand known to the service")
     object: Name = Field(description="name of an object known to the service")
+
+
+def batches_of(grasps: int) -> int:
+    """How many batches so many grasps take."""
+    return -(-grasps // BATCH_SIZE)
 
 
 def check_known(options: JobOptions) -> None:

@@ -32,8 +32,8 @@ class TaskMessage(Model):
     task_id: Word
     job_id: Word
     stage: Stage
-    batch: int = Field(ge=0)
-    count: int = Field(ge=1, description="grasps wanted of this batch")
+    batch: int = Field(ge=0, description="the first batch of its range")
+    count: int = Field(ge=1, description="grasps wanted of all of its batches; all but the last batch are full")
     revision: int = Field(1, ge=1, description="revision of the stage's algorithm that the output's address stands for")
     attempt: int = Field(1, ge=1)
     max_attempt: int = Field(3, ge=1, description="number of the attempt that is the last")

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from typing import Final
 
-from service.model.digests import digest_json
 from service.model.states import AssetKind, Stage
 
 ASSETS: Final = "assets"
 JOBS: Final = "jobs"
 TASKS: Final = "tasks"
 SHARDS: Final = "shards"
-PACKS: Final = "packs"
 DATASETS: Final = "datasets"
 OBJECT_SETS: Final = "object_sets"
 DELETIONS: Final = "deletions"
@@ -94,21 +92,6 @@ def shard_file(stage: Stage, shard: str) -> str:
 def shard_manifest(stage: Stage, shard: str) -> str:
     """Manifest of a shard: the shard exists for its readers once this does."""
     return f"{SHARDS}/{SHARD_KINDS[stage]}/{shard}.json"
-
-
-def packs_of(hand_digest: str, object_digest: str) -> str:
-    """Prefix of the packs with shards of a hand and an object."""
-    return f"{PACKS}/{digest_json([hand_digest, object_digest])}"
-
-
-def pack(folder: str, directory: str) -> str:
-    """Several shards in one object; `directory` is a digest of what it says of them."""
-    return f"{folder}/{directory}.pack"
-
-
-def pack_dead(pack: str) -> str:
-    """Prefix of what says which shards of a pack are gone, though their bytes are there."""
-    return f"{pack.removesuffix('.pack')}.dead"
 
 
 def dataset_record(dataset: str) -> str:

@@ -1,7 +1,8 @@
 """From a job to its tasks, and from what is known of the tasks to their states. Pure functions: no store, no clock.
 
-A job is cut into batches of `BATCH_SIZE` grasps; each batch is a chain of stages, as far as asked: synthesize -> scene
--> render, or where grasps are planned in scenes, scene -> synthesize -> render.
+A job is cut into batches of `BATCH_SIZE` grasps, the unit of seeds and launches, and its batches into ranges of
+`JobRecord.span`. Each range is a chain of tasks, one a stage as far as asked: synthesize -> scene -> render, or where
+grasps are planned in scenes, scene -> synthesize -> render.
 """
 
 from __future__ import annotations
@@ -11,11 +12,17 @@ from dataclasses import dataclass
 from typing import Final
 
 from service.model.digests import digest_json, shard_id
-from service.model.domain import BATCH_SIZE, JobOptions, JobRequest
+from service.model.domain import BATCH_SIZE, JobOptions, JobRequest, batches_of
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane, Stage, State
-from service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_FIELD, SCHEMA_OF_NETWORKS, SCHEMA_OF_PACKS, TASK_SCHEMA
+from service.model.version import (
+    OLDEST_TASK_SCHEMA,
+    SCHEMA_OF_FIELD,
+    SCHEMA_OF_NETWORKS,
+    SCHEMA_OF_RANGES,
+    TASK_SCHEMA,
+)
 
 #: A job this small is somebody waiting at a screen; anything larger runs in bulk.
 INTERACTIVE_GRASPS: Final = 4 * BATCH_SIZE
@@ -27,7 +34,8 @@ MAX_BACKOFF_S: Final = 300.0
 
 @dataclass(frozen=True)
 class PlannedTask:
-    """A task as it follows from its job. `inputs` and `output` are shard ids."""
+    """A task as it follows from its job: batches from `batch` on, as many as `count` grasps take. `inputs` and `output`
+    are shard ids."""
 
     id: str
     stage: Stage
@@ -71,16 +79,17 @@ def task_id(job: str, stage: Stage, batch: int) -> str:
     return digest_json({"job": job, "stage": stage, "batch": batch})
 
 
-def batches_of(request: JobRequest) -> int:
-    """How many batches a job has."""
-    return -(-request.grasps // BATCH_SIZE)
+def ranges_of(grasps: int, span: int) -> int:
+    """How many ranges of `span` batches they take."""
+    return -(-batches_of(grasps) // span)
 
 
-def plan(job: JobRecord, batches: range | None = None) -> Iterator[PlannedTask]:
-    """The tasks of a job, of all batches or some, each batch in the order of its stages."""
+def plan(job: JobRecord, ranges: range | None = None) -> Iterator[PlannedTask]:
+    """The tasks of a job, of all ranges or some, each range in the order of its stages."""
     request = job.request
-    for batch in batches if batches is not None else range(batches_of(request)):
-        count = min(BATCH_SIZE, request.grasps - batch * BATCH_SIZE)
+    for number in ranges if ranges is not None else range(ranges_of(request.grasps, job.span)):
+        batch = number * job.span
+        count = min(job.span * BATCH_SIZE, request.grasps - batch * BATCH_SIZE)
         inputs: tuple[str, ...] = ()
         for stage in stages_of(request):
             output = shard_id(
@@ -97,12 +106,10 @@ def plan(job: JobRecord, batches: range | None = None) -> Iterator[PlannedTask]:
             inputs = (output,)
 
 
-def message_of(
-    job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: int, packed: bool = False
-) -> TaskMessage:
-    """What a worker is told; `packed` says that a shard it reads lies in a pack."""
+def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: int) -> TaskMessage:
+    """What a worker is told."""
     return TaskMessage(
-        schema_=max(needed_schema(job.request), SCHEMA_OF_PACKS if packed else 0),
+        schema_=max(needed_schema(job.request), SCHEMA_OF_RANGES if batches_of(task.count) > 1 else 0),
         newest_schema=TASK_SCHEMA,
         task_id=task.id,
         job_id=job.id,
@@ -158,7 +165,7 @@ def ingest_message(kind: AssetKind, name: str, digest: str, *, attempt: int, max
 
 
 def batch_states(chain: Sequence[TaskFacts], *, job_cancelled: bool) -> list[State]:
-    """States of the tasks of one batch, given in the order of their stages.
+    """States of the tasks of one range, given in the order of their stages.
 
     A task behind one that failed or was cancelled can never start, so it is cancelled.
     """
@@ -174,7 +181,7 @@ def batch_states(chain: Sequence[TaskFacts], *, job_cancelled: bool) -> list[Sta
 
 
 def batch_ready(states: Sequence[State]) -> list[bool]:
-    """Which tasks of a batch may start now: unfinished, and everything before them succeeded."""
+    """Which tasks of a range may start now: unfinished, and everything before them succeeded."""
     return [
         not state.is_final and all(before is State.SUCCEEDED for before in states[:i]) for i, state in enumerate(states)
     ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Self
+from typing import Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -11,6 +11,9 @@ from service.model.messages import Origin
 from service.model.projects import Project
 from service.model.states import AssetKind, Lane, Stage
 from service.model.version import STAGE_REVISIONS
+
+#: Most batches of a task.
+MOST_BATCHES: Final = 64
 
 
 class Record(BaseModel):
@@ -45,6 +48,9 @@ class JobRecord(Record):
     hand_digest: Digest
     object_digest: Digest
     lane: Lane
+    span: int = Field(
+        1, ge=1, le=MOST_BATCHES, exclude_if=lambda value: value == 1, description="batches of each of its tasks"
+    )
     created: str
     origin: Origin | None = None
     owner: str = Field("", max_length=64, description="id of the API key that submitted it; empty: none, or not known")
@@ -65,6 +71,8 @@ class JobRecord(Record):
     @model_validator(mode="after")
     def _knows_its_files(self) -> Self:
         check_known(self.request)
+        if self.span > 1 and self.request.views:
+            raise ValueError("a task of a job with pictures has one batch")
         return self
 
     @property

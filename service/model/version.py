@@ -8,7 +8,7 @@ PACKAGE_VERSION: Final = "0.2.0"
 
 #: Newest schema of task messages, and the oldest that a worker of this version still reads. A message carries the range
 #: that can read it, so workers of two versions may run side by side (`service/model/ability.py`).
-TASK_SCHEMA: Final = 5
+TASK_SCHEMA: Final = 6
 OLDEST_TASK_SCHEMA: Final = 2
 #: Fields of a request by the schema that first had them. A job that uses one needs a worker that knows it; all other
 #: jobs go to older workers too.
@@ -20,8 +20,8 @@ SCHEMA_OF_FIELD: Final[dict[str, int]] = {
     "min_payload": 5,
     "shake": 5,
 }
-#: The first schema whose workers find the shards that they read in packs too.
-SCHEMA_OF_PACKS: Final = 3
+#: The first schema whose tasks may have several batches.
+SCHEMA_OF_RANGES: Final = 6
 #: The first schema whose workers fetch the network that a request's options name.
 SCHEMA_OF_NETWORKS: Final = 4
 

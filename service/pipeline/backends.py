@@ -23,12 +23,13 @@ class Parts:
     queue: TaskQueue
 
     @classmethod
-    def open(cls, settings: Settings, *, patience: int = 3, make: bool = True) -> Self:
-        """Open all three: makes the data folder, migrates the index; does not need Redis to answer yet.
+    def open(cls, settings: Settings, *, patience: int = 3, make: bool = True, anew: bool = False) -> Self:
+        """Open all three: makes the data folder and an index; does not need Redis to answer yet.
 
         Args:
             patience: how often Redis is tried before it counts as away.
             make: whether the folder of a store is made where it is absent.
+            anew: whether an index of another revision is emptied; see `Database`.
 
         Raises:
             NotFoundError: there is no store, and none is to be made.
@@ -38,7 +39,8 @@ class Parts:
         from service.queue.rq_queue import open_queue
 
         store = open_store(settings.resolved_store_url, public_endpoint=settings.store_public_endpoint, make=make)
-        return cls(settings, store, Index(settings.resolved_index_url), open_queue(settings, patience=patience))
+        index = Index(settings.resolved_index_url, anew=anew)
+        return cls(settings, store, index, open_queue(settings, patience=patience))
 
     def close(self) -> None:
         """Give all connections back."""

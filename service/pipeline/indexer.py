@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import Final
 
 from service.model.clock import timestamp
-from service.model.errors import DamagedError, InputError, StoreUnavailable, UnavailableError
+from service.model.errors import InputError, StoreUnavailable, UnavailableError
 from service.model.names import attempt as attempt_key
 from service.model.planning import backoff
 from service.model.records import AttemptRecord
@@ -21,14 +21,15 @@ from service.pipeline.tally import Tally
 from service.queue.port import Event, EventKind
 from service.store.library import load_asset, load_check
 from service.store.manifests import ShardManifest, load_manifest
-from service.store.packs import pack_at, read_manifests
 from service.store.records import read_record
 
 log = logging.getLogger(__name__)
 _REMEMBERED_JOBS: Final = 10_000
 _REMEMBERED_TASKS: Final = 100_000
-#: Shards indexed in one transaction: others who write wait for it, a fraction of a second.
-_SHARDS_AT_ONCE: Final = 200
+#: Batches indexed in one transaction: others who write wait for it, a fraction of a second.
+_BATCHES_AT_ONCE: Final = 200
+#: Manifests in memory at once, of up to 64 batches each.
+_MANIFESTS_AT_ONCE: Final = 32
 _READERS: Final = 8
 
 _NEEDS_STORE: Final = frozenset({EventKind.FINISHED, EventKind.FAILED})
@@ -61,9 +62,7 @@ class Indexer:
             if event.kind is EventKind.STARTED:
                 if event.stage is not Stage.INGEST:
                     started[event.task_id] = event.worker
-            elif event.kind is EventKind.PACKED or (
-                event.kind is EventKind.FINISHED and event.stage not in (None, Stage.INGEST)
-            ):
+            elif event.kind is EventKind.FINISHED and event.stage not in (None, Stage.INGEST):
                 finished.append(place)
             elif event.kind is EventKind.LEFT:
                 left.append(event.worker)
@@ -74,8 +73,7 @@ class Indexer:
                     continue
                 waiting.append(place)
         self._start(started)
-        for first in range(0, len(finished), _SHARDS_AT_ONCE):
-            waiting += self._finish(events, finished[first : first + _SHARDS_AT_ONCE])
+        waiting += self._finish(events, finished)
         if left:
             self._parts.index.live.forget_workers(left)
         return sorted(waiting)
@@ -90,29 +88,34 @@ class Indexer:
     def _finish(self, events: Sequence[Event], places: Sequence[int]) -> list[int]:
         """Index what was made; returns the places of the events whose manifests the store does not give."""
         made, waiting = list[ShardManifest](), []
-        for place, found in zip(places, self._readers.map(self._load, (events[at] for at in places)), strict=True):
-            if isinstance(found, list):
+        for place, found in self._loaded(events, places):
+            if isinstance(found, ShardManifest):
                 self._deferrals.pop(events[place].task_id, None)
-                made += found
+                made.append(found)
+                if sum(manifest.batches for manifest in made) >= _BATCHES_AT_ONCE:
+                    self._index(made)
+                    made = []
             elif isinstance(found, StoreUnavailable):
                 waiting.append(place)
             else:
-                what = events[place].pack or f"task {events[place].task_id}"
-                log.error("event %s of %s is left out", events[place].kind, what, exc_info=found)
+                log.error("the end of task %s is left out", events[place].task_id, exc_info=found)
         if waiting:
             log.warning("the store does not answer, and %d events wait for it", len(waiting))
-        for first in range(0, len(made), _SHARDS_AT_ONCE):
-            self._index(made[first : first + _SHARDS_AT_ONCE])
+        self._index(made)
         return waiting
 
-    def _load(self, event: Event) -> list[ShardManifest] | Exception:
-        """The manifests of what was made. Many are read at once: most of the time the store is waited for."""
-        store = self._parts.store
+    def _loaded(
+        self, events: Sequence[Event], places: Sequence[int]
+    ) -> Iterator[tuple[int, ShardManifest | Exception]]:
+        for first in range(0, len(places), _MANIFESTS_AT_ONCE):
+            some = places[first : first + _MANIFESTS_AT_ONCE]
+            yield from zip(some, self._readers.map(self._load, [events[place] for place in some]), strict=True)
+
+    def _load(self, event: Event) -> ShardManifest | Exception:
+        """The manifest of what was made. Many are read at once: most of the time the store is waited for."""
         try:
-            if event.kind is EventKind.PACKED:
-                return _readable(read_manifests(store, pack_at(store, event.pack)))
             assert event.stage is not None
-            return [load_manifest(store, event.stage, event.output)]
+            return load_manifest(self._parts.store, event.stage, event.output)
         except Exception as error:
             return error
 
@@ -216,14 +219,6 @@ class Indexer:
             self._parts.index.live.set_asset_waiting([digest], queued=False, not_before=not_before, message=message)
         else:
             self.tell(self._parts.index.live.set_waiting([event.task_id], not_before=not_before, message=message))
-
-
-def _readable(found: Sequence[ShardManifest | DamagedError]) -> list[ShardManifest]:
-    """What is not damaged; the task of what is turns up missing, and fails."""
-    for one in found:
-        if isinstance(one, DamagedError):
-            log.error("%s", one)
-    return [one for one in found if isinstance(one, ShardManifest)]
 
 
 @contextmanager

@@ -25,6 +25,7 @@ from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane, State
 from service.pipeline.backends import Parts
 from service.pipeline.fidelity_choice import Resolver
+from service.pipeline.ranges import TaskRanges
 from service.pipeline.recording import recording
 from service.pipeline.routes import Routes
 from service.pipeline.scene_check import check_scene
@@ -77,7 +78,7 @@ def prepare(
     parts.queue.ping()
     named = request.model_copy(update={"hand": hand.name, "object": obj.name})
     request, choice = Resolver(parts.store).choose(named)
-    return JobRecord(
+    record = JobRecord(
         id=job_id(request, hand.digest, obj.digest, reach.project),
         request=request,
         hand_digest=hand.digest,
@@ -89,6 +90,7 @@ def prepare(
         project=reach.project,
         choice=choice,
     )
+    return TaskRanges(parts, reach=reach).sized(record)
 
 
 def enter(parts: Parts, record: JobRecord, *, keeps_assets: bool = False) -> tuple[JobView, bool]:
@@ -175,10 +177,9 @@ def queue_tasks(parts: Parts, ready: Sequence[ReadyTask], *, routes: Routes, aga
     """
     to_queue: dict[tuple[Lane, bool], list[TaskMessage]] = defaultdict(list)
     held: dict[str, list[str]] = defaultdict(list)
-    packed = parts.index.shards.packed([shard for task in ready for shard in task.task.inputs])
     for task in ready:
         attempts = {"attempt": task.last_attempt + 1, "max_attempt": task.retried_upto + parts.settings.task_attempts}
-        message = message_of(task.job, task.task, **attempts, packed=not packed.isdisjoint(task.task.inputs))
+        message = message_of(task.job, task.task, **attempts)
         place = routes.place(need_of(message))
         if place.held:
             held[place.held].append(task.task.id)

@@ -1,8 +1,7 @@
 """The keeper: one loop that runs what must not run in a worker. Killed at any moment, its successor goes on.
 
-Several share the work (`service.pipeline.sharing`): each takes up the events of its jobs, queues their tasks, and finds
-those that were lost. What is of no job, or of all of them, is done by who holds the first shard: workers, checks of
-uploads, datasets, deletions, webhooks, the scrub of the store, and an index that must be made anew.
+It reconciles: events become rows, and what the index calls unfinished and the queue does not know is queued again. Of
+several keepers one leads, and the others stand by (`service.pipeline.leading`).
 """
 
 from __future__ import annotations
@@ -21,8 +20,7 @@ from service.index.rebuild import complete_if_new, rebuild
 from service.model import names
 from service.model.ability import need_of
 from service.model.clock import timestamp
-from service.model.errors import BusyError, DamagedError, IndexUnavailable, StoreUnavailable, UnavailableError
-from service.model.keeper_shards import ALL_SHARDS, KeeperShards, shard_of
+from service.model.errors import BusyError, DamagedError, StoreUnavailable, UnavailableError
 from service.model.planning import ingest_id, ingest_message
 from service.model.states import Lane
 from service.model.turns import Turns
@@ -34,16 +32,17 @@ from service.pipeline.entering import Entering
 from service.pipeline.identity import identify
 from service.pipeline.indexer import Indexer
 from service.pipeline.job_actions import HELD_S, queue_tasks
+from service.pipeline.leading import PART
 from service.pipeline.marking import Marking
 from service.pipeline.pace import Pace
 from service.pipeline.reaper import Reaper
 from service.pipeline.reports import Reports
 from service.pipeline.routes import Routes
 from service.pipeline.scrubber import Scrubber
-from service.pipeline.sharing import PART
 from service.pipeline.sweeper import Sweeper
-from service.queue.port import READS_PACKS, Event, EventKind, part_of
+from service.queue.port import Event, EventKind
 from service.store.library import publish_builtins, stored_assets
+from service.store.packs import take_apart
 
 log = logging.getLogger(__name__)
 #: Events of one round: a second's work. Those behind them wait for the next round, which follows at once.
@@ -67,15 +66,10 @@ _LAST_READ_S: Final = 3.0
 class Keeper:
     """Indexes events, queues what is ready, takes tasks from lost workers, keeps the list of workers."""
 
-    def __init__(
-        self, parts: Parts, shards: KeeperShards = ALL_SHARDS, *, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        """`shards` are those that it holds; with others it is another keeper."""
+    def __init__(self, parts: Parts, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._parts = parts
-        self._shards = shards
-        self._streams = sorted(shards.held)
         self._indexer = Indexer(parts)
-        self._reaper = Reaper(parts, self._indexer, shards, clock=clock)
+        self._reaper = Reaper(parts, self._indexer, clock=clock)
         self._planner = DatasetRounds(parts, clock=clock)
         self._sweeper = Sweeper(parts, clock=clock)
         self._marking = Marking(parts)
@@ -95,7 +89,7 @@ class Keeper:
         self._workers = 0
         """Workers that were there when they were last counted."""
         self._clock = clock
-        self._reports = Reports(parts, shards)
+        self._reports = Reports(parts)
         interval_s = parts.settings.keeper_interval_s
         # Each lease is seen three times before it can be called lost.
         self._looking = Pace(clock, interval_s, longest_s=parts.settings.lease_s / 3)
@@ -113,12 +107,9 @@ class Keeper:
     def _beside(self, stop: threading.Event) -> Iterator[None]:
         """What goes on beside the rounds: webhooks are told what ended, large jobs are entered, and the store is read
         through, where the settings want it."""
-        duties: dict[str, Callable[[], None]] = {}
-        if self._shards.leads:
-            duties["webhooks"] = Courier(self._parts, stop).run
-            duties["entering"] = Entering(self._parts, stop).run
-            if self._parts.settings.scrub_mb_per_s:
-                duties["scrub"] = Scrubber(self._parts, stop).run
+        duties = {"webhooks": Courier(self._parts, stop).run, "entering": Entering(self._parts, stop).run}
+        if self._parts.settings.scrub_mb_per_s:
+            duties["scrub"] = Scrubber(self._parts, stop).run
         threads = [threading.Thread(target=duty, name=name, daemon=True) for name, duty in duties.items()]
         for thread in threads:
             thread.start()
@@ -147,7 +138,7 @@ class Keeper:
                 pause = min(_LONGEST_PAUSE_S, max(1.0, 2 * pause))
                 log.exception("a round broke off; the keeper goes on in %.2g s", pause)
                 stop.wait(pause)
-        if self._shards.leads and self._started:
+        if self._started:
             with _noted([]):
                 self._marking.advance(news=self._made)
 
@@ -167,12 +158,11 @@ class Keeper:
             self._index_events(0.0 if self._has_plans else min(wait_s, _REPORTS_EVERY_S))
         now = self._clock()
         if self._counting.is_due:
-            if self._shards.leads:
-                with _noted(away):
-                    self._parts.queue.tidy()
-                with _noted(away):
-                    self._marking.advance(news=self._made)
-                    self._made = False
+            with _noted(away):
+                self._parts.queue.tidy()
+            with _noted(away):
+                self._marking.advance(news=self._made)
+                self._made = False
             with _noted(away):
                 self._indexer.flush()
                 self._counting.run(self._look_after_workers)
@@ -187,8 +177,7 @@ class Keeper:
         if self._reporting.is_due:
             with _noted(away):
                 self._reporting.run(self._reports.take_up)
-        if self._shards.leads:
-            self._do_what_users_want(now, away)
+        self._do_what_users_want(now, away)
         if away:
             raise away[0]
 
@@ -214,9 +203,6 @@ class Keeper:
         self._seen = {name: one for name, one in self._seen.items() if now - one[0] < _REMEMBERED_S}
         known = [beat for _, beat in self._seen.values()]
         self._routes = Routes(known)
-        if not self._shards.leads:
-            return
-        self._streams = [*sorted(self._shards.held), *self._parts.queue.left_over(self._shards.number)]
         self._parts.queue.clear_untaken(known)
         self._parts.index.live.set_workers(
             present,
@@ -226,16 +212,16 @@ class Keeper:
 
     def _see_to_the_index(self) -> None:
         """It must be whole before events are taken up, and may be lost at any time."""
-        if not self._shards.leads:
-            if self._parts.index.notes.completeness() is None:
-                raise IndexUnavailable("the keeper of the first shard makes the index from the store")
-        elif not self._started:
+        if not self._started:
             self._start()
         elif self._parts.index.notes.completeness() is None or self._is_stale():
             self._make_whole()
 
     def _start(self) -> None:
         publish_builtins(self._parts.store)
+        for manifest in take_apart(self._parts.store):
+            self._alive.touch()
+            self._indexer.made(manifest)
         complete_if_new(self._parts.index, self._parts.store)
         made = self._parts.index.notes.completeness()
         # What was left out may have been mended since.
@@ -268,7 +254,7 @@ class Keeper:
         """Take up what came in; what the store is needed for waits while that is away."""
         if len(self._backlog) < _LONGEST_BACKLOG:
             wait_s = wait_s if not self._backlog else 0.0
-            self._backlog += self._take_in(wait_s)
+            self._backlog += self._parts.queue.consume(limit=_EVENTS_A_ROUND, wait_s=wait_s)
         if not self._backlog:
             return
         waiting = set(self._indexer.apply([event for _, event in self._backlog]))
@@ -280,20 +266,8 @@ class Keeper:
         if waiting:
             raise StoreUnavailable(f"the store does not answer, and {len(waiting)} events wait for it")
 
-    def _take_in(self, wait_s: float) -> list[tuple[str, Event]]:
-        """Events of this keeper's shards. Those of others are handed on: a worker of an earlier version puts all of its
-        events into the first stream, and others lie where they belonged when there were more or fewer shards."""
-        queue, shards = self._parts.queue, self._shards
-        found = queue.consume(limit=_EVENTS_A_ROUND, wait_s=wait_s, shards=self._streams)
-        if foreign := [(event_id, event) for event_id, event in found if not shards.has(event.job_id)]:
-            queue.hand_on([(shard_of(event.job_id, shards.number), event) for _, event in foreign])
-            queue.acknowledge([event_id for event_id, _ in foreign])
-        return [(event_id, event) for event_id, event in found if shards.has(event.job_id)]
-
     def _announce(self) -> None:
-        seconds = 5 * self._parts.settings.keeper_interval_s + 5
-        for part in (READS_PACKS, *(part_of(PART, shard) for shard in self._shards.held)):
-            self._parts.queue.announce(part, seconds)
+        self._parts.queue.announce(PART, 5 * self._parts.settings.keeper_interval_s + 5)
 
     def _look_after_queue(self) -> None:
         # While Redis can be read but not written, as on a full disk, no worker can give a sign of life: then this fails
@@ -305,7 +279,7 @@ class Keeper:
         self._reports.sweep({lease.task_id for lease in leases})
         lost = self._reaper.reap(leases)
         present = waiting | {lease.task_id for lease in leases if lease not in lost}
-        if self._shards.leads and (stray := self._parts.index.feed.cancelled(present)):
+        if stray := self._parts.index.feed.cancelled(present):
             self._parts.queue.discard(stray)
         missing = {*self._reaper.find_missing(present), *(lease.task_id for lease in lost)}
         self._feed(present, missing)
@@ -334,11 +308,10 @@ class Keeper:
         for why in sorted(held - self._held):
             log.warning("tasks are %s", why)
         self._held = held
-        if self._shards.leads:
-            self._feed_checks(present, missing, now)
+        self._feed_checks(present, missing, now)
 
     def _ready(self, lane: Lane, now: float, room: int) -> list[ReadyTask]:
-        return self._parts.index.feed.ready_tasks(lane, self._turns, now=now, limit=room, shards=self._shards)
+        return self._parts.index.feed.ready_tasks(lane, self._turns, now=now, limit=room)
 
     def _feed_checks(self, present: set[str] | None, missing: Collection[str], now: float) -> None:
         for check in self._parts.index.feed.ready_checks(now=now, limit=self._parts.settings.queue_window):

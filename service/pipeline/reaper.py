@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Callable, Collection
 from typing import Final
 
 from service.model import names
 from service.model.clock import timestamp
-from service.model.errors import DamagedError, UnavailableError
-from service.model.keeper_shards import ALL_SHARDS, KeeperShards
+from service.model.errors import DamagedError, NotFoundError, UnavailableError
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.planning import ingest_id
 from service.model.records import AttemptRecord
@@ -19,7 +17,8 @@ from service.model.states import AssetKind, Stage
 from service.pipeline.backends import Parts
 from service.pipeline.indexer import Indexer
 from service.queue.port import Holder, Lease
-from service.store.packs import Finder
+from service.store.manifests import load_manifest
+from service.store.packs import take_apart
 from service.store.records import put_record, read_record, task_attempts
 from service.store.seals import put_document
 
@@ -31,17 +30,8 @@ LOST_AFTER_S: Final = 3.0
 class Reaper:
     """Watches leases by whether they change, on this process's own monotonic clock: set clocks do not matter."""
 
-    def __init__(
-        self,
-        parts: Parts,
-        indexer: Indexer,
-        shards: KeeperShards = ALL_SHARDS,
-        *,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        """`shards` are those of the jobs whose tasks it looks after."""
+    def __init__(self, parts: Parts, indexer: Indexer, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._parts = parts
-        self._shards = shards
         self._indexer = indexer
         self._clock = clock
         self._beats: dict[str, tuple[str, float]] = {}
@@ -61,19 +51,15 @@ class Reaper:
             silence = silence + looked if beat == lease.beat else 0.0
             if silence <= lease_s:
                 beats[lease.key] = (lease.beat, silence)
-            elif self._shards.has(_job_of(holder := self._parts.queue.holder(lease))):
-                self._lose(lease, holder)
-                lost.append(lease)
             else:
-                # Another keeper's: it is not looked at again unless it gives a sign of life.
-                beats[lease.key] = (lease.beat, -math.inf)
+                self._lose(lease, self._parts.queue.holder(lease))
+                lost.append(lease)
         self._beats = beats
         return lost
 
     def find_missing(self, present: Collection[str]) -> list[str]:
         """Ids of tasks that the index believes in the queue, but that are neither there nor with a worker."""
-        tasks, checks = self._parts.index.feed.believed_queued(self._shards)
-        checks = checks if self._shards.leads else set()
+        tasks, checks = self._parts.index.feed.believed_queued()
         believed = tasks | {ingest_id(kind, digest) for kind, digest in checks}
         now = self._clock()
         self._missing = {task: self._missing.get(task, now) for task in believed - set(present)}
@@ -87,9 +73,11 @@ class Reaper:
 
     def _recover(self, missing: list[str]) -> None:
         """Make good a lost event from the store; what the store knows nothing of is queued again."""
-        again, finder = [], Finder(self._parts.store)
-        for task, (stage, shard, pair) in self._parts.index.feed.outputs(missing).items():
-            if self._find(task, Stage(stage), shard, pair, finder):
+        again = []
+        for made in take_apart(self._parts.store) if missing else ():  # of a worker of 0.2, in a rolling upgrade
+            self._indexer.made(made)
+        for task, (stage, shard) in self._parts.index.feed.outputs(missing).items():
+            if self._find(task, Stage(stage), shard):
                 continue
             known = self._parts.index.jobs.task(task).attempt
             try:
@@ -105,16 +93,16 @@ class Reaper:
             log.warning("%d tasks were lost from the queue and are queued again", len(again))
             self._indexer.tell(self._parts.index.live.set_waiting(again))
 
-    def _find(self, task_id: str, stage: Stage, shard: str, pair: tuple[str, str], finder: Finder) -> bool:
+    def _find(self, task_id: str, stage: Stage, shard: str) -> bool:
         """Index a shard that is there; one whose manifest is damaged fails its task, since it cannot be made again.
 
         Returns:
             whether it is there.
         """
         try:
-            if (made := finder.manifest(stage, shard, pair)) is None:
-                return False
-            self._indexer.made(made)
+            self._indexer.made(load_manifest(self._parts.store, stage, shard))
+        except NotFoundError:
+            return False
         except DamagedError as error:
             self._fail(task_id, stage, error)
         return True
@@ -161,8 +149,7 @@ class Reaper:
         self._parts.queue.release(lease)
 
     def _lose_task(self, worker: str, message: TaskMessage) -> None:
-        pair = (message.hand_digest, message.object_digest)
-        if self._find(message.task_id, message.stage, message.output, pair, Finder(self._parts.store)):
+        if self._find(message.task_id, message.stage, message.output):
             return
         attempt = AttemptRecord(
             task_id=message.task_id,
@@ -195,8 +182,3 @@ class Reaper:
             self._indexer.checked(message.kind, message.digest)
         else:
             self._parts.index.live.add_asset_attempt(message.digest, message.attempt, not_before=0.0)
-
-
-def _job_of(holder: Holder) -> str:
-    """Job of a held task; "" for what is of none, such as a check or what somebody made up."""
-    return holder.message.job_id if isinstance(holder.message, TaskMessage) else ""

@@ -17,7 +17,6 @@ from service.model.states import AssetKind, Lane, Stage
 from service.model.version import STAGE_REVISIONS
 from service.pipeline.backends import Parts
 from service.pipeline.scrub import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, STAGES, is_on_its_way
-from service.pipeline.unpacking import unpack
 from service.store.library import builtin_assets, load_asset, publish_builtins
 from service.store.records import read_record, task_attempts
 
@@ -51,8 +50,6 @@ def _mend(parts: Parts, one: Damage, harmed: set[str]) -> str:
     if one.what == FOREIGN:
         parts.store.set_aside(one.key)
         return ""
-    if one.key.startswith(f"{names.PACKS}/") and one.key.endswith(".pack"):
-        return _take_apart(parts, one.key)
     if match := _OF_ASSET.fullmatch(one.key):
         return _asset(parts, one.key, AssetKind(match[1]), match[2], match[3])
     if not one.shard:
@@ -97,23 +94,9 @@ def _asset(parts: Parts, key: str, kind: AssetKind, digest: str, file: str) -> s
     return ""
 
 
-def _take_apart(parts: Parts, pack: str) -> str:
-    """Give each shard of a damaged pack its own file, and queue what is harmed; why some of it cannot be made again."""
-    harmed = unpack(parts, pack)
-    lost = []
-    for stage, shard in harmed:
-        planned = _planned(parts, stage, shard)
-        if isinstance(planned, str):
-            lost.append(f"{shard} of it: {planned}")
-        else:
-            _queue(parts, *planned)
-    return "; ".join(lost)
-
-
 def _queue(parts: Parts, job: JobRecord, task: PlannedTask) -> None:
     number = len(task_attempts(parts.store, task.id)) + 1
-    packed = bool(parts.index.shards.packed(task.inputs))
-    message = message_of(job, task, attempt=number, max_attempt=number, packed=packed)
+    message = message_of(job, task, attempt=number, max_attempt=number)
     parts.queue.enqueue([message], Lane.BULK, again=True)
 
 

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from service.model.keeper_shards import ALL_SHARDS, KeeperShards
 from service.pipeline.backends import Parts
 from service.queue.port import Report
 
 
 class Reports:
-    """Passes on what changed. Keepers share reports out by the ids of the tasks: each concerns one row and no other."""
+    """Passes on what changed."""
 
-    def __init__(self, parts: Parts, shards: KeeperShards = ALL_SHARDS) -> None:
+    def __init__(self, parts: Parts) -> None:
         self._parts = parts
-        self._shards = shards
         self._known: dict[str, Report] = {}
 
     def take_up(self) -> None:
         """Progress of the running tasks into the index."""
-        found = self._parts.queue.reports(self._shards)
+        found = self._parts.queue.reports()
         changed = {task: report for task, report in found.items() if self._known.get(task) != report}
         if changed:
             self._parts.index.live.set_progress({task: (r.done, r.total, r.message) for task, r in changed.items()})

@@ -23,7 +23,6 @@ from service.store.assets import ZipFiles
 from service.store.deletions import Deletion, Released
 from service.store.library import UNPACKED_LIMIT_BYTES, load_check
 from service.store.manifests import ShardManifest
-from service.store.packs import DeadShards, pack_at, read_manifests
 from service.store.records import parse_record
 from service.store.seals import is_sealed
 from service.store.store import Store
@@ -39,7 +38,6 @@ _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
     (r"datasets/[^/]+/events/[^/]+\.json", DatasetEvent),
     (r"datasets/[^/]+/snapshots/[^/]+\.json", Snapshot),
     (r"object_sets/[^/]+/[^/]+\.json", ObjectSet),
-    (r"packs/[0-9a-f]{32}/[0-9a-f]{32}\.dead/[0-9a-f]{32}\.json", DeadShards),
     (r"deletions/[^/]+/[^/]+\.json", Deletion),
     (r"released/[^/]+\.json", Released),
     (r"webhooks/[^/]+\.json", Webhook),
@@ -47,14 +45,13 @@ _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
 )
 #: In the order of the keeper's rounds, which remember a place in it.
 FOLDERS: Final = (
-    names.SHARDS, names.ASSETS, names.JOBS, names.TASKS, names.DATASETS, names.OBJECT_SETS, names.PACKS,
+    names.SHARDS, names.ASSETS, names.JOBS, names.TASKS, names.DATASETS, names.OBJECT_SETS,
     names.DELETIONS, names.RELEASED, names.WEBHOOKS, names.TAGS, CHARTS, IN_SCENES, STABILITY,
     names.MARKS, names.SERVICE, names.REMOVED,
 )  # fmt: skip
 _SEALED: Final = (".json", ".zip", ".npz", ".glb")
 _UPLOAD: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(files\.zip|check\.json)")
 _SHARD: Final = re.compile(r"shards/(base|scene|views)/([0-9a-f]{32})\.(h5|json)")
-_PACK: Final = re.compile(r"packs/[0-9a-f]{32}/[0-9a-f]{32}\.pack")
 STAGES: Final[dict[str, Stage]] = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
 
 MISSING: Final = "its file is gone"
@@ -93,7 +90,7 @@ def is_on_its_way(store: Store, one: Damage) -> bool:
 
 def is_checked(key: str) -> bool:
     """Whether `examine` knows what an object of this name must hold."""
-    return key.startswith((f"{names.SHARDS}/", f"{names.PACKS}/")) or key.endswith(_SEALED)
+    return key.startswith(f"{names.SHARDS}/") or key.endswith(_SEALED)
 
 
 def examine(
@@ -101,10 +98,8 @@ def examine(
 ) -> Damage | None:
     """What is wrong with one object; of a shard, its file is examined with its manifest."""
     try:
-        if not key.startswith((f"{names.SHARDS}/", f"{names.PACKS}/")) or _model_of(key) is not None:
+        if not key.startswith(f"{names.SHARDS}/"):
             return _sealed(store, key, read, unsealed)
-        if _PACK.fullmatch(key):
-            return _pack(store, key, read)
         if (match := _SHARD.fullmatch(key)) is None:
             return Damage(key, FOREIGN) if store.exists(key) else None
         kind, shard, ending = match.groups()
@@ -121,23 +116,6 @@ def examine(
 def _model_of(key: str) -> type[Any] | None:
     """What the record of this name must hold; None for what is no record."""
     return next((model for pattern, model in _RECORDS if re.fullmatch(pattern, key)), None)
-
-
-def _pack(store: Store, key: str, read: Read) -> Damage | None:
-    """Directory, manifests and files of those shards of a pack that are there."""
-    try:
-        pack = pack_at(store, key, anew=True)
-    except DamagedError as error:
-        return Damage(key, str(error))
-    harmed = []
-    for shard, made in zip(pack.living, read_manifests(store, pack), strict=True):
-        digest = hashlib.sha256()
-        for chunk in store.stream(pack.place(shard)):
-            digest.update(chunk)
-            read(len(chunk))
-        if isinstance(made, DamagedError) or digest.hexdigest() != shard.sha256:
-            harmed.append(shard.id)
-    return Damage(key, f"{len(harmed)} of its {len(pack.shards)} shards: {', '.join(harmed)}") if harmed else None
 
 
 def _sealed(store: Store, key: str, read: Read, unsealed: Unsealed) -> Damage | None:

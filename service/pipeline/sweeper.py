@@ -17,7 +17,6 @@ from service.model.states import AssetKind, Stage
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.deletion import delete_job, put_away
-from service.pipeline.pack_removal import remove_packed
 from service.store.datasets import load_dataset
 from service.store.deletions import Deletion, Released, removed_before
 from service.store.records import read_record
@@ -81,8 +80,6 @@ class Sweeper:
                 if self._clock() > deadline:
                     return True
                 self._remove_shard(stage, shard)
-            if not remove_packed(self._parts, released.job, lambda: self._clock() > deadline):
-                return True
             self._parts.store.delete(entry.key)
         return False
 

@@ -71,8 +71,6 @@ class AllowedJob(Job):  # type: ignore[misc]
 class AllowedQueue(Queue):  # type: ignore[misc]
     """A queue of such jobs."""
 
-    job_class = AllowedJob
-
     @classmethod
     def open(cls, name: str, connection: Any) -> AllowedQueue:
         """A queue by its name."""

@@ -8,6 +8,7 @@ from typing import Any
 
 from service.model.clock import age_of
 from service.model.states import Lane, Stage
+from service.queue.rq_keys import held_key, job_key, list_key
 
 Place = tuple[Lane, Stage]
 
@@ -53,9 +54,9 @@ def read_queue(
     """
     with connection.pipeline(transaction=False) as pipe:
         for name in lists:
-            pipe.llen(f"rq:queue:{name}")
-            pipe.lindex(f"rq:queue:{name}", 0)
-            pipe.zcard(f"rq:wip:{name}")
+            pipe.llen(list_key(name))
+            pipe.lindex(list_key(name), 0)
+            pipe.zcard(held_key(name))
         pipe.smembers(workers_key)
         *found, names = pipe.execute()
     lengths, heads, running = found[0::3], found[1::3], found[2::3]
@@ -63,7 +64,7 @@ def read_queue(
     known = sorted(names)
     with connection.pipeline(transaction=False) as pipe:
         for head in first.values():
-            pipe.hget(b"rq:job:" + head, "enqueued_at")
+            pipe.hget(job_key(head.decode(errors="replace")), "enqueued_at")
         for name in known:
             pipe.get(worker_key + name)
             pipe.pttl(worker_key + name)

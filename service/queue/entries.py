@@ -39,7 +39,7 @@ def task_of(job: str) -> tuple[str, int]:
     return (match[1], int(match[2])) if match else (job, 0)
 
 
-def fields(connection: Any, key: bytes, *names: str) -> list[bytes | None]:
+def fields(connection: Any, key: str, *names: str) -> list[bytes | None]:
     """Fields of a hash; none of them where something else stands under its name."""
     try:
         return list(connection.hmget(key, *names))

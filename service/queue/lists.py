@@ -17,9 +17,8 @@ from service.model.ability import FIRST_SCHEMA, Ability, Need
 from service.model.states import Lane, Stage
 from service.queue import entries
 from service.queue.port import lane_order
+from service.queue.rq_keys import LISTS, list_name
 
-#: Names of all lists that a task was ever put into.
-LISTS: Final = "rq:queues"
 #: Later stages first: a batch that was begun is finished before the next begins.
 _STAGE_ORDER: Final = (Stage.INGEST, Stage.RENDER, Stage.SCENE, Stage.SYNTHESIZE)
 #: Versions that can be told apart at once; a name beyond them is nobody's.
@@ -57,7 +56,7 @@ def known_lists(connection: Any) -> list[str]:
         if not entries.is_wrong_type(error):
             raise
         found = set()
-    named = (raw.decode(errors="replace").removeprefix("rq:queue:") for raw in found)
+    named = (list_name(raw.decode(errors="replace")) for raw in found)
     return [*_COMMON, *sorted(name for name in named if is_apart(name))[:_MOST_APART]]
 
 

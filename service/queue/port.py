@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Final, Protocol
@@ -11,7 +11,6 @@ from pydantic import BeforeValidator, ConfigDict, Field
 
 from service.model.base import Model
 from service.model.domain import Word
-from service.model.keeper_shards import ALL_SHARDS, KeeperShards
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Lane, Stage
 from service.model.worker_beat import Count, HostWord, WorkerBeat
@@ -22,15 +21,6 @@ Message = TaskMessage | IngestMessage
 
 #: Of so many tasks a worker looks for one in bulk first: a steady flow of interactive work must not end all other.
 BULK_EVERY: Final = 4
-
-
-#: What a keeper announces that reads packs: while none does, as an older one, workers put each shard by itself.
-READS_PACKS: Final = "reads-packs"
-
-
-def part_of(part: str, shard: int) -> str:
-    """Name under which the keeper of a shard announces itself."""
-    return part if shard == 0 else f"{part}:{shard}"
 
 
 def lane_order(taken: int) -> tuple[Lane, ...]:
@@ -44,8 +34,6 @@ class EventKind(StrEnum):
 
     STARTED = "started"
     FINISHED = "finished"
-    PACKED = "packed"
-    """Several stages finished whose shards lie in one object, `pack`; told in place of `finished` of each."""
     FAILED = "failed"
     """An attempt ended in an error and is recorded in the store."""
     DEFERRED = "deferred"
@@ -61,7 +49,7 @@ class EventKind(StrEnum):
     @property
     def ends_attempt(self) -> bool:
         """Whether nobody works on the task after it."""
-        return self not in (EventKind.STARTED, EventKind.PACKED, EventKind.LEFT, EventKind.JOB)
+        return self not in (EventKind.STARTED, EventKind.LEFT, EventKind.JOB)
 
 
 def _cut(value: object) -> object:
@@ -88,9 +76,6 @@ class Event(Model):
     seconds: Amount = 0.0
     output: Annotated[str, Field(pattern=r"^([a-z]{1,10}/)?[A-Za-z0-9_-]{0,64}$")] = ""
     """Shard id of a finished stage; kind and digest (`hand/...`) of a finished check."""
-
-    pack: Annotated[str, Field(pattern=r"^(packs/[0-9a-f]{32}/[0-9a-f]{32}\.pack)?$")] = ""
-    """Object that holds the shard of a finished stage beside others."""
 
     # A newer worker may say more than an older keeper knows.
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -124,28 +109,6 @@ class Holder:
     worker: str
     message: Message | None
     """None if Redis no longer knows."""
-
-
-@dataclass(frozen=True)
-class Share:
-    """What one of several keepers has of the work."""
-
-    number: int
-    """Shards that the work is cut into: where that is not what the keeper was told, it waits."""
-    fair: int = 0
-    """How many of them it should hold, given who else is there."""
-    held: frozenset[int] = frozenset()
-
-
-@dataclass(frozen=True)
-class Keeping:
-    """A shard of the keepers' work."""
-
-    shard: int
-    holder: str
-    """Empty while nobody holds it."""
-    works: bool
-    """Whether its keeper gave a sign of life lately."""
 
 
 class Tasks(Protocol):
@@ -185,13 +148,10 @@ class Tasks(Protocol):
 
 
 class Events(Protocol):
-    """Bounded streams of what happened, one for each shard of the keepers' work."""
+    """A bounded stream of what happened."""
 
     def publish(self, *events: Event) -> None:
-        """Append each to the stream of its job's shard."""
-
-    def hand_on(self, events: Iterable[tuple[int, Event]]) -> None:
-        """Append events to the streams of the shards given: whoever published them knew of fewer shards."""
+        """Append events."""
 
     def report(self, task_id: str, report: Report) -> float:
         """Say how far a task is, in place of what was said before; gone with the event that ends the attempt.
@@ -200,24 +160,20 @@ class Events(Protocol):
             time after which more is welcome [s].
         """
 
-    def reports(self, shards: KeeperShards = ALL_SHARDS) -> dict[str, Report]:
-        """The last report on each task, of those whose own ids fall into these shards."""
+    def reports(self) -> dict[str, Report]:
+        """The last report on each task."""
 
     def forget_reports(self, task_ids: Collection[str]) -> None:
         """Take reports away whose tasks nobody holds."""
 
-    def consume(self, *, limit: int, wait_s: float, shards: Collection[int] = (0,)) -> list[tuple[str, Event]]:
-        """Next events for the keeper that holds these shards, of each the oldest first; those never acknowledged come
-        again to the next one."""
+    def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
+        """Next events for the keeper, the oldest first; those never acknowledged come again to the next one."""
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
         """Say that the events are in the index."""
 
-    def left_over(self, number: int) -> list[int]:
-        """Shards beyond so many whose streams hold something unread: there were more before."""
-
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
-        """Events of the first shard after an id, for any number of readers. `"$"`: only what comes from now on; `"0"`:
+        """Events after an id, for any number of readers. `"$"`: only what comes from now on; `"0"`:
         all kept."""
 
 
@@ -239,24 +195,11 @@ class Presence(Protocol):
     def set_service(self, identity: str, *, instead: bool = False) -> None:
         """Say which service the queue belongs to, where nobody said it before or `instead` of that."""
 
-    def take_share(self, holder: str, seconds: float, *, number: int, before: Collection[int] = ()) -> Share:
-        """Keep the shards of the keepers' work that are held, for that long, and take of the free ones up to a fair
-        share. Whoever asks counts as one who shares the work, for as long.
+    def lead(self, holder: str, seconds: float) -> bool:
+        """Lead the keepers for that long, or go on to; False: another one does."""
 
-        Args:
-            number: how many shards the holder was told that there are. Who holds the first one says it; to who was told
-                another number nothing is given.
-            before: shards that the holder had, and would rather have again.
-        """
-
-    def resign(self, holder: str, shards: Collection[int]) -> None:
-        """Give shards back that this holder has."""
-
-    def leave(self, holder: str, *, number: int) -> None:
-        """Share the work no longer; with what is still held, `resign` comes first."""
-
-    def keepers(self, part: str) -> list[Keeping]:
-        """Who holds each shard of the work, and whether it said lately that it works (`announce`, see `part_of`)."""
+    def resign(self, holder: str) -> None:
+        """Lead no longer; nothing happens where this one does not."""
 
     def now(self, *, lease_s: float) -> QueueNow:
         """Lengths, ages and workers for the metrics, at a cost that does not grow with the queue.

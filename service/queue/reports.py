@@ -7,7 +7,6 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from service.model.keeper_shards import KeeperShards
 from service.queue.entries import text
 from service.queue.port import Report
 from service.queue.rates import report_every_s
@@ -23,16 +22,14 @@ def put_report(connection: Any, task_id: str, report: Report, workers_key: str) 
         return report_every_s(pipe.execute()[1])
 
 
-def read_reports(connection: Any, shards: KeeperShards) -> dict[str, Report]:
-    """The last report on each task whose id falls into these shards; one that cannot be read says nothing."""
+def read_reports(connection: Any) -> dict[str, Report]:
+    """The last report on each task; one that cannot be read says nothing."""
     found = {}
     for raw, data in connection.hgetall(REPORTS).items():
-        if not shards.has(task := text(raw)):
-            continue
         try:
-            found[task] = Report.model_validate_json(data)
+            found[text(raw)] = Report.model_validate_json(data)
         except ValidationError:
-            found[task] = Report()
+            found[text(raw)] = Report()
     return found
 
 

@@ -8,36 +8,38 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any, Final
 
 from redis import Redis
-from redis.exceptions import RedisError
+from redis.exceptions import LockError, RedisError, ResponseError
+from rq.exceptions import DuplicateJobError
+from rq.serializers import JSONSerializer
 
 from service.model.ability import need_of
 from service.model.errors import QueueUnavailable
-from service.model.keeper_shards import ALL_SHARDS, KeeperShards
 from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
-from service.queue import entries, shares
-from service.queue.adding import Appender
+from service.queue import entries, rq_keys
 from service.queue.address import redis_url
-from service.queue.allowed import AllowedJob
+from service.queue.allowed import FAILURE_TTL_S, TASK_FUNCTION, AllowedJob, AllowedQueue
 from service.queue.at_scrape import QueueNow, read_queue
 from service.queue.connection import connect
-from service.queue.lists import LISTS, known_lists, place_of, queue_name, without_takers
-from service.queue.port import Event, Holder, Keeping, Lease, Message, Report, Share, part_of
+from service.queue.lists import known_lists, place_of, queue_name, without_takers
+from service.queue.port import Event, Holder, Lease, Message, Report
 from service.queue.reports import REPORTS, drop_reports, put_report, read_reports
-from service.queue.streams import EVENTS, NUMBER, EventReader, put_event, put_into, readable, streams_kept
+from service.queue.rq_keys import LISTS, execution_keys, held_key, job_key, list_key
+from service.queue.streams import EVENTS, EventReader, put_event, readable
 from service.settings import Settings
 
 WORKERS: Final = "graspd:workers"
+#: Lease of the keeper that leads. A graspd of 0.2 takes and keeps the same one: so the two give way to each other.
+LEAD: Final = "graspd:lead:keeper"
 #: Sums for Prometheus, a few hundred fields.
 METRICS: Final = "graspd:metrics"
 _SERVICE: Final = "graspd:service"
 _CANCEL_TTL_S: Final = 24 * 3600
-_JOB: Final = b"rq:job:"
 _WORKER: Final = b"graspd:worker:"
 
 
@@ -46,8 +48,10 @@ class RqQueue:
 
     def __init__(self, connection: Redis) -> None:
         self.connection: Any = connection
-        self._appender = Appender(connection)
+        self._queues: dict[str, AllowedQueue] = {}
         self._reader = EventReader(connection)
+        self._leases: dict[str, Any] = {}
+        """Locks of those who lead, or want to, through this connection."""
 
     def ping(self) -> float:
         start = time.perf_counter()
@@ -56,13 +60,21 @@ class RqQueue:
         return time.perf_counter() - start
 
     def enqueue(self, messages: Sequence[Message], lane: Lane, *, again: bool = False, apart: bool = False) -> int:
-        lists = [queue_name(lane, m.stage, need_of(m) if apart else None) for m in messages]
-        jobs = [(name, rq_id(m.task_id, m.attempt), m) for name, m in zip(lists, messages, strict=True)]
         stale = [cancel_key(message.task_id) for message in messages]
         if again:
-            stale += [AllowedJob.key_for(job) for _, job, _ in jobs]
+            stale += [job_key(rq_id(message.task_id, message.attempt)) for message in messages]
+        added = 0
         with _mapped():
-            return self._appender.append(jobs, stale=stale)
+            if stale:
+                self.connection.delete(*stale)
+            for message in messages:
+                name = queue_name(lane, message.stage, need_of(message) if apart else None)
+                if name not in self._queues:
+                    self._queues[name] = AllowedQueue.open(name, self.connection)
+                with suppress(DuplicateJobError):
+                    self._queues[name].enqueue_job(self._job(message), unique=True)
+                    added += 1
+        return added
 
     def discard(self, task_ids: Collection[str]) -> None:
         wanted = set(task_ids)
@@ -74,7 +86,7 @@ class RqQueue:
                 for job in self.connection.lrange(key, 0, -1):
                     if entries.task_of(entries.text(job))[0] in wanted:
                         pipe.lrem(key, 0, job)
-                        pipe.delete(_JOB + job)
+                        pipe.delete(job_key(entries.text(job)))
             pipe.execute()
 
     def waiting(self) -> set[str]:
@@ -87,7 +99,7 @@ class RqQueue:
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             lists = known_lists(self.connection)
             for name in lists:
-                pipe.llen(f"rq:queue:{name}")
+                pipe.llen(list_key(name))
             depths: Counter[tuple[Lane, Stage]] = Counter()
             for name, length in zip(lists, pipe.execute(), strict=True):
                 depths[place_of(name)] += length
@@ -97,37 +109,37 @@ class RqQueue:
         abilities = [(stage, beat.ability) for beat in present for stage in beat.stages]
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for name in without_takers(known_lists(self.connection), abilities):
-                key = f"rq:queue:{name}"
+                key = list_key(name)
                 for job in self.connection.lrange(key, 0, -1):
-                    pipe.delete(_JOB + job)
+                    pipe.delete(job_key(entries.text(job)))
                 pipe.delete(key)
                 # Where one of them is still held, its lease is read under the list's name.
-                if not self.connection.exists(f"rq:wip:{name}"):
+                if not self.connection.exists(held_key(name)):
                     pipe.srem(LISTS, key)
             pipe.execute()
 
     def leases(self) -> list[Lease]:
         # RQ's own readers clean up as they read, which moves lost tasks aside and runs callbacks; so the keys are read.
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
-            keys = [f"rq:wip:{name}" for name in known_lists(self.connection)]
+            keys = [held_key(name) for name in known_lists(self.connection)]
             for key in keys:
                 pipe.zrange(key, 0, -1, withscores=True)
             found = pipe.execute()
         return [_lease(key, entry, score) for key, held in zip(keys, found, strict=True) for entry, score in held]
 
     def holder(self, lease: Lease) -> Holder:
-        job = bytes.fromhex(lease.key.partition(" ")[2]).partition(b":")[0]
+        job = entries.text(bytes.fromhex(lease.key.partition(" ")[2]).partition(b":")[0])
         with _mapped():
-            worker, data = entries.fields(self.connection, _JOB + job, "worker_name", "data")
+            worker, data = entries.fields(self.connection, job_key(job), "worker_name", "data")
         return Holder(entries.text(worker), entries.message(data))
 
     def release(self, lease: Lease) -> None:
         key, _, digits = lease.key.partition(" ")
         entry = bytes.fromhex(digits)
-        job = entry.partition(b":")[0]
+        name = entries.text(entry)
         with _mapped(), self.connection.pipeline(transaction=True) as pipe:
             pipe.zrem(key, entry)
-            pipe.delete(b"rq:execution:" + entry, b"rq:executions:" + job, _JOB + job)
+            pipe.delete(*execution_keys(name), job_key(name.partition(":")[0]))
             pipe.hdel(REPORTS, lease.task_id)
             pipe.execute()
 
@@ -145,36 +157,26 @@ class RqQueue:
                     pipe.hdel(REPORTS, event.task_id)
             pipe.execute()
 
-    def hand_on(self, events: Iterable[tuple[int, Event]]) -> None:
-        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
-            for shard, event in events:
-                put_into(pipe, shard, event)
-            pipe.execute()
-
     def report(self, task_id: str, report: Report) -> float:
         with _mapped():
             return put_report(self.connection, task_id, report, WORKERS)
 
-    def reports(self, shards: KeeperShards = ALL_SHARDS) -> dict[str, Report]:
+    def reports(self) -> dict[str, Report]:
         with _mapped():
-            return read_reports(self.connection, shards)
+            return read_reports(self.connection)
 
     def forget_reports(self, task_ids: Collection[str]) -> None:
         with _mapped():
             drop_reports(self.connection, task_ids)
 
-    def consume(self, *, limit: int, wait_s: float, shards: Collection[int] = (0,)) -> list[tuple[str, Event]]:
+    def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         with _mapped():
-            return self._reader.read(shards, limit=limit, wait_s=wait_s)
+            return self._reader.read(limit=limit, wait_s=wait_s)
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
         if event_ids:
             with _mapped():
                 self._reader.acknowledge(event_ids)
-
-    def left_over(self, number: int) -> list[int]:
-        with _mapped():
-            return self._reader.left_over(number)
 
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         with _mapped():
@@ -198,21 +200,30 @@ class RqQueue:
         with _mapped():
             self.connection.set(_SERVICE, identity, nx=not instead)
 
-    def take_share(self, holder: str, seconds: float, *, number: int, before: Collection[int] = ()) -> Share:
+    def lead(self, holder: str, seconds: float) -> bool:
         with _mapped():
-            return shares.take_share(self.connection, holder, seconds, number, before)
+            new = self.connection.lock(LEAD, timeout=seconds, thread_local=False)
+            lease = self._leases.setdefault(holder, new)
+            lease.timeout = seconds
+            try:
+                if lease.owned():
+                    return bool(lease.reacquire())
+                self.resign(holder)  # what a process of the same name left when it ended
+                if lease.acquire(blocking=False, token=holder):
+                    return True
+                if self.connection.ttl(LEAD) == -1:  # nobody's: a lease has an end
+                    self.connection.delete(LEAD)
+            except LockError:
+                pass
+            except ResponseError as error:
+                if not entries.is_wrong_type(error):
+                    raise
+                self.connection.delete(LEAD)
+            return False
 
-    def resign(self, holder: str, shards: Collection[int]) -> None:
-        with _mapped():
-            shares.give_back(self.connection, holder, shards)
-
-    def leave(self, holder: str, *, number: int) -> None:
-        with _mapped():
-            shares.leave(self.connection, holder, number)
-
-    def keepers(self, part: str) -> list[Keeping]:
-        with _mapped():
-            return shares.read_keepers(self.connection, lambda shard: _part_key(part_of(part, shard)))
+    def resign(self, holder: str) -> None:
+        with _mapped(), suppress(LockError):
+            self.connection.lock(LEAD).do_release(holder)
 
     def now(self, *, lease_s: float) -> QueueNow:
         with _mapped():
@@ -239,29 +250,42 @@ class RqQueue:
     def tidy(self) -> None:
         # RQ's registries of workers and failures are emptied by its own maintenance, which is off.
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
-            streams = streams_kept(self.connection)
-            entries.sweep(self.connection, [*_KINDS, *((name, "stream") for name in streams)], streams)
+            entries.sweep(self.connection, _KINDS, (EVENTS,))
             lists = known_lists(self.connection)
-            entries.sweep(self.connection, _kinds(lists))
+            entries.sweep(self.connection, rq_keys.kinds(lists))
             known = list(self.connection.smembers(WORKERS))
             for name in known:
                 pipe.exists(_WORKER + name)
             for name, lives in zip(known, pipe.execute(), strict=True):
                 if not lives:
-                    key = b"rq:worker:" + name
+                    key = rq_keys.worker_key(entries.text(name))
                     pipe.delete(key)
-                    for registry in ("rq:workers", *(f"rq:workers:{queue}" for queue in lists)):
+                    for registry in (rq_keys.WORKERS, *map(rq_keys.workers_key, lists)):
                         pipe.srem(registry, key)
                     pipe.srem(WORKERS, name)
             for queue in lists:
-                pipe.zremrangebyscore(f"rq:failed:{queue}", 0, time.time())
+                pipe.zremrangebyscore(rq_keys.failed_key(queue), 0, time.time())
             pipe.execute()
 
     def close(self) -> None:
         self.connection.close()
 
+    def _job(self, message: Message) -> AllowedJob:
+        made: AllowedJob = AllowedJob.create(
+            TASK_FUNCTION,
+            args=(message.model_dump(mode="json", by_alias=True),),
+            id=rq_id(message.task_id, message.attempt),
+            connection=self.connection,
+            timeout=-1,  # the worker's own clock ends a task that takes too long: see `worker.process.main`
+            result_ttl=0,
+            failure_ttl=FAILURE_TTL_S,
+            description=f"{message.stage} {message.task_id}",
+            serializer=JSONSerializer,
+        )
+        return made
+
     def _list_keys(self) -> list[str]:
-        return [f"rq:queue:{name}" for name in known_lists(self.connection)]
+        return [list_key(name) for name in known_lists(self.connection)]
 
 
 def open_queue(settings: Settings, *, patience: int = 3) -> RqQueue:
@@ -296,22 +320,15 @@ def _part_key(part: str) -> str:
 
 #: Names of a fixed number, each with its type in Redis.
 _KINDS: Final = (
-    (NUMBER, "string"),
-    (shares.KEEPERS, "zset"),
+    (EVENTS, "stream"),
+    (LEAD, "string"),
     (WORKERS, "set"),
     (METRICS, "hash"),
     (REPORTS, "hash"),
     (_SERVICE, "string"),
-    ("rq:workers", "set"),
+    (rq_keys.WORKERS, "set"),
     (LISTS, "set"),
 )
-
-
-def _kinds(lists: Sequence[str]) -> Iterator[tuple[str, str]]:
-    for name in lists:
-        yield f"rq:queue:{name}", "list"
-        yield from ((f"rq:{registry}:{name}", "zset") for registry in ("wip", "failed"))
-        yield f"rq:workers:{name}", "set"
 
 
 def _amount(raw: bytes) -> float | None:

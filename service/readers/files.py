@@ -12,7 +12,7 @@ from typing import Final
 import h5py
 
 from service.model import names
-from service.model.errors import DamagedShard, InputError, NotFoundError
+from service.model.errors import InputError, NotFoundError
 from service.model.planning import plan
 from service.model.records import JobRecord
 from service.readers.cache import DEFAULT_BYTES, ShardCache
@@ -20,8 +20,8 @@ from service.readers.ranges import RangeReader
 from service.store.columns import ShardKind
 from service.store.datasets import newest_snapshot
 from service.store.integrity import check_file
-from service.store.packs import Finder
-from service.store.parts import is_part
+from service.store.manifests import load_manifest
+from service.store.packs import PACKED, has_packs
 from service.store.records import read_record
 from service.store.shards import kind_of, open_shard
 from service.store.store import Store, open_store
@@ -54,7 +54,6 @@ class Shards:
     stream: bool = False
     """Pictures of the store are read by ranges, and not kept here."""
     _by_id: dict[str, ShardFile] = field(default_factory=dict, repr=False)
-    _places: dict[str, str] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         self._by_id.update({file.id: file for file in self.files})
@@ -95,16 +94,6 @@ class Shards:
         assert self.store is not None, "a shard without a path comes from a store"
         return RangeReader(self.store)
 
-    def place(self, file: ShardFile) -> str:
-        """Where a streamed shard lies in the store: in its pack, or by itself where that was taken apart since."""
-        if not is_part(file.key):
-            return file.key
-        assert self.store is not None, "a shard without a path comes from a store"
-        if file.id not in self._places:
-            own = names.shard_file(_STAGES[file.kind], file.id)
-            self._places[file.id] = file.key if self.store.exists(file.key) else own
-        return self._places[file.id]
-
     @contextmanager
     def opened(self, file: ShardFile, *, whole: bool = False) -> Iterator[h5py.File]:
         """The HDF5 file of a shard; `whole`: of one that is streamed, pictures will be wanted too.
@@ -113,7 +102,7 @@ class Shards:
             what `path`, `open_shard` and `RangeReader.open` raise.
         """
         if self.streamed(file):
-            with self.ranges.open(self.place(file), whole=whole) as found:
+            with self.ranges.open(file.key, whole=whole) as found:
                 yield found
         else:
             with open_shard(self.path(file)) as found:
@@ -130,13 +119,7 @@ class Shards:
             check_file(file.path)
             return file.path
         assert self.store is not None and self.cache is not None, "a shard without a path comes from a store"
-        try:
-            return self.cache.fetch(self.store, file.key, file.sha256)
-        except DamagedShard:
-            # A damaged pack is mended by taking it apart, and a snapshot goes on to name its place there.
-            if not is_part(file.key):
-                raise
-            return self.cache.fetch(self.store, names.shard_file(_STAGES[file.kind], file.id), file.sha256)
+        return self.cache.fetch(self.store, file.key, file.sha256)
 
 
 def open_shards(
@@ -180,9 +163,7 @@ def _paths(entry: Path) -> list[Path]:
     if entry.is_dir():
         found = sorted(entry.rglob("*.h5"))
         if next(entry.rglob("*.pack"), None) is not None:
-            raise InputError(
-                f"{entry} has shards in packs: name the store, {entry.resolve().as_uri()}, and a job or dataset"
-            )
+            raise InputError(f"{entry} has shards in {PACKED}")
         if not found:
             raise NotFoundError(f"{entry} holds no .h5 file")
         return found
@@ -203,6 +184,8 @@ def _local(path: Path) -> ShardFile:
 def _of_store(store: Store, job: str | None, dataset: str | None, snapshot: str | None) -> Iterator[ShardFile]:
     if (job is None) == (dataset is None):
         raise InputError(f"name what to read of {store.url}: a job or a dataset")
+    if has_packs(store):
+        raise InputError(f"{store.url} has shards in {PACKED}")
     if job is not None:
         return _of_job(store, job)
     assert dataset is not None
@@ -211,13 +194,12 @@ def _of_store(store: Store, job: str | None, dataset: str | None, snapshot: str 
 
 def _of_job(store: Store, job: str) -> Iterator[ShardFile]:
     record = read_record(JobRecord, store, names.job_record(job))
-    finder = Finder(store)
     for task in plan(record):
-        made = finder.manifest(task.stage, task.output, (record.hand_digest, record.object_digest))
-        if made is not None:
-            yield ShardFile(
-                made.shard_id, made.kind, made.hand, made.object, made.batch, key=made.key, sha256=made.sha256
-            )
+        try:
+            made = load_manifest(store, task.stage, task.output)
+        except NotFoundError:
+            continue
+        yield ShardFile(made.shard_id, made.kind, made.hand, made.object, made.batch, key=made.key, sha256=made.sha256)
 
 
 def _of_snapshot(store: Store, dataset: str, digest: str | None) -> Iterator[ShardFile]:

@@ -135,7 +135,7 @@ class Pictures(Sequence[dict[str, Any]]):
         if not self.shards.streamed(file):
             path = self.shards.path(file)
             return self._table(file, wanted).row(row, wanted, lambda ranges: read_file(path, ranges))
-        table, reader, key = self._table(file, wanted), self.shards.ranges, self.shards.place(file)
+        table, reader, key = self._table(file, wanted), self.shards.ranges, file.key
         return table.row(
             row, wanted, lambda ranges: reader.read(key, ranges, row, lambda other: table.ranges(other, wanted))
         )

@@ -79,8 +79,7 @@ def keeper(
     check: Annotated[bool, typer.Option("--check", help="Start none; exit code 1 says that none lives.")] = False,
     data_dir: DataDir = None,
 ) -> None:
-    """Reaper, delayed retries and indexer. Several share the work and take over from each other; `graspd up` starts
-    one."""
+    """Reaper, delayed retries and indexer. Of several one leads and the others stand by; `graspd up` starts one."""
     settings = load_settings(data_dir=data_dir)
     log_to_stderr(settings, "keeper")
     keep_private(settings)
@@ -91,26 +90,24 @@ def keeper(
 
 
 def _run_keeper(settings: Settings, stop: threading.Event) -> None:
-    """Keep the shards of the work that are this keeper's; from the start where they become others."""
+    """Lead, or stand by; from the start again where another led meanwhile."""
     from service.pipeline.backends import Parts
     from service.pipeline.keeper import Keeper
-    from service.pipeline.sharing import Sharing
+    from service.pipeline.leading import Leadership
     from service.queue.rq_queue import open_queue
 
     alive = HeartbeatFile(settings.heartbeat_file)
     queue = open_queue(settings, patience=0)
-    sharing = Sharing(
-        queue, number=settings.keeper_shards, lease_s=settings.lease_s, alive=alive, name=settings.keeper_name
-    )
+    leadership = Leadership(queue, lease_s=settings.lease_s, alive=alive, name=settings.keeper_name)
     try:
         # A keeper of another service must not even wait: it would be a standby that all take for their own.
         _identify(settings, stop, alive)
-        while (shards := sharing.wait(stop)) is not None:
-            with sharing.held(stop) as over:
+        while leadership.wait(stop):
+            with leadership.held(stop) as over:
                 # What an earlier keeper took in and did not finish comes again to a fresh one.
                 parts = Parts.open(settings)
                 try:
-                    Keeper(parts, shards).run(over)
+                    Keeper(parts).run(over)
                 finally:
                     parts.close()
     finally:
@@ -149,6 +146,8 @@ def rebuild(
 ) -> None:
     """Make the rows of the index anew from the store, and be the service that works on it from now on.
 
+    An index of another version of graspd gets the tables of this one.
+
     With --check exit code 1: they differ, or a shard is damaged.
     """
     from service.index.rebuild import differences
@@ -156,20 +155,22 @@ def rebuild(
     from service.pipeline.backends import Parts
     from service.pipeline.identity import identify_if_redis_answers
     from service.pipeline.scrub import scan
+    from service.store.packs import take_apart
 
-    parts = Parts.open(load_settings(data_dir=data_dir), patience=0, make=False)
+    parts = Parts.open(load_settings(data_dir=data_dir), patience=0, make=False, anew=not check)
     store, index = parts.store, parts.index
 
     def make() -> dict[str, int]:
         identify_if_redis_answers(parts, take_over=True)
+        for _ in take_apart(store):
+            pass
         return fill(index, store)
 
     try:
-        found = differences(index, store)
+        was = index.database.was
+        found = [f"the index was of revision {was}; it has other tables now"] if was else differences(index, store)
         if check:
-            found += [
-                f"{wrong.key}: {wrong.what}" for _, wrong in scan(store, names.SHARDS, names.PACKS) if wrong is not None
-            ]
+            found += [f"{wrong.key}: {wrong.what}" for _, wrong in scan(store, names.SHARDS) if wrong is not None]
         counts: dict[str, int] = {} if check else make()
     except IndexDamaged:
         if check:
@@ -209,23 +210,6 @@ def export(
             typer.echo(f"{output / name}.parquet  {count} rows")
 
 
-@index_app.command(epilog="graspd index downgrade 0003")
-@reporting_errors
-def downgrade(
-    revision: Annotated[str, typer.Argument(help="Revision of the older graspd: the newest of its migrations.")],
-    data_dir: DataDir = None,
-    json: JsonFlag = False,
-) -> None:
-    """Take the index back to an earlier schema, before an older graspd is installed. Stop the service first."""
-    from service.index.database import downgrade as take_back
-
-    take_back(load_settings(data_dir=data_dir).resolved_index_url, revision)
-    if json:
-        emit({"revision": revision})
-    else:
-        typer.echo(f"the index has revision {revision}; the next start of this graspd would bring it forward again")
-
-
 @index_app.command(epilog="graspd index path")
 @reporting_errors
 def path(data_dir: DataDir = None) -> None:
@@ -245,12 +229,12 @@ def _check_rooms(workers: int) -> None:
 
 def check_keeper(settings: Settings) -> None:
     """UnavailableError if no keeper gave a sign of life lately."""
-    from service.pipeline.sharing import is_kept
+    from service.pipeline.leading import PART
     from service.queue.rq_queue import open_queue
 
     queue = open_queue(settings, patience=0)
     try:
-        if not is_kept(queue):
+        if not queue.announced(PART):
             raise UnavailableError("no keeper gave a sign of life lately; start `graspd keeper`")
     finally:
         queue.close()

@@ -39,7 +39,6 @@ def verify(
     from service.pipeline.repair import repair as mend
     from service.pipeline.scrub import MISSING, scan
     from service.pipeline.scrubber import Turn
-    from service.store.packs import pack_at
 
     parts = Parts.open(load_settings(data_dir=data_dir), make=False)
     if repair:
@@ -48,15 +47,11 @@ def verify(
     try:
         if not turn.is_mine():
             raise ConflictError("another `graspd store verify` reads this store; wait until it is done")
-        shards, unused, found, unsealed = 0, 0, [], list[str]()
+        shards, found, unsealed = 0, [], list[str]()
         for key, wrong in scan(parts.store, read=lambda size: turn.keep(), unsealed=unsealed.append):
             turn.keep()
             shards += key.startswith(f"{names.SHARDS}/") and key.endswith(".json")
             found += [wrong] if wrong is not None else []
-            if key.endswith(".pack") and wrong is None:
-                pack = pack_at(parts.store, key)
-                shards += len(pack.living)
-                unused += sum(shard.length for shard in pack.shards if shard.id in pack.dead)
         parts.index.damage.replace(found)
         repaired, left = mend(parts, found) if repair else ([], found)
     finally:
@@ -67,7 +62,6 @@ def verify(
         emit(
             {
                 "shards": shards,
-                "unused_bytes": unused,
                 "without_digest": len(unsealed),
                 "damaged": [one for one in damaged if one["what"] != MISSING],
                 "missing": [one.shard for one in found if one.what == MISSING],
@@ -80,9 +74,25 @@ def verify(
             typer.echo(f"{one.key}: {one.what}; moved aside, and made again if a job needs it")
         for one in left:
             typer.echo(f"{one.key}: {one.what}")
-        more = f", {unused} bytes in packs that no job needs any more" if unused else ""
-        if unsealed:
-            more += f"; {len(unsealed)} objects that graspd 0.2 wrote have no checksum of their own"
+        more = f"; {len(unsealed)} objects that graspd 0.2 wrote have no checksum of their own" if unsealed else ""
         typer.echo(f"{shards} shards, {len(found)} damaged or missing{more}", err=True)
     if left:
         raise typer.Exit(1)
+
+
+@store_app.command(epilog="graspd store upgrade")
+@reporting_errors
+def upgrade(
+    data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Folder of everything graspd keeps.")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Give every shard that graspd 0.2 put into a pack a file of its own; a keeper does the same when it starts."""
+    from service.store.packs import take_apart
+    from service.store.store import open_store
+
+    store = open_store(load_settings(data_dir=data_dir).resolved_store_url, make=False)
+    shards = sum(1 for _ in take_apart(store))
+    if json:
+        emit({"shards": shards})
+    else:
+        typer.echo(f"{shards} shards were taken out of packs", err=True)

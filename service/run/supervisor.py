@@ -21,7 +21,7 @@ from pydantic import SecretStr
 from service.model.errors import BusyError, GraspdError, InputError, UnavailableError
 from service.pipeline.backends import Parts
 from service.pipeline.identity import identify_if_redis_answers, recorded
-from service.pipeline.sharing import is_kept
+from service.pipeline.leading import PART
 from service.queue.address import redis_url
 from service.queue.port import Presence
 from service.queue.rq_queue import open_queue
@@ -177,7 +177,7 @@ class Supervisor:
     def _missing(self, queue: Presence) -> list[str]:
         missing = []
         try:
-            if not is_kept(queue):
+            if not queue.announced(PART):
                 missing.append("keeper")
             beats = queue.workers()
             if sum(beat.state != "quarantined" for beat in beats) < self._workers:

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from service.model import names
 from service.model.clock import timestamp
-from service.model.domain import Digest, JobRequest
+from service.model.domain import Digest, JobRequest, batches_of
 from service.model.messages import TaskMessage
 from service.model.metric_fields import values, with_fields
 from service.model.metrics import indexed
@@ -67,6 +67,7 @@ class ShardManifest(BaseModel):
     request: JobRequest
     seed: int
     batch: int
+    batches: int = Field(1, ge=1, description="batches from that one on")
     inputs: tuple[str, ...]
     code_version: str
     stage_revision: int
@@ -141,6 +142,7 @@ def manifest_of(
         request=message.request,
         seed=message.request.seed,
         batch=message.batch,
+        batches=batches_of(message.count),
         inputs=message.inputs,
         code_version=PACKAGE_VERSION,
         stage_revision=STAGE_REVISIONS[message.stage],

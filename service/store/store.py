@@ -26,7 +26,6 @@ from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import LocalStore, MemoryStore, from_url
 
 from service.model.errors import InputError, NotFoundError, StoreUnavailable
-from service.store.parts import part_of
 
 _KEY: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]*(/[A-Za-z0-9][A-Za-z0-9._=-]*)*")
 _PROBE: Final = "health/probe"
@@ -92,23 +91,11 @@ class Store:
 
     def get(self, key: str) -> bytes:
         """All bytes of an object; NotFoundError if there is none."""
-        if (part := part_of(key)) is not None:
-            return self.get_range(key, 0, part.length)
         with _mapped(key, self.url):
             return bytes(obstore.get(self._backend, check_key(key)).bytes())
 
     def get_range(self, key: str, start: int, length: int) -> bytes:
-        """`length` bytes from offset `start`; NotFoundError if there is no such object.
-
-        Of a part whose object was cut off it gives those that are left: its checksum then says that it is damaged.
-        """
-        if (part := part_of(key)) is not None:
-            try:
-                return self.get_range(part.key, part.start + start, max(0, min(length, part.length - start)))
-            except StoreUnavailable:
-                if self.size(part.key) > part.start + start:
-                    raise
-                return b""
+        """`length` bytes from offset `start`; NotFoundError if there is no such object."""
         with _mapped(key, self.url):
             return bytes(obstore.get_range(self._backend, check_key(key), start=start, length=length))
 
@@ -123,8 +110,6 @@ class Store:
 
     def size(self, key: str) -> int:
         """Bytes of an object; NotFoundError if there is none."""
-        if (part := part_of(key)) is not None:
-            return max(0, min(part.length, self.size(part.key) - part.start))
         with _mapped(key, self.url):
             return int(obstore.head(self._backend, check_key(key))["size"])
 
@@ -142,9 +127,8 @@ class Store:
 
     def stamp(self, key: str) -> Stamp:
         """What tells whether an object was exchanged or written over; NotFoundError if there is none."""
-        part = part_of(key)
         with _mapped(key, self.url):
-            meta = obstore.head(self._backend, check_key(part.key if part is not None else key))
+            meta = obstore.head(self._backend, check_key(key))
             return int(meta["size"]), meta["last_modified"].isoformat(), str(meta.get("e_tag") or "")
 
     def exists(self, key: str) -> bool:
@@ -161,9 +145,7 @@ class Store:
                 yield from (Entry(str(meta["path"]), int(meta["size"])) for meta in batch)
 
     def sign(self, key: str, *, seconds: int = 3600) -> str | None:
-        """URL from which anybody may read the object for a while; None where the store makes none, and of a part."""
-        if part_of(key) is not None:
-            return None
+        """URL from which anybody may read the object for a while; None where the store makes none."""
         check_key(key)
         try:
             return (

@@ -20,7 +20,7 @@ pytestmark = [
     pytest.mark.skipif(find_spec("build") is None, reason="no `build`: pip install -e '.[release]'"),
 ]
 
-#: What a user does first, from files of the package alone: migrations, templates, built-in hands.
+#: What a user does first, from files of the package alone: templates, built-in hands.
 FIRST_STEPS = """
 import pathlib, graspd, service.index.index, api.dashboard.rendering, service.store.library
 assert str(pathlib.Path(graspd.__file__)).startswith({place!r}), graspd.__file__
@@ -56,7 +56,7 @@ def test_two_builds_are_the_same_bytes(first: dict[str, Path], tmp_path: Path) -
 def test_the_sdist_holds_what_the_wheel_is_made_of(first: dict[str, Path]) -> None:
     with tarfile.open(first[".gz"]) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    assert {"pyproject.toml", "LICENSE", "graspd/cli.py", "service/index/migrations/env.py"} <= names
+    assert {"pyproject.toml", "LICENSE", "graspd/cli.py"} <= names
     assert not any(name.startswith(("tests/", "benchmarks/")) for name in names)
 
 

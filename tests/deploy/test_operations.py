@@ -83,18 +83,6 @@ def test_a_damaged_copy_is_noticed(kept: Parts, tmp_path: Path) -> None:
         restored.close()
 
 
-def test_an_index_goes_back_for_an_older_version_and_forward_again(kept: Parts, tmp_path: Path) -> None:
-    before = {job.id: job.state for job in kept.index.jobs.page(limit=10).items}
-    kept.index.close()
-    done = page.run("downgrade", tmp_path, {"GRASPD_DATA_DIR": str(kept.settings.data_dir)})
-    assert done.returncode == 0, done.stderr
-    again = Index(kept.settings.resolved_index_url)
-    try:
-        assert {job.id: job.state for job in again.jobs.page(limit=10).items} == before
-    finally:
-        again.close()
-
-
 def test_an_empty_index_is_filled_from_the_store(kept: Parts) -> None:
     before = {job.id: job.state for job in kept.index.jobs.page(limit=10).items}
     empty = Index(f"sqlite:///{kept.settings.data_dir / 'older.sqlite'}")

@@ -17,7 +17,7 @@ from service.run.embedded import server_command
 from service.settings import Settings
 from service.store.store import open_store
 from tests.fakes import add_assets
-from tests.indexes import MigratedSchemas, empty_index
+from tests.indexes import EmptySchemas, empty_index
 from tests.memory_queue import MemoryQueue
 from tests.servers import PostgresServer
 from tests.waiting import until
@@ -61,9 +61,9 @@ def rq_queue(redis_server: str) -> Iterator[RqQueue]:
 
 
 @pytest.fixture(scope="session")
-def migrated_schemas(postgres_server: PostgresServer) -> Iterator[MigratedSchemas]:
+def empty_schemas(postgres_server: PostgresServer) -> Iterator[EmptySchemas]:
     """Schemas of the PostgreSQL of this test process that tests lend one after another."""
-    made = MigratedSchemas(postgres_server)
+    made = EmptySchemas(postgres_server)
     yield made
     made.close()
 
@@ -72,7 +72,7 @@ def migrated_schemas(postgres_server: PostgresServer) -> Iterator[MigratedSchema
 def index_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
     """Where `empty_index` opens an index without rows: on a database of each kind in turn."""
     if request.param == "postgres":
-        schemas: MigratedSchemas = request.getfixturevalue("migrated_schemas")
+        schemas: EmptySchemas = request.getfixturevalue("empty_schemas")
         with schemas.lent() as url:
             yield url
     else:
@@ -81,8 +81,9 @@ def index_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
 
 @pytest.fixture
 def parts(tmp_path: Path) -> Iterator[Parts]:
-    """A service without processes: memory store, SQLite index, memory queue, a hand `gripper` and an object `ball`."""
-    settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0)
+    """A service without processes: memory store, SQLite index, memory queue, a hand `gripper` and an object `ball`;
+    each batch is a task."""
+    settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0, task_s=0.0)
     index = empty_index(settings.resolved_index_url)
     made = Parts(settings, open_store("memory://"), index, MemoryQueue())
     add_assets(made)

@@ -9,7 +9,7 @@ from service.model.clock import timestamp
 from service.model.states import Lane
 from service.queue.port import Event, EventKind, Report
 from service.queue.rq_queue import RqQueue, cancel_key
-from service.queue.streams import EVENTS, EVENTS_KEPT, NUMBER
+from service.queue.streams import EVENTS, EVENTS_KEPT
 from service.store.store import open_store
 from tests.fakes import message_for
 from tests.indexes import empty_index
@@ -69,10 +69,10 @@ def test_everything_in_redis_that_is_not_of_a_fixed_number_has_an_end(rq_queue: 
     rq_queue.enqueue([message_for()], Lane.BULK)
     rq_queue.discard(["0" * 32])
     rq_queue.announce("keeper", 5)
-    rq_queue.take_share("a", 5, number=4)
+    rq_queue.lead("a", 5)
     rq_queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), task_id="a"))
     rq_queue.report("a", Report(done=1.0, total=2.0))
     rq_queue.publish(Event(kind=EventKind.FINISHED, at=timestamp(), task_id="a"))
-    fixed = ("rq:queue", "rq:job", "rq:unique", EVENTS, NUMBER, "graspd:workers", "graspd:tally")
+    fixed = ("rq:queue", "rq:job", "rq:unique", EVENTS, "graspd:workers", "graspd:tally")
     without_end = [key.decode() for key in rq_queue.connection.keys("*") if rq_queue.connection.ttl(key) < 0]
     assert [key for key in without_end if not key.startswith(fixed)] == []

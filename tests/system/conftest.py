@@ -77,7 +77,9 @@ def starting(folder: Path, patch: pytest.MonkeyPatch) -> Iterator[Started]:
     ) -> System:
         for name, value in {"FAKE_HOLD": str(folder / "hold"), **(environment or {})}.items():
             patch.setenv(name, value)
-        wanted = Settings(data_dir=folder / "data", port=0, device="cpu", keeper_interval_s=0.5, **settings)
+        wanted = Settings(
+            data_dir=folder / "data", port=0, device="cpu", keeper_interval_s=0.5, **{"task_s": 0.0, **settings}
+        )
         command = ("-m", "tests.fakes") if fakes else ("-m", "graspd", "worker")
         supervisor = Supervisor(wanted, workers=workers, api=api, worker_command=(sys.executable, *command))
         empty_index(wanted.resolved_index_url).close()

@@ -29,7 +29,7 @@ class House:
     """Redis, keepers and a worker as processes, each with a log. While there is a file `hold` no task ends."""
 
     def __init__(self, folder: Path, *, lease_s: float = LEASE_S) -> None:
-        self.settings = Settings(data_dir=folder / "data", lease_s=lease_s, keeper_interval_s=0.3)
+        self.settings = Settings(data_dir=folder / "data", lease_s=lease_s, keeper_interval_s=0.3, task_s=0.0)
         self._logs = folder / "logs"
         self._logs.mkdir()
         self.hold = folder / "hold"
@@ -49,6 +49,7 @@ class House:
             "GRASPD_REDIS_URL": redis_url(self.settings),
             "GRASPD_LEASE_S": str(self.settings.lease_s),
             "GRASPD_KEEPER_INTERVAL_S": "0.3",
+            "GRASPD_TASK_S": "0",
             "GRASPD_LOG_FORMAT": "text",
             "FAKE_HOLD": str(self.hold),
             **more,

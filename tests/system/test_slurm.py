@@ -54,7 +54,11 @@ def slurm(tmp_path: Path) -> Iterator[FakeSlurm]:
 def test_preemption_a_lost_node_and_a_time_limit_lose_nothing(tmp_path: Path, slurm: FakeSlurm) -> None:
     shared = tmp_path / "shared"
     settings = Settings(
-        data_dir=tmp_path / "data", store_url=(shared / "store").as_uri(), keeper_interval_s=0.3, lease_s=2.0
+        data_dir=tmp_path / "data",
+        store_url=(shared / "store").as_uri(),
+        keeper_interval_s=0.3,
+        lease_s=2.0,
+        task_s=0.0,
     )
     others = joining(settings, shared / "join.env", host="127.0.0.1")
     supervisor = Supervisor(settings, workers=0, api=False, joining=others)
@@ -104,7 +108,8 @@ def test_the_service_of_a_lost_node_starts_anew_elsewhere_and_the_workers_find_i
     add_assets_to(shared)
     real = command(tmp_path / "bin" / "real" / "graspd", "graspd")
     fakes = command(tmp_path / "bin" / "fake" / "graspd", "tests.fakes")
-    quick = {"GRASPD_LEASE_S": "2", "GRASPD_KEEPER_INTERVAL_S": "0.3", "GRASPD_PORT": "0", "JOIN_HOST": "127.0.0.1"}
+    quick = {"GRASPD_LEASE_S": "2", "GRASPD_KEEPER_INTERVAL_S": "0.3", "GRASPD_PORT": "0", "GRASPD_TASK_S": "0",
+             "JOIN_HOST": "127.0.0.1"}  # fmt: skip
     nodes = [environment(shared, GRASPD=str(real), TMPDIR=str(tmp_path / node), **quick) for node in ("node1", "node2")]
     for node in ("node1", "node2"):
         (tmp_path / node).mkdir()

@@ -16,8 +16,7 @@ from service.model.errors import NotFoundError
 from service.model.metrics import GRASP_METRICS
 from service.readers import ShardFile
 from service.store import standing
-from service.store.manifests import ShardManifest
-from service.store.packs import manifest_at
+from service.store.manifests import ShardManifest, load_manifest
 from service.store.shards import json_attribute, open_shard, read_column
 from worker.cards.contents import Contents
 
@@ -82,7 +81,7 @@ def _manifest(contents: Contents, file: ShardFile) -> ShardManifest | None:
     if store is None:
         return None
     try:
-        return manifest_at(store, file.key, _STAGES[file.kind], file.id)
+        return load_manifest(store, _STAGES[file.kind], file.id)
     except NotFoundError:
         return None
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from service.model.worker_beat import WorkerBeat
+from service.queue.rq_keys import execution_keys
 from service.queue.rq_queue import WORKERS, cancel_key, worker_key
 from service.queue.streams import EVENTS, EVENTS_KEPT
 from worker.stages.context import StopReason, TaskContext
@@ -46,18 +47,19 @@ class Hold:
             "entry": self.entry,
             "registry": self.registry,
             "cancel": cancel_key(self.task_id),
+            "kept": execution_keys(self.entry),
             "seconds": self.timeout_s,
         }
 
 
 class Heartbeat:
-    """Keeps a worker's registration and the leases of its tasks alive, and listens for cancellation."""
+    """Keeps a worker's registration and the lease of its task alive, and listens for cancellation."""
 
     def __init__(self, url: str, beat: WorkerBeat, *, lease_s: float, alive: Path | None = None) -> None:
         """`url` is that of Redis; `alive` a file that is touched with each beat."""
         self._beat = asdict(beat)
         self._place = place_of(beat.name, lease_s) | {"url": url, "alive": str(alive or "")}
-        self._holds: dict[str, Hold] = {}
+        self._hold: Hold | None = None
         self._limit: dict[str, Any] | None = None
         self._lock = threading.RLock()
         self._pending = False
@@ -93,11 +95,11 @@ class Heartbeat:
         """Of the pulse."""
         return self._process.pid if self._process is not None else None
 
-    def hold(self, *holds: Hold, state: str | None = None) -> None:
-        """The tasks in hand from now on; the registration names the first of them."""
+    def hold(self, hold: Hold | None, *, state: str | None = None) -> None:
+        """The task in hand from now on; None: there is none."""
         with self._lock:
-            self._holds = {hold.entry: hold for hold in holds}
-            self.update(task_id=holds[0].task_id if holds else "", state=state or ("busy" if holds else "idle"))
+            self._hold = hold
+            self.update(task_id=hold.task_id if hold else "", state=state or ("busy" if hold else "idle"))
 
     def limit(self, what: str, seconds: float) -> None:
         """Something besides a task that must end within a time, or else the worker is ended."""
@@ -116,8 +118,7 @@ class Heartbeat:
             self._tell()
 
     def _tell(self) -> None:
-        holds = [hold.told() for hold in self._holds.values()]
-        now_at = {"beat": self._beat, "limit": self._limit, "holds": holds}
+        now_at = {"beat": self._beat, "limit": self._limit, "hold": self._hold and self._hold.told()}
         # A pulse that is not there yet, or busy, gets the news after its next beat.
         self._pending = not self._write(now_at)
 
@@ -183,7 +184,7 @@ class Heartbeat:
         with self._lock:
             if word == "." and (self._pending or self._unsent):
                 self._tell()
-            elif word in set(StopReason) and (hold := self._holds.get(about)) is not None:
+            elif word in set(StopReason) and (hold := self._hold) is not None and hold.entry == about:
                 hold.context.stop(StopReason(word))
 
 

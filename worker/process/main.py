@@ -13,7 +13,7 @@ import secrets
 import signal
 import socket
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import Any, Final
 
 from redis.exceptions import ResponseError
@@ -24,7 +24,6 @@ from rq.timeouts import BaseDeathPenalty
 
 from service.model.ability import own_ability
 from service.model.clock import timestamp
-from service.model.domain import BATCH_SIZE
 from service.model.errors import QueueUnavailable
 from service.model.states import Stage
 from service.model.version import PACKAGE_VERSION
@@ -38,18 +37,15 @@ from service.queue.rq_queue import RqQueue, open_queue, worker_key
 from service.settings import Settings
 from service.store.store import open_store
 from worker.engines.devices import Device
-from worker.meeting import Meeting
-from worker.process.company import Alike, Company, Held, run_together, tell_end
 from worker.process.fitness import Check, Fitness
 from worker.process.heartbeat import Heartbeat, Hold
 from worker.process.pulse import LEASE_KEPT_S
 from worker.process.runner import Runner
 from worker.process.selfcheck import check_engine
 from worker.process.surroundings import Surroundings
-from worker.stages import alike_tasks, stage_table
+from worker.stages import stage_table
 from worker.stages.context import StopReason, TaskContext
 from worker.stages.output import StageFunction
-from worker.stages.packing import Packer
 
 log = logging.getLogger(__name__)
 #: Reconnection attempts of a worker, about a minute's worth: longer than a Redis takes to come back.
@@ -57,6 +53,8 @@ _PATIENCE: Final = 60
 #: RQ waits this long for a task before it looks after itself [s]: its `worker_ttl` less 15.
 _WORKER_TTL_S: Final = 20
 _REFUSED_PAUSE_S: Final = 0.5
+#: Longest wait between two attempts to reach Redis [s].
+_LONGEST_RETRY_S: Final = 2.0
 
 
 class _NoAlarm(BaseDeathPenalty):  # type: ignore[misc]
@@ -73,10 +71,6 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
     """RQ's in-process worker without RQ's maintenance, command channel, alarm and retries: the keeper does all that."""
 
     death_penalty_class = _NoAlarm
-    queue_class = AllowedQueue
-    job_class = AllowedJob
-    max_connection_wait_time = 2.0
-    log_result_lifespan = False
 
     def __init__(
         self,
@@ -85,26 +79,26 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         heart: Heartbeat,
         surroundings: Surroundings,
         fitness: Fitness,
-        company: Company | None = None,
         *,
         stages: Collection[Stage],
         name: str,
     ) -> None:
-        """Without `company` it takes one task at a time."""
         super().__init__(
             queues=queue_names(stages, ability=own_ability()),
             name=name,
             connection=queue.connection,
             serializer=JSONSerializer,
             worker_ttl=_WORKER_TTL_S,
+            queue_class=AllowedQueue,
+            job_class=AllowedJob,
+            log_job_description=False,
         )
-        self.log_job_description = False
+        self.max_connection_wait_time = _LONGEST_RETRY_S
         self._queue = queue
         self._runner = runner
         self._heart = heart
         self._surroundings = surroundings
         self._fitness = fitness
-        self._company = company
         self._stages, self._taken = stages, 0
         self.gave_up = False
         """Whether it ended because it is unfit for tasks."""
@@ -113,10 +107,8 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         """Whether it ended because no task waits."""
         self.makes_room = False
         """Whether it ended so that its supervisor starts a fresh one."""
-        self._contexts: list[TaskContext] = []
+        self._context: TaskContext | None = None
         self._outcome: Event | None = None
-        self._closing: Held | None = None
-        """The task that was done beside others and whose books are being closed."""
         self._was_late = False
         AllowedJob.function = self._run_task
 
@@ -124,68 +116,25 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         return LEASE_KEPT_S
 
     def execute_job(self, job: Any, queue: Any) -> None:
-        """One task under a lease, or several of one pair. An outcome is told after RQ has closed its books on it."""
+        """One task under a lease. Its outcome is told after RQ has closed its books on it."""
         self._outcome = None
-        first = self._begun(job, queue)
-        try:
-            self._hold([first])
-            others = self._company.take(job, queue.name) if self._company is not None else []
-            if self._company is not None and others:
-                self._do_together(first, others, self._company.join)
-            else:
-                self.perform_job(job, queue)
-        finally:
-            self._hold([])
-            self._contexts = []
-        if not others:
-            self._tell_outcome()
-        self._look_after_itself()
-        self.set_state("idle")
-
-    def _do_together(self, first: Held, others: Sequence[Any], join: int) -> None:
-        """All leases begin before the first task, and each ends with its own."""
-        with Meeting(1 + len(others), join * BATCH_SIZE) as meeting:
-            left: list[Held] = []
-            for one in (first, *(self._begun(job, first.queue) for job in others)):
-                super().prepare_job_execution(one.job)
-                one.context.meeting = meeting
-                left.append(one)
-            packer = self._surroundings.packer([one.context for one in left], self._queue)
-            self._hold(left)
-
-            def close(one: Held) -> None:
-                self._outcome, self._closing, self.execution = None, one, one.execution
-                try:
-                    self.perform_job(one.job, one.queue)
-                finally:
-                    self._closing = None
-                left.remove(one)
-                self._hold(left)
-                self._tell_outcome(packer)
-
-            run_together(list(left), self._runner, close)
-
-    def _hold(self, held: Sequence[Held]) -> None:
-        state = "stopping" if self._stop_requested else "busy" if held else "idle"
-        self._heart.hold(*(one.hold for one in held), state=state)
-
-    def _begun(self, job: Any, queue: Any) -> Held:
-        """The task under its lease."""
         self.prepare_execution(job)
         raw = _raw(job)
-        context = self._surroundings.context(raw, self._queue)
-        self._contexts.append(context)
+        self._context = self._surroundings.context(raw, self._queue)
         if self._stop_requested:
-            context.stop(StopReason.SHUTDOWN)
+            self._context.stop(StopReason.SHUTDOWN)
         limit_s = self._surroundings.settings.task_timeout_s
         task_id = job.id.rpartition("-")[0]
-        hold = Hold.of(task_id, context, self.execution, job.started_job_registry, limit_s)
-        return Held(job, queue, self.execution, raw, context, hold)
-
-    def prepare_job_execution(self, job: Any, remove_from_intermediate_queue: bool = False) -> None:
-        """RQ's note that a job begins; one that was done beside others has it already."""
-        if self._closing is None:
-            super().prepare_job_execution(job, remove_from_intermediate_queue)
+        hold = Hold.of(task_id, self._context, self.execution, job.started_job_registry, limit_s)
+        self._heart.hold(hold, state="stopping" if self._stop_requested else "busy")
+        try:
+            self.perform_job(job, queue)
+        finally:
+            self._heart.hold(None, state="stopping" if self._stop_requested else "idle")
+            self._context = None
+        self._tell_outcome()
+        self._look_after_itself()
+        self.set_state("idle")
 
     def _look_after_itself(self) -> None:
         """What a worker sees to between two tasks: is it fit, and is it time to end?"""
@@ -218,22 +167,18 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         else:
             super().handle_job_failure(job, *args, **options)
 
-    def _tell_outcome(self, packer: Packer | None = None) -> None:
+    def _tell_outcome(self) -> None:
         """Of a task whose books are closed."""
         self._surroundings.tasks_done += 1
         if self._outcome is not None:
             try:
-                tell_end(self._queue, self._outcome, packer)
+                self._queue.publish(self._outcome)
             except QueueUnavailable as error:
                 log.warning("the end of task %s is for the keeper to find: %s", self._outcome.task_id, error)
 
     def _run_task(self, message: dict[str, Any]) -> None:
-        if self._closing is None:
-            self._outcome = self._runner.run(message, self._contexts[0])
-        elif self._closing.error is not None:
-            raise self._closing.error
-        else:
-            self._outcome = self._closing.outcome
+        assert self._context is not None
+        self._outcome = self._runner.run(message, self._context)
         self._wait_for_writes()
 
     def _wait_for_writes(self) -> None:
@@ -263,14 +208,14 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
 
     def kill_horse(self, sig: signal.Signals = signal.SIGTERM) -> None:
         """RQ's way to stop a task: there is no child to kill, so the task is asked."""
-        for context in self._contexts:
-            context.stop(StopReason.CANCELLED)
+        if self._context is not None:
+            self._context.stop(StopReason.CANCELLED)
 
     def handle_warm_shutdown_request(self) -> None:
-        """SIGTERM: the tasks in hand stop at their next launch and go back to the queue."""
+        """SIGTERM: the task in hand stops at its next launch and goes back to the queue."""
         self._heart.stopping()
-        for context in self._contexts:
-            context.stop(StopReason.SHUTDOWN)
+        if self._context is not None:
+            self._context.stop(StopReason.SHUTDOWN)
 
     @property
     def should_run_maintenance_tasks(self) -> bool:
@@ -288,9 +233,6 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
     def unsubscribe(self) -> None:
         """There is no channel."""
 
-    def procline(self, message: str) -> None:
-        """The process keeps its name."""
-
 
 def _raw(job: Any) -> Mapping[str, Any]:
     try:
@@ -305,7 +247,6 @@ def run_worker(
     stages: Collection[Stage] = tuple(Stage),
     table: Mapping[Stage, StageFunction] | None = None,
     check: Check | None = None,
-    alike: Alike | None = None,
     burst: bool = False,
     idle_s: int = 0,
     max_tasks: int | None = None,
@@ -316,8 +257,6 @@ def run_worker(
         table: what each stage does; the real ones by default.
         idle_s: with `burst`: how long it waits for a task before none waits [s].
         check: of what they run on, before the first task and in doubt; that of the real engine if the stages are.
-        alike: which tasks may be done together, if the settings join any; that of the real stages if these are.
-        max_tasks: these are taken one at a time.
 
     Returns:
         False if the worker ended because something broke.
@@ -338,13 +277,10 @@ def run_worker(
     )
     if table is None:
         table, check = stage_table(), lambda some: check_engine(device.resolve, some, threads=settings.threads)
-        alike = alike_tasks
     fitness = Fitness(store, check)
     runner = Runner(table, worker=name, publish=queue.publish, fitness=fitness)
     surroundings = Surroundings(settings, store, device)
-    joins = alike is not None and max_tasks is None and settings.join != "1"
-    company = Company(queue.connection, surroundings.join, alike) if alike is not None and joins else None
-    worker = GraspWorker(queue, runner, heart, surroundings, fitness, company, stages=stages, name=name)
+    worker = GraspWorker(queue, runner, heart, surroundings, fitness, stages=stages, name=name)
     does_all = not burst and max_tasks is None
     heart.start()
     try:

@@ -45,8 +45,8 @@ class Pulse:
 
     `place` names the keys (`worker`, `workers`, `events`), `events_kept`, `lease_s`, and the file `alive`, if there is
     one. What the worker is at: `beat` is what its registration says; `limit` names a piece of work that must end (`id`,
-    `seconds`); `holds` are the leases of tasks (`entry`, the keys `registry` and `cancel`, and `seconds`, in which the
-    task must end).
+    `seconds`); `hold` is the lease of a task (`entry`, the keys `registry` and `cancel`, two that are `kept`, and
+    `seconds`, in which the task must end), if there is one.
     """
 
     def __init__(
@@ -74,27 +74,27 @@ class Pulse:
         self._now_at = now_at
 
     def tick(self) -> None:
-        """One beat; says which tasks in hand must stop. Raises RedisError when Redis is away."""
+        """One beat; says whether the task in hand must stop. Raises RedisError when Redis is away."""
         if not self._now_at:
             return
         self._watch_time()
-        holds = self._now_at.get("holds", ())
+        hold = self._now_at.get("hold")
         beat = self._now_at["beat"] | {"seen": timestamp()}
         with self._connection.pipeline() as pipe:
             pipe.set(self._place["worker"], json.dumps(beat), ex=max(2, round(self._place["lease_s"])))
             pipe.sadd(self._place["workers"], beat["name"])
             pipe.scard(self._place["workers"])
-            for hold in holds:
+            if hold:
                 # Nothing is made that is not there: the task may be done, or taken away, by now.
                 pipe.zadd(hold["registry"], {hold["entry"]: time.time() + LEASE_KEPT_S}, xx=True)
-                pipe.expire(f"rq:execution:{hold['entry']}", LEASE_KEPT_S)
-                pipe.expire(f"rq:executions:{hold['entry'].partition(':')[0]}", LEASE_KEPT_S)
+                for key in hold["kept"]:
+                    pipe.expire(key, LEASE_KEPT_S)
                 pipe.zscore(hold["registry"], hold["entry"])
                 pipe.exists(hold["cancel"])
             results = pipe.execute()
         self.interval_s = beat_every_s(results[2], self._place["lease_s"])
-        for number, hold in enumerate(holds):
-            score, cancelled = results[6 + 5 * number : 8 + 5 * number]
+        if hold:
+            score, cancelled = results[6:8]
             if cancelled:
                 self._tell("cancelled", hold["entry"])
             elif score is None:
@@ -133,7 +133,7 @@ def _limits(now_at: dict[str, Any]) -> dict[str, float]:
     """What must end, and how long it may take [s]."""
     limit = now_at.get("limit")
     found = {limit["id"]: limit["seconds"]} if limit else {}
-    return found | {hold["entry"]: hold["seconds"] for hold in now_at.get("holds", ())}
+    return found | ({hold["entry"]: hold["seconds"]} if (hold := now_at.get("hold")) else {})
 
 
 def is_stopped(pid: int) -> bool:

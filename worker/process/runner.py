@@ -16,13 +16,20 @@ from service import logs, tracing
 from service.model import names
 from service.model.ability import need_of, own_ability
 from service.model.clock import timestamp
-from service.model.errors import DamagedError, DamagedShard, InputError, TaskCancelled, TaskRefused, UnavailableError
+from service.model.errors import (
+    DamagedError,
+    DamagedShard,
+    InputError,
+    NotFoundError,
+    TaskCancelled,
+    TaskRefused,
+    UnavailableError,
+)
 from service.model.messages import IngestMessage, Origin, TaskMessage
 from service.model.records import AttemptRecord
 from service.model.states import Stage
 from service.queue.port import Event, EventKind, Message
 from service.store.manifests import ShardManifest, load_manifest, publish_shard, shard_exists
-from service.store.packs import find_manifest
 from service.store.records import put_record
 from worker.engines.cuda_errors import DeviceLost, check_device
 from worker.pool.pool import ProcessLost
@@ -99,7 +106,7 @@ class Runner:
             if (why := self._loss(error, context)) and first_loss(message.task_id):
                 log.error("the task is handed back: %s", why, exc_info=True)
                 return self._event(EventKind.RETURNED, message, message=why)
-            if not why and (why := self._doubt(message, error, context)):
+            if not why and self._fitness is not None and (why := self._fitness.doubt(message, error)):
                 log.warning("the task is handed back; it failed because of this worker", exc_info=True)
                 return self._event(EventKind.RETURNED, message, message=why)
             return self._failed(message, error, context, started)
@@ -117,9 +124,8 @@ class Runner:
         clock = time.perf_counter()
         lost = self._lost(message, context)
         made = self._stages[message.stage](message, context)
-        if context.meeting is None:  # in a meeting each launch ends with it
-            self._check_device(context.device)
-        seconds, pack = time.perf_counter() - clock, ""
+        self._check_device(context.device)
+        seconds = time.perf_counter() - clock
         if made is not None and isinstance(message, TaskMessage):
             context.check()
             manifest, data = shard_of(
@@ -130,36 +136,26 @@ class Runner:
                     f"{lost.key} was made again and is not what it was: made on {lost.device} by graspd "
                     f"{lost.code_version}, again on {context.device}; put a copy in its place"
                 )
-            pack = "" if lost is not None else context.pack(message.task_id, manifest, data)
-            if not pack:
-                publish_shard(context.store, manifest, data)
+            publish_shard(context.store, manifest, data)
         if self._fitness is not None:
             self._fitness.passed()
-        return self._event(EventKind.FINISHED, message, output=output, seconds=seconds, pack=pack)
+        return self._event(EventKind.FINISHED, message, output=output, seconds=seconds)
 
     def _loss(self, error: Exception, context: TaskContext) -> str:
         """What became of the device, or of a process beside this one, if that is what the error comes from; else ""."""
         try:
-            _on_device(context, lambda: self._check_device(context.device))
+            self._check_device(context.device)
         except DeviceLost as lost:
             error = lost
         if isinstance(error, DeviceLost):
             self.device_lost = str(error)
         return str(error) if isinstance(error, ProcessLost) else self.device_lost
 
-    def _doubt(self, message: Message, error: Exception, context: TaskContext) -> str:
-        """Why this worker is to blame for a failure; "" if it is not known to be."""
-        if (fitness := self._fitness) is None:
-            return ""
-        return str(_on_device(context, lambda: fitness.doubt(message, error)))
-
     def _is_done(self, message: Message, context: TaskContext) -> bool:
         if isinstance(message, IngestMessage):
             return context.store.exists(names.asset_check(message.kind, message.digest))
-        if shard_exists(context.store, message.stage, message.output):
-            return context.store.exists(names.shard_file(message.stage, message.output))
-        # A listing of packs for every task would cost more than a task that is done twice after a loss of Redis.
-        return message.attempt > 1 and _has_manifest(message, context)
+        is_there = shard_exists(context.store, message.stage, message.output)
+        return is_there and context.store.exists(names.shard_file(message.stage, message.output))
 
     def _lost(self, message: Message, context: TaskContext) -> ShardManifest | None:
         """The manifest of a shard that was made before and whose file is gone."""
@@ -219,18 +215,11 @@ class Runner:
         )
 
 
-def _on_device(context: TaskContext, work: Callable[[], Any]) -> Any:
-    """Work that must not meet another's launches."""
-    return work() if context.meeting is None else context.meeting.alone(work)
-
-
 def _has_manifest(message: TaskMessage, context: TaskContext) -> bool:
     """Whether a readable manifest says that the task has succeeded; a damaged one says nothing."""
     try:
-        pair = (message.hand_digest, message.object_digest)
-        made = find_manifest(context.store, message.stage, message.output, pair)
-        return made is not None and made.shard_id == message.output
-    except DamagedError:
+        return load_manifest(context.store, message.stage, message.output).shard_id == message.output
+    except (NotFoundError, DamagedError):
         return False
 
 

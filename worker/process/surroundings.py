@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from service.model.errors import QueueUnavailable
 from service.model.states import Stage
-from service.queue.port import READS_PACKS, Events, Presence, Report
+from service.queue.port import Events, Report
 from service.settings import Settings
 from service.store.store import Store
 from worker.engines.devices import Device
@@ -18,7 +18,6 @@ from worker.pool.pool import Pool
 from worker.pool.size import processes_at_once
 from worker.process.memory import limit_mb, resident_mb
 from worker.stages.context import TaskContext
-from worker.stages.packing import WAIT_S, Packer
 
 log = logging.getLogger(__name__)
 
@@ -46,8 +45,10 @@ class Surroundings:
             return f"it holds {held:.0f} MiB, over {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"
         return ""
 
-    def join(self) -> int:
-        """Batches of one pair that one launch plans on the device; waits until that is known."""
+    def join(self, raw: Mapping[str, Any]) -> int:
+        """Batches that one launch of a task plans on the device; waits until that is known."""
+        if raw.get("stage") != Stage.SYNTHESIZE:
+            return 1
         if not self._joined:
             self._joined = batches_at_once(self._device.resolve(), parse_join(self.settings.join))
         return self._joined
@@ -66,24 +67,6 @@ class Surroundings:
         if self._pool is not None:
             self._pool.start()
         return self._pool
-
-    def packer(self, together: Sequence[TaskContext], queue: Presence) -> Packer | None:
-        """Where tasks that are done together leave their shards, as their contexts know from then on; None where each
-        puts its own."""
-        least = self.settings.shard_pack
-        if least < 2 or len(together) < least:
-            return None
-
-        def is_read() -> bool:
-            try:
-                return queue.announced(READS_PACKS)
-            except QueueUnavailable:
-                return False
-
-        packer = Packer(self.store, len(together), least=least, is_read=is_read, wait_s=WAIT_S)
-        for context in together:
-            context.packer = packer
-        return packer
 
     def close(self) -> None:
         """End what was started for tasks."""
@@ -105,5 +88,5 @@ class Surroundings:
         chosen = self.settings
         return TaskContext(
             self.store, device=device, threads=chosen.threads, first_judge=chosen.first_judge,
-            pool=self.pool(raw.get("stage", "")), tell=tell,
+            pool=self.pool(raw.get("stage", "")), join=self.join(raw), tell=tell,
         )  # fmt: skip

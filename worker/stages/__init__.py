@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
-from service.model.messages import TaskMessage
 from service.model.states import Stage
 
 if TYPE_CHECKING:
@@ -24,12 +23,6 @@ _MODULES: Final = {
 def stage_table() -> Mapping[Stage, StageFunction]:
     """The real stages. Their modules are imported on the first task, so that a worker is there at once."""
     return {stage: _Lazy(module) for stage, module in _MODULES.items()}
-
-
-def alike_tasks(message: TaskMessage) -> Hashable | None:
-    """See `worker.stages.alike`."""
-    found: Hashable | None = import_module("worker.stages.alike").alike(message)
-    return found
 
 
 class _Lazy:

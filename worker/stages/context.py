@@ -9,12 +9,9 @@ from enum import StrEnum
 from typing import Final
 
 from service.model.errors import TaskCancelled
-from service.store.manifests import ShardManifest
 from service.store.store import Store
-from worker.meeting import Meeting
 from worker.pool.pool import Pool
 from worker.run import FirstJudge, Run
-from worker.stages.packing import Packer
 
 #: Pause between two reports where nobody asks for another [s]: enough for a smooth bar.
 _REPORT_EVERY_S: Final = 0.25
@@ -40,19 +37,17 @@ class TaskContext:
         threads: int = 0,
         first_judge: FirstJudge = "auto",
         pool: Pool | None = None,
+        join: int = 1,
         tell: Callable[[float, float, str], float | None] | None = None,
     ) -> None:
-        """`tell` takes done, total and a message, and may answer when it wants to hear more [s]."""
+        """`join` is how many batches one launch plans; `tell` takes done, total and a message, and may answer when it
+        wants to hear more [s]."""
         self.store = store
         self.device = device
         self.threads = threads
         self.first_judge: FirstJudge = first_judge
         self.pool = pool
-        self.meeting: Meeting | None = None
-        """Where the task is done beside others; None: by itself."""
-        self.packer: Packer | None = None
-        """Where it leaves its shard for those of others; None: nowhere."""
-        self._departed = False
+        self.join = join
         self._tell = tell
         self._tell_again = 0.0
         self._stop = threading.Event()
@@ -63,39 +58,14 @@ class TaskContext:
         now = time.monotonic()
         if self._tell is not None and now >= self._tell_again:
             self._tell_again = now + _REPORT_EVERY_S
-            # A worker tells no more for having more tasks in hand.
-            share = max(1, self.meeting.members) if self.meeting is not None else 1
-            self._tell_again = now + share * (self._tell(done, total, message) or _REPORT_EVERY_S)
-
-    def depart(self) -> None:
-        """Ask for no more launches and leave no shard: the others need not wait for this task."""
-        if self._departed:
-            return
-        self._departed = True
-        if self.meeting is not None:
-            self.meeting.leave()
-        if self.packer is not None:
-            self.packer.leave()
-
-    def pack(self, task: str, manifest: ShardManifest, data: bytes) -> str:
-        """Put the shard of this task together with those of the tasks that end with this one.
-
-        Returns:
-            key of the pack that holds it; "" where it was not put: the task is done by itself, or too few end with it.
-        """
-        if self.packer is None or self._departed:
-            return ""
-        self._departed = True
-        if self.meeting is not None:
-            self.meeting.leave()
-        return self.packer.put(task, manifest, data)
+            self._tell_again = now + (self._tell(done, total, message) or _REPORT_EVERY_S)
 
     @property
     def run(self) -> Run:
         """What the engine room needs to know of the task."""
         return Run(
-            self.device, self.threads, self.progress, self.cancelled, self.meeting, self.first_judge, self.pool,
-        )  # fmt: skip
+            self.device, self.threads, self.progress, self.cancelled, first_judge=self.first_judge, pool=self.pool
+        )
 
     def cancelled(self) -> bool:
         """Whether to stop at the next launch."""

@@ -11,7 +11,7 @@ from service.model.errors import MeshError, SceneError
 from service.model.messages import TaskMessage
 from service.model.states import Stage
 from service.store.attributes import Attribute
-from service.store.shards import json_attribute
+from service.store.shards import Shard, json_attribute
 from worker.files.base_attributes import wrist_attributes
 from worker.grasps import Posture
 from worker.scenes import drop, transfer
@@ -21,6 +21,7 @@ from worker.stages.assets import beside_attributes, hand_of, neighbours_of, obje
 from worker.stages.context import TaskContext
 from worker.stages.inputs import input_of
 from worker.stages.output import Output, batch_seed
+from worker.stages.ranges import base_rows, batches_of, joined
 
 #: Columns of carried-over grasps in a shard of scenes that grasps are yet to be planned in.
 _NO_GRASPS: Final[dict[str, NDArray[Any]]] = {
@@ -33,8 +34,20 @@ _NO_GRASPS: Final[dict[str, NDArray[Any]]] = {
 
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
-    """The scenes of a batch."""
-    return _before_grasps(message, context) if message.request.in_scene else _after_grasps(message, context)
+    """The scenes of each batch."""
+    parts = batches_of(message)
+
+    def told(number: int) -> TaskContext:
+        context.check()
+        context.progress(number, len(parts), "scenes")
+        return context
+
+    if message.request.in_scene:
+        return joined(message, [_before_grasps(part, told(number)) for number, part in enumerate(parts)])
+    base = input_of(message, context, Stage.SYNTHESIZE)
+    rows = base_rows(base, message)
+    made = [_after_grasps(part, told(number), base, rows[number]) for number, part in enumerate(parts)]
+    return joined(message, made, base_rows=rows)
 
 
 def _before_grasps(message: TaskMessage, context: TaskContext) -> Output:
@@ -44,8 +57,6 @@ def _before_grasps(message: TaskMessage, context: TaskContext) -> Output:
         SceneError: they do not fit in, stand in one another, or do not come to rest.
     """
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
-    context.check()
-    context.progress(0.0, 1.0, "scenes")
     place = message.request.place
     # The first batch has the scenes of `graspd synth` with the same seed.
     seed = batch_seed(message) if message.batch else message.request.seed
@@ -62,16 +73,15 @@ def _before_grasps(message: TaskMessage, context: TaskContext) -> Output:
     return Output({**scenes, **_NO_GRASPS}, said)
 
 
-def _after_grasps(message: TaskMessage, context: TaskContext) -> Output:
-    """Drop the object `request.scenes` times and carry the grasps of the base shard over."""
-    base = input_of(message, context, Stage.SYNTHESIZE)
+def _after_grasps(message: TaskMessage, context: TaskContext, base: Shard, rows: range) -> Output:
+    """Drop the object `request.scenes` times and carry grasps of the base shard over, numbered within these rows."""
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     context.check()
-    context.progress(0.0, 1.0, "drops")
     scenes = drop(obj, count=message.request.scenes, seed=batch_seed(message))
     context.check()
-    context.progress(0.7, 1.0, "table clearance")
-    grasp, pregrasp = (Posture.from_columns(base.arrays, name) for name in ("grasp", "pregrasp"))
+    grasp, pregrasp = (
+        Posture.from_columns(base.arrays, name).take(np.array(rows, int)) for name in ("grasp", "pregrasp")
+    )
     placed = transfer(hand, grasp, pregrasp, scenes["scene/object_pose"])
     attributes: dict[str, Attribute] = {"base_shard": message.inputs[0], "root_link": hand.root_link}
     attributes |= wrist_attributes(hand)

@@ -1,9 +1,11 @@
-"""From a hand and an object to a batch of grasps with their quality: a base shard."""
+"""From a hand and an object to grasps with their quality: a base shard."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -11,10 +13,10 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError, LoadError, SceneError
 from service.model.messages import TaskMessage
-from service.model.outcomes import told
+from service.model.outcomes import told, totals
 from service.model.states import Stage
 from service.store.attributes import Attribute
-from worker.certified import Certified, certified_grasps
+from worker.certified import Certified
 from worker.files.base_attributes import base_attributes
 from worker.planners import NoPlace, planner
 from worker.scenes.beside import neighbour_of
@@ -25,13 +27,15 @@ from worker.stages.context import TaskContext
 from worker.stages.inputs import input_of
 from worker.stages.output import Output
 from worker.stages.pieces import pieces_of
+from worker.stages.ranges import joined, sizes_of
+from worker.together import certified_batches
 
 #: Columns of the scene shard that stand in the base shard as well: so it can be used by itself.
 _OF_SCENES: Final = ("scene/object_pose", "scene/rest_probability", "scene/neighbour_pose")
 
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
-    """Grasps of one batch with quality and verdict: `message.count` valid ones, as far as the job's budget goes.
+    """Grasps with quality and verdict: `message.count` valid ones, as far as the job's budget goes.
 
     Raises:
         SceneError: no hand can reach into the scenes, a job's first batch finds no grasp, or its method knows none.
@@ -40,26 +44,43 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     keep_network(context.store, message)
     columns = _scene_columns(message, context)
-    scenes = _scenes(message, columns, context) if columns else None
+    scenes = [_scenes(message, part, context) for part in columns]
     context.check()
     try:
-        found = certified_grasps(
+        found = certified_batches(
             hand,
             obj,
             message.request,
-            count=message.count,
-            batch=message.batch,
-            scenes=scenes,
+            sizes=sizes_of(message),
+            first=message.batch,
+            join=context.join,
+            scenes=scenes or None,
             pieces=lambda prepared: pieces_of(context.store, prepared),
             run=context.run,
+            checked=partial(_check_hope, message, in_scenes=bool(scenes)),
+            empty_on=(NoPlace,) if scenes else (),
         )
     except InputError as error:
         # Of hand and object there are errors of their own; what is left is that no hand finds a way in.
-        if scenes is not None and type(error) in (InputError, NoPlace):
+        if scenes and type(error) in (InputError, NoPlace):
             raise SceneError(str(error)) from None
         raise
-    if message.batch == 0:
-        _check_hope(message, found, in_scenes=scenes is not None)
+    made = [_output(one, part) for one, part in zip(found, columns or [{}] * len(found), strict=True)]
+    said = base_attributes(
+        hand,
+        obj,
+        message.request,
+        tried=sum(one.tried for one in found),
+        verdict_key=found[0].verdict_key,
+        outcomes=totals(one.outcomes for one in found),
+    )
+    of_scenes: dict[str, Attribute] = {"scene_shard": message.inputs[0]} if scenes else {}
+    whole = joined(message, made)
+    return replace(whole, attributes={**whole.attributes, **said, **of_scenes, **beside_attributes(message)})
+
+
+def _output(found: Certified, columns: Mapping[str, NDArray[Any]]) -> Output:
+    """The columns of one batch, and what is told of it."""
     seconds = {f"{name}_seconds": round(value, 4) for name, value in found.seconds.items()}
     shares = {name: round(value, 4) for name, value in found.shares.items()}
     info = {
@@ -70,29 +91,27 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         "planned": found.planned,
         **_json(found.grasps.info),
     }
-    said = base_attributes(
-        hand, obj, message.request, tried=found.tried, verdict_key=found.verdict_key, outcomes=found.outcomes
-    )
-    of_scenes: dict[str, Attribute] = {"scene_shard": message.inputs[0]} if scenes is not None else {}
-    said |= of_scenes | beside_attributes(message)
-    return Output({**found.grasps.to_columns(), **found.columns, **columns}, said, info)
+    return Output({**found.grasps.to_columns(), **found.columns, **columns}, info=info)
 
 
-def _scene_columns(message: TaskMessage, context: TaskContext) -> dict[str, NDArray[Any]]:
-    """Where the object stands in the scenes of the batch; nothing where it floats."""
+def _scene_columns(message: TaskMessage, context: TaskContext) -> list[dict[str, NDArray[Any]]]:
+    """Where the object stands in the scenes of each batch; none where it floats."""
     request = message.request
     if not request.in_scene:
-        return {}
+        return []
     try:
         planner(request.method, request.options, in_scenes=True)
     except InputError as error:
         raise SceneError(str(error)) from None
     shard = input_of(message, context, Stage.SCENE)
-    return {name: np.asarray(shard[name], float) for name in _OF_SCENES if name in shard.arrays}
+    there = {name: np.asarray(shard[name], float) for name in _OF_SCENES if name in shard.arrays}
+    count = len(sizes_of(message))
+    parts = {name: np.split(column, count) for name, column in there.items()}
+    return [{name: column[number] for name, column in parts.items()} for number in range(count)]
 
 
 def _scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: TaskContext) -> Scenes:
-    """The scenes of the batch, with what stands there."""
+    """The scenes of a batch, with what stands there."""
     scenes = Scenes(supports_of(message.request.place), columns["scene/object_pose"])
     others = neighbours_of(context.store, message)
     if not others:
@@ -101,10 +120,10 @@ def _scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: Tas
     return replace(scenes, neighbours=beside, neighbour_pose=columns["scene/neighbour_pose"])
 
 
-def _check_hope(message: TaskMessage, found: Certified, *, in_scenes: bool) -> None:
+def _check_hope(message: TaskMessage, batch: int, found: Certified, *, in_scenes: bool) -> None:
     """What the first batch does not find at all, the others of its job are not made to look for."""
     request, limit = message.request, found.limit
-    if request.want == "raw" or len(found.grasps):
+    if batch or request.want == "raw" or len(found.grasps):
         return
     none = f"none of {found.planned} grasps tried is {request.counted}"
     if limit is not None and limit.hopeless:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 from sqlalchemy import Connection, delete, select, update
@@ -29,7 +28,7 @@ class Live:
     def set_running(self, workers: Mapping[str, str]) -> dict[str, State]:
         """Workers took tasks: the worker of each. Returns the states of the jobs to which it makes a difference."""
         running = State.RUNNING.value
-        with self.database.writing(concerns=partial(_jobs_of, list(workers))) as connection:
+        with self.database.writing() as connection:
             jobs_of: dict[str, str] = {}
             for some in chunks(list(workers)):
                 waiting = tasks.c.id.in_(some) & (tasks.c.state == State.QUEUED.value)
@@ -59,7 +58,7 @@ class Live:
 
     def set_queued(self, task_ids: Sequence[str]) -> None:
         """Tasks that were put into the queue."""
-        with self.database.writing(concerns=partial(_jobs_of, task_ids)) as connection:
+        with self.database.writing() as connection:
             for some in chunks(task_ids):
                 connection.execute(update(tasks).where(tasks.c.id.in_(some), _UNFINISHED).values(queued=True))
 
@@ -136,10 +135,3 @@ class Live:
             connection.execute(
                 update(assets).where(assets.c.digest == digest, assets.c.last_attempt < number).values(**values)
             )
-
-
-def _jobs_of(task_ids: Sequence[str], connection: Connection) -> set[str]:
-    found: set[str] = set()
-    for some in chunks(task_ids):
-        found |= set(connection.scalars(select(tasks.c.job_id).where(tasks.c.id.in_(some)).distinct()))
-    return found

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Final
 
 from sqlalchemy import Connection, delete, select, update
@@ -16,14 +15,13 @@ from service.index.changes.states import ENTERING, settle, settle_batches
 from service.index.database import Database, chunks
 from service.index.tables import assets, attempts, grasps, jobs, notes, shards, tasks
 from service.model.domain import Asset
-from service.model.planning import batches_of
+from service.model.planning import ranges_of
 from service.model.records import AttemptRecord, JobEvent, JobRecord
 from service.model.states import State
 from service.store.manifests import ShardManifest
-from service.store.parts import preference
 
-#: Batches that are entered in one turn: some tenths of a second, for which others wait.
-BATCHES_AT_ONCE: Final = 500
+#: Ranges that are entered in one turn: some tenths of a second, for which others wait.
+RANGES_AT_ONCE: Final = 500
 
 
 @dataclass(frozen=True)
@@ -57,7 +55,7 @@ class Changes:
             if record is None or not is_there:
                 connection.execute(delete(notes).where(notes.c.name == ENTERING + job_id))
             elif note is not None:
-                self._enter(connection, record, note["batch"], goes_on=True)
+                self._enter(connection, record, note["range"], goes_on=True)
 
     def add_manifests(
         self, manifests: Iterable[ShardManifest], *, within: Connection | None = None
@@ -67,10 +65,8 @@ class Changes:
         Returns:
             the states of the jobs concerned.
         """
-        # In one order, so that writers that bring the same shards, of jobs that are gone, do not wait in a ring.
-        made = sorted(manifests, key=lambda manifest: manifest.shard_id)
-        with self.database.writing(within, concerns=partial(self._jobs_of, made)) as connection:
-            return self._add_manifests(connection, made)
+        with self.database.writing(within) as connection:
+            return self._add_manifests(connection, list(manifests))
 
     def add_manifest(self, manifest: ShardManifest) -> dict[str, State]:
         """One shard."""
@@ -112,15 +108,15 @@ class Changes:
         upsert(connection, tasks, rows, keep=[name for name in rows[0] if name != "lane"])
 
     def _enter(self, connection: Connection, record: JobRecord, first: int, *, goes_on: bool) -> None:
-        """Some batches from one on. A note tells where the next ones begin, and that the job cannot have ended."""
-        number = batches_of(record.request)
-        some = range(first, min(number, first + BATCHES_AT_ONCE))
+        """Some ranges from one on. A note tells where the next ones begin, and that the job cannot have ended."""
+        number = ranges_of(record.request.grasps, record.span)
+        some = range(first, min(number, first + RANGES_AT_ONCE))
         self._upsert_tasks(connection, list(task_rows(record, some)))
         if goes_on and some.stop < number:
-            upsert(connection, notes, [{"name": ENTERING + record.id, "value": {"batch": some.stop}}])
+            upsert(connection, notes, [{"name": ENTERING + record.id, "value": {"range": some.stop}}])
         elif goes_on:
             connection.execute(delete(notes).where(notes.c.name == ENTERING + record.id))
-        settle(connection, record.id, some)
+        settle(connection, record.id, [number * record.span for number in some])
 
     def _finished_shards(self, connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, Any]]:
         found: dict[str, dict[str, Any]] = {}
@@ -131,7 +127,7 @@ class Changes:
         return found
 
     def _add_manifests(self, connection: Connection, given: Sequence[ShardManifest]) -> dict[str, State]:
-        manifests = _counting(connection, given)
+        manifests = list({manifest.shard_id: manifest for manifest in given}.values())
         charged = self._askers(connection, [manifest.shard_id for manifest in manifests])
         rows = [shard_row(manifest) | {"charged": charged.get(manifest.shard_id, "")} for manifest in manifests]
         upsert(connection, shards, rows, keep=("charged",))
@@ -147,12 +143,6 @@ class Changes:
             for job, batch in connection.execute(done):
                 touched[job].add(batch)
         return settle_batches(connection, touched)
-
-    def _jobs_of(self, manifests: Sequence[ShardManifest], connection: Connection) -> set[str]:
-        found: set[str] = set()
-        for some in chunks([manifest.shard_id for manifest in manifests]):
-            found |= set(connection.scalars(select(tasks.c.job_id).where(tasks.c.shard_id.in_(some)).distinct()))
-        return found
 
     def _askers(self, connection: Connection, ids: Sequence[str]) -> dict[str, str]:
         """Project of the first job that asked for each shard, where it has one."""
@@ -197,26 +187,6 @@ class Changes:
                 connection.execute(update(tasks).where(*task, tasks.c.last_attempt <= upto).values(**fresh))
                 connection.execute(update(tasks).where(*task).values(retried_upto=upto))
         return settle(connection, job_id)
-
-
-def _counting(connection: Connection, given: Sequence[ShardManifest]) -> list[ShardManifest]:
-    """One manifest of each shard, where it counts before the one whose rows are there; those rows' grasps go.
-
-    A task that was done twice may have left its shard in a file of its own and in a pack: whichever comes first, the
-    rows are those of the same one.
-    """
-    best: dict[str, ShardManifest] = {}
-    for manifest in given:
-        rival = best.get(manifest.shard_id)
-        if rival is None or preference(manifest.key) <= preference(rival.key):
-            best[manifest.shard_id] = manifest
-    for some in chunks(list(best)):
-        for shard, key in connection.execute(select(shards.c.id, shards.c.key).where(shards.c.id.in_(some))).all():
-            if preference(key) < preference(best[shard].key):
-                del best[shard]
-            elif key != best[shard].key:
-                connection.execute(delete(grasps).where(grasps.c.shard_id == shard))
-    return list(best.values())
 
 
 _OUTCOME = (shards.c.worker, shards.c.device, shards.c.seconds, shards.c.created)

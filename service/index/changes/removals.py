@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection, delete, exists, func, insert, or_, select, update
 
-from service.index.database import Database, chunks
+from service.index.database import Database
 from service.index.dataset_tables import dataset_cells, dataset_snapshots, datasets, object_sets
 from service.index.tables import assets, attempts, grasps, jobs, shards, spent, tasks
 from service.index.views import AssetView
@@ -74,15 +74,6 @@ class Removals:
         query = select(shards.c.id).where(shards.c.id.in_(ids), ~exists().where(tasks.c.shard_id == shards.c.id))
         with self.database.reading() as connection:
             return set(connection.scalars(query))
-
-    def without_rows(self, ids: Sequence[str], *, within: Connection) -> set[str]:
-        """Of these shards, those that are not in the index and that no task of any job makes."""
-        known = {
-            shard for some in chunks(ids) for shard in within.scalars(select(shards.c.id).where(shards.c.id.in_(some)))
-        }
-        made = select(tasks.c.shard_id)
-        known |= {shard for some in chunks(ids) for shard in within.scalars(made.where(tasks.c.shard_id.in_(some)))}
-        return set(ids) - known
 
     def remove_asset(self, kind: AssetKind, digest: str, *, within: Connection | None = None) -> None:
         """A hand, object or network."""

@@ -35,6 +35,7 @@ def job_row(record: JobRecord) -> Row:
         "owner": record.owner,
         "project": record.project,
         "cancelled": False,
+        "span": record.span,
         "created": record.created,
         "finished": None,
         "reason": None,
@@ -49,10 +50,10 @@ def beside(options: JobOptions) -> str:
     return " ".join(dict.fromkeys(one.digest or "" for one in options.beside))
 
 
-def task_rows(record: JobRecord, batches: range | None = None) -> Iterator[Row]:
-    """The tasks of a job, of all batches or some, before anything happened to them."""
+def task_rows(record: JobRecord, ranges: range | None = None) -> Iterator[Row]:
+    """The tasks of a job, of all ranges or some, before anything happened to them."""
     order = stages_of(record.request)
-    for task in plan(record, batches):
+    for task in plan(record, ranges):
         yield {
             "id": task.id,
             "job_id": record.id,
@@ -125,6 +126,7 @@ def shard_row(manifest: ShardManifest) -> Row:
         "hand_digest": manifest.hand_digest,
         "object_digest": manifest.object_digest,
         "batch": manifest.batch,
+        "batches": manifest.batches,
         "seed": manifest.seed,
         "inputs": list(manifest.inputs),
         "device": manifest.device,

@@ -15,13 +15,13 @@ from service.model.names import SHARD_KINDS
 from service.model.projects import EVERYTHING, Reach
 from service.model.states import Stage
 
-#: Batches looked at of each stage, the newest first: what a machine did long ago says less.
+#: Tasks looked at of each stage, the newest first: what a machine did long ago says less.
 _NEWEST: Final = 2000
 
 
 @dataclass(frozen=True)
 class BatchCost:
-    """One finished batch: what was asked, what it took, what came out."""
+    """The finished batches of a task: what was asked, what they took, what came out."""
 
     hand: str
     object: str
@@ -32,6 +32,7 @@ class BatchCost:
     valid: int
     tried: int
     size_bytes: int
+    batches: int = 1
 
     @property
     def kept(self) -> int:
@@ -45,14 +46,14 @@ class Costs:
 
     database: Database
 
-    def of_batches(self, stage: Stage, *, reach: Reach = EVERYTHING) -> list[BatchCost]:
-        """The newest finished batches of a stage."""
+    def of_batches(self, stage: Stage, *, limit: int = _NEWEST, reach: Reach = EVERYTHING) -> list[BatchCost]:
+        """The newest finished batches of a stage, those of at most `limit` tasks."""
         columns = [shards.c[name] for name in BatchCost.__dataclass_fields__ if name != "request"]
         query = (
             select(*columns, shards.c.manifest["request"].label("request"))
             .where(shards.c.kind == SHARD_KINDS[stage], *seen_shards(reach, shards.c.id))
             .order_by(shards.c.created.desc(), shards.c.id.desc())
-            .limit(_NEWEST)
+            .limit(limit)
         )
         with self.database.reading() as connection:
             rows = connection.execute(query).mappings().all()

@@ -18,10 +18,10 @@ from service.index.reach import seen_datasets
 from service.index.tables import attempts, jobs, shards, tasks
 from service.index.views import Page
 from service.model.dataset_records import SnapshotShard
-from service.model.domain import BATCH_SIZE, JobOptions
+from service.model.domain import JobOptions
 from service.model.errors import NotFoundError
 from service.model.outcomes import shortfall
-from service.model.planning import job_state, stages_of
+from service.model.planning import job_state, ranges_of, stages_of
 from service.model.projects import EVERYTHING, Reach
 from service.model.states import Stage, State
 from service.model.suggestions import SEARCHED, known_names
@@ -89,7 +89,13 @@ class Datasets:
             dataset = _dataset_row(connection, name, reach)
             now = _cell_state(dataset["cancelled"])
             query = (
-                select(dataset_cells, now.label("state"), jobs.c.id.is_not(None).label("planned"), jobs.c.reason)
+                select(
+                    dataset_cells,
+                    now.label("state"),
+                    jobs.c.id.is_not(None).label("planned"),
+                    jobs.c.reason,
+                    jobs.c.span,
+                )
                 .outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id)
                 .where(dataset_cells.c.dataset == name)
                 .order_by(dataset_cells.c.position)
@@ -157,7 +163,7 @@ def _dataset_view(connection: Connection, row: Any) -> DatasetView:
     state = _state(row, states)
     work = _work(connection, dataset_cells.c.dataset == row["name"])
     made = _made(connection, dataset_cells.c.dataset == row["name"])
-    tasks_asked = max(work["tasks"], row["cells"] * _tasks_of_cell(options))
+    tasks_asked = max(work["tasks"], _tasks_of_dataset(connection, row["name"], options))
     left = tasks_asked - work["share"]
     pace = made["seconds"] / work["done"] if work["done"] else None
     return DatasetView(
@@ -200,8 +206,16 @@ def _states(connection: Connection, row: Any) -> dict[State, int]:
     return {state: found.get(state, 0) for state in State}
 
 
-def _tasks_of_cell(options: JobOptions) -> int:
-    return -(-options.grasps // BATCH_SIZE) * len(stages_of(options))
+def _tasks_of_cell(options: JobOptions, span: int | None) -> int:
+    """Tasks of a cell whose job has so many batches a task; None: it is not planned yet, and may have one."""
+    return ranges_of(options.grasps, span or 1) * len(stages_of(options))
+
+
+def _tasks_of_dataset(connection: Connection, name: str, options: JobOptions) -> int:
+    query = select(jobs.c.span, func.count()).select_from(dataset_cells)
+    query = query.outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id).where(dataset_cells.c.dataset == name)
+    found = connection.execute(query.group_by(jobs.c.span))
+    return sum(count * _tasks_of_cell(options, span) for span, count in found)
 
 
 def _work(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
@@ -247,7 +261,7 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
     for row in rows:
         job = row["job_id"]
         count = work[job]
-        total = max(count["tasks"], _tasks_of_cell(options))
+        total = max(count["tasks"], _tasks_of_cell(options, row["span"]))
         yields = made.get(job, {"seconds": 0.0})
         found = yields.get("valid" if options.counted == "valid" else "grasps", 0)
         reason = row["reason"]

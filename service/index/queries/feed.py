@@ -11,7 +11,6 @@ from sqlalchemy import Column, ColumnElement, exists, or_, select
 
 from service.index.database import Database, chunks
 from service.index.tables import assets, jobs, tasks
-from service.model.keeper_shards import ALL_SHARDS, KeeperShards
 from service.model.planning import MAX_BACKOFF_S, PlannedTask
 from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane, Stage, State
@@ -58,29 +57,20 @@ class Feed:
             rows = connection.execute(query).all()
         return [WaitingJob(row.id, share_of(row.project, (row.origin or {}).get("key", ""))) for row in rows]
 
-    def ready_tasks(
-        self, lane: Lane, turns: Turns, *, now: float, limit: int, shards: KeeperShards = ALL_SHARDS
-    ) -> list[ReadyTask]:
-        """At most `limit` tasks to be queued: in turn those of each project or key, and of each job of it.
-
-        Args:
-            shards: of whose jobs. Turns are given among all of them, as each keeper does for itself: together the tasks
-                they queue are those that one keeper would.
-        """
-        of_key: dict[str, list[list[tuple[WaitingJob, ReadyTask | None]]]] = defaultdict(list)
+    def ready_tasks(self, lane: Lane, turns: Turns, *, now: float, limit: int) -> list[ReadyTask]:
+        """At most `limit` tasks to be queued: in turn those of each project or key, and of each job of it."""
+        of_key: dict[str, list[list[tuple[WaitingJob, ReadyTask]]]] = defaultdict(list)
         for job, share in turns.order(self.waiting_jobs(lane, now=now), limit):
-            mine = shards.has(job.id)
-            found = self.ready_of_job(job.id, limit=share, now=now) if mine else [None] * share
-            of_key[job.key].append([(job, task) for task in found])
+            of_key[job.key].append([(job, task) for task in self.ready_of_job(job.id, limit=share, now=now)])
         chosen = interleave([interleave(of_jobs) for of_jobs in of_key.values()])[:limit]
         turns.served([job for job, _ in chosen])
-        return [task for _, task in chosen if task is not None]
+        return [task for _, task in chosen]
 
     def ready_of_job(self, job_id: str, *, limit: int, now: float | None = None) -> list[ReadyTask]:
         """The first tasks of one job that may be queued; at a time, or none of them heeding its back-off."""
         due = () if now is None else (_due(tasks.c.not_before, now),)
         query = (
-            select(tasks, jobs.c.request, jobs.c.revisions, jobs.c.origin, jobs.c.hand_digest, jobs.c.object_digest)
+            select(tasks, *(jobs.c[name] for name in _OF_THE_JOB))
             .join(jobs, jobs.c.id == tasks.c.job_id)
             .where(tasks.c.job_id == job_id, *_WAITING, *due)
             .order_by(tasks.c.batch)
@@ -101,27 +91,23 @@ class Feed:
                 for row in connection.execute(query).mappings()
             ]
 
-    def believed_queued(self, shards: KeeperShards = ALL_SHARDS) -> tuple[set[str], set[tuple[AssetKind, str]]]:
-        """Unfinished tasks of the jobs of these shards, and checks of assets, that were given to the queue."""
+    def believed_queued(self) -> tuple[set[str], set[tuple[AssetKind, str]]]:
+        """Unfinished tasks, and checks of assets, that were given to the queue."""
         unfinished = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
         of_tasks = select(tasks.c.id).where(tasks.c.ready.is_(True), tasks.c.queued.is_(True), unfinished)
-        if not shards.all_held:
-            some = ((tasks.c.job_id >= first) & (tasks.c.job_id < end) for first, end in shards.ranges())
-            of_tasks = of_tasks.where(or_(*some))
         of_checks = select(assets.c.kind, assets.c.digest).where(assets.c.queued.is_(True), assets.c.verdict.is_(None))
         with self.database.reading() as connection:
             checks = {(AssetKind(kind), digest) for kind, digest in connection.execute(of_checks)}
             return set(connection.scalars(of_tasks)), checks
 
-    def outputs(self, task_ids: Collection[str]) -> dict[str, tuple[str, str, tuple[str, str]]]:
-        """Stage and shard id of tasks, with the digests of hand and object."""
-        of_job = (jobs.c.hand_digest, jobs.c.object_digest)
-        query = select(tasks.c.id, tasks.c.stage, tasks.c.shard_id, *of_job).join(jobs, jobs.c.id == tasks.c.job_id)
+    def outputs(self, task_ids: Collection[str]) -> dict[str, tuple[str, str]]:
+        """Stage and shard id of tasks."""
+        query = select(tasks.c.id, tasks.c.stage, tasks.c.shard_id)
         with self.database.reading() as connection:
             return {
-                task: (stage, shard, (hand, obj))
+                task: (stage, shard)
                 for some in chunks(list(task_ids))
-                for task, stage, shard, hand, obj in connection.execute(query.where(tasks.c.id.in_(some)))
+                for task, stage, shard in connection.execute(query.where(tasks.c.id.in_(some)))
             }
 
     def cancelled(self, task_ids: Collection[str]) -> set[str]:
@@ -153,6 +139,7 @@ class Feed:
             return list(connection.scalars(query))
 
 
+_OF_THE_JOB = ("request", "revisions", "span", "origin", "hand_digest", "object_digest")
 _WAITING = (tasks.c.ready.is_(True), tasks.c.queued.is_(False))
 
 
@@ -164,11 +151,7 @@ def _due(not_before: Column[float], now: float) -> ColumnElement[bool]:
 def _record(row: Any) -> JobRecord:
     return JobRecord(
         id=row["job_id"],
-        request=row["request"],
-        revisions=row["revisions"],
-        origin=row["origin"],
-        hand_digest=row["hand_digest"],
-        object_digest=row["object_digest"],
+        **{name: row[name] for name in _OF_THE_JOB},
         lane=row["lane"],
         created=row["created"],
     )

@@ -16,7 +16,7 @@ from service.index.reach import seen_jobs, seen_tasks
 from service.index.tables import attempts, jobs, shards, tasks
 from service.index.views import AttemptView, JobView, Page, StageProgress, TaskView
 from service.model.errors import NotFoundError
-from service.model.planning import batches_of
+from service.model.planning import ranges_of
 from service.model.projects import EVERYTHING, Reach
 from service.model.states import Stage, State
 
@@ -129,17 +129,18 @@ def _job_views(connection: Connection, rows: Sequence[Any]) -> list[JobView]:
     ids = [row["id"] for row in rows]
     progress = _progress(connection, ids)
     made = _made(connection, ids)
-    views = (
+    views = [
         JobView(
             **{name: row[name] for name in JobView.model_fields if name in row},
             stages=progress[row["id"]],
             **made.get(row["id"], {}),
         )
         for row in rows
-    )
+    ]
+    wholes = (ranges_of(view.request.grasps, row["span"]) for view, row in zip(views, rows, strict=True))
     return [
-        view.model_copy(update={"stages": [_whole(one, batches_of(view.request)) for one in view.stages]})
-        for view in views
+        view.model_copy(update={"stages": [_whole(one, tasks) for one in view.stages]})
+        for view, tasks in zip(views, wholes, strict=True)
     ]
 
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from sqlalchemy import select, tuple_
 
-from service.index.database import Database, chunks
+from service.index.database import Database
 from service.index.queries import cursors
 from service.index.reach import seen_shards, seen_tasks
 from service.index.tables import shards, tasks
 from service.index.views import Page, ShardView
-from service.model import names
 from service.model.errors import NotFoundError
 from service.model.projects import EVERYTHING, Reach
 
@@ -61,18 +60,6 @@ class Shards:
         query = select(shards.c.id, shards.c.hand_digest, shards.c.object_digest).where(shards.c.id.in_(ids))
         with self.database.reading() as connection:
             return {shard: (hand, obj) for shard, hand, obj in connection.execute(query)}
-
-    def packed(self, ids: Sequence[str]) -> set[str]:
-        """Those of these shards that lie in a pack."""
-        query = select(shards.c.id).where(shards.c.key.like(f"{names.PACKS}/%"))
-        with self.database.reading() as connection:
-            return {shard for some in chunks(ids) for shard in connection.scalars(query.where(shards.c.id.in_(some)))}
-
-    def of_pack(self, pack: str) -> list[ShardView]:
-        """The shards that lie in a pack, with their manifests."""
-        query = select(shards).where(shards.c.key.like(f"{pack}@%"))
-        with self.database.reading() as connection:
-            return [_shard_view(row, whole=True) for row in connection.execute(query).mappings()]
 
     def job_of(self, shard_id: str, *, reach: Reach = EVERYTHING) -> str | None:
         """A job within reach that wanted this shard; several may, and a pruned index may know none."""

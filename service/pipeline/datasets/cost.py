@@ -4,7 +4,7 @@
     seconds of a cell  = tries x seconds per try + batches x scenes x seconds per scene + pictures x seconds per picture
     time of W workers  = the larger of seconds / W and rounds of batches x seconds of a batch
 
-The rates, each with an interval, come from `service.pipeline.datasets.rates`; intervals add, as if all were off
+The rates, each with an interval, come from `service.pipeline.rates`; intervals add, as if all were off
 together. A worker is one process of `graspd worker` on a device like those that were measured.
 """
 
@@ -26,8 +26,8 @@ from service.model.planning import stages_of
 from service.model.projects import EVERYTHING, Reach
 from service.model.states import AssetKind, Stage
 from service.pipeline.datasets.estimate import Estimate, RateUsed, WorkersPlan
-from service.pipeline.datasets.rates import Machine, Rate, Rates, StageRate, picture_rate, scene_rate
 from service.pipeline.datasets.spec import MAX_CELLS, Matrix
+from service.pipeline.rates import Machine, Rate, Rates, StageRate, picture_rate, scene_rate, tries
 
 WORKERS: Final = (1, 8, 64)
 #: A task in the queue and the events it sends back, both ways (docs/scaling.md) [bytes].
@@ -104,7 +104,7 @@ def _once(objects: list[str], options: JobOptions) -> list[str]:
 
 
 def _add_cell(sums: _Sums, hand: str, rate: Rate, options: JobOptions) -> None:
-    tried = _tries(rate, options)
+    tried = tries(rate, options)
     valid = tried * rate.valid_yield
     kept = min(valid, options.grasps) if options.want == "valid" else options.grasps
     sums.tried += tried
@@ -116,13 +116,6 @@ def _add_cell(sums: _Sums, hand: str, rate: Rate, options: JobOptions) -> None:
     sums.high += seconds * rate.spread[1]
     sums.base_bytes += kept * rate.bytes_per_grasp
     sums.cells[hand, rate] += 1
-
-
-def _tries(rate: Rate, options: JobOptions) -> float:
-    if options.want == "raw":
-        return float(options.grasps)
-    most = options.grasps * options.budget
-    return min(most, options.grasps / rate.valid_yield) if rate.valid_yield > 0 else most
 
 
 def _estimate(

@@ -17,6 +17,7 @@ from service.model.errors import ConflictError
 from service.model.states import State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
+from service.pipeline.ranges import TaskRanges
 from service.store.records import job_events
 
 log = logging.getLogger(__name__)
@@ -31,6 +32,7 @@ class DatasetRounds:
     def __init__(self, parts: Parts, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._parts = parts
         self._clock = clock
+        self._ranges = TaskRanges(parts, clock=clock)
         self._positions: dict[tuple[str, int], int] = {}
 
     def advance(self, budget_s: float = BUDGET_S) -> bool:
@@ -53,9 +55,8 @@ class DatasetRounds:
             for cell in cells:
                 if self._clock() > deadline:
                     return False
-                job_actions.enter(
-                    self._parts, job_of(cell, work.options, work.revisions, work.owner, work.project), keeps_assets=True
-                )
+                job = job_of(cell, work.options, work.revisions, work.owner, work.project)
+                job_actions.enter(self._parts, self._ranges.sized(job, among=len(cells)), keeps_assets=True)
                 after = cell.position
             if not cells:
                 break

@@ -68,12 +68,14 @@ def _judge(name: str, settings: Settings, found: IndexCondition) -> Finding:
         return bad(
             name,
             f"{line}: a newer graspd made it; this one knows {found.newest}",
-            f"install the newer version here, or with it run graspd index downgrade {found.newest}",
+            "install the newer version here, or graspd index rebuild: it is made again from the store",
+        )
+    if found.revision and not found.is_ready:
+        return bad(
+            name, f"{line}: this graspd has {found.newest}", "graspd index rebuild: it is made again from the store"
         )
     if not found.is_ready:
-        return warning(
-            name, f"{line}: this graspd has {found.newest}", "the next start brings it forward; back up first"
-        )
+        return warning(name, line, "the next start makes its tables")
     used, most = found.connections
     if most and used > _CROWDED * most:
         return warning(

@@ -15,7 +15,7 @@ from service.model.finding import Finding, bad, good, skipped, warning
 from service.model.states import Stage
 from service.model.version import PACKAGE_VERSION
 from service.model.worker_beat import WorkerBeat
-from service.pipeline.sharing import PART
+from service.pipeline.leading import PART
 from service.queue.rq_queue import RqQueue, open_queue
 from service.run.address import recorded_address
 from service.run.doctor.redis_server import is_there
@@ -27,25 +27,22 @@ _AWAY: Final = "Redis does not answer"
 
 
 def keeper(settings: Settings) -> Finding:
-    """Whether every shard of the work has one that gave a sign of life lately."""
+    """Whether one gave a sign of life lately."""
     name = "keeper"
     if not is_there(settings):
         return skipped(name, _IDLE)
     try:
         with closing(open_queue(settings, patience=0)) as queue:
-            shards = queue.keepers(PART)
+            lives = queue.announced(PART)
     except QueueUnavailable:
         return skipped(name, _AWAY)
-    holders = {one.holder for one in shards if one.works}
-    if silent := [str(one.shard) for one in shards if not one.works]:
-        of = f" of shards {', '.join(silent)} of {len(shards)}" if holders else ""
+    if not lives:
         return bad(
             name,
-            f"no keeper{of} gave a sign of life: finished tasks are not taken up, and nothing is queued",
+            "no keeper gave a sign of life: finished tasks are not taken up, and nothing is queued",
             "graspd keeper",
         )
-    holding = "a keeper lives" if len(holders) == 1 else f"{len(holders)} keepers live"
-    return good(name, holding if len(shards) == 1 else f"{holding}, with all {len(shards)} shards of the work")
+    return good(name, "a keeper lives")
 
 
 def workers(settings: Settings) -> Finding:

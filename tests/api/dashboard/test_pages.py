@@ -58,15 +58,6 @@ def test_home_shows_jobs_workers_and_failures(http: TestClient, parts: Parts) ->
     assert "the mesh has 12 open edges" in page
 
 
-def test_workers_tells_which_keeper_has_which_part_of_the_work(http: TestClient, parts: Parts) -> None:
-    assert "shard 0" not in http.get("/workers").text, "where one keeper does it all"
-    parts.queue.take_share("node-7", 600, number=2)
-    parts.queue.announce("keeper", 600)
-    page = http.get("/workers").text
-    assert "node-7" in page
-    assert [found[1] for found in re.finditer(r'badge (\w+)"><span class="dot"></span>shard', page)] == ["ok", "bad"]
-
-
 @pytest.mark.parametrize("state", list(State))
 def test_home_filters_by_state(http: TestClient, parts: Parts, state: State) -> None:
     add_job(parts)

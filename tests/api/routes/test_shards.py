@@ -11,13 +11,10 @@ from starlette.testclient import TestClient
 
 from api.dashboard.pictures import Pictures
 from api.routes.shards import parse_range
-from service.index.rebuild import rebuild
-from service.model import names
 from service.pipeline.backends import Parts
-from service.store.packs import put_pack
 from service.store.store import Store
 from tests.api.factories import add_job, finish_all
-from tests.damage import cut, flip, flipped, overwrite, remove
+from tests.damage import cut, flip, remove
 
 
 @pytest.fixture
@@ -106,27 +103,6 @@ def test_a_damaged_shard_is_refused_with_its_name(
     assert shard in answer.json()["detail"]
     assert "etag" not in answer.headers
     assert "immutable" not in answer.headers.get("cache-control", "")
-
-
-def test_a_shard_in_a_pack_is_read_as_any_other(http: TestClient, parts: Parts) -> None:
-    made = finish_all(parts, add_job(parts, grasps=64))
-    files = {one.shard_id: http.get(f"/v1/shards/{one.shard_id}/file").content for one in made}
-    put_pack(parts.store, [(one, files[one.shard_id]) for one in made])
-    for one in made:
-        parts.store.delete(names.shard_manifest(one.stage, one.shard_id))
-        parts.store.delete(one.key)
-    rebuild(parts.index, parts.store)
-    for shard, whole in files.items():
-        assert http.get(f"/v1/shards/{shard}/file", follow_redirects=False).content == whole
-        some = http.get(f"/v1/shards/{shard}/file", headers={"Range": "bytes=-100"})
-        assert (some.status_code, some.content) == (206, whole[-100:])
-        assert http.get(f"/v1/shards/{shard}/file", headers={"Range": f"bytes={len(whole)}-"}).status_code == 416
-        assert http.get(f"/v1/grasps/{shard}/0").status_code == 200
-    key, _, place = parts.index.shards.get(made[0].shard_id).key.partition("@")
-    overwrite(parts.store, key, flipped(parts.store.get(key), int(place.partition("+")[0]) + 50))
-    answers = [http.get(f"/v1/shards/{one.shard_id}/file") for one in made]
-    assert [answer.status_code for answer in answers] == [500, 200]
-    assert key in answers[0].json()["detail"]
 
 
 def test_a_picture_of_a_damaged_shard_is_refused(http: TestClient, parts: Parts) -> None:

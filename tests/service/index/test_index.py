@@ -11,8 +11,6 @@ from datetime import datetime
 from pathlib import Path
 
 import pytest
-from alembic.autogenerate import compare_metadata
-from alembic.migration import MigrationContext
 from pydantic import SecretStr
 from sqlalchemy import delete, update
 
@@ -20,7 +18,6 @@ from service.index import tables
 from service.index.filters import GraspFilter, GraspSort
 from service.index.index import Index
 from service.index.rebuild import differences, rebuild
-from service.index.tables import metadata
 from service.index.views import GraspView
 from service.model import names
 from service.model.clock import timestamp
@@ -52,7 +49,7 @@ def index(index_url: str) -> Iterator[Index]:
 @pytest.fixture
 def parts(tmp_path: Path, index: Index, index_url: str) -> Parts:
     """A service without processes on an index of each kind: a hand `gripper` and an object `ball`."""
-    settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0, index_url=SecretStr(index_url))
+    settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0, task_s=0.0, index_url=SecretStr(index_url))
     made = Parts(settings, open_store("memory://"), index, MemoryQueue())
     add_assets(made)
     return made
@@ -84,13 +81,7 @@ def fail(parts: Parts, job: str, batch: int, number: int, *, last: bool) -> None
     parts.index.write.add_attempt(attempt)
 
 
-def test_the_migrations_make_the_tables_that_the_code_uses(index: Index) -> None:
-    with index.database.reading() as connection:
-        made = MigrationContext.configure(connection, opts={"compare_type": True})
-        assert compare_metadata(made, metadata) == []
-
-
-def test_opening_a_migrated_index_again_changes_nothing(parts: Parts) -> None:
+def test_opening_an_index_again_changes_nothing(parts: Parts) -> None:
     job, _ = job_actions.submit(parts, request())
     again = Index(parts.settings.resolved_index_url)
     assert again.jobs.get(job.id) == parts.index.jobs.get(job.id)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import pytest
-
 from service.index.rebuild import rebuild
 from service.index.views import UsageDay
 from service.model import names
 from service.model.clock import timestamp
-from service.model.keeper_shards import ALL_SHARDS, KeeperShards
 from service.model.messages import Origin
 from service.model.planning import message_of, plan
 from service.model.projects import Reach
@@ -109,22 +106,15 @@ def test_usage_is_the_same_after_the_index_was_made_anew(parts: Parts) -> None:
     assert parts.index.usage.days("2000-01-01", "2999-01-01") == before
 
 
-@pytest.mark.parametrize("number", [1, 4])
-def test_projects_share_the_queue_evenly_whatever_their_keys_and_jobs_are(parts: Parts, number: int) -> None:
-    """And however many keepers share the work: each queues its own jobs in the turns of all."""
+def test_projects_share_the_queue_evenly_whatever_their_keys_and_jobs_are(parts: Parts) -> None:
     for seed in range(6):
         enter(parts, "greedy", seed, key=f"greedy-{seed % 3}", batches=6, where=seed * 2)
     enter(parts, "modest", 9, batches=12, where=5)
     enter(parts, "", 10, key="alone", batches=12, where=13)
-    shards = [KeeperShards(number, frozenset({shard})) if number > 1 else ALL_SHARDS for shard in range(number)]
-    turns = [Turns() for _ in shards]
+    turns = Turns()
     queued: dict[str, int] = {"greedy": 0, "modest": 0, "": 0}
-    for room in (3, 6, 12, 9):  # as it comes up, round by round; all keepers look before any of them queues
-        ready = [
-            task
-            for own, mine in zip(turns, shards, strict=True)
-            for task in parts.index.feed.ready_tasks(Lane.BULK, own, now=2e9, limit=room, shards=mine)
-        ]
+    for room in (3, 6, 12, 9):  # as it comes up, round by round
+        ready = parts.index.feed.ready_tasks(Lane.BULK, turns, now=2e9, limit=room)
         assert len(ready) == room
         parts.index.live.set_queued([task.task.id for task in ready])
         for task in ready:

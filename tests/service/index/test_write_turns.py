@@ -1,17 +1,15 @@
-"""Several keepers write one index at once: right on every database; on PostgreSQL they do not wait for one another."""
+"""Several processes write one index at once, as for a moment where one keeper follows another."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from sqlalchemy import text
 
-from service.index.index import Index
 from service.index.rebuild import differences
 from service.model import names
 from service.model.clock import timestamp
@@ -25,8 +23,7 @@ from service.store.store import open_store
 from tests.fakes import add_assets, make_shard, request
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
-from tests.servers import PostgresServer
-from tests.waiting import PATIENCE_S, until
+from tests.waiting import PATIENCE_S
 
 KEEPERS = 4
 
@@ -61,7 +58,7 @@ def enter(parts: Parts, place: int, seed: int, *, batches: int = 1) -> JobRecord
 
 
 def test_keepers_that_index_at_once_leave_the_rows_that_follow_from_the_store(processes: list[Parts]) -> None:
-    """Each indexes the jobs of its shard, two of eight; each job wants what a job of another shard wants as well."""
+    """Each indexes two jobs of eight; each job wants what a job of another wants as well."""
     jobs = [enter(processes[0], 2 * place, place % 4, batches=2) for place in range(8)]
     messages = {job.id: [message_of(job, task, attempt=1, max_attempt=3) for task in plan(job)] for job in jobs}
     made = {message.output: make_shard(processes[0].store, message) for job in jobs[:4] for message in messages[job.id]}
@@ -86,42 +83,3 @@ def test_keepers_that_index_at_once_leave_the_rows_that_follow_from_the_store(pr
     ends = processes[0].index.outgoing.ends(0, limit=99)
     assert sorted(end.subject for end in ends) == sorted(job.id for job in jobs), "each is told once"
     assert len({end.seq for end in ends}) == len(jobs)
-
-
-@pytest.mark.postgres
-def test_on_postgresql_only_writers_of_the_same_jobs_wait(postgres_server: PostgresServer) -> None:
-    url = postgres_server.database()
-    first, second = Index(url), Index(url)
-
-    def waiting() -> bool:
-        with first.database.reading() as connection:
-            return bool(
-                connection.scalar(text("SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND NOT granted"))
-            )
-
-    def write(*jobs: str) -> Callable[[], None]:
-        def run() -> None:
-            with second.database.writing(concerns=lambda _: jobs):
-                pass
-
-        return run
-
-    def write_anything() -> None:
-        with second.database.writing():
-            pass
-
-    low, middle, high = ("0" * 32, "8" * 32, "f" * 32)
-    try:
-        with ThreadPoolExecutor(1) as pool:
-            for others, is_blocked in ((write(middle), False), (write(middle, high), True), (write_anything, True)):
-                with first.database.writing(concerns=lambda _: (high, low)):
-                    done: Future[None] = pool.submit(others)
-                    if is_blocked:
-                        until(waiting, "the other waits")
-                        assert not done.done()
-                    else:
-                        done.result(PATIENCE_S)
-                done.result(PATIENCE_S)
-    finally:
-        first.close()
-        second.close()

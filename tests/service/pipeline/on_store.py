@@ -18,7 +18,7 @@ from tests.memory_queue import MemoryQueue
 def parts_on(kind: str, request: pytest.FixtureRequest, folder: Path) -> Iterator[Parts]:
     """SQLite index, memory queue, a hand and an object; `kind` of store: files or s3."""
     url = request.getfixturevalue("s3_url") if kind == "s3" else (folder / "store").as_uri()
-    settings = Settings(data_dir=folder, store_url=url, retry_backoff_s=0.0)
+    settings = Settings(data_dir=folder, store_url=url, retry_backoff_s=0.0, task_s=0.0)
     made = Parts(settings, open_store(url), empty_index(settings.resolved_index_url), MemoryQueue())
     add_assets(made)
     yield made

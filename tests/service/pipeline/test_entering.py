@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from sqlalchemy import func, select
 
-from service.index.changes.records import BATCHES_AT_ONCE
+from service.index.changes.records import RANGES_AT_ONCE
 from service.index.rebuild import differences
 from service.index.tables import tasks
 from service.model import names
@@ -21,7 +21,7 @@ from service.pipeline.deletion import delete_job
 from service.pipeline.entering import Entering
 from tests.fakes import request
 
-LARGE = 32 * (2 * BATCHES_AT_ONCE + 1)
+LARGE = 32 * (2 * RANGES_AT_ONCE + 1)
 
 
 def entered(parts: Parts) -> int:
@@ -47,10 +47,10 @@ def work_off(parts: Parts) -> list[tuple[str, int]]:
 
 def test_turns_are_short_and_alternate(parts: Parts) -> None:
     jobs = [job_actions.submit(parts, request(grasps=LARGE, seed=seed))[0].id for seed in range(2)]
-    assert entered(parts) == 2 * BATCHES_AT_ONCE
+    assert entered(parts) == 2 * RANGES_AT_ONCE
     turns = work_off(parts)
     assert [job for job, _ in turns] == 2 * sorted(jobs)
-    assert [rows for _, rows in turns] == [BATCHES_AT_ONCE, BATCHES_AT_ONCE, 1, 1]
+    assert [rows for _, rows in turns] == [RANGES_AT_ONCE, RANGES_AT_ONCE, 1, 1]
     assert differences(parts.index, parts.store) == []
 
 

@@ -30,13 +30,12 @@ from service.store.assets import pack as pack_files
 from service.store.deletions import Deletion, Released, removed_folder
 from service.store.library import builtin_assets, load_check, publish_builtins, store_files
 from service.store.manifests import load_manifest
-from service.store.packs import DeadShards, pack_at
 from service.store.records import add_job_event, put_record, read_record
 from service.store.seals import put_document, put_sealed
 from service.store.study_records import latest, publish
 from tests.damage import flipped, overwrite
 from tests.fakes import HAND_FILES, OBJECT_FILES, make_shard, request
-from tests.packing import pack, tasks_of
+from tests.packs import tasks_of
 
 #: Flips of each object: with some thirty objects more than the 265 that were once tried by hand.
 FLIPS: Final = 15
@@ -50,12 +49,9 @@ def full(parts: Parts) -> Parts:
     store = parts.store
     job, _ = job_actions.submit(parts, request(grasps=96))
     record = read_record(JobRecord, store, names.job_record(job.id))
-    lone, first, second = tasks_of(record)
+    lone, first, _ = tasks_of(record)
     manifest = make_shard(store, lone)
     parts.index.write.add_manifest(manifest)
-    key = pack(store, [first, second])
-    dead = DeadShards(shards=(pack_at(store, key).shards[0].id,))
-    put_record(store, f"{names.pack_dead(key)}/{'d' * 32}.json", dead)
     add_job_event(store, job.id, "cancelled")
     attempt = {"task_id": first.task_id, "job_id": job.id, "stage": Stage.SYNTHESIZE, "number": 1, "kind": "Error"}
     failed = AttemptRecord(**attempt, reason="broke", worker="w", ended=timestamp(), last=False)
@@ -98,19 +94,9 @@ def keys_of_each_kind(parts: Parts) -> list[str]:
 def test_every_flipped_byte_is_found_and_named(full: Parts) -> None:
     draw, missed, tried = random.Random(45), [], 0
     keys = keys_of_each_kind(full)
-    packed = next(key for key in keys if key.endswith(".pack"))
-    there = pack_at(full.store, packed)
     for key in keys:
         data = full.store.get(key)
-        # The bytes of a shard that is gone are of no use, though they stay until the pack goes.
-        gone = {
-            at
-            for shard in there.shards
-            if key == packed and shard.id in there.dead
-            for start, length in ((shard.start, shard.length), (shard.manifest_start, shard.manifest_length))
-            for at in range(there.body + start, there.body + start + length)
-        }
-        for at in draw.sample(sorted(set(range(len(data))) - gone), FLIPS):
+        for at in draw.sample(range(len(data)), FLIPS):
             overwrite(full.store, key, data[:at] + bytes([data[at] ^ 1 << draw.randrange(8)]) + data[at + 1 :])
             # The file of a shard is examined with its manifest.
             wrong = examine(full.store, re.sub(r"\.h5$", ".json", key))

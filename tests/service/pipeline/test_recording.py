@@ -24,7 +24,7 @@ from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.deletion import delete_asset, delete_job
 from service.store.records import read_record
 from tests.fakes import make_shard, request
-from tests.packing import tasks_of
+from tests.packs import tasks_of
 
 ALL = (names.JOBS, names.DATASETS, names.OBJECT_SETS, names.TAGS, names.DELETIONS)
 

@@ -112,7 +112,7 @@ def test_a_forged_entry_stops_neither_feeding_nor_reaping_nor_pages(parts: Parts
     queue.discard([task.id])
     assert task.id not in queue.waiting()
     page = Snapshot()
-    page.add_queue(queue.now(lease_s=6), queue.keepers("keeper"))
+    page.add_queue(queue.now(lease_s=6), is_kept=queue.announced("keeper"))
     page.add_sums(queue.counted())
     assert b"graspd_workers" in Metrics().render(page)
     assert [beat.name for beat in queue.workers()] == []

@@ -11,14 +11,13 @@ from rq import SimpleWorker
 from rq.executions import prepare_execution
 
 from service.model.clock import timestamp
-from service.model.keeper_shards import KeeperShards
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
 from service.queue.allowed import AllowedJob, AllowedQueue
 from service.queue.lists import queue_names
-from service.queue.port import BULK_EVERY, Counters, Event, EventKind, Holder, Keeping, Report, Share, TaskQueue
-from service.queue.rq_queue import RqQueue, worker_key
+from service.queue.port import BULK_EVERY, Counters, Event, EventKind, Holder, TaskQueue
+from service.queue.rq_queue import LEAD, RqQueue, worker_key
 from tests.fakes import request
 from tests.memory_queue import MemoryQueue
 from tests.waiting import PATIENCE_S, until
@@ -125,7 +124,7 @@ def one_beat(connection: Any, name: str, hold: Hold | None = None) -> list[str]:
     """Of a worker; returns why its task must stop."""
     said: list[str] = []
     pulse = Pulse(connection, place_of(name, 6), tell=lambda word, entry: said.append(word), end_worker=said.append)
-    pulse.take({"beat": asdict(beat_of(name)), "holds": [hold.told()] if hold else []})
+    pulse.take({"beat": asdict(beat_of(name)), "hold": hold.told() if hold else None})
     pulse.tick()
     return said
 
@@ -302,87 +301,37 @@ def test_a_part_is_there_as_long_as_it_says_so(sides: tuple[TaskQueue, Worker]) 
 def test_of_those_who_want_to_lead_one_does_until_it_is_silent_or_resigns(sides: tuple[TaskQueue, Worker]) -> None:
     queue, _ = sides
 
-    def leads(holder: str, seconds: float = 600) -> bool:
-        return bool(queue.take_share(holder, seconds, number=1).held)
-
-    assert leads("a")
-    assert not leads("b")
-    assert leads("a"), "who leads may go on"
-    queue.resign("b", {0})
-    assert not leads("b"), "only its holder gives it back"
-    queue.resign("a", {0})
-    queue.leave("a", number=1)
-    assert leads("b", 0.05)
-    until(lambda: leads("a"), "the lease of b is over")
-    assert not leads("b")
+    assert queue.lead("a", 600)
+    assert not queue.lead("b", 600)
+    assert queue.lead("a", 600), "who leads may go on"
+    queue.resign("b")
+    assert not queue.lead("b", 600), "only its holder gives it back"
+    queue.resign("a")
+    assert queue.lead("b", 0.05)
+    until(lambda: queue.lead("a", 600), "the lease of b is over")
+    assert not queue.lead("b", 600)
 
 
-def test_shards_are_shared_evenly_among_all_keepers_and_served_by_one_alone(sides: tuple[TaskQueue, Worker]) -> None:
-    queue, _ = sides
-
-    def share(holder: str) -> Share:
-        """Of a keeper that gives back at once what is more than its share."""
-        found = queue.take_share(holder, 600, number=5)
-        queue.resign(holder, sorted(found.held)[found.fair :])
-        return queue.take_share(holder, 600, number=5)
-
-    assert share("a").held == {0, 1, 2, 3, 4}
-    queue.announce("keeper:1", 600)
-    assert queue.keepers("keeper")[:2] == [Keeping(0, "a", False), Keeping(1, "a", True)]
-    for _ in range(2):
-        held = {holder: share(holder).held for holder in "abc"}
-    assert sorted(map(len, held.values())) == [1, 2, 2]
-    assert sorted(shard for some in held.values() for shard in some) == [0, 1, 2, 3, 4]
-    assert {holder: share(holder).held for holder in "abc"} == held, "nothing moves while nobody comes or goes"
-    queue.resign("a", held["a"])
-    queue.leave("a", number=5)
-    after = {holder: share(holder).held for holder in "bc"}
-    assert sorted(map(len, after.values())) == [2, 3] and after["b"] >= held["b"] and after["c"] >= held["c"]
+def test_a_keeper_that_is_started_again_under_its_name_leads_at_once(rq_queue: RqQueue) -> None:
+    assert rq_queue.lead("node-1", 600)
+    again = RqQueue(rq_queue.connection)
+    assert not again.lead("node-2", 600)
+    assert again.lead("node-1", 600)
 
 
-def test_who_holds_the_first_shard_says_how_many_there_are(sides: tuple[TaskQueue, Worker]) -> None:
-    queue, _ = sides
-    assert queue.take_share("a", 600, number=2).held == {0, 1}
-    assert queue.take_share("b", 600, number=4) == Share(2)
-    queue.resign("a", {0})
-    assert queue.take_share("b", 600, number=4) == Share(4, 4, frozenset({0, 2, 3})), "the other is still held"
-    assert queue.take_share("a", 600, number=2) == Share(4), "who was told so waits"
-    queue.resign("a", {1})
-    assert queue.take_share("b", 600, number=4).held == {0, 1, 2, 3}
+def test_a_keeper_of_graspd_0_2_holds_the_same_lease(rq_queue: RqQueue) -> None:
+    rq_queue.connection.set(LEAD, "a keeper of 0.2", px=600_000)
+    assert not rq_queue.lead("a", 600)
+    rq_queue.connection.delete(LEAD)
+    assert rq_queue.lead("a", 600)
+    assert rq_queue.connection.get(LEAD) == b"a" and rq_queue.connection.pttl(LEAD) > 0, "as it would write it"
 
 
-def test_events_go_to_the_shard_of_their_job_and_to_who_holds_it(sides: tuple[TaskQueue, Worker]) -> None:
-    queue, _ = sides
-    low, high = "0" * 32, "f" * 32
-    early = [Event(kind=EventKind.STARTED, at=timestamp(), job_id=job, task_id="early") for job in (low, high)]
-    queue.publish(*early)
-    queue.take_share("a", 600, number=2)
-    queue.publish(*(Event(kind=EventKind.STARTED, at=timestamp(), job_id=job) for job in (low, high, "", "no-hash")))
-    second = queue.consume(limit=9, wait_s=0, shards=[1])
-    assert [event.job_id for _, event in second] == [high]
-    first = queue.consume(limit=9, wait_s=0, shards=[0])
-    assert [event.job_id for _, event in first] == [low, high, low, "", "no-hash"]
-    queue.hand_on([(1, early[1])])
-    queue.acknowledge([event_id for event_id, _ in (*first, *second)])
-    assert [event.task_id for _, event in _restarted(queue).consume(limit=9, wait_s=0, shards=[0, 1])] == ["early"]
-
-
-def test_what_lies_in_streams_that_no_longer_are_is_found(sides: tuple[TaskQueue, Worker]) -> None:
-    queue, _ = sides
-    queue.take_share("a", 600, number=4)
-    queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), job_id="f" * 32))
-    assert queue.left_over(4) == [] and queue.left_over(2) == [3]
-    ((event_id, _),) = queue.consume(limit=9, wait_s=0, shards=[0, 3])
-    queue.acknowledge([event_id])
-    assert queue.left_over(2) == []
-
-
-def test_progress_is_shared_out_by_the_ids_of_tasks(sides: tuple[TaskQueue, Worker]) -> None:
-    queue, _ = sides
-    for task_id in ("0" * 32, "f" * 32):
-        queue.report(task_id, Report(done=1.0))
-    assert set(queue.reports()) == {"0" * 32, "f" * 32}
-    assert set(queue.reports(KeeperShards(2, frozenset({1})))) == {"f" * 32}
+@pytest.mark.parametrize("forge", [lambda redis: redis.set(LEAD, "for ever"), lambda redis: redis.rpush(LEAD, "x")])
+def test_a_lease_that_is_none_keeps_nobody_from_leading(rq_queue: RqQueue, forge: Callable[[Any], None]) -> None:
+    forge(rq_queue.connection)
+    assert not rq_queue.lead("a", 600)
+    assert rq_queue.lead("a", 600)
 
 
 def test_sums_add_up_and_each_name_has_its_own(sides: tuple[TaskQueue, Worker]) -> None:

@@ -123,21 +123,6 @@ def test_what_is_held_is_bounded(folder: Path, tmp_path: Path, monkeypatch: pyte
     assert set(reader._objects) == {"object-4", "object-5"}
 
 
-@pytest.mark.parametrize("apart", [False, True])
-def test_a_shard_is_read_in_its_pack_and_by_itself_once_that_was_taken_apart(
-    folder: Path, tmp_path: Path, apart: bool
-) -> None:
-    store = open_store("memory://")
-    shards = streamed(folder, store, tmp_path)
-    views, data = shards.of("views")[0], (folder / "views.h5").read_bytes()
-    if not apart:
-        store.delete(VIEWS_KEY)
-        store.put("packs/one", bytes(100) + data + bytes(7))
-    packed = replace(views, key=f"packs/one@100+{len(data)}")
-    files = tuple(packed if file is views else file for file in shards)
-    same(Pictures(Shards(files, store, shards.cache, stream=True)), Pictures(open_shards(folder)))
-
-
 def test_damage_is_told_with_the_row_and_what_is_gone_with_its_name(folder: Path, tmp_path: Path) -> None:
     store = open_store(f"file://{tmp_path / 'store'}")
     shards = streamed(folder, store, tmp_path / "cache")

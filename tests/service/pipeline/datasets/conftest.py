@@ -30,7 +30,7 @@ def parts(tmp_path: Path) -> Iterator[Parts]:
 
 
 def _service(folder: Path, url: str) -> Iterator[Parts]:
-    settings = Settings(data_dir=folder, retry_backoff_s=0.0, index_url=SecretStr(url))
+    settings = Settings(data_dir=folder, retry_backoff_s=0.0, task_s=0.0, index_url=SecretStr(url))
     made = Parts(settings, open_store("memory://"), empty_index(url), MemoryQueue())
     add_assets(made)
     for kind, name in (("hand", "claw"), ("object", "cube"), ("object", "cone")):

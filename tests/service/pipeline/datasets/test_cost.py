@@ -11,7 +11,7 @@ from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.cost import estimate
 from service.pipeline.datasets.estimate import Estimate
-from service.pipeline.datasets.rates import ORIGIN, STORED, STORED_METHODS, STORED_MODEL_S, STORED_PLACE, machine_of
+from service.pipeline.rates import ORIGIN, STORED, STORED_METHODS, STORED_MODEL_S, STORED_PLACE, machine_of
 from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import finish, jobs_of, wanted
 

@@ -18,8 +18,7 @@ from service.model.finding import Condition
 from service.model.states import Lane, Stage
 from service.model.version import PACKAGE_VERSION
 from service.model.worker_beat import WorkerBeat
-from service.pipeline.sharing import PART
-from service.queue.port import part_of
+from service.pipeline.leading import PART
 from service.queue.rq_queue import WORKERS, RqQueue, worker_key
 from service.run.address import record_address
 from service.run.doctor.clocks import clocks
@@ -48,15 +47,6 @@ def test_a_keeper_that_lives_and_one_that_does_not(settings: Settings, rq_queue:
     assert found.mend == "graspd keeper"
     rq_queue.announce(PART, 60)
     assert keeper(settings).condition is Condition.GOOD
-
-
-def test_shards_of_the_work_that_have_no_keeper_are_named(settings: Settings, rq_queue: RqQueue) -> None:
-    rq_queue.take_share("a", 60, number=3)
-    rq_queue.announce(part_of(PART, 1), 60)
-    assert "no keeper of shards 0, 2 of 3 gave a sign of life" in keeper(settings).message
-    for shard in (0, 2):
-        rq_queue.announce(part_of(PART, shard), 60)
-    assert keeper(settings).message == "a keeper lives, with all 3 shards of the work"
 
 
 def test_workers_that_fit_are_counted(settings: Settings, rq_queue: RqQueue) -> None:

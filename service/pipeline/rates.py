@@ -162,6 +162,14 @@ class Rates:
         return Rate(seconds * machine.factor, share, _BYTES_PER_GRASP, machine.scaled(origin), 0, machine.stored_spread)
 
 
+def tries(rate: Rate, options: JobOptions) -> float:
+    """Grasps that are tried for a job."""
+    if options.want == "raw":
+        return float(options.grasps)
+    most = options.grasps * options.budget
+    return min(most, options.grasps / rate.valid_yield) if rate.valid_yield > 0 else most
+
+
 def _stored_of(options: JobOptions) -> tuple[float, float, str]:
     """Stored seconds per try, yield and origin."""
     if options.models:
@@ -243,9 +251,9 @@ def scene_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machi
     rows = sum(batch.count for batch in found)
     if not rows:
         return _on(machine, STORED_PLACE if options.in_scene else STORED_SCENE)
-    scenes = sum(batch.request.scenes for batch in found)
+    scenes = sum(batch.batches * batch.request.scenes for batch in found)
     seconds = sum(batch.seconds for batch in found) / scenes
-    spread = _spread([batch.seconds / batch.request.scenes for batch in found], MEASURED_SPREAD)
+    spread = _spread([one.seconds / (one.batches * one.request.scenes) for one in found], MEASURED_SPREAD)
     return StageRate(seconds, sum(b.size_bytes for b in found) / rows, "measured here", len(found), spread)
 
 

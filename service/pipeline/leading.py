@@ -1,0 +1,99 @@
+"""Of several keepers one leads, by a lease in Redis, and the others stand by.
+
+Two that both believe to lead, one of them having been stopped for longer than its lease, do no harm for the moment that
+it lasts: what they write follows from facts in the store, a task is queued once for each attempt, and writers of the
+index take turns.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Final
+
+from service.heartbeat_file import HeartbeatFile
+from service.model.errors import QueueUnavailable
+from service.queue.port import Presence
+
+log = logging.getLogger(__name__)
+#: As what the keeper that leads announces itself.
+PART: Final = "keeper"
+#: So many renewals fit a lease.
+_RENEWALS: Final = 3.0
+#: How long it may take until a process that is told to stop hears it [s].
+_LOOK_S: Final = 0.1
+
+
+class Leadership:
+    """The lease that one process wants and holds."""
+
+    def __init__(self, queue: Presence, *, lease_s: float, alive: HeartbeatFile, name: str | None = None) -> None:
+        """
+        Args:
+            queue: used by a thread of its own while the lease is held.
+            lease_s: how long the lease outlives its last renewal [s].
+            alive: touched while another leads.
+            name: under which it leads; one that is started again under the same name need not wait for its lease.
+        """
+        self._queue, self._lease_s, self._alive = queue, lease_s, alive
+        self.holder = name or f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
+
+    def wait(self, stop: threading.Event) -> bool:
+        """Until this process leads; False if it is told to stop first. Redis may be away meanwhile."""
+        told = False
+        while not stop.is_set():
+            self._alive.touch()
+            try:
+                if self._queue.lead(self.holder, self._lease_s):
+                    log.info("this keeper leads")
+                    return True
+                if not told:
+                    log.info("another keeper leads; this one waits to take over")
+                told = True
+            except QueueUnavailable as error:
+                log.warning("%s", error)
+            stop.wait(self._lease_s / _RENEWALS)
+        return False
+
+    @contextmanager
+    def held(self, stop: threading.Event) -> Iterator[threading.Event]:
+        """Keep the lease; gives an event that is set once another leads, or `stop` is; stopped, gives it back.
+
+        The lease is lost only where Redis says that another has it: while Redis is away nobody else can take it.
+        """
+        over, done = threading.Event(), threading.Event()
+        thread = threading.Thread(target=self._renew, args=(stop, over, done), name="keeper-lease", daemon=True)
+        thread.start()
+        try:
+            yield over
+        finally:
+            over.set()
+            done.set()
+            thread.join(self._lease_s)
+            if stop.is_set():
+                try:
+                    self._queue.resign(self.holder)
+                except QueueUnavailable:
+                    log.debug("the lease of the keeper runs out by itself")
+
+    def _renew(self, stop: threading.Event, over: threading.Event, done: threading.Event) -> None:
+        # Also while the work is laid down.
+        while not done.is_set():
+            try:
+                if not self._queue.lead(self.holder, self._lease_s) and not over.is_set():
+                    log.warning("this keeper was silent for too long, and another leads now")
+                    over.set()
+            except QueueUnavailable:
+                log.debug("the lease of the keeper cannot be renewed now")
+            end = time.monotonic() + self._lease_s / _RENEWALS
+            while not (stop.is_set() or done.wait(_LOOK_S)) and time.monotonic() < end:
+                pass
+            if stop.is_set():
+                over.set()
+                return

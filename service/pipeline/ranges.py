@@ -1,0 +1,78 @@
+"""How many batches a task of a job has: as many as keep a worker busy for a while, and no more than its fair share."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import Final
+
+from service.index.queries.costs import BatchCost
+from service.model.domain import JobRequest, batches_of
+from service.model.projects import EVERYTHING, Reach
+from service.model.records import MOST_BATCHES, JobRecord
+from service.model.states import Lane, Stage
+from service.model.version import SCHEMA_OF_RANGES
+from service.model.worker_beat import WorkerBeat
+from service.pipeline.backends import Parts
+from service.pipeline.rates import Rates, tries
+
+#: Finished tasks that tell how long a batch takes.
+_LOOKED_AT: Final = 64
+#: Workers that are expected where none is there: a service may start them once a task waits.
+_EXPECTED: Final = 8
+#: How long what is known of workers and rates counts [s].
+_KNOWN_S: Final = 10.0
+
+
+class TaskRanges:
+    """Chooses the ranges of jobs as they are planned."""
+
+    def __init__(self, parts: Parts, *, reach: Reach = EVERYTHING, clock: Callable[[], float] = time.monotonic) -> None:
+        """`reach`: whose measurements count."""
+        self._parts, self._reach, self._clock = parts, reach, clock
+        self._read_again = -math.inf
+        self._workers: list[WorkerBeat] = []
+        self._costs: list[BatchCost] = []
+
+    def sized(self, job: JobRecord, *, among: int = 1) -> JobRecord:
+        """A job with the number of batches of its tasks.
+
+        Args:
+            job: as it was planned.
+            among: jobs that are planned at once, and share the workers.
+
+        Raises:
+            QueueUnavailable, IndexUnavailable: a part is away.
+        """
+        batches, wanted_s = batches_of(job.request.grasps), self._parts.settings.task_s
+        # Pictures of a batch are a file of megabytes already.
+        if batches == 1 or job.request.views or not wanted_s:
+            return job
+        if self._clock() >= self._read_again:
+            self._workers = self._parts.queue.workers()
+            self._costs = self._parts.index.costs.of_batches(Stage.SYNTHESIZE, limit=_LOOKED_AT, reach=self._reach)
+            self._read_again = self._clock() + _KNOWN_S
+        able = [worker for worker in self._workers if Stage.SYNTHESIZE in worker.stages]
+        if any(worker.ability.schemas[1] < SCHEMA_OF_RANGES for worker in able):
+            return job
+        # Somebody who watches a small job sees its grasps batch by batch; a GPU makes them all in one launch.
+        if job.lane is Lane.INTERACTIVE and not (able and all(one.device.startswith("cuda") for one in able)):
+            return job
+        by_time = int(wanted_s / max(1e-3, self._batch_s(job.request, {one.device for one in able}) or wanted_s))
+        workers = -(-(len(able) or _EXPECTED) // among)
+        return job.model_copy(update={"span": span_of(batches, by_time, workers)})
+
+    def _batch_s(self, request: JobRequest, devices: set[str]) -> float:
+        """How long one of its batches takes [s]."""
+        rate = Rates(self._costs, request, devices).of(request.hand, request.object)
+        return rate.seconds_per_try * tries(rate, request) / batches_of(request.grasps)
+
+
+def span_of(batches: int, by_time: int, workers: int) -> int:
+    """Batches of each task of a job that has so many, where `by_time` last as long as a task should.
+
+    Tasks of a job are of one length, but for the last, and no worker has none while another has two.
+    """
+    most = max(1, min(by_time, MOST_BATCHES, -(-batches // max(1, workers))))
+    return -(-batches // -(-batches // most))

@@ -1,0 +1,200 @@
+"""How many batches a task has: by what was measured, by who is there, and never more than a fair share."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from service.index.changes.records import Changes
+from service.index.rebuild import differences
+from service.model.clock import timestamp
+from service.model.planning import message_of, plan
+from service.model.records import JobRecord
+from service.model.states import AssetKind, Lane, Stage, State
+from service.model.version import SCHEMA_OF_RANGES, STAGE_REVISIONS, TASK_SCHEMA
+from service.model.worker_beat import WorkerBeat
+from service.pipeline import job_actions
+from service.pipeline.backends import Parts
+from service.pipeline.datasets import actions
+from service.pipeline.datasets.spec import DatasetRequest
+from service.pipeline.ranges import TaskRanges, span_of
+from service.settings import Settings
+from service.store.library import publish_asset
+from service.store.manifests import ShardManifest, publish_shard
+from tests.fakes import OBJECT_FILES, fake_stages, request
+from tests.planning import plan_all
+from tests.service.pipeline.test_keeper import Bench
+from worker.stages.context import TaskContext
+from worker.stages.output import shard_of
+
+
+@pytest.fixture
+def parts(parts: Parts) -> Parts:
+    """A service whose tasks last half a minute."""
+    return replace(parts, settings=parts.settings.model_copy(update={"task_s": 30.0}))
+
+
+def worker(name: str = "w", *, device: str = "cpu", schemas: tuple[int, int] = (2, TASK_SCHEMA)) -> WorkerBeat:
+    now = timestamp()
+    return WorkerBeat(
+        name=name, host="h", pid=1, device=device, device_name="d", stages=tuple(Stage), version="0", state="idle",
+        task_id="", started=now, seen=now, schemas=schemas, revisions=dict(STAGE_REVISIONS),
+    )  # fmt: skip
+
+
+def here(parts: Parts, *workers: WorkerBeat) -> None:
+    parts.queue._workers = {one.name: one for one in workers}  # type: ignore[attr-defined]
+
+
+def measured(parts: Parts, seconds: float) -> None:
+    """A batch took so long."""
+    job, _ = job_actions.submit(parts, request(seed=99))
+    (task,) = plan(record := JobRecord.model_validate_json(parts.store.get(f"jobs/{job.id}/job.json")))
+    message = message_of(record, task, attempt=1, max_attempt=1)
+    made = fake_stages()[Stage.SYNTHESIZE](message, TaskContext(parts.store))
+    manifest, data = shard_of(message, made, device="cpu", seconds=seconds, worker="w")
+    publish_shard(parts.store, manifest, data)
+    parts.index.write.add_manifest(manifest)
+
+
+def span(parts: Parts, grasps: int, lane: Lane = Lane.BULK, **changes: object) -> int:
+    return job_actions.prepare(parts, request(grasps=grasps, **changes), lane=lane).span
+
+
+@given(st.integers(1, 40_000), st.integers(0, 5000), st.integers(0, 300))
+def test_tasks_are_of_one_length_and_no_worker_waits_while_another_has_two(
+    batches: int, by_time: int, workers: int
+) -> None:
+    found = span_of(batches, by_time, workers)
+    assert 1 <= found <= max(1, min(64, by_time))
+    tasks = math.ceil(batches / found)
+    assert found * tasks - batches < tasks, "all but the last are full, and it lacks less than one batch a task"
+    if workers:
+        assert found <= math.ceil(batches / workers)
+
+
+def test_a_task_of_a_larger_job_lasts_about_as_long_as_the_settings_say(parts: Parts) -> None:
+    here(parts, worker())
+    assert span(parts, 32 * 100) == 4, "nothing was measured: a stored rate on two cores, 7 s a batch"
+    # Half of what the fakes make is valid, so that a job of so many valid ones takes twice the tries of a batch.
+    measured(parts, 0.5)
+    assert 20 <= span(parts, 32 * 1000) <= 40
+    measured(parts, 60.0)
+    assert span(parts, 32 * 1000) == 1
+
+
+def test_a_job_of_ten_thousand_grasps_makes_few_objects(parts: Parts) -> None:
+    here(parts, worker())
+    usual = replace(parts, settings=Settings(data_dir=parts.settings.data_dir))
+    on_two_cores = job_actions.prepare(usual, request(grasps=10_000), lane=Lane.BULK)
+    assert 2 * len(list(plan(on_two_cores))) == 80
+    measured(parts, 0.1)
+    job = job_actions.prepare(parts, request(grasps=10_000), lane=Lane.BULK)
+    assert 2 * len(list(plan(job))) <= 12
+    slow = replace(parts, settings=parts.settings.model_copy(update={"task_s": 0.0}))
+    assert 2 * len(list(plan(job_actions.prepare(slow, request(grasps=10_000), lane=Lane.BULK)))) == 626
+
+
+def test_workers_share_a_job_fairly(parts: Parts) -> None:
+    measured(parts, 0.01)
+    here(parts, *(worker(f"w{number}") for number in range(4)))
+    assert span(parts, 32 * 16) == 4
+    here(parts, worker("a"), worker("b"))
+    assert span(parts, 32 * 16) == 8
+    here(parts)
+    assert span(parts, 32 * 16) == 2, "a fleet may start once tasks wait"
+
+
+@pytest.mark.parametrize(("cells", "tasks"), [(1, 4), (2, 2), (8, 1)])
+def test_cells_of_a_dataset_share_the_workers(parts: Parts, cells: int, tasks: int) -> None:
+    measured(parts, 0.01)
+    here(parts, *(worker(f"w{number}") for number in range(4)))
+    for number in range(1, cells):
+        asset = publish_asset(parts.store, AssetKind.OBJECT, f"ball{number}", {**OBJECT_FILES, "n": bytes([number])})
+        parts.index.write.add_asset(asset, {"verdict": "accept", "message": "fine"})
+    objects = ("ball", *(f"ball{number}" for number in range(1, cells)))
+    actions.create(parts, DatasetRequest(name="d", hands=("gripper",), objects=objects, grasps=32 * 16))
+    assert parts.index.datasets.get("d").tasks == 16 * cells, "what it would be with a batch a task, until it is known"
+    plan_all(parts)
+    dataset = parts.index.datasets.get("d")
+    assert dataset.tasks == tasks * cells
+    assert {cell.tasks for cell in parts.index.datasets.cells("d").items} == {tasks}
+
+
+def test_a_small_job_shows_its_grasps_batch_by_batch_but_for_a_gpu_that_makes_them_in_one_launch(parts: Parts) -> None:
+    measured(parts, 0.01)
+    here(parts, worker())
+    assert span(parts, 128, Lane.INTERACTIVE) == 1
+    here(parts, worker(device="cuda:0"))
+    assert span(parts, 128, Lane.INTERACTIVE) == 4
+    here(parts, worker("a", device="cuda:0"), worker("b"))
+    assert span(parts, 128, Lane.INTERACTIVE) == 1
+
+
+def test_pictures_and_older_workers_keep_one_batch_a_task(parts: Parts) -> None:
+    measured(parts, 0.01)
+    here(parts, worker())
+    assert span(parts, 3200, scenes=1, views=1) == 1
+    assert span(parts, 3200, scenes=1) > 1
+    here(parts, worker("new"), worker("old", schemas=(2, SCHEMA_OF_RANGES - 1)))
+    assert span(parts, 3200) == 1
+    known = job_actions.prepare(parts, request(grasps=3200, scenes=1, views=1))
+    with pytest.raises(ValidationError, match="pictures"):
+        JobRecord.model_validate({**known.model_dump(mode="json"), "span": 2})
+
+
+def test_rates_and_workers_are_read_once_for_many_jobs(parts: Parts) -> None:
+    here(parts, worker())
+    now = 0.0
+    ranges = TaskRanges(parts, clock=lambda: now)
+    job = job_actions.prepare(replace(parts, settings=parts.settings.model_copy(update={"task_s": 0.0})),
+                              request(grasps=3200), lane=Lane.BULK)  # fmt: skip
+    assert ranges.sized(job).span == 4
+    measured(parts, 0.01)
+    assert ranges.sized(job).span == 4
+    now = 60.0
+    assert ranges.sized(job).span > 4
+
+
+def test_a_job_of_ranges_goes_through_its_stages_and_the_index_is_the_store(parts: Parts) -> None:
+    bench = Bench(parts)
+    bench.keeper.round()
+    here(parts, worker())
+    job = job_actions.prepare(parts, request(grasps=32 * 6 + 5, scenes=2), lane=Lane.BULK)
+    assert job.span == 4
+    job_actions.enter(parts, job)
+    bench.work_off()
+    done = parts.index.jobs.get(job.id)
+    assert (done.state, done.grasps) == (State.SUCCEEDED, 197)
+    assert [stage.tasks for stage in done.stages] == [2, 2]
+    shards = parts.index.shards.page(job=job.id).items
+    assert {(shard.stage, shard.batch) for shard in shards} == {
+        (s, b) for s in (Stage.SYNTHESIZE, Stage.SCENE) for b in (0, 4)
+    }
+    assert differences(parts.index, parts.store) == []
+
+
+def test_shards_of_many_batches_enter_the_index_in_short_turns(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench(parts)
+    bench.keeper.round()
+    record = job_actions.prepare(parts, request(grasps=32 * 64 * 5), lane=Lane.BULK)
+    job, _ = job_actions.enter(parts, record.model_copy(update={"span": 64}))
+    turns: list[int] = []
+    add = Changes.add_manifests
+
+    def counted(self: Changes, manifests: list[ShardManifest], **options: Any) -> dict[str, State]:
+        turns.append(sum(manifest.batches for manifest in manifests))
+        return add(self, manifests, **options)
+
+    monkeypatch.setattr(Changes, "add_manifests", counted)
+    while (delivery := bench.queue.take("w")) is not None:
+        bench.do(delivery)
+    bench.pass_time(1)
+    assert parts.index.jobs.get(job.id).state is State.SUCCEEDED
+    assert turns == [256, 64]

@@ -1,0 +1,94 @@
+"""What RQ's defaults lose that are switched off: docs/adr has the decisions."""
+
+from __future__ import annotations
+
+import re
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from rq import Queue
+from rq.command import send_stop_job_command
+from rq.executions import Execution
+from rq.job import Job
+from rq.registry import StartedJobRegistry
+from rq.serializers import JSONSerializer
+
+from service.model.states import Lane, Stage
+from service.pipeline import job_actions
+from service.pipeline.backends import Parts
+from service.pipeline.indexer import Indexer
+from service.pipeline.reaper import Reaper
+from service.queue.lists import queue_name
+from service.queue.rq_keys import held_key
+from service.queue.rq_queue import RqQueue, cancel_key, rq_id
+from tests.conftest import REPOSITORY
+from tests.fakes import request
+
+NAME = queue_name(Lane.INTERACTIVE, Stage.SYNTHESIZE)
+#: How long RQ's worker says that its lease lasts [s].
+LEASE_S = 60
+
+
+@pytest.fixture
+def held(parts: Parts, rq_queue: RqQueue) -> tuple[Parts, Job]:
+    """A task that a worker of RQ took just now, and beats for."""
+    parts = replace(parts, queue=rq_queue)
+    job, _ = job_actions.submit(parts, request())
+    (task,) = parts.index.jobs.tasks(job=job.id).items
+    assert Queue(NAME, connection=rq_queue.connection).pop_job_id() == rq_id(task.id, 1)
+    taken = Job.fetch(rq_id(task.id, 1), connection=rq_queue.connection, serializer=JSONSerializer)
+    with rq_queue.connection.pipeline() as pipe:
+        Execution.create(taken, ttl=LEASE_S, pipeline=pipe)
+        pipe.execute()
+    return parts, taken
+
+
+def test_a_clock_that_is_ahead_takes_no_task_from_a_worker_that_lives(
+    held: tuple[Parts, Job], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts, job = held
+    registry = StartedJobRegistry(NAME, connection=parts.queue.connection, serializer=JSONSerializer)  # type: ignore[attr-defined]
+    now = [0.0]
+    reaper = Reaper(parts, Indexer(parts), clock=lambda: now[0])
+    ahead = time.time() + 10 * LEASE_S
+    monkeypatch.setattr(time, "time", lambda: ahead)
+    for _ in range(50):
+        now[0] += 1.0
+        for entry, score in registry.connection.zrange(registry.key, 0, -1, withscores=True):
+            registry.connection.zadd(registry.key, {entry: score + 1})  # a beat, by the worker's own clock
+        assert reaper.reap(parts.queue.leases()) == []
+    assert not parts.index.jobs.attempts(task=job.id.rpartition("-")[0])
+    # RQ's own cleaning up, at that moment by that clock.
+    registry.cleanup(timestamp=ahead)
+    assert job.get_status() == "failed", "RQ calls it abandoned"
+    assert not registry.connection.exists(held_key(NAME))
+
+
+def test_a_command_that_is_published_while_nobody_listens_is_lost_and_a_key_is_not(held: tuple[Parts, Job]) -> None:
+    parts, job = held
+    connection = parts.queue.connection  # type: ignore[attr-defined]
+    job.worker_name = "w"
+    job.save()
+    connection.hset(job.key, "worker_name", "w")
+    listener = connection.pubsub()
+    send_stop_job_command(connection, job.id, serializer=JSONSerializer)
+    listener.subscribe("rq:pubsub:w")  # the worker is connected again
+    time.sleep(0.1)
+    said = [
+        message for _ in range(3) if (message := listener.get_message(timeout=0.1)) and message["type"] == "message"
+    ]
+    assert said == []
+    task = job.id.rpartition("-")[0]
+    parts.queue.discard([task])
+    assert connection.exists(cancel_key(task)), "its next beat finds this"
+    listener.close()
+
+
+def test_every_decision_names_a_test_that_is_there() -> None:
+    for page in sorted((REPOSITORY / "docs" / "adr").glob("*.md")):
+        named = re.findall(r"`(tests/[a-z_/]+\.py)(?:::(test_\w+))?`", page.read_text())
+        assert named, f"{page.name} names no test"
+        for file, test in named:
+            assert f"def {test}" in Path(REPOSITORY / file).read_text(), (page.name, file, test)

@@ -1,0 +1,159 @@
+"""A task of several batches makes what tasks of one batch would, bit for bit, in one shard."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.model import names
+from service.model.clock import timestamp
+from service.model.digests import job_id
+from service.model.domain import JobRequest
+from service.model.errors import DamagedShard, TaskCancelled
+from service.model.planning import message_of, plan
+from service.model.records import JobRecord
+from service.model.states import AssetKind, Lane, Stage
+from service.queue.port import EventKind
+from service.store.assets import builtin_files
+from service.store.library import publish_asset
+from service.store.manifests import load_manifest, load_shard
+from service.store.records import put_record
+from service.store.shards import Shard
+from service.store.store import Store, open_store
+from worker import certified
+from worker.planners import NoPlace
+from worker.process.runner import Runner
+from worker.stages import scene, synthesize
+from worker.stages.context import StopReason, TaskContext
+from worker.stages.ranges import base_rows, batches_of
+
+STAGES = {Stage.SCENE: scene.run, Stage.SYNTHESIZE: synthesize.run}
+#: Batches as small as they can be, so that several take a few seconds.
+SIZE = 3
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in ("service.model.domain", "service.model.planning", "worker.stages.ranges"):
+        monkeypatch.setattr(f"{module}.BATCH_SIZE", SIZE)
+
+
+def made(store: Store, span: int, **request: Any) -> tuple[JobRecord, list[tuple[Stage, Shard, Any]]]:
+    """What a job makes whose tasks have so many batches: stage, shard and manifest of each task."""
+    hand = publish_asset(store, AssetKind.HAND, "barrett", builtin_files(AssetKind.HAND, "barrett"))
+    obj = publish_asset(store, AssetKind.OBJECT, "block", builtin_files(AssetKind.OBJECT, "block"))
+    wanted = JobRequest(hand="barrett", object="block", fidelity="draft", seed=3, **request)
+    job = JobRecord(
+        id=job_id(wanted, hand.digest, obj.digest), request=wanted, hand_digest=hand.digest, object_digest=obj.digest,
+        lane=Lane.BULK, span=span, created=timestamp(),
+    )  # fmt: skip
+    put_record(store, names.job_record(job.id), job)
+    runner = Runner(STAGES, worker="w", publish=lambda event: None)  # type: ignore[arg-type]
+    found = []
+    for task in plan(job):
+        message = message_of(job, task, attempt=1, max_attempt=3)
+        event = runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(store, threads=2))
+        assert event is not None and event.kind is EventKind.FINISHED, event
+        found.append(
+            (task.stage, load_shard(store, task.stage, task.output), load_manifest(store, task.stage, task.output))
+        )
+    return job, found
+
+
+@pytest.mark.parametrize(
+    "request_of", [{"scenes": 2}, {"scene": "table", "scenes": 2, "budget": 20}], ids=["scenes after", "scenes before"]
+)
+def test_a_range_is_its_batches_one_after_the_other(request_of: dict[str, Any]) -> None:
+    apart = made(open_store("memory://"), 1, grasps=2 * SIZE + 1, **request_of)[1]
+    _, together = made(open_store("memory://"), 3, grasps=2 * SIZE + 1, **request_of)
+    assert len(apart) == 3 * len(together) == 6
+    for stage, whole, manifest in together:
+        parts = [shard for of, shard, _ in apart if of is stage]
+        of_parts = [one for of, _, one in apart if of is stage]
+        scenes = (
+            np.cumsum([0, *(len(part["scene/object_pose"]) for part in parts)])
+            if "scene/object_pose" in whole.arrays
+            else None
+        )
+        bases = np.cumsum([0, *(len(shard["grasp/hand_pose"]) for of, shard, _ in apart if of is Stage.SYNTHESIZE)])
+        assert whole.arrays.keys() == parts[0].arrays.keys()
+        for path, column in whole.arrays.items():
+            if path == "quality/thresholds_m":
+                np.testing.assert_array_equal(column, parts[0][path])
+                continue
+            pieces = [part[path] for part in parts]
+            if path == "grasp/scene_index":
+                assert scenes is not None
+                pieces = [piece + first for piece, first in zip(pieces, scenes, strict=False)]
+            elif path == "grasp/base_index":
+                pieces = [piece + first for piece, first in zip(pieces, bases, strict=False)]
+            np.testing.assert_array_equal(column, np.concatenate(pieces), err_msg=path)
+        assert manifest.batches == 3
+        assert manifest.valid == sum(one.valid for one in of_parts)
+        assert manifest.tried == sum(one.tried for one in of_parts)
+        if stage is Stage.SYNTHESIZE:
+            assert whole.attributes["batch_rows"] == str([one.count for one in of_parts])
+            assert manifest.info["planned"] == sum(one.info["planned"] for one in of_parts)
+            assert manifest.grasps == sum((one.grasps for one in of_parts), ())
+
+
+def test_a_base_shard_of_other_batches_is_refused() -> None:
+    job, ((_, base, _),) = made(open_store("memory://"), 2, grasps=2 * SIZE)
+    (task,) = plan(job)
+    message = message_of(job, task, attempt=1, max_attempt=1).model_copy(update={"inputs": ("a" * 32,)})
+    assert base_rows(base, message) == [range(SIZE), range(SIZE, 2 * SIZE)]
+    assert [(one.batch, one.count) for one in batches_of(message)] == [(0, SIZE), (1, SIZE)]
+    with pytest.raises(DamagedShard, match="2 batches"):
+        base_rows(base, message.model_copy(update={"count": 3 * SIZE}))
+
+
+def test_a_range_tells_how_far_it_is_and_stops_where_it_is_told_to() -> None:
+    store = open_store("memory://")
+    job, _ = made(store, 2, grasps=2 * SIZE, want="raw")
+    message = message_of(job, next(plan(job)), attempt=1, max_attempt=1)
+    told: list[float] = []
+
+    def tell(done: float, total: float, _: str) -> float:
+        told.append(done / total)
+        if len(told) == stops_at:
+            context.stop(StopReason.CANCELLED)
+        return 1e-9
+
+    for stops_at in (0, 1):
+        told.clear()
+        context = TaskContext(store, threads=2, tell=tell)
+        if stops_at:
+            with pytest.raises(TaskCancelled):
+                synthesize.run(message, context)
+            assert told[-1] < 0.5, "it ends in its first batch"
+        else:
+            synthesize.run(message, context)
+            assert told == sorted(told)
+            assert any(0 < share < 0.5 for share in told) and any(0.5 < share < 1 for share in told)
+
+
+@pytest.mark.parametrize(("refused", "rows"), [({1}, f"[{SIZE}, 0, 1]"), ({0}, ""), ({0, 1, 2}, "")])
+def test_a_batch_whose_scenes_leave_no_place_has_no_grasps_but_for_the_first_of_a_job(
+    monkeypatch: pytest.MonkeyPatch, refused: set[int], rows: str
+) -> None:
+    """As where none is found within the budget: the grasps of the other batches stay."""
+    whole = certified.certified_grasps
+
+    def some(*given: Any, batch: int, **options: Any) -> Any:
+        if batch in refused:
+            raise NoPlace("no hand finds a way in")
+        return whole(*given, batch=batch, **options)
+
+    monkeypatch.setattr("worker.together.certified_grasps", some)
+    asked = {"grasps": 2 * SIZE + 1, "scene": "table", "scenes": 2, "budget": 20}
+    if not rows:
+        with pytest.raises(AssertionError, match="no hand finds a way in"):
+            made(open_store("memory://"), 3, **asked)
+        return
+    _, (_, (_, base, manifest)) = made(open_store("memory://"), 3, **asked)
+    assert base.attributes["batch_rows"] == rows
+    assert set(base["grasp/scene_index"]) <= {0, 1, 4, 5}, "the scenes of the batch are there, and empty"
+    assert len(base["scene/object_pose"]) == 6
+    assert manifest.count == SIZE + 1
