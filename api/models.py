@@ -120,9 +120,6 @@ class GraspQuery(BaseModel):
     )
     neighbours: bool | None = Field(None, description="whether other objects stood in that scene")
     lift_hard: bool | None = Field(None, description="lifted at half the friction")
-    pushes_held: bool | None = Field(
-        None, description="planned in a scene, and holds against the six pushes without it"
-    )
     robust_weakest: Literal[WORDS] | None = Field(  # type: ignore[valid-type]
         None, description="axis of the first model around the nominal one in which it does not hold"
     )
@@ -166,7 +163,6 @@ class GraspScene(BaseModel):
     clearance_m: float | None = Field(None, description="least distance of the hand from what stands there, on its way")
     lift: str | None = Field(None, description="what the lift test came to; None: not tried")
     lift_hard: bool | None = Field(None, description="whether it lifts at half the friction; None: not tested")
-    pushes: bool | None = Field(None, description="whether it holds the six pushes; None: not tested")
 
 
 class Push(BaseModel):

@@ -64,7 +64,7 @@ def _batch_of_grasps(message: TaskMessage, context: TaskContext) -> Output:
     }
     if message.request.in_scene:
         assert context.store.exists(names.shard_manifest(Stage.SCENE, message.inputs[0]))
-        quality |= {"quality/clearance_m": rng.random(n), "quality/lift_hard": valid, "quality/pushes": 1 - valid}
+        quality |= {"quality/clearance_m": rng.random(n), "quality/lift_hard": valid}
     return Output({**postures, **quality}, {"joint_names": ["a", "b"]})
 
 

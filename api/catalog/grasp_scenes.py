@@ -56,7 +56,6 @@ def scene(file: Shard, row: int) -> GraspScene | None:
         clearance_m=clearance if math.isfinite(clearance) else None,
         lift=LIFT_OUTCOMES.get(tried, "unknown") if tried else None,
         lift_hard=_verdict(file, "quality/lift_hard", row),
-        pushes=_verdict(file, "quality/pushes", row),
     )
 
 

@@ -144,7 +144,6 @@ def _bounded(query: GraspQuery) -> GraspFilter:
         neighbours=query.neighbours,
         lift_hard=query.lift_hard,
         judged=query.judged,
-        pushes_held=query.pushes_held,
         robust_weakest=query.robust_weakest,
         at_least=bounds["min"],
         at_most=bounds["max"],

@@ -37,7 +37,6 @@ class GraspFilter(Model):
     neighbours: bool | None = None
     """Whether other objects stood in that scene."""
     lift_hard: bool | None = None
-    pushes_held: bool | None = None
     robust_weakest: str | None = None
     """Axis of the first model in which it does not hold."""
     at_least: dict[Metric, float] = Field(default_factory=dict)

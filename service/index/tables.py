@@ -170,7 +170,6 @@ grasps: Final = Table(
     Column("scene_kind", String(8), nullable=False, server_default="free"),
     Column("neighbours", Integer, nullable=False, server_default="0"),
     Column("lift_hard", Boolean),
-    Column("pushes_held", Boolean),
     Column("robust_weakest", String(16)),
     Column("created", String(32), nullable=False),
     *(Index(f"grasps_{name}", name, "shard_id", "row") for name in (*METRICS, "created")),

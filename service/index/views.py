@@ -161,9 +161,6 @@ class GraspView(View):
     scene_kind: str = Field("free", description="kind of the scene it was planned in; free: around a floating object")
     neighbours: int = Field(0, description="other objects that stood in that scene")
     lift_hard: bool | None = Field(None, description="in a scene: lifted at half the friction; None: not tested")
-    pushes_held: bool | None = Field(
-        None, description="in a scene: held against the six pushes without it; None: not tested"
-    )
     robust_weakest: str | None = Field(
         None, description="axis of the first model in which it does not hold; None: held in all, or not judged there"
     )

@@ -29,7 +29,6 @@ _FLAGS: Final = {
     "held": "quality/success",
     "lift": "quality/lift_outcome",
     "lift_hard": "quality/lift_hard",
-    "pushes": "quality/pushes",
 }
 
 

@@ -174,7 +174,12 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "N", "i1", "bool", "none", "lift test at half the friction: 1 lifted, 0 not, -1 not tested", optional=True
         ),
         "quality/pushes": Column(
-            "N", "i1", "bool", "none", "six pushes without the scene: 1 held, 0 dropped, -1 not tested", optional=True
+            "N",
+            "i1",
+            "bool",
+            "none",
+            "of files of 0.2, six pushes without the scene: 1 held, 0 dropped, -1 not tested",
+            optional=True,
         ),
     },
     "scene": {

@@ -41,7 +41,6 @@ class GraspSummary(BaseModel):
     success: bool | None = None
     verdict_level: str | None = Field(None, description="level of the referee that gave `success`")
     lift_hard: bool | None = Field(None, description="in a scene: lifted at half the friction")
-    pushes_held: bool | None = Field(None, description="in a scene: held against the six pushes without it")
     robust_weakest: str | None = Field(
         None, description="axis of the first model in which it does not hold; None: held in all, or not judged there"
     )
@@ -184,8 +183,7 @@ def summarise(
     columns["success"] = [_verdict(int(v)) for v in arrays.get("quality/success", np.full(count, -1))]
     level = (attributes or {}).get("verdict_level")
     columns["verdict_level"] = [None if verdict is None else level for verdict in columns["success"]]
-    for name, path in (("lift_hard", "quality/lift_hard"), ("pushes_held", "quality/pushes")):
-        columns[name] = [_verdict(int(v)) for v in arrays.get(path, np.full(count, -1))]
+    columns["lift_hard"] = [_verdict(int(v)) for v in arrays.get("quality/lift_hard", np.full(count, -1))]
     columns["robust_weakest"] = [axis_word(int(v)) for v in arrays.get("quality/robust_weakest", np.zeros(count))]
     rows = zip(*columns.values(), strict=True)
     return float(thresholds[at]), tuple(GraspSummary(**dict(zip(columns, row, strict=True))) for row in rows)

@@ -121,7 +121,7 @@ def conditions(where: GraspFilter | None) -> list[Test]:
     for name, wanted in (("hand", where.hand), ("object", where.object)):
         if wanted is not None:
             found.append(Condition("pair", grasps.c[name], operator.eq, wanted))
-    flags = {name: getattr(where, name) for name in ("valid", "success", "lift_hard", "pushes_held")}
+    flags = {name: getattr(where, name) for name in ("valid", "success", "lift_hard")}
     found += [Condition("flag", grasps.c[name], is_, flag) for name, flag in flags.items() if flag is not None]
     # What nobody judged was not rejected.
     judged = True if where.valid is False else where.judged

@@ -26,7 +26,6 @@ _FLAGS: Final[dict[str, Callable[[Columns], ColumnElement[bool]]]] = {
     # What judges a grasp that was planned in a scene is the lift.
     "lift": lambda grasps: and_(grasps.scene_kind != "free", grasps.success.is_(True)),
     "lift_hard": lambda grasps: grasps.lift_hard.is_(True),
-    "pushes": lambda grasps: grasps.pushes_held.is_(True),
 }
 
 
