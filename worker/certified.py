@@ -36,7 +36,7 @@ from worker.quality.referee.first.screening import first_terms
 from worker.quality.referee.judge import judge
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lift import LiftOutcome
-from worker.quality.referee.lifting import KnownLifts, judge_lifts, lift_key
+from worker.quality.referee.lifting import judge_lifts, lift_key
 from worker.quality.referee.limit import Limit, limit_of
 from worker.quality.referee.payload import payloads
 from worker.quality.referee.protocol import DIRECTIONS, Outcome
@@ -200,8 +200,8 @@ class _Work:
         self.tried = self.repeated = 0
         self.limit: Limit | None = None
         self._trials: Trial | None = None
-        self._lifts: KnownLifts = {}
-        """What candidates were lifted by the planner's trial."""
+        self._known: dict[str, Any] = {}
+        """Verdicts on candidates from the planner's trial, of lifts or of pushes."""
         self._audits: Future[NDArray[np.int8]] | None = None
         self._kept = np.zeros((0, POINTS, 3))
         self.seconds: dict[str, float] = {"planner": 0.0, "referee": 0.0, "quality": 0.0}
@@ -371,8 +371,8 @@ class _Work:
                 self.obj,
                 self.pieces.result,
                 in_scenes=in_scenes,
-                known=self._lifts,
-                level=lift_level(self.request.referee),
+                known=self._known,
+                level=self._level,
             )
         return self._trials
 
@@ -447,7 +447,7 @@ class _Work:
         began = time.perf_counter()
         grasps, columns, counts = scene_verdicts(
             self.hand, self.obj, grasps, scenes, level=lift_level(self.request.referee), pieces=pieces,
-            known=self._lifts, run=run.part(*_PARTS[:2]),
+            known=self._known, run=run.part(*_PARTS[:2]),
         )  # fmt: skip
         seconds["referee"] += time.perf_counter() - began
         return grasps, columns, counts
@@ -457,7 +457,7 @@ class _Work:
             return {}
         verdicts = judge(
             self.hand, self.obj, grasps, level=self._level, pieces=self.pieces.result(),
-            run=run.part(*_PARTS[:2]),
+            known=self._known, run=run.part(*_PARTS[:2]),
         )  # fmt: skip
         seconds["referee"] += verdicts.seconds
         return {

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,13 @@ from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
+from worker.quality.referee.judge import KnownTrials, judge
+from worker.quality.referee.key import Level
 from worker.quality.referee.lift import LiftOutcome
 from worker.quality.referee.lifting import KnownLifts, LiftLevel, judge_lifts
 from worker.quality.referee.short import SLIPS, ShortLifts, push_trial
 from worker.run import Run
+from worker.scenes.verdicts import lift_level
 from worker.scenes.way import plan_way
 from worker.simulation.surroundings import Placed
 
@@ -43,10 +46,10 @@ def trial_on(
     pieces: Callable[[], ConvexPieces],
     *,
     in_scenes: bool,
-    known: KnownLifts | None = None,
-    level: LiftLevel = "lift",
+    known: dict[str, Any] | None = None,
+    level: Level = "certificate",
 ) -> Callable[[GraspSet, Placed | None, Floats], Floats] | None:
-    """The trial for what `run` plans on; None: the planner's own merit chooses.
+    """The trial for what `run` plans on; None: the planner's own merit chooses. `known` keeps the verdicts of `level`.
 
     Around free objects a GPU plans faster than the processor tries; in scenes it waits, for all threads that there are.
     """
@@ -56,8 +59,37 @@ def trial_on(
         if not in_scenes:
             return None
     if not in_scenes:
-        return push_trial(hand, obj, pieces)
-    return lift_trial(hand, obj, pieces, threads=threads, known=known, level=level)
+        return hold_trial(hand, obj, pieces, known=known, level=level)
+    return lift_trial(hand, obj, pieces, threads=threads, known=known, level=lift_level(level))
+
+
+def hold_trial(
+    hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, known: KnownTrials | None = None,
+    level: Level = "certificate",
+) -> Callable[[GraspSet, Placed | None, Floats], Floats]:  # fmt: skip
+    """A trial of free grasps as `worker.planners.Wanted` takes it: (N,) scores of short pushes, below 2 for grasps that
+    hold the object against the six pushes as well.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        pieces: gives the object's convex pieces when they are first needed.
+        known: keeps the verdicts, for the referee.
+        level: of the verdicts.
+    """
+    short, run = push_trial(hand, obj, pieces), Run(threads=1)
+
+    def trial(grasps: GraspSet, placed: Placed | None, beat: Floats | None = None) -> Floats:
+        grasps = grasps.moved(np.zeros(3))
+        score = short(grasps, placed, np.zeros(0))
+        held = np.flatnonzero(score < SLIPS + 1.0)
+        if len(held):
+            verdicts = judge(hand, obj, grasps.take(held), level=level, pieces=pieces(), known=known, run=run)
+            fell = held[verdicts.success != 1]
+            score[fell] = SLIPS + 1.0 + FALLS * np.minimum(score[fell], 1.0)
+        return score
+
+    return trial
 
 
 def lift_trial(

@@ -1,4 +1,4 @@
-"""The trial of candidates in a scene is the lift test itself, which is then not done again."""
+"""The trial of candidates is the test of the referee itself, which is then not done again."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ import pytest
 from tests.worker.quality.test_lift import BOX, HAND, PLACED, WHOLE, grasp
 from tests.worker.quality.test_short_tests import LEAST
 from worker.grasps import joined
+from worker.quality.referee.judge import KnownTrials, judge
 from worker.quality.referee.lift import Lift
 from worker.quality.referee.lifting import KnownLifts, judge_lifts
+from worker.quality.referee.protocol import Test
 from worker.quality.referee.short import SLIPS, ShortLifts
 from worker.scenes import trial as trials
-from worker.scenes.trial import BEST, FALLS, TOUCHES, lift_trial
+from worker.scenes.trial import BEST, FALLS, TOUCHES, hold_trial, lift_trial
 from worker.simulation.surroundings import Placed
 
 SQUEEZES = (-0.005, 1.3 * LEAST, 4 * LEAST)
@@ -98,3 +100,25 @@ def test_a_hand_that_must_lift_at_half_the_friction_to_be_better_and_does_not_is
     outcomes = {True: [LIFTED, FELL], False: [LIFTED, LIFTED]}
     found = trial_of(monkeypatch, [0.2, 0.3], outcomes, np.array([1.5, 1.5]))
     assert found == pytest.approx([0.2, 1.5])
+
+
+@pytest.mark.parametrize(("verdict", "score"), [(1, 0.2), (0, SLIPS + 1.0 + FALLS * 0.2)])
+def test_a_free_grasp_that_the_referee_drops_is_no_good_candidate(
+    monkeypatch: pytest.MonkeyPatch, verdict: int, score: float
+) -> None:
+    monkeypatch.setattr(trials, "push_trial", lambda *_: lambda grasps, *_: np.array([0.2, 4.0, 4.0]))
+    monkeypatch.setattr(trials, "judge", lambda *_, **__: type("Verdicts", (), {"success": np.array([verdict])}))
+    assert hold_trial(HAND, BOX, lambda: WHOLE)(MANY, None).tolist() == pytest.approx([score, 4.0, 4.0])
+
+
+def test_a_verdict_that_is_known_is_not_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows: list[int] = []
+    certificate = Test.certificate
+    monkeypatch.setattr(Test, "certificate", lambda self, given, row: rows.append(row) or certificate(self, given, row))
+    known: KnownTrials = {}
+    first = judge(HAND, BOX, MANY, pieces=WHOLE, known=known)
+    again = judge(HAND, BOX, MANY.take(np.array([2, 0])), pieces=WHOLE, known=known)
+    assert sorted(rows) == [0, 1, 2]
+    assert np.array_equal(again.outcome, first.outcome[[2, 0]])
+    judge(HAND, BOX, MANY, pieces=WHOLE, hard=True, known=known)
+    assert len(rows) == 6

@@ -26,7 +26,7 @@ TOGETHER: Final = 2
 HOPEFUL: Final = 0.3
 #: Score beyond which that of a grasp is as good as nothing: lost, or its way is blocked.
 POOR: Final = 7.0
-#: A hand in a scene that does not lift at half the friction, but nearly, is tried once more with so much of the force.
+#: A hand that does not hold at half the friction, but nearly, is tried once more with so much of the force.
 #: 140 hands of Shadow lift .80 with all of it, .83 with half, .92 with the better of these; twice as much helps few.
 GENTLER: Final = 0.5
 NEARLY: Final = 2.5
@@ -117,8 +117,7 @@ def tried(
                 hand, obj, seated.state[rows[open_]], seated.losses[rows[open_]], where, device=device
             )  # fmt: skip
             score = _scores(found, seated.unsound[rows[open_]], which, taken.score[which], trial)
-            if placed is not None:
-                _gentler(hand, obj, found, score, which, trial, device)
+            _gentler(hand, obj, found, score, which, trial, device)
             _take(found, seated, rows[open_], which, score, taken)
         left = left[~(taken.score[left] < 1.0)]
     return taken

@@ -33,6 +33,8 @@ log = logging.getLogger(__name__)
 #: Grasps that a process of a pool judges at a time: few, so that those of one batch are shared by many processes.
 _CHUNK: Final = 2
 LEVELS: Final = ("letter", "certificate", "screen")
+#: Trials that were done, by `postures_key` of one grasp.
+KnownTrials = dict[str, Trial]
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,7 @@ def judge(
     hard: bool = False,
     pieces: ConvexPieces | None = None,
     cache: Path | None = None,
+    known: KnownTrials | None = None,
     run: Run = ALONE,
 ) -> Verdicts:
     """Test grasps by the DexGraspBench force-closure protocol; see `worker.quality.referee.protocol` for the levels.
@@ -108,6 +111,7 @@ def judge(
         hard: sliding friction halved, torsional friction a tenth.
         pieces: convex pieces of the object; by default its CoACD pieces.
         cache: folder of the pieces, see `decompose`.
+        known: trials of the CPU on these terms that are not done again; others are added.
         run: told of grasps done; asked between grasps whether to stop.
 
     Raises:
@@ -126,7 +130,13 @@ def judge(
     terms = verdict_key(hand, obj, level, hard, pieces=pieces, first_judge=first_judge)
     first = screened(case.scene, terms, grasps, level=level, run=run) if first_judge else Screened({}, {})
     trials = dict(first.stands)
-    _try(case, grasps, [row for row in range(len(grasps)) if row not in trials], trials, run)
+    left = [row for row in range(len(grasps)) if row not in trials]
+    keys = {} if known is None else {row: postures_key(terms, grasps.take(slice(row, row + 1))) for row in left}
+    if known is not None:
+        trials |= {row: known[key] for row, key in keys.items() if key in known}
+    _try(case, grasps, [row for row in left if row not in trials], trials, run)
+    if known is not None:
+        known |= {key: trials[row] for row, key in keys.items()}
     contradicted = first.contradicted(trials)
     if not first.believed(contradicted):
         log.warning("%d of %d audited verdicts are contradicted: the CPU judges all", contradicted, len(first.audited))

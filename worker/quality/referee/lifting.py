@@ -20,7 +20,7 @@ from worker.quality import postures
 from worker.quality.referee import lift as protocol
 from worker.quality.referee.compiled import scene_of
 from worker.quality.referee.decomposition import ConvexPieces, decompose
-from worker.quality.referee.key import verdict_key
+from worker.quality.referee.key import postures_key, verdict_key
 from worker.quality.referee.lift import Lift, LiftOutcome, LiftTrial
 from worker.quality.referee.model import TOUCH_ROUNDING_M, MujocoOptions
 from worker.quality.referee.threads import answers
@@ -127,11 +127,10 @@ def judge_lifts(
 def lift_of(grasps: GraspSet, row: int, placed: Placed, *, hard: bool) -> str:
     """Digest of all that a lift of one grasp depends on besides hand, object, level and fixed surroundings."""
     number = int(placed.index[row])
-    parts = [part.take(slice(row, row + 1)) for part in (grasps.pregrasp, grasps.grasp, grasps.squeeze)]
-    numbers = [array for part in parts for array in (part.hand_pose, part.joint_positions)]
-    numbers += [array[row] for array in (grasps.approach, grasps.coming) if array is not None]
-    numbers += [placed.object_pose[number], placed.scenes[number].up, *placed.neighbours_of(number)]
-    return digest_bytes(b"".join(np.asarray(array, float).tobytes() for array in numbers) + bytes([hard]))
+    around = [array[row] for array in (grasps.approach, grasps.coming) if array is not None]
+    around += [placed.object_pose[number], placed.scenes[number].up, *placed.neighbours_of(number)]
+    terms = digest_bytes(b"".join(np.asarray(array, float).tobytes() for array in around) + bytes([hard]))
+    return postures_key(terms, grasps.take(slice(row, row + 1)))
 
 
 def require_ways(grasps: GraspSet, placed: Placed, level: LiftLevel) -> None:
