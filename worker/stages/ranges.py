@@ -20,6 +20,8 @@ from worker.stages.output import Output
 
 #: Axes whose rows are those of one batch after the other; what has another axis is common to all.
 _ROWS: Final = ("N", "S", "K")
+#: Columns that only some batches of a job have, with what stands in the rows of the others.
+_OF_SOME: Final = {"quality/audit": np.int8(-1)}
 
 
 def sizes_of(message: TaskMessage) -> list[int]:
@@ -40,7 +42,7 @@ def joined(message: TaskMessage, made: Sequence[Output], *, base_rows: Sequence[
 
     Args:
         message: the task.
-        made: of each of its batches, with the same columns.
+        made: of each of its batches, with the same columns but for audits.
         base_rows: rows of each batch in the base shard, where columns number these.
     """
     if len(made) == 1:
@@ -51,11 +53,11 @@ def joined(message: TaskMessage, made: Sequence[Output], *, base_rows: Sequence[
     if "scene/object_pose" in parts[0]:
         firsts["grasp/scene_index"] = _starts([len(part["scene/object_pose"]) for part in parts])
     columns: dict[str, NDArray[Any]] = {}
-    for path, column in parts[0].items():
+    for path in dict.fromkeys(path for part in parts for path in part):
         if schema[path].shape.split()[0] not in _ROWS:
-            columns[path] = column
+            columns[path] = parts[0][path]
             continue
-        rows: list[NDArray[Any]] = [part[path] for part in parts]
+        rows: list[NDArray[Any]] = [part[path] if path in part else _without(path, part) for part in parts]
         if first := firsts.get(path):
             rows = [numbers + start for numbers, start in zip(rows, first, strict=True)]
         columns[path] = np.concatenate(rows)
@@ -76,6 +78,10 @@ def base_rows(base: Shard, message: TaskMessage) -> list[range]:
     if len(counts) != len(sizes_of(message)):
         raise DamagedShard(f"shard {message.inputs[0]} has {len(counts)} batches, not {len(sizes_of(message))}")
     return [range(start, start + count) for start, count in zip(_starts(counts), counts, strict=True)]
+
+
+def _without(path: str, part: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+    return np.full(len(part["grasp/hand_pose"]), _OF_SOME[path])
 
 
 def _summed(told: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
