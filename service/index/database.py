@@ -25,7 +25,7 @@ from service.model.errors import IndexDamaged, IndexUnavailable, InputError
 log = logging.getLogger(__name__)
 T = TypeVar("T")
 #: Revision of `service.index.tables`: another number for every change of them but for new metrics.
-REVISION: Final = "0020"
+REVISION: Final = "0021"
 #: Table that names the revision. A graspd of 0.2 reads it, and refuses an index of a revision that it does not know.
 REVISION_TABLE: Final = "alembic_version"
 #: A job of a million grasps is one transaction of a few seconds; others wait for it.
