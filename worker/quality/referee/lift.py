@@ -200,12 +200,10 @@ class Lift(Test):
         return bool((distance < -allowed)[on_support].any() or (distance[of_hand & ~on_support] < -OVERHANG_M).any())
 
     def _rise(self, grasps: GraspSet, row: int, path: Floats = SMOOTHLY, step_s: float = RISING_S) -> None:
-        squeeze = grasps.squeeze.take(slice(row, row + 1))
-        pose = squeeze.hand_pose.copy()
-        pose[:, :3] += RISE_M * self._up
-        raised = Posture(pose, squeeze.joint_positions)
+        root = np.asarray(grasps.squeeze.hand_pose[row], float)
+        self.scene.command(self.data, root, grasps.squeeze.joint_positions[row])
         for share in path:
-            self.scene.command(self.data, *blend(squeeze, raised, 0, float(share)))
+            self.data.mocap_pos[0] = root[:3] + share * RISE_M * self._up
             self._run(step_s)
         self._goal = RISE_M * self._up
 
