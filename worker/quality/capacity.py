@@ -12,7 +12,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linprog
 
 from service.model.matter import ACCELERATION
 from service.model.transforms import cross
@@ -76,6 +75,8 @@ def _limits(hand: HandModel, q: Floats) -> Floats:
 
 def _load(forces: Floats, moments: Floats, torques: Floats, efforts: Floats, along: Floats) -> float:
     """Largest weight [N] that edges of pyramids, of forces (E, 3), moments (E, 3) and torques (E, D), balance."""
+    from scipy.optimize import linprog
+
     count = len(forces)
     balance = np.column_stack([np.hstack([forces, moments]).T, -np.concatenate([along, np.zeros(3)])])
     exerted = np.column_stack([np.vstack([torques.T, -torques.T]), np.zeros(len(efforts))])

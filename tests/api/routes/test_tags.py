@@ -83,7 +83,7 @@ def test_all_that_pass_a_filter_are_tagged(http: TestClient, made: ShardManifest
         "type = power or type = 'lateral' and not held",
         "hand = allegro and object != mug",
         "robust >= 0 or not robust < 1",
-        "lift or lift_hard or pushes or clearance_m > -1",
+        "lift or lift_hard or clearance_m > -1",
     ],
 )
 def test_the_index_chooses_what_the_shards_choose(
