@@ -11,6 +11,7 @@ import pytest
 
 from service.index.rebuild import differences
 from service.model import names
+from service.model.errors import QueueUnavailable
 from service.model.states import State
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.status import status
@@ -43,6 +44,7 @@ def test_a_dataset_goes_on_after_everything_was_killed(start: Callable[..., Syst
             os.kill(pid, signal.SIGKILL)
     before = made(system)
     assert len(before) < 2 * len(OBJECTS)
+    system.until(lambda: _redis_answers(system), "Redis is started again")
     again, new = actions.create(system.parts, request)
     assert not new and not again.state.is_final
     system.hold.unlink()
@@ -72,6 +74,14 @@ def test_a_dataset_that_is_cancelled_stops_and_stays_so(start: Callable[..., Sys
     system.until(lambda: not differences(system.parts.index, system.parts.store), "the index is what the store says")
     states = {cell.state for cell in status(system.parts.index, "kitchen").cells}
     assert states == {State.SUCCEEDED, State.CANCELLED}
+
+
+def _redis_answers(system: System) -> bool:
+    try:
+        system.parts.queue.ping()
+    except QueueUnavailable:
+        return False
+    return True
 
 
 def _waits_for_nothing(system: System) -> bool:
