@@ -27,7 +27,7 @@ HOPEFUL: Final = 0.3
 #: Score beyond which that of a grasp is as good as nothing: lost, or its way is blocked.
 POOR: Final = 7.0
 #: A hand that does not hold at half the friction, but nearly, is tried once more with so much of the force.
-#: 140 hands of Shadow lift .80 with all of it, .83 with half, .92 with the better of these; twice as much helps few.
+#: 144 hands of Shadow lift .80 with all of it, .83 with half, .92 with the best of six forces.
 GENTLER: Final = 0.5
 NEARLY: Final = 2.5
 #: Score of what has none.
