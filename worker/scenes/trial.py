@@ -1,5 +1,5 @@
 """The trial that candidates of a grasp go through: in their scene a short lift, and a free way in and out; around a
-free object short pushes (`worker.quality.referee.short`)."""
+free object short pushes (`worker.quality.referee.short`). What passes goes through the referee's own test."""
 
 from __future__ import annotations
 
@@ -53,13 +53,10 @@ def trial_on(
 
     Around free objects a GPU plans faster than the processor tries; in scenes it waits, for all threads that there are.
     """
-    threads = 1
-    if run.device.startswith("cuda"):
-        threads = run.apart().cores
-        if not in_scenes:
-            return None
+    on_gpu = run.device.startswith("cuda")
     if not in_scenes:
-        return hold_trial(hand, obj, pieces, known=known, level=level)
+        return None if on_gpu else hold_trial(hand, obj, pieces, known=known, level=level)
+    threads = run.apart().cores if on_gpu else 1
     return lift_trial(hand, obj, pieces, threads=threads, known=known, level=lift_level(level))
 
 

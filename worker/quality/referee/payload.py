@@ -28,7 +28,7 @@ from worker.quality.referee.hanging import CLOSING, Hanging
 from worker.quality.referee.model import Scene
 from worker.quality.referee.protocol import DIRECTIONS, Outcome, Test
 from worker.quality.referee.short import LIFTING
-from worker.quality.referee.threads import answers
+from worker.quality.referee.threads import measured
 from worker.run import ALONE, Run
 from worker.simulation.surroundings import Placed
 
@@ -175,19 +175,10 @@ def payloads(
     Raises:
         TaskCancelled: when `run.cancelled()` answers True.
     """
-    out = np.full(len(grasps), np.nan)
-    rows = np.arange(len(grasps)) if held is None else np.flatnonzero(held)
-    if not len(rows):
-        return out
-    around = (placed.supports, placed.neighbours) if placed is not None else ()
-    scene = scene_of(hand, obj, pieces, LIFTING, *around)
-
-    def ask(test: LiftPayload | PushPayload, row: int) -> float:
-        run.check("the referee")
-        return test.payload(grasps, row)
 
     def make() -> LiftPayload | PushPayload:
+        around = (placed.supports, placed.neighbours) if placed is not None else ()
+        scene = scene_of(hand, obj, pieces, LIFTING, *around)
         return PushPayload(scene) if placed is None else LiftPayload(scene, placed)
 
-    out[rows] = answers(rows.tolist(), make, ask, threads=run.cores, name="payload")
-    return out
+    return measured(len(grasps), held, make, lambda test, row: test.payload(grasps, row), run=run, name="payload")

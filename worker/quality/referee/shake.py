@@ -23,7 +23,7 @@ from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.hanging import Hanging
 from worker.quality.referee.protocol import LOST
 from worker.quality.referee.short import LIFTING
-from worker.quality.referee.threads import answers
+from worker.quality.referee.threads import measured
 from worker.run import ALONE, Run
 from worker.simulation.surroundings import Placed
 
@@ -85,15 +85,8 @@ def shake_margins(
     Raises:
         TaskCancelled: when `run.cancelled()` answers True.
     """
-    out = np.full(len(grasps), np.nan)
-    rows = np.arange(len(grasps)) if held is None else np.flatnonzero(held)
-    if not len(rows):
-        return out
-    scene = scene_of(hand, obj, pieces, LIFTING, placed.supports, placed.neighbours)
 
-    def ask(test: Shake, row: int) -> float:
-        run.check("the referee")
-        return test.margin(grasps, row)
+    def make() -> Shake:
+        return Shake(scene_of(hand, obj, pieces, LIFTING, placed.supports, placed.neighbours), placed)
 
-    out[rows] = answers(rows.tolist(), lambda: Shake(scene, placed), ask, threads=run.cores, name="shake")
-    return out
+    return measured(len(grasps), held, make, lambda test, row: test.margin(grasps, row), run=run, name="shake")

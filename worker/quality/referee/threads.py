@@ -7,6 +7,11 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.run import Run
+
 Test = TypeVar("Test")
 Answer = TypeVar("Answer")
 
@@ -37,3 +42,32 @@ def answers(
 
     with ThreadPoolExecutor(workers, thread_name_prefix=name) as pool:
         return list(pool.map(work, rows))
+
+
+def measured(
+    count: int, held: NDArray[np.bool_] | None, make: Callable[[], Test], ask: Callable[[Test, int], float], *,
+    run: Run, name: str,
+) -> NDArray[np.float64]:  # fmt: skip
+    """(count,) what tests measure of the grasps that are `held` (count,), None: of all; nan of the others.
+
+    Args:
+        count: grasps.
+        held: which of them are tested.
+        make: makes a test; not called where there is nothing to test.
+        ask: asks a test of a grasp.
+        run: asked between grasps whether to stop.
+        name: of the threads.
+
+    Raises:
+        TaskCancelled: when `run.cancelled()` answers True.
+    """
+
+    def asked(test: Test, row: int) -> float:
+        run.check("the referee")
+        return ask(test, row)
+
+    out = np.full(count, np.nan)
+    rows = np.arange(count) if held is None else np.flatnonzero(held)
+    if len(rows):
+        out[rows] = answers(rows.tolist(), make, asked, threads=run.cores, name=name)
+    return out
