@@ -15,7 +15,7 @@ from worker.quality.probe import Probe
 from worker.scenes.clearance import MARGIN_M
 from worker.simulation.mounting import wrist_room
 from worker.simulation.obstacles import obstacle_room
-from worker.simulation.surroundings import STANDOFF_M, Surroundings
+from worker.simulation.surroundings import STANDOFF_M, Placed
 
 Floats = NDArray[np.float64]
 
@@ -37,24 +37,25 @@ OPENNESS: Final = (1.0, 0.5, 0.0)
 
 
 def come_open(
-    probe: Probe, pregrasp: Posture, wide: Floats, wrist: Floats, scene: Surroundings
+    probe: Probe, pregrasp: Posture, wide: Floats, wrist: Floats, placed: Placed
 ) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
     """Waypoints (n, W, 7), joints (n, J) of the hand that comes, the least distance of it and its mounting, at wrist
     angles (n, K), from obstacles (n,) and whether it touches the object (n,): wide open if it can, its fingers far from
     the object."""
     count = len(pregrasp)
+    up = np.array([scene.up for scene in placed.scenes])[placed.index]
     back = -quat_rotate(pregrasp.hand_pose[:, 3:], probe.hand.palm.approach)
     best, least, touching = np.full(count, -np.inf), np.zeros(count), np.ones(count, bool)
     chosen, joints = np.zeros((count, 3)), np.array(wide)
     open_ = np.arange(count)
     for openness in OPENNESS:
         for share in SHARES_UP:
-            way = (1 - share) * back[open_] + share * scene.up
+            way = (1 - share) * back[open_] + share * up[open_]
             length = np.linalg.norm(way, axis=1, keepdims=True)
-            way = np.where(length > 1e-6, way / np.maximum(length, 1e-6), scene.up)
+            way = np.where(length > 1e-6, way / np.maximum(length, 1e-6), up[open_])
             start = pregrasp.joint_positions[open_]
             opened = start + openness * (wide[open_] - start)
-            room, gap = _seen(probe, pregrasp.take(open_), opened, wrist[open_], way, scene)
+            room, gap = _seen(probe, pregrasp.take(open_), opened, wrist[open_], way, placed.take(open_))
             score = np.minimum(room, MARGIN_M) + 0.1 * np.minimum(gap, OBJECT_WANTED_M) - (gap < OBJECT_MARGIN_M)
             better = score > best[open_]
             rows = open_[better]
@@ -71,7 +72,7 @@ def come_open(
 
 
 def _seen(
-    probe: Probe, pregrasp: Posture, opened: Floats, wrist: Floats, way: Floats, scene: Surroundings
+    probe: Probe, pregrasp: Posture, opened: Floats, wrist: Floats, way: Floats, placed: Placed
 ) -> tuple[Floats, Floats]:
     """Least distance (n,) from obstacles of hands that come open along directions `way` (n, 3) on their mountings, and
     of hands from the object until they have closed to the pregrasp."""
@@ -82,12 +83,13 @@ def _seen(
     joints = opened[:, None] + share[:, None] * (pregrasp.joint_positions - opened)[:, None]
     postures = Posture(poses.reshape(-1, 7), joints.reshape(len(share) * count, -1))
     coming = np.tile(share == 0, count)
-    room = obstacle_room(probe.hand, postures.take(np.flatnonzero(coming)), [scene]).reshape(count, looks)
-    free = room.min(axis=1)
+    scenes, which = placed.scenes, np.asarray(placed.index, np.intp)
+    room = obstacle_room(probe.hand, postures.take(np.flatnonzero(coming)), scenes, np.repeat(which, looks))
+    free = room.reshape(count, looks).min(axis=1)
     rows = np.flatnonzero(free >= MARGIN_M)
     if (mounting := probe.hand.mounting) is not None and len(rows):
         # A mounting is thicker than a finger: it is looked at half as often, where the hand itself is clear.
-        mounted = wrist_room(mounting, poses[rows, :looks:2], wrist[rows], [scene], np.zeros(len(rows), np.intp))
+        mounted = wrist_room(mounting, poses[rows, :looks:2], wrist[rows], scenes, which[rows])
         free[rows] = np.minimum(free[rows], mounted)
     # What is farther than this counts alike.
     reach = OBJECT_WANTED_M + 2 * NEARER_M

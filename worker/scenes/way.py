@@ -22,7 +22,7 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.postures import wide_open
 from worker.quality.probe import Probe, probe_of
-from worker.scenes.clearance import MARGIN_M, approach
+from worker.scenes.clearance import MARGIN_M, PATH_POSTURES, approach
 from worker.scenes.coming import LOOKS, OBJECT_MARGIN_M, WAYPOINTS, come_open
 from worker.simulation.mounting import mounting_room
 from worker.simulation.obstacles import obstacle_room
@@ -79,37 +79,26 @@ class Way:
 def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed) -> Way:
     """The way of every grasp in its scene: the first direction of retreat that is free, or else the freest."""
     probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
-    count = len(grasps)
-    path = np.zeros((count, WAYPOINTS, 7))
-    contact, closing, coming, lifting, mounting = (np.full(count, np.inf) for _ in range(5))
-    wrist = np.zeros((count, 0 if hand.mounting is None else hand.mounting.dofs))
-    touching = np.zeros(count, bool)
-    raised = np.array(grasps.squeeze.hand_pose, float)
+    count, scenes, which = len(grasps), placed.scenes, np.asarray(placed.index, np.intp)
+    rise = RISE_M * np.array([scene.up for scene in scenes])[which]
     wide = wide_open(hand, obj, grasps.pregrasp, placed)
-    came = np.array(wide)
-    for number, scene in enumerate(placed.scenes):
-        rows = np.flatnonzero(placed.index == number)
-        if not len(rows):
-            continue
-        mine = grasps.take(rows)
-        closing_hand = approach(mine.grasp, mine.pregrasp)
-        between = obstacle_room(hand, closing_hand, [scene]).reshape(len(rows), -1)
-        rise = RISE_M * scene.up
-        raised[rows, :3] += rise
-        lifted = np.repeat(mine.grasp.hand_pose[:, None], WAYPOINTS, axis=1)
-        lifted[..., :3] += np.linspace(0, 1, WAYPOINTS)[:, None] * rise
-        taken = np.concatenate([closing_hand.hand_pose.reshape(len(rows), -1, 7)[:, ::4], lifted], axis=1)
-        wrist[rows], mounting[rows] = mounting_room(hand, taken, [scene])
-        path[rows], came[rows], coming[rows], touching[rows] = come_open(
-            probe, mine.pregrasp, wide[rows], wrist[rows], scene
-        )
-        opened = Posture(mine.pregrasp.hand_pose, came[rows])
-        before = obstacle_room(hand, approach(mine.pregrasp, opened), [scene]).reshape(len(rows), -1)
-        contact[rows], closing[rows] = between[:, -1], np.minimum(between.min(axis=1), before.min(axis=1))
-        joints = np.repeat(mine.grasp.joint_positions, WAYPOINTS, axis=0)
-        lifting[rows] = (
-            obstacle_room(hand, Posture(lifted.reshape(-1, 7), joints), [scene]).reshape(len(rows), -1).min(axis=1)
-        )
+
+    def room(postures: Posture, steps: int = PATH_POSTURES) -> Floats:
+        return obstacle_room(hand, postures, scenes, np.repeat(which, steps)).reshape(count, steps)
+
+    closing_hand = approach(grasps.grasp, grasps.pregrasp)
+    between = room(closing_hand)
+    lifted = np.repeat(grasps.grasp.hand_pose[:, None], WAYPOINTS, axis=1)
+    lifted[..., :3] += np.linspace(0, 1, WAYPOINTS)[:, None] * rise[:, None]
+    taken = np.concatenate([closing_hand.hand_pose.reshape(count, PATH_POSTURES, 7)[:, ::4], lifted], axis=1)
+    wrist, mounting = mounting_room(hand, taken, scenes, which)
+    path, came, coming, touching = come_open(probe, grasps.pregrasp, wide, wrist, placed)
+    before = room(approach(grasps.pregrasp, Posture(grasps.pregrasp.hand_pose, came)))
+    joints = np.repeat(grasps.grasp.joint_positions, WAYPOINTS, axis=0)
+    lifting = room(Posture(lifted.reshape(-1, 7), joints), WAYPOINTS).min(axis=1)
+    contact, closing = between[:, -1], np.minimum(between.min(axis=1), before.min(axis=1))
+    raised = np.array(grasps.squeeze.hand_pose, float)
+    raised[:, :3] += rise
     lift = Posture(moved(raised, np.zeros(3)), np.array(grasps.squeeze.joint_positions, float))
     return Way(moved(path, np.zeros(3)), came, lift, contact, closing, coming, lifting, touching, wrist, mounting)
 

@@ -35,7 +35,7 @@ MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
     matter: ("ACCELERATION",),
     model: (
         "FRICTION", "HARD", "DAMPING_TIME", "HAND_SOLIMP", "HAND_SOLREF", "COUPLING_SOLREF",
-        "COUPLING_SOLIMP", "NOT_IN_3_3_2", "_BARE_RADIUS", "_MIN_MASS",
+        "COUPLING_SOLIMP", "NOT_IN_3_3_2", "SPARSE", "_BARE_RADIUS", "_MIN_MASS",
     ),
     opening: (
         "CLEARANCE_M", "STUCK_M", "PALM_CLEARANCE_M", "PLAIN_OPENING", "OPENING_STEP", "SLIDING_STEP_M",

@@ -50,6 +50,8 @@ OVERHANG_M: Final = 0.002
 #: asks the hand for 25 m/s2.
 RISING: Final = 100
 RISING_S: Final = 0.008
+#: Steps of the rise between two looks for an object that is lost.
+LOSSES: Final = 5
 SMOOTHLY: Final = np.asarray(np.polyval([6, -15, 10, 0, 0, 0], np.linspace(0, 1, RISING + 1)[1:]), float)
 
 
@@ -200,12 +202,15 @@ class Lift(Test):
         return bool((distance < -allowed)[on_support].any() or (distance[of_hand & ~on_support] < -OVERHANG_M).any())
 
     def _rise(self, grasps: GraspSet, row: int, path: Floats = SMOOTHLY, step_s: float = RISING_S) -> None:
+        """The root to the top, or, but for the letter, to where the object is lost."""
         root = np.asarray(grasps.squeeze.hand_pose[row], float)
         self.scene.command(self.data, root, grasps.squeeze.joint_positions[row])
-        for share in path:
-            self.data.mocap_pos[0] = root[:3] + share * RISE_M * self._up
+        for number, share in enumerate(path):
+            self._goal = share * RISE_M * self._up
+            self.data.mocap_pos[0] = root[:3] + self._goal
             self._run(step_s)
-        self._goal = RISE_M * self._up
+            if self._in_hand and number % LOSSES == 0 and self._lost():
+                break
 
     def _offset(self) -> Floats:
         """(3,) of the object's frame from where it should be [m]."""

@@ -42,7 +42,7 @@ SURE: Final = 0.5
 STILL: Final = 0.5
 #: Excess of what is no number any more.
 LOST: Final = 10.0
-#: The object is lost while closing beyond this; no grasp that passes was ever seen past half of it.
+#: The object is lost while closing or rising beyond this; no grasp that passes was ever seen past half of it.
 LOST_ROTATION: Final = math.radians(30.0)
 #: Coarse physics are trusted where their worst displacement or rotation over its limit is outside this band. What they
 #: wrongly accept moves little in them: a band that begins at 0.7 of the limit leaves nearly twice as many.
@@ -182,11 +182,13 @@ class Test:
         for hand_pose, joints in self._way(grasps, row, stages):
             self.scene.command(self.data, hand_pose, joints)
             self._run(STAGE_S)
-            if give_up:
-                moved, turned = self._motion()
-                if moved > MAX_DISPLACEMENT_M or turned > LOST_ROTATION:
-                    return False
+            if give_up and self._lost():
+                return False
         return True
+
+    def _lost(self) -> bool:
+        moved, turned = self._motion()
+        return moved > MAX_DISPLACEMENT_M or turned > LOST_ROTATION
 
     def _way(self, grasps: GraspSet, row: int, stages: int = STAGES) -> Iterator[tuple[Floats, Floats]]:
         """Commanded postures (7,), (J,) from pregrasp over grasp to squeeze, one a stage."""
