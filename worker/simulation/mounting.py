@@ -11,7 +11,7 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, apply, spread_directions
+from service.model.transforms import IDENTITY_POSE, apply, quat_conjugate, quat_rotate, spread_directions
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
@@ -112,9 +112,13 @@ def point_room(mounting: HandModel, poses: Floats, scenes: Sequence[Surroundings
     out = np.full((len(poses), len(points)), np.inf)
     for scene in np.unique(which):
         rows = np.flatnonzero(which == scene)
-        place = apply(poses[rows][:, :, None, None], points)
+        place, flat = poses[rows][:, :, None], points.reshape(-1, 3).T
         for obstacle in scenes[scene].obstacles:
-            out[rows] = np.minimum(out[rows], obstacle.distance(place).min(axis=(1, 3)))
+            # Planes as the root sees them: points are many, planes few.
+            normals = quat_rotate(quat_conjugate(place[..., 3:]), obstacle.planes[:, :3])
+            shift = place[..., :3] @ obstacle.planes[:, :3].T - obstacle.planes[:, 3]
+            distance = (normals @ flat + shift[:, :, 0, :, None]).max(axis=2).min(axis=1)
+            out[rows] = np.minimum(out[rows], distance.reshape(len(rows), *points.shape[:2]).min(axis=2))
     return out
 
 

@@ -157,8 +157,8 @@ def attempts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return made
 
 
-@pytest.mark.parametrize(("score", "made"), [(0.5, 1), (1.5, 3), (9.0, 6)])
-def test_in_scenes_a_grasp_sets_out_again_while_it_fails_and_twice_if_it_lifts_barely(
+@pytest.mark.parametrize(("score", "made"), [(0.5, 1), (1.5, 2), (9.0, 6)])
+def test_in_scenes_a_grasp_sets_out_again_while_it_fails_and_once_if_it_lifts_barely(
     scene, attempts: list[int], score: float, made: int
 ) -> None:
     hand, obj, placed = scene

@@ -64,9 +64,9 @@ FAILED: Final = 2.0
 #: How often grasps whose hands are tried may set out again. One more attempt finds what the first ones found, so valid
 #: grasps a second hardly depend on it, and fewer grasps of a hard pair are left that hold nothing.
 ATTEMPTS: Final = 20
-#: Scores beyond which grasps in scenes set out again, at each attempt: at the first two also those that lift at the
-#: whole friction only. An attempt costs as much as another grasp of the batch.
-IN_SCENES: Final = (1.0, 1.0, FAILED, FAILED, FAILED)
+#: Scores beyond which grasps in scenes set out again, at each attempt: at the first also those that lift at the whole
+#: friction only. An attempt costs half of another grasp of the batch, and one in ten of these then lifts at half.
+IN_SCENES: Final = (1.0, FAILED, FAILED, FAILED, FAILED)
 #: Attempts of one grasp that are made at once, at the most.
 AHEAD: Final = 4
 
