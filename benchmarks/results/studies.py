@@ -16,6 +16,10 @@ IN_SCENES: Final = ("synthesize", "scene")
 ALL: Final = ("synthesize", "scene", "render")
 #: Beside DATA, SOURCES and BEFORE: what a study may need.
 SERVICE, BROWSER, GPU, TORCH, FIRST_JUDGE = "a service", "a browser", "a GPU", "PyTorch", "mujoco-warp"
+#: What is written beside the pages and pictures that readers see: not in git, made again by the study.
+RAW: Final = frozenset({".json", ".csv", ".svg", ".sha256"})
+#: Written by hand, so kept.
+NOT_RAW: Final = frozenset({"results/pilot/assets.json"})
 #: Files that the study `predictor` leaves in WORK.
 NETWORK = "trained networks"
 
@@ -301,7 +305,7 @@ STUDIES: Final = (
         "modelling", "what graspd leaves out: its cost and its effect", ("results/modelling.json",),
         ("python -m benchmarks.modelling --data DATA --out OUT/results",),
         ("python -m benchmarks.modelling --only drops --grasps 2 --out OUT/results",),
-        ALL,
+        ALL, prints="results/modelling.md",
     ),
     Study(
         "scene-ways", "what stands in the way of grasps in scenes", ("results/scene-ways.md",),
@@ -464,5 +468,11 @@ BY_NAME: Final = {study.name: study for study in STUDIES}
 
 
 def files_of(study: Study, docs: Path) -> list[Path]:
-    """What there is of a study's files under a folder of the docs."""
-    return sorted({file for glob in study.files for file in docs.glob(glob) if file.is_file()})
+    """What there is of a study's files under a folder of the docs, raw results too."""
+    globs = (*study.files, study.prints) if study.prints else study.files
+    return sorted({file for glob in globs for file in docs.glob(glob) if file.is_file()})
+
+
+def is_raw(path: str) -> bool:
+    """Whether a file, by its path under the folder of the docs, is a raw result that git does not keep."""
+    return Path(path).suffix in RAW and path not in NOT_RAW

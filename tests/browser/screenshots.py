@@ -52,6 +52,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=REPOSITORY / "docs" / "images")
     parser.add_argument("--only", default="", help="names of pictures, with commas between")
     given = parser.parse_args(arguments)
+    if missing := [str(file.relative_to(REPOSITORY)) for file in (*CHARTS, MAPS) if not file.is_file()]:
+        parser.error(
+            f"{', '.join(missing)} missing: python -m benchmarks.results --again --only chart scenes-chart stability"
+        )
     with tempfile.TemporaryDirectory() as scratch:
         wanted = Settings(data_dir=given.data_dir or Path(scratch), port=0)
         with Supervisor(wanted, workers=1) as supervisor:
