@@ -14,10 +14,6 @@ import warp as wp
 from worker.engines.baked import lay_out
 from worker.engines.kernel_cache import kernel_cache
 
-#: The release of Warp within which `kept_hashes` and `late_parsing` work, as their tests say; another one hashes and
-#: parses its own way, which takes a tenth of a second longer.
-KNOWN_WARP = "1.19.0"
-
 _HARMLESS = b"Could not find or load the NVIDIA CUDA driver"
 _lock = threading.Lock()
 _started = False
@@ -25,8 +21,9 @@ _started = False
 
 def _default_of_each_thread() -> None:
     """Let every thread have a default device of its own. Warp has one for all: a `ScopedDevice` of one thread would put
-    the arrays that another makes meanwhile onto its device, and leave its own behind as the default."""
-    from warp._src.context import Runtime, runtime
+    the arrays that another makes meanwhile onto its device, and leave its own behind as the default. Until every
+    array is made with its device named, this is the one place that touches Warp's internals."""
+    from warp._src.context import Runtime, runtime  # noqa: TID251
 
     first, own = runtime.default_device, threading.local()
 
@@ -40,13 +37,6 @@ def _default_of_each_thread() -> None:
             own.device = device
 
     runtime.__class__ = Threaded
-
-
-def _start_sooner() -> None:
-    from worker.engines import kept_hashes, late_parsing
-
-    kept_hashes.install()
-    late_parsing.install()
 
 
 def start() -> None:
@@ -72,7 +62,5 @@ def start() -> None:
                 if _HARMLESS not in line:
                     os.write(2, line)
         _default_of_each_thread()
-        if wp.config.version == KNOWN_WARP:
-            _start_sooner()
         lay_out(Path(wp.config.kernel_cache_dir))
         _started = True

@@ -61,7 +61,7 @@ def test_the_host_takes_some_of_the_time_of_a_grasp_and_not_all(result: tuple[di
 
 def test_kernels_on_the_processor_are_no_time_of_the_host() -> None:
     hand, obj, fidelity, count = hand_from_path("barrett"), object_from_path("block"), FIDELITIES["draft"], 16
-    host = host_ms(hand, obj, fidelity, count, "cpu")
+    host = host_ms(hand, obj, fidelity, count)
     began = time.thread_time()
     plan(hand, obj, Wanted(count, fidelity, seed=0), Run("cpu", threads=1))
     assert host < 0.5 * 1e3 * (time.thread_time() - began) / count
