@@ -59,7 +59,7 @@ _STATES: Final = {*(state.value for state in State), "min", "left"}
 _OPERATORS: Final = {"|", "||", "&&", ";", "&", ">", ">>", "<", "2>", "(", ")"}
 #: What a line has that is not run here, and why. A line with none of it is run.
 NOT_RUN: Final = (
-    (r'^(\w+="[^"]*" )?(docker|kubectl|sbatch|apptainer|ray|osmo|sky|ssh|oauth2-proxy|for|done)\b|SHARED|cp \.env|'
+    (r'^(\w+="[^"]*" )?(docker|kubectl|sbatch|apptainer|ssh|oauth2-proxy|for|done)\b|SHARED|cp \.env|'
      "--grasps 3200", "needs Docker, or a cluster"),
     (r"\.\.\.|…|\[-|\[[A-Z]|<\w", "stands for a family of commands"),
     (r"\b(DATA|DIR|FILE|FOLDER|HAND|OBJECT|OTHER|BEFORE|AFTER|NAME|ID|UUID|URL|MESH|SHARDS|SOURCES|W|JOB|PROJECT|KEY|"
