@@ -66,7 +66,6 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
 
     for module in ("commands", "dataset_commands", "tag_commands", "webhook_commands"):
         monkeypatch.setattr(f"api.client.{module}.open_client", opened)
-    monkeypatch.setattr("api.client.dataset_commands.DatasetClient", lambda client: client)
 
     def run(*arguments: str) -> list[str]:
         done = CliRunner().invoke(build(), arguments, env={"COLUMNS": "80"})
