@@ -144,9 +144,19 @@ def main(
     for name, urdf in HANDS.items():
         typer.echo(run.graspd("hands", "add", str(data / "hands" / urdf), "--name", name, "--no-self-test")["message"])
     create = (
-        "datasets", "create", DATASET, "--hands", ",".join(HANDS), "--objects", str(data / "objects"),
-        "--grasps", str(grasps), "--fidelity", fidelity, "--yes",
-    )  # fmt: skip
+        "datasets",
+        "create",
+        DATASET,
+        "--hands",
+        ",".join(HANDS),
+        "--objects",
+        str(data / "objects"),
+        "--grasps",
+        str(grasps),
+        "--fidelity",
+        fidelity,
+        "--yes",
+    )
     start = time.monotonic()
     estimate = run.graspd(*create)["estimate"]
     kept.estimate_s = kept.estimate_s or estimate["seconds"]

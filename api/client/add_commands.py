@@ -79,9 +79,17 @@ def add_hand(
 ) -> None:
     """Upload a hand, wait for its check, say what was guessed and what it holds of plain objects."""
     options = hand_options(
-        urdf=urdf, xacro=xacro, palm=palm, approach=approach, root=root, pre_shape=pre_shape, closing=closing,
-        fingertips=fingertips, fix=fix, drop=drop,
-    )  # fmt: skip
+        urdf=urdf,
+        xacro=xacro,
+        palm=palm,
+        approach=approach,
+        root=root,
+        pre_shape=pre_shape,
+        closing=closing,
+        fingertips=fingertips,
+        fix=fix,
+        drop=drop,
+    )
     options |= provenance(licence, source)
     with upload_of(file) as (upload, main):
         said = ({"file": main} if main else {}) | options

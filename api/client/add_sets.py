@@ -118,6 +118,9 @@ def _upload(
     except InputError as error:
         return {"name": name, "verdict": "refuse", "message": str(error), "repairs": []}
     return {
-        "name": asset.name, "digest": asset.digest, "verdict": asset.verdict, "message": asset.message or "",
+        "name": asset.name,
+        "digest": asset.digest,
+        "verdict": asset.verdict,
+        "message": asset.message or "",
         "repairs": asset.repairs,
-    }  # fmt: skip
+    }

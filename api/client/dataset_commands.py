@@ -237,9 +237,13 @@ def export(
     if format not in FORMATS:
         raise InputError(f"there is no format {format!r}; there are: {one_of(format, FORMATS)}")
     columns = (
-        TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[files]}"),
-        DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn(),
-    )  # fmt: skip
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TextColumn("{task.fields[files]}"),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+        TimeRemainingColumn(),
+    )
     with open_client(url) as client:
         taken = client.snapshot(name, snapshot or client.take_snapshot(name).digest)
         console = plain_console(stderr=True)

@@ -96,10 +96,12 @@ def print_cells(dataset: DatasetView, cells: Sequence[CellView], console: Consol
 def watch_dataset(client: Client, name: str, console: Console) -> DatasetView:
     """The dataset in its final state, with a bar of its tasks meanwhile."""
     columns = (
-        TextColumn("{task.description}", markup=False), BarColumn(bar_width=32),
-        TextColumn("{task.percentage:>3.0f} %"), TextColumn("{task.fields[rate]}", style="cyan"),
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=32),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TextColumn("{task.fields[rate]}", style="cyan"),
         TextColumn("{task.fields[left]}"),
-    )  # fmt: skip
+    )
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         bar = progress.add_task(name, total=1.0, rate="", left="")
         said = -1.0

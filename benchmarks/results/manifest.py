@@ -120,12 +120,17 @@ def entered(study: Study, docs: Path) -> dict[str, Any]:
     date, _, revision = ("", "", _git("rev-parse", "--short", "HEAD")) if changed else min(commits).partition(" ")
     said = _said_by(files_of(study, docs))
     return {
-        "told_by": "files and history", "command": said.get("command"), "revision": revision,
-        "stage_revisions": dict(STAGE_REVISIONS) if changed else stage_revisions_at(revision), "seeds": None,
-        "machine": said.get("device"), "versions": said.get("versions"),
+        "told_by": "files and history",
+        "command": said.get("command"),
+        "revision": revision,
+        "stage_revisions": dict(STAGE_REVISIONS) if changed else stage_revisions_at(revision),
+        "seeds": None,
+        "machine": said.get("device"),
+        "versions": said.get("versions"),
         "date": str(said.get("created") or said.get("card_made") or said.get("date") or date)[:10] or None,
-        "seconds": None, "files": files,
-    }  # fmt: skip
+        "seconds": None,
+        "files": files,
+    }
 
 
 def stage_revisions_at(revision: str) -> dict[str, int] | None:

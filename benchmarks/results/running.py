@@ -96,13 +96,22 @@ class Runner:
         for file in files_of(study, self.out):
             self._without_places(file)
             slim(file)
-        self.records = load(self.out) | {study.name: {
-            "told_by": "run", "command": self._told(study), "revision": self.revision,
-            "stage_revisions": dict(STAGE_REVISIONS), "seeds": list(study.seeds) or None, "machine": machine(),
-            "versions": versions(), "date": datetime.now(UTC).date().isoformat(),
-            "seconds": round(time.time() - began, 1), "cpu_seconds": round(_spent() - spent, 1),
-            **({"older_files": older} if older else {}), "files": digests(study, self.out),
-        }}  # fmt: skip
+        self.records = load(self.out) | {
+            study.name: {
+                "told_by": "run",
+                "command": self._told(study),
+                "revision": self.revision,
+                "stage_revisions": dict(STAGE_REVISIONS),
+                "seeds": list(study.seeds) or None,
+                "machine": machine(),
+                "versions": versions(),
+                "date": datetime.now(UTC).date().isoformat(),
+                "seconds": round(time.time() - began, 1),
+                "cpu_seconds": round(_spent() - spent, 1),
+                **({"older_files": older} if older else {}),
+                "files": digests(study, self.out),
+            }
+        }
         save(self.out, self.records)
         return f"made in {time.time() - began:.0f} s"
 
@@ -116,9 +125,13 @@ class Runner:
         with log.open("wb") as errors, self._service(study) as environment:
             for line in self.lines(study):
                 done = subprocess.run(
-                    self._words(line), cwd=REPOSITORY, env=environment, stdout=subprocess.PIPE, stderr=errors,
+                    self._words(line),
+                    cwd=REPOSITORY,
+                    env=environment,
+                    stdout=subprocess.PIPE,
+                    stderr=errors,
                     check=False,
-                )  # fmt: skip
+                )
                 errors.write(done.stdout)
                 if done.returncode:
                     return f"`{line}` ended with {done.returncode}; see {log}"

@@ -138,9 +138,12 @@ class Clouds(Sequence[dict[str, Any]]):
             empty = np.zeros((self.points, 3), np.float32)
             none = np.zeros(self.points, np.uint8)
             return {
-                "cloud/points": empty, "cloud/normals": empty.copy(), "cloud/object": none,
-                "cloud/pixel": np.zeros((self.points, 3), np.int32), "cloud/seen": 0,
-            }  # fmt: skip
+                "cloud/points": empty,
+                "cloud/normals": empty.copy(),
+                "cloud/object": none,
+                "cloud/pixel": np.zeros((self.points, 3), np.int32),
+                "cloud/seen": 0,
+            }
         normals = transforms.quat_rotate(into[3:], _of(views, pixel, CloudView.normals))
         return {
             "cloud/points": transforms.apply(into, _of(views, pixel, CloudView.points)).astype(np.float32),

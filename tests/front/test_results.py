@@ -22,10 +22,12 @@ from tests.conftest import REPOSITORY
 
 MOST_BYTES, MOST_LINES = 8_000_000, 6_000
 ADD = Study(
-    "add", "a sum", ("results/total.txt",),
+    "add",
+    "a sum",
+    ("results/total.txt",),
     ("python -c \"import sys; open(sys.argv[1], 'w').write(str(1 + 1)); print('done')\" OUT/results/total.txt",),
     prints="results/sum.md",
-)  # fmt: skip
+)
 
 
 def runner(folder: Path, **options: bool) -> Runner:
@@ -172,9 +174,12 @@ def test_what_a_study_lacks_is_said(tmp_path: Path) -> None:
 def test_folders_of_this_machine_are_not_in_the_figures(tmp_path: Path) -> None:
     tells = "import sys, json; json.dump(sys.argv[1:], open(sys.argv[2], 'w'))"
     says = Study(
-        "add", "a sum", ("results/where.json",), (f'python -c "{tells}" DATA/hands OUT/results/where.json',),
+        "add",
+        "a sum",
+        ("results/where.json",),
+        (f'python -c "{tells}" DATA/hands OUT/results/where.json',),
         prints="results/where.md",
-    )  # fmt: skip
+    )
     made = runner(tmp_path)
     made.places["DATA"] = tmp_path / "data"
     made.run(says)

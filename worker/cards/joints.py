@@ -61,7 +61,11 @@ class JointUse:
                 (np.searchsorted(below, q) + 0.5) / BINS for q in (0.01, 0.05, 0.5, 0.95, 0.99)
             )
             found[name] = {
-                "p5": float(p5), "median": float(middle), "p95": float(p95), "used": float(high - low),
-                "at_lower": float(counts[:near].sum() / total), "at_upper": float(counts[-near:].sum() / total),
-            }  # fmt: skip
+                "p5": float(p5),
+                "median": float(middle),
+                "p95": float(p95),
+                "used": float(high - low),
+                "at_lower": float(counts[:near].sum() / total),
+                "at_upper": float(counts[-near:].sum() / total),
+            }
         return found

@@ -22,8 +22,13 @@ from worker.quality import gate as gates
 Row = Mapping[str, Any]
 
 #: Sizes as hubs class them.
-_SIZES: Final = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"),
-                 (10_000_000, "1M<n<10M"))  # fmt: skip
+_SIZES: Final = (
+    (1_000, "n<1K"),
+    (10_000, "1K<n<10K"),
+    (100_000, "10K<n<100K"),
+    (1_000_000, "100K<n<1M"),
+    (10_000_000, "1M<n<10M"),
+)
 #: A longer table of objects is folded.
 _UNFOLDED: Final = 20
 _LEVELS: Final = {
@@ -61,10 +66,20 @@ def front_matter(card: Row) -> str:
 def page(card: Row, plots: Mapping[str, str]) -> str:
     """The whole page; `plots` are file names and what they show."""
     sections = (
-        front_matter(card), f"# {card['name']}", _summary(card, plots), _composition(card), _making(card),
-        _validity(card, plots), _quality(card, plots), _coverage(card, plots), _biases(card), _licence(card),
-        _opening(card), _citing(card), _files(card, plots),
-    )  # fmt: skip
+        front_matter(card),
+        f"# {card['name']}",
+        _summary(card, plots),
+        _composition(card),
+        _making(card),
+        _validity(card, plots),
+        _quality(card, plots),
+        _coverage(card, plots),
+        _biases(card),
+        _licence(card),
+        _opening(card),
+        _citing(card),
+        _files(card, plots),
+    )
     return "\n\n".join(section for section in sections if section) + "\n"
 
 

@@ -109,8 +109,20 @@ class Tally:
         return [cell for (_, name), cell in self.cells.items() if name == obj]
 
 
-_ATTRIBUTES: Final = ("method", "fidelity", "seed", "want", "device", "worker", "code_version", "verdict_level", "mu",
-                      "source", "verdict_key", "scene")  # fmt: skip
+_ATTRIBUTES: Final = (
+    "method",
+    "fidelity",
+    "seed",
+    "want",
+    "device",
+    "worker",
+    "code_version",
+    "verdict_level",
+    "mu",
+    "source",
+    "verdict_key",
+    "scene",
+)
 
 
 def tally_of(contents: Contents, pieces: Iterable[Piece]) -> Tally:

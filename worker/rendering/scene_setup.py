@@ -102,10 +102,14 @@ class Setting:
         self.shot = Shot(
             world=np.repeat(np.arange(len(poses), dtype=np.int32), plan.placements * plan.eyes),
             extrinsics=np.concatenate([scene.extrinsics for scene in scenes]),
-            intrinsics=plan.intrinsics, width=plan.width, height=plan.height, samples=samples,
+            intrinsics=plan.intrinsics,
+            width=plan.width,
+            height=plan.height,
+            samples=samples,
             toward_lamp=_toward_lamp(np.random.default_rng([seed, 2**31])),
-            turn=np.array([scene.turn for scene in scenes]), lamps=[scene.lamp for scene in scenes],
-        )  # fmt: skip
+            turn=np.array([scene.turn for scene in scenes]),
+            lamps=[scene.lamp for scene in scenes],
+        )
 
     def shoot(self, run: Run, *, normals: bool = False) -> Pictures:
         """The pictures; `Pictures.shape` is 0 for supports, 1 for the object, 2 + m for neighbour m."""
@@ -169,8 +173,10 @@ class _Scene:
         others = [object_look(rng) for _ in objects[1:]]
         walls = table_look(rng) if len(supports) > 1 else table
         self.looks: list[Look] = [
-            *(table if k == 0 or isinstance(s, HalfSpace) else walls for k, s in enumerate(supports)), thing, *others
-        ]  # fmt: skip
+            *(table if k == 0 or isinstance(s, HalfSpace) else walls for k, s in enumerate(supports)),
+            thing,
+            *others,
+        ]
 
 
 def _unhidden(draw: Callable[[], Sequence[Floats]], supports: Supports, points: Floats) -> Sequence[Floats]:

@@ -139,12 +139,19 @@ class _Film:
         shape = wp.empty(size, dtype=wp.int32, device=device)
         normal = wp.empty(size if shot.normals else (0, 0, 0), dtype=wp.vec3f, device=device)
         inputs = [
-            tracer._placed, tracer._corner_normals, tracer._materials,
+            tracer._placed,
+            tracer._corner_normals,
+            tracer._materials,
             wp.array(world, dtype=wp.int32, device=device),
             wp.array(self._cameras[views], dtype=wp.transformf, device=device),
             _structs([shot.lamps[w] for w in world], Light, device),
-            wp.vec2f(k[0, 0], k[1, 1]), wp.vec2f(k[0, 2], k[1, 2]), self._passes, self._toward, shot.shaded, threads,
-        ]  # fmt: skip
+            wp.vec2f(k[0, 0], k[1, 1]),
+            wp.vec2f(k[0, 2], k[1, 2]),
+            self._passes,
+            self._toward,
+            shot.shaded,
+            threads,
+        ]
 
         def rows(first: int) -> None:
             wp.launch(

@@ -31,9 +31,17 @@ Say = Callable[[str], None]
 
 
 def bench(
-    hand: HandModel, load: Load, *, fidelities: Sequence[Fidelity], batches: Sequence[int], threads: Sequence[int],
-    device: str, repeats: int, joins: Sequence[int] = (1,), say: Say = lambda line: None,
-) -> dict[str, Any]:  # fmt: skip
+    hand: HandModel,
+    load: Load,
+    *,
+    fidelities: Sequence[Fidelity],
+    batches: Sequence[int],
+    threads: Sequence[int],
+    device: str,
+    repeats: int,
+    joins: Sequence[int] = (1,),
+    say: Say = lambda line: None,
+) -> dict[str, Any]:
     """One run per fidelity x batch x joins x threads.
 
     Args:
@@ -89,9 +97,15 @@ def _start_times(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: 
 
 
 def _run(
-    hand: HandModel, obj: ObjectModel, fidelity: Fidelity, batch: int, join: int, threads: int, device: str,
+    hand: HandModel,
+    obj: ObjectModel,
+    fidelity: Fidelity,
+    batch: int,
+    join: int,
+    threads: int,
+    device: str,
     repeats: int,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     seconds, run = [], Run(threads=threads, device=device)
     for seed in range(repeats + 1):
         began = time.perf_counter()

@@ -17,8 +17,13 @@ Columns = Any
 
 _METRICS: Final = frozenset(metric.name for metric in indexed())
 _OPERATORS: Final[dict[str, Callable[[Any, Any], ColumnElement[bool]]]] = {
-    "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "=": operator.eq, "!=": operator.ne,
-}  # fmt: skip
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "=": operator.eq,
+    "!=": operator.ne,
+}
 _FLAGS: Final[dict[str, Callable[[Columns], ColumnElement[bool]]]] = {
     "judged": lambda grasps: grasps.success.is_not(None),
     "valid": lambda grasps: grasps.valid.is_(True),

@@ -90,8 +90,10 @@ def test_a_set_goes_by_its_name_beside_the_folder_it_was_added_from(
     (tmp_path / "kit").mkdir()
     (tmp_path / "kit" / "cup.stl").write_bytes(b"solid cup\nendsolid cup\n")
     monkeypatch.chdir(tmp_path)
-    cells = {place: graspd.json("datasets", "estimate", "--hands", "allegro", "--objects", place)["cells"]
-             for place in ("kit", "./kit")}  # fmt: skip
+    cells = {
+        place: graspd.json("datasets", "estimate", "--hands", "allegro", "--objects", place)["cells"]
+        for place in ("kit", "./kit")
+    }
     assert cells == {"kit": 2, "./kit": 1}
 
 

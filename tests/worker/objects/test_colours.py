@@ -97,9 +97,11 @@ def test_a_texture_that_promises_too_much_is_not_unpacked() -> None:
     material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
     picture = large()
     document = {
-        "materials": [material], "textures": [{"source": 0}], "images": [{"bufferView": 0}],
+        "materials": [material],
+        "textures": [{"source": 0}],
+        "images": [{"bufferView": 0}],
         "bufferViews": [{"byteLength": len(picture)}],
-    }  # fmt: skip
+    }
     assert np.isnan(material_colour(document, picture, {"material": 0})).all()
 
 

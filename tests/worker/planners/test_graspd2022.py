@@ -39,9 +39,12 @@ def probed(
     found: list[Any] = [wp.zeros(n, dtype=kind, device="cpu") for kind in (wp.float32, wp.vec3, wp.vec3)]
     given = wp.array(points, dtype=wp.vec3, device="cpu")
     wp.launch(
-        kernels.probe, n, inputs=[physics_of(SPHERE.gyration_radius), grid, given, wp.vec3(*velocity)], outputs=found,
+        kernels.probe,
+        n,
+        inputs=[physics_of(SPHERE.gyration_radius), grid, given, wp.vec3(*velocity)],
+        outputs=found,
         device="cpu",
-    )  # fmt: skip
+    )
     return tuple(f.numpy() for f in found)
 
 

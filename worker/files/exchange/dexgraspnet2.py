@@ -145,9 +145,11 @@ def _write_scene(
         intrinsics = np.asarray(sample["camera/intrinsics"], float) - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
         pose = np.asarray(sample["object/pose"])
         meta = {
-            "intrinsic_matrix": intrinsics, "factor_depth": np.array([[FACTOR]]), "cls_indexes": np.array([[1]]),
+            "intrinsic_matrix": intrinsics,
+            "factor_depth": np.array([[FACTOR]]),
+            "cls_indexes": np.array([[1]]),
             "poses": pose_to_matrix(pose)[:3, :, None],
-        }  # fmt: skip
+        }
         scipy.io.savemat(path / "meta" / f"{view:04}.mat", meta)
         if labels.any():  # its loader passes over a view of nothing, which has no workspace
             found = graspness.of_view(steps / FACTOR, labels, intrinsics, first @ poses[view], pose)
@@ -226,10 +228,13 @@ def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[Imported]:
     set_ = _with_ours(path, model, found, grasp, away)
     return [
         Imported(
-            model, thing, completed(model, thing, grasp) if set_ is None else set_, path.stem,
+            model,
+            thing,
+            completed(model, thing, grasp) if set_ is None else set_,
+            path.stem,
             published=None if published is None or len(np.ravel(published)) != count else verdicts(published),
         )
-    ]  # fmt: skip
+    ]
 
 
 def _with_ours(

@@ -168,9 +168,10 @@ def convention(hand: HandModel) -> dict[str, Any]:
     x = x / np.linalg.norm(x)
     w, *xyz = quat_from_matrix(np.stack([x, np.cross(z, x), z], axis=1)).tolist()
     return {
-        "width": width, "depth": depth,
+        "width": width,
+        "depth": depth,
         "transform_offset_from_asset_to_graspgen_convention": [[0.0, 0.0, 0.0], [*xyz, w]],
-    }  # fmt: skip
+    }
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Imported]:

@@ -40,9 +40,12 @@ def distance_grid(obj: DeviceObject, cells: int) -> Any:
         corner = low + np.array([first * cell, 0.0, 0.0])
         with wp.ScopedDevice(device):
             wp.launch(
-                surface.sample_field, dim=(last - first, shape[1], shape[2]),
-                inputs=[flat, wp.vec3(*corner), cell, reach], outputs=[field[first:last]], device=device,
-            )  # fmt: skip
+                surface.sample_field,
+                dim=(last - first, shape[1], shape[2]),
+                inputs=[flat, wp.vec3(*corner), cell, reach],
+                outputs=[field[first:last]],
+                device=device,
+            )
 
     threads = 1 if wp.get_device(device).is_cuda else available_cores()
     bounds = np.linspace(0, shape[0], 4 * threads + 1).astype(int)

@@ -127,10 +127,11 @@ class Search:
             begun, done = state.numpy(), 0
             for _ in range(0, max(0, PATIENCE * (steps - FIRST_STEP)), ROUNDS):
                 wp.launch(
-                    kernels.anneal, chains,
+                    kernels.anneal,
+                    chains,
                     inputs=[self.problem, ROUNDS, steps, ALIKE],
                     outputs=[counter, rng, state, energy, best, best_energy, *scratch],
-                )  # fmt: skip
+                )
                 now = int((counter.numpy() - FIRST_STEP).sum())
                 tell(now - done, "annealing")
                 done = now

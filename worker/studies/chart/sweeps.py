@@ -105,9 +105,16 @@ def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[Turn]:
 
 
 def sweep(
-    hand: HandModel, thing: Thing, *, batch: int, repeats: int, quick: bool, run: Run,
-    knobs: Sequence[str] = (), say: Say = lambda line: None,
-) -> list[dict[str, Any]]:  # fmt: skip
+    hand: HandModel,
+    thing: Thing,
+    *,
+    batch: int,
+    repeats: int,
+    quick: bool,
+    run: Run,
+    knobs: Sequence[str] = (),
+    say: Say = lambda line: None,
+) -> list[dict[str, Any]]:
     """One row per knob and value: `knob`, `value`, `default`, `speedup` and the figures of a run.
 
     Values are run in turn, repeat by repeat. `speedup` is what the default costs over what the value costs: in
