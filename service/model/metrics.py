@@ -3,7 +3,7 @@
 Shards (`service.store.columns`), manifests, the index, the API, the dashboard, a dataset's card and the docs read this
 table. A new metric is a row here and the function that computes it (`MEASURES` in `worker.quality.table`); make it
 `optional`, since older shards lack it. The index gets its column when it is opened next
-(`service.index.metric_columns`). What says yes or no of a grasp is a verdict and no metric.
+(`service.index.database`). What says yes or no of a grasp is a verdict and no metric.
 """
 
 from __future__ import annotations

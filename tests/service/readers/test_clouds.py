@@ -11,8 +11,7 @@ import pytest
 from service.model import transforms
 from service.model.errors import InputError
 from service.readers import Pictures, open_shards
-from service.readers.clouds import Clouds
-from service.readers.graspness import graspness
+from service.readers.clouds import Clouds, graspness
 from service.store.shards import read_shard
 from tests.service.readers import box_scenes
 from tests.service.readers.box_scenes import EYES, POSES, SCENE_OF_GRASP, SIZE, VALID

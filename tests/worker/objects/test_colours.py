@@ -14,7 +14,7 @@ from PIL import Image
 from tests.worker.hands.urdfs import BOX, joint, link, robot
 from worker.hands.load import load_hand
 from worker.objects.formats import read_mesh
-from worker.objects.formats.glb_colours import material_colour
+from worker.objects.formats.glb import material_colour
 from worker.rendering.hands import hand_parts
 
 #: sRGB of a byte, rounded twice.

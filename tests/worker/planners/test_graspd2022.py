@@ -12,8 +12,17 @@ import warp as wp
 
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.planners.graspd2022 import kernels
-from worker.planners.graspd2022.grid import distance_grid
-from worker.planners.graspd2022.search import FRICTION, LEAK, MISMATCH, STIFFNESS, VISCOUS, Search, _Batch, physics_of
+from worker.planners.graspd2022.search import (
+    FRICTION,
+    LEAK,
+    MISMATCH,
+    STIFFNESS,
+    VISCOUS,
+    Search,
+    _Batch,
+    distance_grid,
+    physics_of,
+)
 from worker.planners.peers import ground_of
 from worker.simulation.state import HandState
 

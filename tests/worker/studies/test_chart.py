@@ -21,8 +21,7 @@ from worker.run import Run
 from worker.studies.chart.report import markdown
 from worker.studies.chart.settings import settings_of
 from worker.studies.chart.statistics import first_valid, pareto, summed
-from worker.studies.chart.sweeps import Turn, _make, turns
-from worker.studies.chart.variants import asking_each
+from worker.studies.chart.sweeps import Turn, _make, asking_each, turns
 
 RUN_KEYS = {
     "method",
