@@ -26,8 +26,7 @@ from sqlalchemy import (
 
 from service.index.bulk import upsert
 from service.index.database import Database
-from service.index.dataset_tables import datasets
-from service.index.tables import metadata
+from service.index.tables import datasets, metadata
 from service.index.views import DeliveryView, EndView, WebhookView
 from service.model.clock import timestamp
 from service.model.errors import NotFoundError

@@ -34,10 +34,8 @@ from sqlalchemy import (
 )
 from sqlalchemy.sql.operators import in_op, is_
 
-from service.index.dataset_tables import dataset_cells
 from service.index.filters import GraspFilter, GraspSort
-from service.index.tables import grasps, jobs, shards, tasks
-from service.index.tag_tables import tagged
+from service.index.tables import dataset_cells, grasps, jobs, shards, tagged, tasks
 from service.model.errors import InputError
 from service.model.metrics import indexed
 from service.model.states import Stage
