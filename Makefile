@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 # Tests wait for processes a fifth of their time: three at once keep two cores busy.
 JOBS ?= 3
 
-.PHONY: clusters results docs-commands dist gpu-check help install demo test test-slow test-containers check format browser screenshots docs pins licences audit clean
+.PHONY: results docs-commands dist gpu-check help install demo test test-slow test-containers check format browser screenshots docs pins licences audit clean
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-15s %s\n", $$1, $$2}'
 
@@ -66,11 +66,6 @@ dist: $(STAMP) ## wheel and sdist in dist/, the same bytes from the same sources
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,release]'
 	$(BIN)/python docker/dist.py dist
 
-clusters: ## files for clusters read by SkyPilot, Ray and spython, in an environment of their own (600 MB)
-	test -x .venv-clusters/bin/python || $(PYTHON) -m venv .venv-clusters
-	.venv-clusters/bin/python -m pip install --quiet --disable-pip-version-check 'skypilot>=0.10,<1' 'spython>=0.3,<0.4' 'ray>=2.40,<3'
-	.venv-clusters/bin/python tests/deploy/cluster_tools.py
-
 pins: $(STAMP) ## versions and hashes that the images install: those of .venv (asks the package index)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,postgres,otel,gpu]'
 	$(BIN)/python docker/pin.py
@@ -84,4 +79,4 @@ audit: $(STAMP) ## known vulnerabilities of what .venv and the images install (a
 	$(BIN)/python docker/audit.py
 
 clean: ## what the verbs above made
-	rm -rf $(VENV) .venv-clusters build dist demo-out *.egg-info
+	rm -rf $(VENV) build dist demo-out *.egg-info

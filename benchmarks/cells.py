@@ -81,8 +81,10 @@ class Cell:
         found.seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
         found.info = {"cpu_seconds": cpu}
         arrays: dict[str, Any] = {
-            "loss": found.stability_loss, "seconds": np.array(found.seconds), "cpu_seconds": np.array(cpu)
-        }  # fmt: skip
+            "loss": found.stability_loss,
+            "seconds": np.array(found.seconds),
+            "cpu_seconds": np.array(cpu),
+        }
         for name in POSTURES:
             part: Posture = getattr(found, name)
             arrays |= {f"{name}_pose": part.hand_pose, f"{name}_joints": part.joint_positions}

@@ -105,9 +105,11 @@ def table(pair: str, before: dict[str, Any], after: dict[str, Any]) -> list[str]
     """The stages of one pair; the planner makes raw grasps, so all is told of a valid one."""
     each = [{stage: ms / max(1, found["valid"]) for stage, ms in found["ms"].items()} for found in (before, after)]
     lines = [
-        f"### {pair}: {before['valid']} and {after['valid']} of {before['raw']} hold", "",
-        "| core-ms a valid grasp | before | after | times |", "| --- | --- | --- | --- |",
-    ]  # fmt: skip
+        f"### {pair}: {before['valid']} and {after['valid']} of {before['raw']} hold",
+        "",
+        "| core-ms a valid grasp | before | after | times |",
+        "| --- | --- | --- | --- |",
+    ]
     lines += [row(stage, each[0][stage], each[1][stage]) for stage in each[0]]
     totals = [sum(found.values()) for found in each]
     rest = [total - found["planner"] for total, found in zip(totals, each, strict=True)]
@@ -131,14 +133,17 @@ def service_table(pair: str, before: dict[str, float], after: dict[str, float], 
     rates = [found["valid"] / found["wall"] for found in (before, after)]
     costs = [1e3 * found["processor"] / found["valid"] for found in (before, after)]
     return [
-        f"### {pair}: {before['valid']:.0f} and {after['valid']:.0f} valid grasps", "",
-        "| through the service | before | after | times |", "| --- | --: | --: | --: |",
+        f"### {pair}: {before['valid']:.0f} and {after['valid']:.0f} valid grasps",
+        "",
+        "| through the service | before | after | times |",
+        "| --- | --: | --: | --: |",
         f"| valid grasps/s | {rates[0]:.2f} | {rates[1]:.2f} | {rates[1] / rates[0]:.2f} |",
         row("core-ms a valid grasp", *costs),
         f"| core-ms a raw grasp of the planner alone, before | {raw_ms:.1f} | | |",
         f"| valid grasps over raw ones of that planner, for the same processor time | {raw_ms / costs[0]:.2f} "
-        f"| {raw_ms / costs[1]:.2f} | |", "",
-    ]  # fmt: skip
+        f"| {raw_ms / costs[1]:.2f} | |",
+        "",
+    ]
 
 
 def compare_services(given: argparse.Namespace) -> dict[str, Any]:

@@ -63,9 +63,12 @@ def study(hand: HandModel, obj: ObjectModel, others: list[ObjectModel], scene: i
         batch += 1
     tried = max(1, found["tried"])
     return {
-        **found, "clear": found["clear"] / tried, "lift": found["lift"] / tried, "gap": 1e3 * gap,
+        **found,
+        "clear": found["clear"] / tried,
+        "lift": found["lift"] / tried,
+        "gap": 1e3 * gap,
         "seconds": min(spent, seconds),
-    }  # fmt: skip
+    }
 
 
 def crowd(

@@ -56,9 +56,13 @@ def first_grasp(root: Path, hand: str, obj: str) -> dict[str, float]:
     """Seconds of one process: `clock`, `processor`, and processor time of its laps."""
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     done = subprocess.run(
-        [sys.executable, "-c", FIRST, hand, obj], cwd=root, env=environment_of(root), capture_output=True, text=True,
+        [sys.executable, "-c", FIRST, hand, obj],
+        cwd=root,
+        env=environment_of(root),
+        capture_output=True,
+        text=True,
         check=False,
-    )  # fmt: skip
+    )
     clock, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode:
         sys.exit(f"{root}: {done.stderr[-2000:]}")
@@ -73,9 +77,13 @@ def first_command(root: Path, hand: str, obj: str, seed: int) -> dict[str, float
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "graspd", "synth", "--hand", hand, "--object", obj, "-n", "1"]
         done = subprocess.run(
-            [*command, "--seed", str(seed), "-o", f"{folder}/g.h5", "--json"], cwd=root, env=environment_of(root),
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
+            [*command, "--seed", str(seed), "-o", f"{folder}/g.h5", "--json"],
+            cwd=root,
+            env=environment_of(root),
+            capture_output=True,
+            text=True,
+            check=False,
+        )
     clock, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode or json.loads(done.stdout.splitlines()[-1])["valid"] != 1:
         sys.exit(f"{root}: seed {seed}: {done.stderr[-2000:] or 'no valid grasp'}")
@@ -139,13 +147,17 @@ def commands(roots: Sequence[Path], hand: str, obj: str, seeds: Sequence[int], r
                 timed.append(one)
     lines = head("`graspd synth -n 1`, s", [str(root) for root in roots])
     for seed in (*seeds, None):
-        mine = [[run for (of, at), all_ in found.items() if at == root and seed in (of, None) for run in all_]
-                for root in roots]  # fmt: skip
+        mine = [
+            [run for (of, at), all_ in found.items() if at == root and seed in (of, None) for run in all_]
+            for root in roots
+        ]
         name = "all seeds" if seed is None else f"seed {seed}"
         for part, of, told in (
-            ("clock", median, "clock, median"), ("clock", min, "clock, least"), ("processor, user", median, "user"),
+            ("clock", median, "clock, median"),
+            ("clock", min, "clock, least"),
+            ("processor, user", median, "user"),
             ("processor, system", median, "system"),
-        ):  # fmt: skip
+        ):
             lines.append(row(f"{name}: {told}", [of(run[part] for run in each) for each in mine]))
     return [*lines, ""]
 

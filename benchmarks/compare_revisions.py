@@ -36,8 +36,10 @@ import typer
 ROOMS: Final = ("service", "worker", "api", "tests", "benchmarks", "examples")
 #: Attributes of a shard that tell of the run and not of what was made.
 OF_THE_RUN: Final = {"seconds", "created"}
-#: Fields of a record that do; a shard's checksum is of its times too, and its attributes are compared in the shard.
-PASSING: Final = {"created", "origin", "at", "seconds", "sha256", "size_bytes", "worker", "attributes"}
+#: Fields of a record that do; checksums are of times too, and a shard's attributes are compared in the shard.
+PASSING: Final = {"created", "origin", "at", "seconds", "sha256", "checksum", "size_bytes", "worker", "attributes"}
+#: Folders of a store that hold identities drawn anew for each service.
+DRAWN: Final = {"marks", "service"}
 #: Differences of one thing that are printed.
 _SHOWN: Final = 12
 
@@ -194,7 +196,8 @@ def _store_of_demo(side: Checkout) -> dict[str, Path]:
     stores = [path.parent for path in out.rglob("shards") if (path.parent / "jobs").is_dir()]
     if len(stores) != 1:
         sys.exit(f"{side.root}: graspd demo left {len(stores)} stores in {out}")
-    return {str(file.relative_to(stores[0])): file for file in stores[0].rglob("*") if file.is_file()}
+    files = {str(file.relative_to(stores[0])): file for file in stores[0].rglob("*") if file.is_file()}
+    return {name: file for name, file in files.items() if name.partition("/")[0] not in DRAWN}
 
 
 def _lasting(value: Any) -> Any:

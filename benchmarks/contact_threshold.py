@@ -107,8 +107,16 @@ def panel(axis: Axes, key: str, found: dict[str, Any]) -> None:
             values = by_friction[friction][key]
             axis.plot(THRESHOLDS_MM, values["mean"], color=COLOURS[hand], linestyle=style, linewidth=2)
         # Two hands have the same values in the paper: side by side both are seen.
-        axis.plot(5 + SHIFT[hand], PAPER[hand][key], "o", markersize=7, markerfacecolor="white", markeredgewidth=1.8,
-                  color=COLOURS[hand], zorder=5)  # fmt: skip
+        axis.plot(
+            5 + SHIFT[hand],
+            PAPER[hand][key],
+            "o",
+            markersize=7,
+            markerfacecolor="white",
+            markeredgewidth=1.8,
+            color=COLOURS[hand],
+            zorder=5,
+        )
     axis.set_title(label, loc="left", fontsize=12, fontweight="bold", color=INK, pad=30)
     axis.text(0, 1.08, meaning, transform=axis.transAxes, color=FAINT, fontsize=9)
     axis.set_xlabel("contact threshold  [mm]", color=INK)

@@ -28,9 +28,11 @@ SEED = 1400
 SIZE: Final = (0.05, 0.06, 0.08)
 #: Directions in which something stands, as signs of x and y.
 PLACES: Final = {
-    "wall": ((1, 0),), "corner": ((1, 0), (0, 1)), "slot": ((1, 0), (-1, 0)),
+    "wall": ((1, 0),),
+    "corner": ((1, 0), (0, 1)),
+    "slot": ((1, 0), (-1, 0)),
     "neighbours": ((1, 0), (-1, 0), (0, 1), (0, -1)),
-}  # fmt: skip
+}
 #: Thickness and height of walls [m].
 WALL: Final = (0.02, 0.15)
 HEAD = """# Lifts beside walls and among neighbours

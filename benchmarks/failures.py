@@ -150,8 +150,11 @@ def main() -> None:
             figures.append(cell.kept("failures", lambda cell=cell: found_out(cell)))  # type: ignore[misc]
             sys.stderr.write(f"{hand}: {cell.object_name} {np.mean(figures[-1]['success']):.2f}\n")
         order = np.argsort([np.mean(found["success"]) for found in figures], kind="stable")
-        lines += [f"## {hand}\n", "| object | hold | lost while closing | turns | slips | too deep | other |",
-                  "| --- | --: | --: | --: | --: | --: | --: |"]  # fmt: skip
+        lines += [
+            f"## {hand}\n",
+            "| object | hold | lost while closing | turns | slips | too deep | other |",
+            "| --- | --: | --: | --: | --: | --: | --: |",
+        ]
         for at in order:
             counts = Counter(kind(reason) for reason in figures[at]["reasons"])
             named = ("held", "lost while closing", "turns", "slips", "penetration")
@@ -169,8 +172,10 @@ def main() -> None:
             name = f"failures/{hand}-{cell.object_name}.png"
             picture(cell, found, args.out / name)
             drawn.add(args.out / name)
-            lines += [f"**{cell.object_name}**, {np.mean(found['success']):.0%} hold: {why(found)}.\n",
-                      f"![{hand} on {cell.object_name}: grasps that fail, one that holds]({name})\n"]  # fmt: skip
+            lines += [
+                f"**{cell.object_name}**, {np.mean(found['success']):.0%} hold: {why(found)}.\n",
+                f"![{hand} on {cell.object_name}: grasps that fail, one that holds]({name})\n",
+            ]
     for older in set((args.out / "failures").glob("*.png")) - drawn:
         older.unlink()
     (args.out / "failures.md").write_text("\n".join(lines))

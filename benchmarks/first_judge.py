@@ -103,13 +103,21 @@ def speeds(cell: Cell, device: str, counts: list[int], worlds: list[int]) -> Ite
             found: FirstTrials = pool.judge(grasps)
             seconds = time.perf_counter() - began
             yield {
-                "hand": cell.hand_name, "object": cell.object_name, "device": device, "worlds": size, "grasps": count,
-                "seconds": round(seconds, 3), "grasps_per_second": round(count / seconds, 1),
+                "hand": cell.hand_name,
+                "object": cell.object_name,
+                "device": device,
+                "worlds": size,
+                "grasps": count,
+                "seconds": round(seconds, 3),
+                "grasps_per_second": round(count / seconds, 1),
                 "world_steps_per_second": round(10 * float(found.ticks.sum()) / seconds),
-                "launches": pool.launches, "seconds_per_launch": round(seconds / max(1, pool.launches), 5),
-                "overflows": int(found.overflow.sum()), "held": int(found.held.sum()),
-                "clear": int((found.clearly_held | found.clearly_failed).sum()), "seconds_to_make": round(made, 2),
-            }  # fmt: skip
+                "launches": pool.launches,
+                "seconds_per_launch": round(seconds / max(1, pool.launches), 5),
+                "overflows": int(found.overflow.sum()),
+                "held": int(found.held.sum()),
+                "clear": int((found.clearly_held | found.clearly_failed).sum()),
+                "seconds_to_make": round(made, 2),
+            }
 
 
 AGREEMENT = (

@@ -156,8 +156,10 @@ def fleet(settings: Settings, workers: int, task_s: float) -> Iterator[None]:
 def environment(settings: Settings) -> dict[str, str]:
     """The settings as a process of its own takes them."""
     given = {name: getattr(settings, name) for name in settings.model_fields_set}
-    plain = {name: value.get_secret_value() if hasattr(value, "get_secret_value") else str(value)
-             for name, value in given.items()}  # fmt: skip
+    plain = {
+        name: value.get_secret_value() if hasattr(value, "get_secret_value") else str(value)
+        for name, value in given.items()
+    }
     return {f"GRASPD_{name.upper()}": value for name, value in plain.items()}
 
 
@@ -256,8 +258,10 @@ def main() -> None:
     parser.add_argument("--s3", action="store_true", help="the store on an S3 server instead of files")
     parser.add_argument("--json", type=Path, help="keep the figures there")
     given = parser.parse_args()
-    say("| workers | lag of events, p95 | worst | lease sweep | tasks/s "
-        "| keeper, of a task | database | Redis | events | objects |")  # fmt: skip
+    say(
+        "| workers | lag of events, p95 | worst | lease sweep | tasks/s "
+        "| keeper, of a task | database | Redis | events | objects |"
+    )
     say(f"|{' --: |' * 10}")
     results = []
     for workers in given.workers:

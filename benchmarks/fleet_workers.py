@@ -189,18 +189,33 @@ class Fleet:
 def _beat(name: str, held: Held | None) -> dict[str, Any]:
     now = timestamp()
     task = held.message["task_id"] if held else ""
-    return {"name": name, "host": "fleet", "pid": 1, "device": "cpu", "device_name": "none", "stages": ["synthesize"],
-            "version": PACKAGE_VERSION, "state": "busy" if held else "idle", "task_id": task, "started": now,
-            "seen": now, "schemas": own_ability().schemas, "revisions": dict(own_ability().revisions)}  # fmt: skip
+    return {
+        "name": name,
+        "host": "fleet",
+        "pid": 1,
+        "device": "cpu",
+        "device_name": "none",
+        "stages": ["synthesize"],
+        "version": PACKAGE_VERSION,
+        "state": "busy" if held else "idle",
+        "task_id": task,
+        "started": now,
+        "seen": now,
+        "schemas": own_ability().schemas,
+        "revisions": dict(own_ability().revisions),
+    }
 
 
 def main() -> None:
     workers, task_s = int(sys.argv[1]), float(sys.argv[2])
     settings = Settings()
     fleet = Fleet(
-        open_queue(settings), open_store(settings.resolved_store_url), workers=workers, task_s=task_s,
+        open_queue(settings),
+        open_store(settings.resolved_store_url),
+        workers=workers,
+        task_s=task_s,
         lease_s=settings.lease_s,
-    )  # fmt: skip
+    )
     ended: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, _: ended.append(number))
     while not ended:

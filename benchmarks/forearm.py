@@ -44,9 +44,12 @@ class Upstream:
 
     def __init__(self, urdf: Path, root: str) -> None:
         self.robot = yourdfpy.URDF.load(
-            str(urdf), load_meshes=False, build_scene_graph=True, load_collision_meshes=True,
+            str(urdf),
+            load_meshes=False,
+            build_scene_graph=True,
+            load_collision_meshes=True,
             build_collision_scene_graph=True,
-        )  # fmt: skip
+        )
         self.root = root
         carrier = {joint.child: joint for joint in self.robot.robot.joints}
         self.links: list[str] = []

@@ -38,14 +38,22 @@ HAND = "hands/shadow/shadow_hand_right.urdf"
 OTHER = "robopianist/models/hands/third_party/shadow_hand/right_hand.xml"
 #: How grasps are planned, and the options of the hand.
 PLANS: dict[str, dict[str, Any]] = {
-    "a drive each": {"tendons": {}}, "tendons": {}, "tendons, shapes as they look": {"shapes": "visual"},
-}  # fmt: skip
+    "a drive each": {"tendons": {}},
+    "tendons": {},
+    "tendons, shapes as they look": {"shapes": "visual"},
+}
 #: Neither the seeds nor the objects that anything here was chosen with (404, 405; ball, brick, cube, can, mug, koala,
 #: banana): these are held out.
 SEED = 7020
 HELD_OUT = (
-    "003_cracker_box", "006_mustard_bottle", "024_bowl", "035_power_drill", "037_scissors", "048_hammer", "spot",
-)  # fmt: skip
+    "003_cracker_box",
+    "006_mustard_bottle",
+    "024_bowl",
+    "035_power_drill",
+    "037_scissors",
+    "048_hammer",
+    "spot",
+)
 NOMINAL, FOREIGN = "nominal", "foreign"
 #: Models of one URDF: with the shapes that touch in it, and with those that it shows.
 TOUCH, LOOKS = "ours, shapes that touch", "ours, shapes as they look"
@@ -103,25 +111,33 @@ class Bench:
         same: SameHand = self.same[plan]
         ours, theirs, there = same.ours, same.theirs, in_other_model(same, grasps)
         found = {NOMINAL: (ours, grasps), FOREIGN: (theirs, there), TOUCH: (self.hands["tendons"], grasps)}
-        return found if plan != TRACED else found | {
-            LOOKS: (self.hands["tendons, shapes as they look"], grasps),
-            "ours, a drive each": (replace(ours, tendons=()), grasps),
-            "ours, their shapes": (with_their_shapes(same), grasps),
-            "theirs, our shapes": (with_our_shapes(same), there),
-            "theirs, a drive each": (replace(theirs, tendons=()), there),
-            "theirs, without armature and dry friction": (replace(theirs, drag=None), there),
-        }  # fmt: skip
+        return (
+            found
+            if plan != TRACED
+            else found
+            | {
+                LOOKS: (self.hands["tendons, shapes as they look"], grasps),
+                "ours, a drive each": (replace(ours, tendons=()), grasps),
+                "ours, their shapes": (with_their_shapes(same), grasps),
+                "theirs, our shapes": (with_our_shapes(same), there),
+                "theirs, a drive each": (replace(theirs, tendons=()), there),
+                "theirs, without armature and dry friction": (replace(theirs, drag=None), there),
+            }
+        )
 
 
 def page(rows: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
     lines = [
-        "# Shadow grasps in a foreign model", "",
+        "# Shadow grasps in a foreign model",
+        "",
         "`python -m benchmarks.foreign DATA --sources SOURCES --out docs/results/foreign --objects ...`: "
         f"{facts['grasps']} raw standard grasps on each object, seed {facts['seed']}, planned with the URDF, "
         "judged by the certificate in it (*nominal*) and in robopianist's MJCF (*foreign*), fingertips within "
-        f"{facts['fingertips_mm']:.2f} mm. Counts: grasps that hold nominally and, of these, in the foreign model.", "",
-        "| object | " + " | ".join(PLANS) + " |", "| --- | " + " | ".join("--:" for _ in PLANS) + " |",
-    ]  # fmt: skip
+        f"{facts['fingertips_mm']:.2f} mm. Counts: grasps that hold nominally and, of these, in the foreign model.",
+        "",
+        "| object | " + " | ".join(PLANS) + " |",
+        "| --- | " + " | ".join("--:" for _ in PLANS) + " |",
+    ]
     for name, row in rows.items():
         lines.append(
             f"| {name} | "
@@ -140,16 +156,24 @@ def page(rows: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
             else []
         )
         lines += [f"| **{title}** | " + " | ".join(cells) + " |"] if cells else []
-    lines += ["", "By model, all objects: the share of raw grasps that holds in it, and of those that hold nominally.",
-              "",
-              "| planned with | judged in | holds | of nominal |", "| --- | --- | --: | --: |"]  # fmt: skip
+    lines += [
+        "",
+        "By model, all objects: the share of raw grasps that holds in it, and of those that hold nominally.",
+        "",
+        "| planned with | judged in | holds | of nominal |",
+        "| --- | --- | --: | --: |",
+    ]
     for plan in PLANS:
         for model in next(iter(rows.values()))[plan]:
             a, b = (joined(rows, list(rows), plan, which) for which in (NOMINAL, model))
             lines.append(f"| {plan} | {model} | {b.mean():.2f} | {(a & b).sum() / max(1, a.sum()):.2f} |")
-    lines += ["", "Certified in both models that one URDF gives, with the shapes that touch and with those it shows:",
-              "",
-              "| planned with | of all | of these in the foreign model |", "| --- | --: | --: |"]  # fmt: skip
+    lines += [
+        "",
+        "Certified in both models that one URDF gives, with the shapes that touch and with those it shows:",
+        "",
+        "| planned with | of all | of these in the foreign model |",
+        "| --- | --: | --: |",
+    ]
     for plan, looks, touch in ((TRACED, LOOKS, NOMINAL), ("tendons, shapes as they look", NOMINAL, TOUCH)):
         twice = joined(rows, list(rows), plan, looks) & joined(rows, list(rows), plan, touch)
         there = twice & joined(rows, list(rows), plan, FOREIGN)

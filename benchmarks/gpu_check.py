@@ -75,8 +75,10 @@ def kernels(name: str, arch: int, assembler: Path) -> list[Kernel]:
         path.write_bytes(text)
         done = subprocess.run(
             [assembler, "-v", f"-arch=sm_{arch}", path, "-o", Path(folder) / "out.cubin"],
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            check=False,
+        )
     if done.returncode:
         sys.exit(f"{name} for sm_{arch}: {done.stderr.strip()[:400]}")
     return list(_told(done.stderr, name, arch))

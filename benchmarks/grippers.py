@@ -52,9 +52,12 @@ def main() -> None:
         if done.get(name, {}).get("key") != key:
             jaws = jaws_of(hand)
             done[name] = {
-                "key": key, "title": entry.title, "grasps": asked.grasps, "cells": {},
+                "key": key,
+                "title": entry.title,
+                "grasps": asked.grasps,
+                "cells": {},
                 "opening_mm": round(1e3 * jaws.opening, 1) if jaws else None,
-            }  # fmt: skip
+            }
         for mesh in objects:
             cells = done[name]["cells"]
             if mesh.parent.name not in cells:
@@ -87,12 +90,15 @@ def page(done: dict[str, Any]) -> str:
         f"{done[n]['title']}" + (f", {done[n]['opening_mm']:.0f} mm" if done[n]["opening_mm"] else "") for n in names
     ]
     rows = [
-        "# Grippers on objects that fit", "",
+        "# Grippers on objects that fit",
+        "",
         "`python -m benchmarks.grippers DATA --sources /tmp/hands`: share of raw grasps that hold by the certificate, "
         f"{done[names[0]]['grasps']} a cell, standard fidelity, seed {SEED}; no object was used to choose a setting. "
         "The title tells how far a gripper opens; *too wide*: said before any work. The mean is over objects that fit.",
-        "", "| object | " + " | ".join(titles) + " |", "| --- |" + " --: |" * len(names),
-    ]  # fmt: skip
+        "",
+        "| object | " + " | ".join(titles) + " |",
+        "| --- |" + " --: |" * len(names),
+    ]
     for obj in objects:
         cells = (done[name]["cells"].get(obj) for name in names)
         shown = [

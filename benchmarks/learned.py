@@ -45,9 +45,15 @@ FIDELITY = FIDELITIES["standard"]
 BUDGET = 16.0
 HELD_OUT = ("006_mustard_bottle", "025_mug", "035_power_drill", "061_foam_brick")
 TITLES = {
-    "hand": "hand", "object": "object", "method": "method", "found": "first found", "first": "CPU s to the first",
-    "valid": "valid of tried", "rate": "valid per CPU s", "gain": "rate over fast_graspd",
-}  # fmt: skip
+    "hand": "hand",
+    "object": "object",
+    "method": "method",
+    "found": "first found",
+    "first": "CPU s to the first",
+    "valid": "valid of tried",
+    "rate": "valid per CPU s",
+    "gain": "rate over fast_graspd",
+}
 
 
 def study(
@@ -62,9 +68,14 @@ def study(
     def made(name: str, count: int, scenes: Scenes, seed: int, want: str = "valid") -> tuple[int, int, float]:
         """Valid grasps, grasps tried, processor time."""
         request = JobOptions(
-            method=name.split()[0], options=methods[name], fidelity=FIDELITY, seed=seed, want=want, audits=0,
+            method=name.split()[0],
+            options=methods[name],
+            fidelity=FIDELITY,
+            seed=seed,
+            want=want,
+            audits=0,
             budget=BUDGET if count == 1 else 4.0,
-        )  # fmt: skip
+        )
         began = time.process_time()
         done = certified_grasps(
             hand, obj, request, count=count, scenes=scenes, pieces=lambda _: pieces, run=Run(threads=1)
@@ -81,14 +92,21 @@ def study(
     own = batch["fast_graspd"][0] / batch["fast_graspd"][2]
     return [
         {
-            "hand": hand.name, "object": obj.name, "method": name, "many": many, "seeds": seeds,
-            "found": sum(one[0] for one in found[name]), "firsts": [round(one[2], 3) for one in found[name]],
-            "first": float(np.median([one[2] for one in found[name]])), "valid": batch[name][0] / batch[name][1],
-            "seconds": batch[name][2], "rate": batch[name][0] / batch[name][2],
+            "hand": hand.name,
+            "object": obj.name,
+            "method": name,
+            "many": many,
+            "seeds": seeds,
+            "found": sum(one[0] for one in found[name]),
+            "firsts": [round(one[2], 3) for one in found[name]],
+            "first": float(np.median([one[2] for one in found[name]])),
+            "valid": batch[name][0] / batch[name][1],
+            "seconds": batch[name][2],
+            "rate": batch[name][0] / batch[name][2],
             "gain": batch[name][0] / batch[name][2] / own if own else None,
         }
         for name in methods
-    ]  # fmt: skip
+    ]
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
@@ -104,14 +122,18 @@ def page(rows: Sequence[dict[str, Any]], networks: dict[str, str], command: str)
     """The table as a page of the docs, with what each network says of itself."""
     many, seeds = rows[0]["many"], rows[0]["seeds"]
     lines = [
-        "# Seeds from a network", "",
+        "# Seeds from a network",
+        "",
         f"graspd {PACKAGE_VERSION}, `{command}`: a table, {FIDELITY.name} fidelity, certified, one thread. The first: "
         f"processor time until one grasp is valid, the median over {seeds} seeds, those included that gave up after "
         f"{BUDGET:g} tries. Valid of tried and the rate: one batch of {many}. Planning, verdicts and metrics count; "
-        "loading does not.", "",
-        *(f"- `{digest}`: {about or 'says nothing of itself'}" for digest, about in networks.items()), "", table(rows),
+        "loading does not.",
         "",
-    ]  # fmt: skip
+        *(f"- `{digest}`: {about or 'says nothing of itself'}" for digest, about in networks.items()),
+        "",
+        table(rows),
+        "",
+    ]
     return "\n".join(lines)
 
 

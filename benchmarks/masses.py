@@ -77,9 +77,12 @@ def lifts(given: Any, hand: str, name: str, mass: float) -> tuple[float, float]:
         grasps=given.grasps, want="raw", audits=0, seed=given.seed, scene="table", scenes=given.scenes, mass=mass
     )
     made = synthesized(
-        str(given.data / "hands" / HANDS[hand]), str(given.data / "objects" / name / "clean.stl"), request,
-        place=parse_scene("table"), scenes=given.scenes,
-    )  # fmt: skip
+        str(given.data / "hands" / HANDS[hand]),
+        str(given.data / "objects" / name / "clean.stl"),
+        request,
+        place=parse_scene("table"),
+        scenes=given.scenes,
+    )
     told = made.summary()
     return told["lift_share"], told["lift_hard_share"]
 

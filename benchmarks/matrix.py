@@ -24,7 +24,6 @@ from typing import Annotated, Any, Final
 import typer
 
 from api.client.client import Client
-from api.client.datasets import DatasetClient
 from api.formatting import duration, size
 from service.index.dataset_views import CellView, DatasetView
 from service.model.cores import available_cores
@@ -93,8 +92,8 @@ class Run:
             raise SystemExit(f"{' '.join(arguments)}: {done.stderr}")
         return json.loads(done.stdout.splitlines()[-1])
 
-    def datasets(self) -> DatasetClient:
-        return DatasetClient(Client(self.url))
+    def client(self) -> Client:
+        return Client(self.url)
 
     def shards(self) -> dict[str, tuple[str, str]]:
         """Checksum and time of each manifest in the store."""
@@ -145,9 +144,19 @@ def main(
     for name, urdf in HANDS.items():
         typer.echo(run.graspd("hands", "add", str(data / "hands" / urdf), "--name", name, "--no-self-test")["message"])
     create = (
-        "datasets", "create", DATASET, "--hands", ",".join(HANDS), "--objects", str(data / "objects"),
-        "--grasps", str(grasps), "--fidelity", fidelity, "--yes",
-    )  # fmt: skip
+        "datasets",
+        "create",
+        DATASET,
+        "--hands",
+        ",".join(HANDS),
+        "--objects",
+        str(data / "objects"),
+        "--grasps",
+        str(grasps),
+        "--fidelity",
+        fidelity,
+        "--yes",
+    )
     start = time.monotonic()
     estimate = run.graspd(*create)["estimate"]
     kept.estimate_s = kept.estimate_s or estimate["seconds"]
@@ -161,7 +170,7 @@ def main(
     kept.seconds += time.monotonic() - start
     kept.save(data_dir / "run.json")
     after = run.shards()
-    found, cells = run.datasets().dataset(DATASET), list(run.datasets().cells(DATASET))
+    found, cells = run.client().dataset(DATASET), list(run.client().cells(DATASET))
     check = run.graspd("index", "rebuild", "--check", "--data-dir", str(data_dir / "data"))
     run.stop()
     facts = {
@@ -182,7 +191,7 @@ def follow(run: Run, *, until: float, end: float) -> float:
     """Wait until a share of the tasks is done, the dataset has ended, or the time is over; returns the share."""
     said = 0.0
     while True:
-        found = run.datasets().dataset(DATASET)
+        found = run.client().dataset(DATASET)
         if found.progress - said > 0.02:
             said = found.progress
             typer.echo(f"{time.strftime('%H:%M:%S')} {100 * found.progress:.0f} % {found.valid} of {found.tried}")

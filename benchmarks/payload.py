@@ -167,9 +167,7 @@ def every(grasps: GraspSet) -> NDArray[np.intp]:
     return np.tile(np.arange(len(grasps)), 1 + len(FORCES_N))
 
 
-def valid_grasps(
-    given: Any, hand: HandModel, mesh: Path, mass: float
-) -> tuple[GraspSet, ObjectModel, Placed | None]:  # fmt: skip
+def valid_grasps(given: Any, hand: HandModel, mesh: Path, mass: float) -> tuple[GraspSet, ObjectModel, Placed | None]:
     """Grasps of an object about its centre, and their scenes; None: the object is free."""
     obj = object_from_path(str(mesh), face_error_m=FIDELITIES["standard"].face_error_m).weighing(mass=mass)
     request = JobOptions(grasps=given.grasps, audits=0, seed=given.seed)

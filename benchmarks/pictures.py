@@ -48,9 +48,13 @@ def run(root: Path, *arguments: str) -> tuple[dict[str, Any], dict[str, NDArray[
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "made.npz"
         done = subprocess.run(
-            [sys.executable, "-c", CHILD, *arguments, str(file)], cwd=root, env=environment_of(root),
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
+            [sys.executable, "-c", CHILD, *arguments, str(file)],
+            cwd=root,
+            env=environment_of(root),
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         if done.returncode:
             sys.exit(f"{root}: {done.stderr[-2000:]}")
         with np.load(file) as stored:

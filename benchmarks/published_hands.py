@@ -39,13 +39,22 @@ MORE = (
     Entry("allegro-left", "Allegro, left", "mani-skill, Apache-2.0", f"{_SKILL}/allegro/allegro_hand_left.urdf"),
     Entry("dclaw", "D'Claw", "mani-skill, Apache-2.0", f"{_SKILL}/dclaw/dclaw_gripper_glb.urdf"),
     Entry("f5d6", "Dexmate F5D6", "dexmate-urdf, Apache-2.0", f"{_MATE}/f5d6_right.urdf"),
-    Entry("adroit", "Adroit", "gymnasium-robotics, MIT",
-          "gymnasium_robotics/envs/assets/adroit_hand/adroit_relocate.xml"),
-    Entry("inspire-urdf", "Inspire RH56, URDF", "mani-skill, Apache-2.0",
-          f"{_SKILL}/inspire_hand/RH56DFX-2LR/urdf/inspire_hand_right.urdf"),
-    Entry("ability-urdf", "PSYONIC Ability, URDF", "mani-skill, Apache-2.0",
-          f"{_SKILL}/ability_hand/ability_hand_right.urdf"),
-)  # fmt: skip
+    Entry(
+        "adroit", "Adroit", "gymnasium-robotics, MIT", "gymnasium_robotics/envs/assets/adroit_hand/adroit_relocate.xml"
+    ),
+    Entry(
+        "inspire-urdf",
+        "Inspire RH56, URDF",
+        "mani-skill, Apache-2.0",
+        f"{_SKILL}/inspire_hand/RH56DFX-2LR/urdf/inspire_hand_right.urdf",
+    ),
+    Entry(
+        "ability-urdf",
+        "PSYONIC Ability, URDF",
+        "mani-skill, Apache-2.0",
+        f"{_SKILL}/ability_hand/ability_hand_right.urdf",
+    ),
+)
 OBJECTS = ("025_mug", "005_tomato_soup_can", "011_banana")
 #: Not a seed that any setting was chosen with.
 SEED, SCENES = 404, 4
@@ -74,9 +83,15 @@ def main() -> None:
         seconds = time.perf_counter() - began
         lifts = {name: lift_share(hand, asked.data / "objects" / name, asked.grasps) for name in OBJECTS}
         done[entry.name] = {
-            "key": key, "title": entry.title, "source": entry.source, "dofs": hand.dofs, "grasps": asked.grasps,
-            "self_test": tried, "seconds": round(seconds, 1), "lifts": lifts,
-        }  # fmt: skip
+            "key": key,
+            "title": entry.title,
+            "source": entry.source,
+            "dofs": hand.dofs,
+            "grasps": asked.grasps,
+            "self_test": tried,
+            "seconds": round(seconds, 1),
+            "lifts": lifts,
+        }
         results.write_text(json.dumps(done, indent=1) + "\n")
         (asked.out / "published_hands.md").write_text(page(done))
         sys.stderr.write(f"{entry.title}: {tried['says']}; {lifts}\n")

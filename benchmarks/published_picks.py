@@ -158,8 +158,11 @@ def picked(case: Case, pieces: ConvexPieces, terms: Terms) -> dict[str, Any]:
         halves = list(pool.map(part, [range(0, len(grasps), 2), range(1, len(grasps), 2)]))
     found: list[tuple[str, float]] = [("", 0.0)] * len(grasps)
     found[0::2], found[1::2] = halves
-    return {"held": [what == "lifted" for what, _ in found], "reasons": [what for what, _ in found],
-            "margin": [finite(margin) for _, margin in found]}  # fmt: skip
+    return {
+        "held": [what == "lifted" for what, _ in found],
+        "reasons": [what for what, _ in found],
+        "margin": [finite(margin) for _, margin in found],
+    }
 
 
 def finite(value: float) -> float:
@@ -168,8 +171,11 @@ def finite(value: float) -> float:
 
 def pushed(case: Case, pieces: ConvexPieces, **terms: Any) -> dict[str, Any]:
     found = judge(case.hand, case.obj, case.grasps, pieces=pieces, **terms)
-    return {"held": (found.success == 1).tolist(), "reasons": found.reasons,
-            "margin": [finite(one) for one in found.margin]}  # fmt: skip
+    return {
+        "held": (found.success == 1).tolist(),
+        "reasons": found.reasons,
+        "margin": [finite(one) for one in found.margin],
+    }
 
 
 def lifted(case: Case, pieces: ConvexPieces) -> dict[str, Any]:
@@ -178,8 +184,12 @@ def lifted(case: Case, pieces: ConvexPieces) -> dict[str, Any]:
     way = plan_way(case.hand, case.obj, case.grasps, placed)
     grasps = replace(case.grasps, approach=way.approach, coming=way.open, lift=way.lift)
     found = judge_lifts(case.hand, case.obj, grasps, placed, pieces=pieces)
-    return {"held": (found.success == 1).tolist(), "reasons": found.reasons,
-            "margin": [finite(one) for one in found.margin], "clear": way.clear.tolist()}  # fmt: skip
+    return {
+        "held": (found.success == 1).tolist(),
+        "reasons": found.reasons,
+        "margin": [finite(one) for one in found.margin],
+        "clear": way.clear.tolist(),
+    }
 
 
 def no_holds(case: Case, pieces: ConvexPieces) -> dict[str, Any]:
@@ -258,11 +268,16 @@ def row(words: str, held: NDArray[np.bool_], margin: Floats | None, truth: NDArr
     # A test differs from the constant only where it says "fails": McNemar, exact.
     chance = float(binomtest(right, right + wrong).pvalue) if right + wrong else 1.0
     return {
-        "test": words, "n": len(truth), "holds": float(held.mean()), "agreement": agree / len(truth),
+        "test": words,
+        "n": len(truth),
+        "holds": float(held.mean()),
+        "agreement": agree / len(truth),
         "interval": [round(bound, 4) for bound in wilson(agree, len(truth))],
-        "fails_both": right, "fails_here_alone": wrong, "p_against_constant": chance,
+        "fails_both": right,
+        "fails_here_alone": wrong,
+        "p_against_constant": chance,
         "auc": None if margin is None else area_under_curve(margin, truth),
-    }  # fmt: skip
+    }
 
 
 def main() -> None:
@@ -286,17 +301,25 @@ def main() -> None:
     picks = [one for one in picks if one["pick_success_published"] is not None]
     auc = {name: area_under_curve(-np.array([one[key] for one in picks]), truth) for name, key in scores.items()}
     objects = [
-        {"object": file.stem, "n": int((case.published >= 0).sum()), "picked": float((case.published == 1).sum()
-         / (case.published >= 0).sum()), **{words: float(np.mean(np.array(one[words]["held"])
-         == (case.published[case.published >= 0] == 1))) for words in SHOWN}}  # type: ignore[operator, index]
+        {
+            "object": file.stem,
+            "n": int((case.published >= 0).sum()),
+            "picked": float((case.published == 1).sum() / (case.published >= 0).sum()),
+            **{
+                words: float(np.mean(np.array(one[words]["held"]) == (case.published[case.published >= 0] == 1)))
+                for words in SHOWN
+            },
+        }  # type: ignore[operator, index]
         for file, case, one in zip(files, cases, found, strict=True)
-    ]  # fmt: skip
+    ]
     nothing = {
-        name: {"n": sum(len(one["no holds"][name]["held"]) for one in found),
-               "held": sum(sum(one["no holds"][name]["held"]) for one in found),
-               "reasons": dict(Counter(why for one in found for why in one["no holds"][name]["reasons"]).most_common())}
+        name: {
+            "n": sum(len(one["no holds"][name]["held"]) for one in found),
+            "held": sum(sum(one["no holds"][name]["held"]) for one in found),
+            "reasons": dict(Counter(why for one in found for why in one["no holds"][name]["reasons"]).most_common()),
+        }
         for name in found[0]["no holds"]
-    }  # fmt: skip
+    }
     text = markdown(rows, auc, objects, nothing)
     sys.stdout.write(text)
     if args.out:
@@ -315,8 +338,10 @@ SHOWN = (
 def markdown(
     rows: list[dict[str, Any]], auc: dict[str, float], objects: list[dict[str, Any]], nothing: dict[str, dict[str, Any]]
 ) -> str:
-    lines = ["| test | holds | agrees with the published pick (95 %) | fails here and there, here alone | p | AUC |",
-             "| --- | --: | --- | --: | --: | --: |"]  # fmt: skip
+    lines = [
+        "| test | holds | agrees with the published pick (95 %) | fails here and there, here alone | p | AUC |",
+        "| --- | --: | --- | --: | --: | --: |",
+    ]
     for one in rows:
         low, high = (f"{100 * bound:.1f}" for bound in one["interval"])
         area = "" if one["auc"] is None else f"{one['auc']:.2f}"

@@ -34,15 +34,29 @@ PAPER = {
     "shadow": {"ca_cm2": 58.6, "iv_cm3": 6.34, "epsilon": 0.18, "wrench_volume": 3.42, "sd_cm": 2.42},
 }
 COLUMNS = {
-    "pd_mm": "penetration_depth_mm", "spd_mm": "self_penetration_depth_mm", "ca_cm2": "contact_area_cm2",
-    "iv_cm3": "intersection_volume_cm3", "epsilon": "epsilon", "wrench_volume": "wrench_volume",
-}  # fmt: skip
+    "pd_mm": "penetration_depth_mm",
+    "spd_mm": "self_penetration_depth_mm",
+    "ca_cm2": "contact_area_cm2",
+    "iv_cm3": "intersection_volume_cm3",
+    "epsilon": "epsilon",
+    "wrench_volume": "wrench_volume",
+}
 #: Columns of the printed table: key, heading, digits.
 PRINTED = (
-    ("gsr", "GSR", 2), ("gsr_hard", "hard", 2), ("robust", "robust", 2), ("sgs", "SGS", 1),
-    ("pd_mm", "PD", 2), ("spd_mm", "SPD", 2), ("cdc_mm", "CDC", 2), ("ca_cm2", "CA", 1), ("iv_cm3", "IV", 2),
-    ("epsilon", "ε", 2), ("wrench_volume", "Vol", 2), ("sd_cm", "SD", 2), ("diversity", "D", 2),
-)  # fmt: skip
+    ("gsr", "GSR", 2),
+    ("gsr_hard", "hard", 2),
+    ("robust", "robust", 2),
+    ("sgs", "SGS", 1),
+    ("pd_mm", "PD", 2),
+    ("spd_mm", "SPD", 2),
+    ("cdc_mm", "CDC", 2),
+    ("ca_cm2", "CA", 1),
+    ("iv_cm3", "IV", 2),
+    ("epsilon", "ε", 2),
+    ("wrench_volume", "Vol", 2),
+    ("sd_cm", "SD", 2),
+    ("diversity", "D", 2),
+)
 
 
 def metrics(cell: Cell) -> dict[str, Any]:
@@ -75,18 +89,26 @@ def row(cell: Cell) -> dict[str, Any]:
     top = np.argsort(-np.array(quality["epsilon"]))[:TOP]
     made, judged = cell.cpu_seconds / CORES, certificate["cpu_seconds"] / CORES
     return {
-        "object": cell.object_name, "n": len(letter), "gsr": float(letter.mean()), "gsr_hard": float(hard.mean()),
-        "robust": float(shares.mean()) if len(shares) else None, "robust_n": len(shares),
+        "object": cell.object_name,
+        "n": len(letter),
+        "gsr": float(letter.mean()),
+        "gsr_hard": float(hard.mean()),
+        "robust": float(shares.mean()) if len(shares) else None,
+        "robust_n": len(shares),
         "robust_many": int(reaches(shares, SHARE).sum()),
-        "osr": float(letter.any()), "osr_hard": float(hard.any()), "held": int(letter.sum()),
-        "seconds": made, "referee_seconds": judged, "sgs": float(letter.sum() / (made + judged)),
+        "osr": float(letter.any()),
+        "osr_hard": float(hard.any()),
+        "held": int(letter.sum()),
+        "seconds": made,
+        "referee_seconds": judged,
+        "sgs": float(letter.sum() / (made + judged)),
         "sgs_without_referee": float(letter.sum() / made),
         **{key: float(np.median(quality[key])) for key in (*COLUMNS, "cdc_mm", "sd_cm")},
         "diversity": quality["diversity"],
         "top": {key: float(np.array(quality[key])[top].mean()) for key in PAPER["allegro"]},
         "top_held": float(letter[top].mean()),
         **{key: cell.verdicts("letter", False)[key] for key in ("pieces", "volume_ratio", "excess_mm", "terms")},
-    }  # fmt: skip
+    }
 
 
 def whole(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -97,14 +119,20 @@ def whole(rows: list[dict[str, Any]]) -> dict[str, Any]:
     certified = sum(r["robust_n"] for r in rows)
     known = [r for r in rows if r["robust_n"]]
     return out | {
-        "object": "all", "n": n, "gsr": held / n, "gsr_hard": sum(r["gsr_hard"] * r["n"] for r in rows) / n,
+        "object": "all",
+        "n": n,
+        "gsr": held / n,
+        "gsr_hard": sum(r["gsr_hard"] * r["n"] for r in rows) / n,
         "robust": sum(r["robust"] * r["robust_n"] for r in known) / certified if certified else None,
-        "robust_n": certified, "robust_many": sum(r["robust_many"] for r in rows),
-        "osr": float(np.mean([r["osr"] for r in rows])), "osr_hard": float(np.mean([r["osr_hard"] for r in rows])),
-        "sgs": held / (made + judged), "sgs_without_referee": held / made,
+        "robust_n": certified,
+        "robust_many": sum(r["robust_many"] for r in rows),
+        "osr": float(np.mean([r["osr"] for r in rows])),
+        "osr_hard": float(np.mean([r["osr_hard"] for r in rows])),
+        "sgs": held / (made + judged),
+        "sgs_without_referee": held / made,
         "top": {key: float(np.mean([r["top"][key] for r in rows])) for key in PAPER["allegro"]},
         "top_held": float(np.mean([r["top_held"] for r in rows])),
-    }  # fmt: skip
+    }
 
 
 def shown(value: float | None, digits: int) -> str:

@@ -76,10 +76,14 @@ def study(cell: Cell, draws: int) -> dict[str, Any]:
         if not wanted:
             share, weakest = found.share[held], found.weakest[held]
     return {
-        "raw": len(held), "held": int(held.sum()), "rows": rows, "jobs": jobs,
-        "shares": [round(float(one), 6) for one in share], "weakest": [int(one) for one in weakest],
+        "raw": len(held),
+        "held": int(held.sum()),
+        "rows": rows,
+        "jobs": jobs,
+        "shares": [round(float(one), 6) for one in share],
+        "weakest": [int(one) for one in weakest],
         "nominal_cpu_seconds": cell.verdicts("certificate", False)["cpu_seconds"],
-    }  # fmt: skip
+    }
 
 
 def summed(hand: str, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
@@ -94,8 +98,13 @@ def summed(hand: str, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
     tried = len(shares)
     reached = {f"{wanted:g}": int(reaches(shares, wanted).sum()) for wanted in SHARES}
     return {
-        "hand": hand, "raw": sum(cell["raw"] for cell in every), "held": tried, "rows": rows,
-        "share": float(shares.mean()), "reached": reached, "weakest": dict(weakest.most_common()),
+        "hand": hand,
+        "raw": sum(cell["raw"] for cell in every),
+        "held": tried,
+        "rows": rows,
+        "share": float(shares.mean()),
+        "reached": reached,
+        "weakest": dict(weakest.most_common()),
         "cpu_ms": {
             wanted: 1e3 * sum(cell["jobs"][wanted]["cpu_seconds"] for cell in every) / tried
             for wanted in every[0]["jobs"]
@@ -105,7 +114,7 @@ def summed(hand: str, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
         },
         "nominal_cpu_ms": 1e3 * sum(cell["nominal_cpu_seconds"] for cell in every) / sum(c["raw"] for c in every),
         "cells": found,
-    }  # fmt: skip
+    }
 
 
 def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:

@@ -59,9 +59,13 @@ np.savez(sys.argv[4], spent=spent, steps=found.steps, **{{name: getattr(found, n
 def run(root: Path, code: str, *arguments: str) -> None:
     """Runs a program in a checkout; ends this one if it fails."""
     done = subprocess.run(
-        [sys.executable, "-c", code, *arguments], cwd=root, env=environment_of(root), capture_output=True, text=True,
+        [sys.executable, "-c", code, *arguments],
+        cwd=root,
+        env=environment_of(root),
+        capture_output=True,
+        text=True,
         check=False,
-    )  # fmt: skip
+    )
     if done.returncode:
         sys.exit(f"{root}: {done.stderr[-2000:]}")
 
@@ -101,9 +105,11 @@ def main() -> None:
             exact = ("outcome", "margin", "penetration_depth_mm", "self_penetration_depth_mm")
             count = len(found[0]["outcome"])
             row = [
-                count, equal_rows(*found, ("outcome",)), equal_rows(*found, exact),
+                count,
+                equal_rows(*found, ("outcome",)),
+                equal_rows(*found, exact),
                 *(1e3 * float(one["spent"]) for one in found),
-            ]  # fmt: skip
+            ]
             totals += row
             lines.append(line(f"{hand}, {obj}", row))
     sys.stdout.write("\n".join([*lines, line("**all**", list(totals))]) + "\n")

@@ -51,12 +51,23 @@ COMMAND = (
 SEED = 404
 FIDELITY = FIDELITIES["standard"]
 TITLES = {
-    "object": "object", "count": "grasps", "faces": "faces", "clear_contact": "clear at contact",
-    "clear_way": "clear on the way", "pushes_of_clear": "of these six pushes", "letter": "letter, clear",
-    "lift": "lift", "hard": "lift, half friction", "faces_held": "faces with one", "reach": "faces in reach",
-    "reach_held": "of these with one", "filter_lift": "free, filtered: lift", "price": "CPU over free",
-    "gain": "valid/s over filtered", "of_free": "valid/s over free valid/s",
-}  # fmt: skip
+    "object": "object",
+    "count": "grasps",
+    "faces": "faces",
+    "clear_contact": "clear at contact",
+    "clear_way": "clear on the way",
+    "pushes_of_clear": "of these six pushes",
+    "letter": "letter, clear",
+    "lift": "lift",
+    "hard": "lift, half friction",
+    "faces_held": "faces with one",
+    "reach": "faces in reach",
+    "reach_held": "of these with one",
+    "filter_lift": "free, filtered: lift",
+    "price": "CPU over free",
+    "gain": "valid/s over filtered",
+    "of_free": "valid/s over free valid/s",
+}
 
 
 def study(
@@ -171,13 +182,14 @@ def table(rows: list[dict[str, Any]]) -> str:
 def page(results: dict[str, list[dict[str, Any]]]) -> str:
     """The tables of all hands as a page of the docs."""
     lines = [
-        "# Grasps planned in scenes", "",
+        "# Grasps planned in scenes",
+        "",
         f"graspd {PACKAGE_VERSION}, `{COMMAND}`: real URDFs, {FIDELITY.name} fidelity, seed {SEED}; a table, each "
         "stable resting face that at least 3 % of drops end on. Shares are of all raw grasps unless it says otherwise; "
         "seconds are CPU time of planning. A face is in reach if two points of the object that look away from each "
         "other lie 4 mm clear of the table, less than 30 degrees from level, and no farther apart than the hand's "
         "opposed fingers open. Where no filtered grasp lifts, the gain is counted as if one had: it is more.",
-    ]  # fmt: skip
+    ]
     for name, rows in results.items():
         lines += ["", f"## {name}", "", table(rows)]
     every = [row for rows in results.values() for row in rows]
@@ -189,10 +201,11 @@ def page(results: dict[str, list[dict[str, Any]]]) -> str:
     seconds = sum(row["seconds"] * row["count"] for row in every)
     free_seconds = sum(row["free_seconds"] * row["filter_count"] for row in every)
     lines += [
-        "", f"Planned in their scenes {lifted} of {raw} grasps lift, {lifted / seconds:.2f} a second; planned free and "
+        "",
+        f"Planned in their scenes {lifted} of {raw} grasps lift, {lifted / seconds:.2f} a second; planned free and "
         f"filtered {filtered} of {sum(row['filter_count'] for row in every)}, {filtered / free_seconds:.3f} a second: "
         f"{lifted / seconds * free_seconds / max(filtered, 1):.0f} times as many.",
-    ]  # fmt: skip
+    ]
     return "\n".join(
         [*lines, "", "## All pairs", "", *table(every).splitlines()[:2], table(every).splitlines()[-1], ""]
     )

@@ -71,9 +71,12 @@ def again(given: Any, name: str, hand: HandModel, obj: str, mass: float) -> tupl
     mesh_file = given.data / "objects" / obj / "clean.stl"
     request = JobOptions(grasps=given.grasps, audits=0, seed=given.seed, scene="table", scenes=given.scenes, mass=mass)
     made = synthesized(
-        str(given.data / "hands" / HANDS[name]), str(mesh_file), request, place=parse_scene("table"),
+        str(given.data / "hands" / HANDS[name]),
+        str(mesh_file),
+        request,
+        place=parse_scene("table"),
         scenes=given.scenes,
-    ).arrays  # fmt: skip
+    ).arrays
     rows = np.flatnonzero(made["quality/valid"])
     if not len(rows):
         return 0, 0
@@ -116,9 +119,14 @@ def lift_model(hand: HandModel, mesh: trimesh.Trimesh, mass: float) -> Any:
             leading[d] = b
             effort = float(hand.effort[d])
             ET.SubElement(
-                actuators, "position", name=f"a{d}", joint=f"j{b}", kp=f"{hand.stiffness[d]:g}",
-                forcerange=f"{-effort:g} {effort:g}", forcelimited="true",
-            )  # fmt: skip
+                actuators,
+                "position",
+                name=f"a{d}",
+                joint=f"j{b}",
+                kp=f"{hand.stiffness[d]:g}",
+                forcerange=f"{-effort:g} {effort:g}",
+                forcelimited="true",
+            )
     for i, piece in enumerate(hand.pieces):
         vertices = said(piece.vertices.ravel())
         ET.SubElement(assets, "mesh", name=f"h{i}", vertex=vertices, inertia="convex")

@@ -148,9 +148,14 @@ def indexer(url: str | None) -> None:
 def api(data_dir: Path, url: str | None) -> None:
     """Latency of the API, one request after the other, on an index that is full."""
     settings = Settings(
-        data_dir=data_dir, port=0, requests_per_minute=0, address_requests_per_minute=0, concurrency=0,
-        log_level="WARNING", **({"index_url": url} if url else {}),
-    )  # fmt: skip
+        data_dir=data_dir,
+        port=0,
+        requests_per_minute=0,
+        address_requests_per_minute=0,
+        concurrency=0,
+        log_level="WARNING",
+        **({"index_url": url} if url else {}),
+    )
     with Supervisor(settings, workers=0) as supervisor:
         supervisor.wait_ready()
         with httpx.Client(base_url=supervisor.api_url, timeout=60, trust_env=False) as http:

@@ -73,9 +73,14 @@ def service_of(root: Path) -> Iterator[Service]:
     with tempfile.TemporaryDirectory() as folder, (Path(folder) / "up.log").open("w") as log:
         up = [sys.executable, "-m", "graspd", "up", "--port", "0", "--data-dir", folder, "--json"]
         process = subprocess.Popen(
-            up, cwd=root, env=environment_of(root), stdout=subprocess.PIPE, stderr=log, text=True,
+            up,
+            cwd=root,
+            env=environment_of(root),
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
             start_new_session=True,
-        )  # fmt: skip
+        )
         try:
             began = time.perf_counter()
             service = Service(_address(process), process.pid, 0.0)

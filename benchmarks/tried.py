@@ -54,11 +54,15 @@ def found_of(hand: HandModel, mesh: Path, count: int) -> dict[str, dict[str, Any
         table = measure(hand, obj, grasps, friction=FRICTION, thresholds_m=[THRESHOLD_M])
         best = np.argsort(-table["quality/epsilon"][:, 0])[: max(1, count // 3)]
         found[way] = {
-            "grasps": count, "held": int(held.sum()), "hard": int((held & hard).sum()), "planned_s": planned,
-            "judged_s": judged, "depth_mm": float(np.median(table["quality/penetration_depth_mm"])),
+            "grasps": count,
+            "held": int(held.sum()),
+            "hard": int((held & hard).sum()),
+            "planned_s": planned,
+            "judged_s": judged,
+            "depth_mm": float(np.median(table["quality/penetration_depth_mm"])),
             "area_cm2": float(table["quality/contact_area_cm2"][best].mean()),
             "epsilon": float(table["quality/epsilon"][best].mean()),
-        }  # fmt: skip
+        }
     return found
 
 
@@ -77,8 +81,20 @@ def row(hand: str, way: str, pairs: list[dict[str, Any]]) -> str:
 
 
 def page(done: dict[str, dict[str, dict[str, Any]]], count: int) -> str:
-    titles = ("hand", "hands chosen", "GSR", "worst object", "hard", "planner ms", "referee ms", "ms a valid grasp",
-              "ms a hard one", "PD mm", "CA cm²", "ε")  # fmt: skip
+    titles = (
+        "hand",
+        "hands chosen",
+        "GSR",
+        "worst object",
+        "hard",
+        "planner ms",
+        "referee ms",
+        "ms a valid grasp",
+        "ms a hard one",
+        "PD mm",
+        "CA cm²",
+        "ε",
+    )
     objects = len(next(iter(done.values())))
     return "\n".join(
         [

@@ -70,9 +70,14 @@ class Rates:
 
 
 HARSH: Final = Rates(
-    reclaimed_per_day=12.0, killed_per_day=2.0, cut_off_per_day=4.0, zone_per_week=7.0, keeper_killed_per_day=24.0,
-    redis_restarts_per_week=14.0, store_outages_per_week=7.0,
-)  # fmt: skip
+    reclaimed_per_day=12.0,
+    killed_per_day=2.0,
+    cut_off_per_day=4.0,
+    zone_per_week=7.0,
+    keeper_killed_per_day=24.0,
+    redis_restarts_per_week=14.0,
+    store_outages_per_week=7.0,
+)
 
 
 @dataclass
@@ -159,15 +164,19 @@ class Week:
     def _plan(self) -> None:
         rates = self._rates
         for what, per_day in {
-            "reclaimed": rates.reclaimed_per_day, "killed": rates.killed_per_day, "cut_off": rates.cut_off_per_day,
-        }.items():  # fmt: skip
+            "reclaimed": rates.reclaimed_per_day,
+            "killed": rates.killed_per_day,
+            "cut_off": rates.cut_off_per_day,
+        }.items():
             for who in range(len(self._nodes)):
                 for at in self._times(self._rng.poisson(per_day * self._end / _DAY_S)):
                     self._add(at, what, who)
         for what, per_day in {
-            "zone": rates.zone_per_week / 7, "keeper": rates.keeper_killed_per_day,
-            "redis": rates.redis_restarts_per_week / 7, "store": rates.store_outages_per_week / 7,
-        }.items():  # fmt: skip
+            "zone": rates.zone_per_week / 7,
+            "keeper": rates.keeper_killed_per_day,
+            "redis": rates.redis_restarts_per_week / 7,
+            "store": rates.store_outages_per_week / 7,
+        }.items():
             # As many as there should be: of one or two a week none may be missing.
             for at in self._times(round(per_day * self._end / _DAY_S)):
                 self._add(at, what, -1)
@@ -310,7 +319,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rates = Rates() if given.rates == "cloud" else HARSH
     told = Week(
         nodes=given.nodes, days=given.days, task_s=task_seconds(given.cores), rates=rates, seed=given.seed
-    ).run()  # fmt: skip
+    ).run()
     for line in table(told):
         say(line)
     if given.json:
@@ -335,7 +344,7 @@ def table(told: Told) -> list[str]:
         ("keeper busy", f"{100 * told.keeper_busy:.0f} %"),
         ("events behind a keeper that took over", f"{told.most_behind:,.0f}"),
         ("they were made up for in", f"{told.longest_catch_up_s:.0f} s"),
-    ]  # fmt: skip
+    ]
     return ["| what | |", "| --- | --: |", *(f"| {name} | {value} |" for name, value in rows)]
 
 

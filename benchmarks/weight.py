@@ -114,9 +114,10 @@ def main() -> None:
     for extra in EXTRAS:
         sizes = sorted(((size_mb(name), name) for name in closure(extra)), reverse=True)
         found["installs"][f"graspd[{extra}]" if extra else "graspd"] = {
-            "packages": len(sizes), "mb": sum(mb for mb, _ in sizes),
+            "packages": len(sizes),
+            "mb": sum(mb for mb, _ in sizes),
             "largest": [(name, mb) for mb, name in sizes[:LARGEST]],
-        }  # fmt: skip
+        }
     for name, code in STARTS.items():
         found["starts"][name] = {"seconds": import_seconds(code, given.runs), "parts_ms": parts_ms(code)}
     sys.stdout.write("\n".join(lines(found)) + "\n")

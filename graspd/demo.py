@@ -69,10 +69,16 @@ def demo(
     request = validated(
         JobRequest,
         {
-            "hand": hand, "object": object, "grasps": grasps, "scenes": scenes, "views": views,
-            "stereo": views > 0, "fidelity": fidelity, "seed": seed,
-        }
-    )  # fmt: skip
+            "hand": hand,
+            "object": object,
+            "grasps": grasps,
+            "scenes": scenes,
+            "views": views,
+            "stereo": views > 0,
+            "fidelity": fidelity,
+            "seed": seed,
+        },
+    )
     console = plain_console(stderr=json)
     out.mkdir(parents=True, exist_ok=True)
     settings = load_settings(data_dir=out / "service", host="127.0.0.1", port=0)
@@ -119,9 +125,7 @@ def print_results(console: Console, best: list[GraspView], job: JobDetail, paths
     for name in ("rank", "ε", "contact (cm²)", "intersection (cm³)", "penetration (mm)", "shard:row"):
         table.add_column(name, justify="right")
     for rank, grasp in enumerate(best, start=1):
-        values = (
-            grasp.epsilon, grasp.contact_area_cm2, grasp.intersection_volume_cm3, grasp.penetration_depth_mm,
-        )  # fmt: skip
+        values = (grasp.epsilon, grasp.contact_area_cm2, grasp.intersection_volume_cm3, grasp.penetration_depth_mm)
         table.add_row(str(rank), *(metric(value) for value in values), f"{grasp.shard_id[:8]}:{grasp.row}")
     console.print(table)
     console.print(f"\n{yield_of(job)}; {means_of(job)}")
@@ -129,9 +133,10 @@ def print_results(console: Console, best: list[GraspView], job: JobDetail, paths
         console.print(f"{stage.stage.value:<11} {count(stage.tasks)} × {duration(stage.seconds / stage.tasks)}")
     console.print()
     for what, path in (
-        *(("shard", path) for path in paths.shards), *(("picture", path) for path in paths.pictures),
+        *(("shard", path) for path in paths.shards),
+        *(("picture", path) for path in paths.pictures),
         ("page", paths.page),
-    ):  # fmt: skip
+    ):
         console.print(f"{what:<8} {path}", soft_wrap=True)
 
 

@@ -5,9 +5,17 @@ from typing import Any
 from service.readers import Clouds, DepthNoise, Grasps, Pictures, ShardCache, ShardFile, Shards, open_shards, prefetched
 
 __all__ = [
-    "Clouds", "DepthNoise", "Grasps", "Pictures", "ShardCache", "ShardFile", "Shards", "hand_surface", "open_shards",
+    "Clouds",
+    "DepthNoise",
+    "Grasps",
+    "Pictures",
+    "ShardCache",
+    "ShardFile",
+    "Shards",
+    "hand_surface",
+    "open_shards",
     "prefetched",
-]  # fmt: skip
+]
 
 
 def hand_surface(shard: Any, rows: Any) -> Any:

@@ -101,18 +101,39 @@ def synthesize(
         raise ImportError(f"synthesize needs {error.name}; run pip install 'graspd[worker]'") from error
     try:
         request = JobOptions(
-            grasps=count, want=want, budget=budget, referee=referee, method=method, seed=seed, friction=friction,
-            options=of_this_machine(method, options), min_distance=min_distance, audits=0, robust=robust,
-            robust_models=robust_models, mass=mass, density=density, object_friction=object_friction,
-            payload=payload, min_payload=min_payload, shake=shake,
-        )  # fmt: skip
+            grasps=count,
+            want=want,
+            budget=budget,
+            referee=referee,
+            method=method,
+            seed=seed,
+            friction=friction,
+            options=of_this_machine(method, options),
+            min_distance=min_distance,
+            audits=0,
+            robust=robust,
+            robust_models=robust_models,
+            mass=mass,
+            density=density,
+            object_friction=object_friction,
+            payload=payload,
+            min_payload=min_payload,
+            shake=shake,
+        )
     except ValidationError as error:
         raise InputError(refusal(error)) from None
     request = request.model_copy(update={"fidelity": chosen_fidelity(fidelity)})
     place = parse_scene(str(scene), faces=faces, touch=touch, beside=[str(one) for one in beside])
     made = synthesized(
-        str(hand), str(object), request, place=place, scenes=scenes,
-        mesh=object_options(units=units, scale_to=scale_to), device=device, threads=threads,
-        join=join, progress=(lambda done, total, _message: progress(done / total)) if progress else None,
-    )  # fmt: skip
+        str(hand),
+        str(object),
+        request,
+        place=place,
+        scenes=scenes,
+        mesh=object_options(units=units, scale_to=scale_to),
+        device=device,
+        threads=threads,
+        join=join,
+        progress=(lambda done, total, _message: progress(done / total)) if progress else None,
+    )
     return Grasps(made.arrays, made.attributes)

@@ -81,9 +81,11 @@ class Settings(BaseSettings):
     )
     threads: int = Field(0, ge=0, description="CPU threads of a worker; 0: one per core")
     processes: int = Field(
-        0, ge=0, le=1024,
+        0,
+        ge=0,
+        le=1024,
         description="processes of a worker that judge and measure; 1: its own; 0: on a GPU one a core less one, else 1",
-    )  # fmt: skip
+    )
     workers_here: int = Field(1, ge=1, description="workers of this machine that share its cores and memory")
     join: str = Field(
         "auto",

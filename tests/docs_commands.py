@@ -59,11 +59,17 @@ _STATES: Final = {*(state.value for state in State), "min", "left"}
 _OPERATORS: Final = {"|", "||", "&&", ";", "&", ">", ">>", "<", "2>", "(", ")"}
 #: What a line has that is not run here, and why. A line with none of it is run.
 NOT_RUN: Final = (
-    (r'^(\w+="[^"]*" )?(docker|kubectl|sbatch|apptainer|ray|osmo|sky|ssh|oauth2-proxy|for|done)\b|SHARED|cp \.env|'
-     "--grasps 3200", "needs Docker, or a cluster"),
+    (
+        r'^(\w+="[^"]*" )?(docker|kubectl|sbatch|apptainer|ssh|oauth2-proxy|for|done)\b|SHARED|cp \.env|'
+        "--grasps 3200",
+        "needs Docker, or a cluster",
+    ),
     (r"\.\.\.|…|\[-|\[[A-Z]|<\w", "stands for a family of commands"),
-    (r"\b(DATA|DIR|FILE|FOLDER|HAND|OBJECT|OTHER|BEFORE|AFTER|NAME|ID|UUID|URL|MESH|SHARDS|SOURCES|W|JOB|PROJECT|KEY|"
-     r"PASSWORD)\b|--joint-map", "has a place that the reader fills in"),
+    (
+        r"\b(DATA|DIR|FILE|FOLDER|HAND|OBJECT|OTHER|BEFORE|AFTER|NAME|ID|UUID|URL|MESH|SHARDS|SOURCES|W|JOB|PROJECT|KEY|"
+        r"PASSWORD)\b|--joint-map",
+        "has a place that the reader fills in",
+    ),
     (r"python src/|dexlearn\.train|cp -r", "needs the sources of another project"),
     (r"^pip |\bjq\b|benchmarks\.gallery", "needs packages or programs from elsewhere"),
     (r"cuda|--join\b|on_gpu|gpu-check", "needs a GPU, or its tools"),
@@ -72,7 +78,7 @@ NOT_RUN: Final = (
     (r"graspd (keys|projects|webhooks)\b", "with the first key every other line needs one; tests/api runs them"),
     (r"datasets (cancel|retry|delete)", "the dataset that stands in has ended, and is read below; tests/api runs them"),
     (r"--grasps 1000|kitchen\.toml --yes|my-objects --yes$", "takes hours; a small dataset of that name stands for it"),
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -253,9 +259,17 @@ def run_line(text: str, folder: Path, environment: Mapping[str, str]) -> tuple[i
     try:
         os.write(terminal, b"y\n")
         done = subprocess.run(
-            text, shell=True, cwd=folder, env=dict(environment), stdin=stdin, stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT, text=True, check=False, timeout=LIMIT_S,
-        )  # fmt: skip
+            text,
+            shell=True,
+            cwd=folder,
+            env=dict(environment),
+            stdin=stdin,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            check=False,
+            timeout=LIMIT_S,
+        )
     except subprocess.TimeoutExpired:
         return 124, f"not ended after {LIMIT_S:.0f} s"
     finally:

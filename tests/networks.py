@@ -12,15 +12,26 @@ from service.store.network_file import ProposalNetwork, numbers, to_bytes, weigh
 DIGEST = "0" * 32
 #: A small job that sets out from a network, but for its options.
 LEARNED = {
-    "grasps": 3, "fidelity": "draft", "seed": 5, "audits": 0, "want": "raw", "scene": "table", "scenes": 2,
+    "grasps": 3,
+    "fidelity": "draft",
+    "seed": 5,
+    "audits": 0,
+    "want": "raw",
+    "scene": "table",
+    "scenes": 2,
     "method": "learned",
-}  # fmt: skip
+}
 
 
 def random_network(
-    joint_names: Sequence[str] = ("a", "b"), *, hand: str = "some_hand", digest: str = DIGEST, points: int = 64,
-    steps: int = 16, seed: int = 0,
-) -> ProposalNetwork:  # fmt: skip
+    joint_names: Sequence[str] = ("a", "b"),
+    *,
+    hand: str = "some_hand",
+    digest: str = DIGEST,
+    points: int = 64,
+    steps: int = 16,
+    seed: int = 0,
+) -> ProposalNetwork:
     """Weights as torch draws them for a fresh `Linear`: uniform within one over the root of the inputs."""
     rng = np.random.default_rng(seed)
     weights, bound = {}, 1.0

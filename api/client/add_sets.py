@@ -11,7 +11,6 @@ from typing import Any
 import typer
 
 from api.client.client import Client
-from api.client.datasets import DatasetClient
 from api.client.reports import open_client
 from api.uploads import name_of_upload
 from service.cli import emit
@@ -69,7 +68,7 @@ def add_set(
         told = upload_set(client, objects, prefix=prefix, options=options, shared=shared, wait=wait, say=say)
         taken = [one["name"] for one in told if one["verdict"] != "refuse"]
         if taken:
-            DatasetClient(client).add_object_set(name, taken)
+            client.add_object_set(name, taken)
     refused = [one["name"] for one in told if one["verdict"] == "refuse"]
     if json:
         emit({"objects": told, "refused": refused, "set": name if taken else None})
@@ -119,6 +118,9 @@ def _upload(
     except InputError as error:
         return {"name": name, "verdict": "refuse", "message": str(error), "repairs": []}
     return {
-        "name": asset.name, "digest": asset.digest, "verdict": asset.verdict, "message": asset.message or "",
+        "name": asset.name,
+        "digest": asset.digest,
+        "verdict": asset.verdict,
+        "message": asset.message or "",
         "repairs": asset.repairs,
-    }  # fmt: skip
+    }

@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 from urllib.parse import quote
 
 import httpx
 from httpx_sse import EventSource
+from pydantic import BaseModel, TypeAdapter
 
 from api.hosts import is_loopback
 from api.models import GraspQuery, Health, Job, JobDetail, Shard
+from service.index.dataset_views import CellView, DatasetView, ObjectSetView, SnapshotView
 from service.index.views import AssetView, GraspView, Page
+from service.model.dataset_records import Snapshot
 from service.model.domain import JobRequest
 from service.model.errors import ERRORS, GraspdError, InputError, RateError, UnavailableError
 from service.model.redaction import without_secrets
 from service.model.states import AssetKind, State
+from service.pipeline.datasets.estimate import Estimate
+from service.pipeline.datasets.spec import DatasetRequest, Matrix
 
 _PATIENCE_S: Final = 30.0
 _CONNECT_S: Final = 5.0
@@ -27,8 +32,13 @@ _TIMEOUT: Final = httpx.Timeout(_PATIENCE_S, connect=_CONNECT_S)
 #: The server sends a sign of life every 15 s.
 _STREAM_TIMEOUT: Final = httpx.Timeout(40.0, connect=5.0)
 _POLL_S: Final = 0.3
+_DATASET_POLL_S: Final = 1.0
+#: Rows of a page.
+_PAGE: Final = 200
 #: Longest waits before another try when the service says that requests come too fast [s].
 _WAITS_S: Final = (2.0, 5.0, 10.0, 20.0)
+
+View = TypeVar("View", bound=BaseModel)
 
 
 class Client:
@@ -98,14 +108,7 @@ class Client:
 
     def assets(self, kind: AssetKind, *, refused: bool = False) -> Iterator[AssetView]:
         """All hands, objects or networks; those that the check refused only where asked for."""
-        cursor: str | None = None
-        while True:
-            answer = self.send("GET", f"/v1/{kind.value}s", params={"limit": 200, "cursor": cursor, "refused": refused})
-            page = Page[AssetView].model_validate_json(answer.content)
-            yield from page.items
-            cursor = page.next
-            if cursor is None:
-                return
+        return self._pages(AssetView, f"/v1/{kind.value}s", refused=refused)
 
     def asset(self, kind: AssetKind, name: str) -> AssetView:
         return AssetView.model_validate_json(self.send("GET", path_of(f"{kind.value}s", name)).content)
@@ -205,6 +208,67 @@ class Client:
                 on_progress(job)
         return self.job(job_id)
 
+    def create_dataset(self, request: DatasetRequest) -> DatasetView:
+        answer = self.send("POST", "/v1/datasets", json=_matrix_body(request))
+        return DatasetView.model_validate_json(answer.content)
+
+    def estimate(self, matrix: Matrix) -> Estimate:
+        """What the datasets of a matrix would take."""
+        body = {name: value for name, value in _matrix_body(matrix).items() if name in Matrix.model_fields}
+        return Estimate.model_validate_json(self.send("POST", "/v1/datasets/estimate", json=body).content)
+
+    def datasets(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
+        """Datasets, newest first."""
+        answer = self.send("GET", "/v1/datasets", params={"limit": limit, "cursor": cursor})
+        return Page[DatasetView].model_validate_json(answer.content)
+
+    def dataset(self, name: str) -> DatasetView:
+        return DatasetView.model_validate_json(self.send("GET", path_of("datasets", name)).content)
+
+    def cells(self, name: str, *, state: State | None = None) -> Iterator[CellView]:
+        """All cells of a dataset, or those in a state."""
+        return self._pages(CellView, path_of("datasets", name, "cells"), state=state)
+
+    def cancel_dataset(self, name: str) -> DatasetView:
+        return DatasetView.model_validate_json(self.send("POST", path_of("datasets", name, "cancel")).content)
+
+    def retry_dataset(self, name: str) -> DatasetView:
+        return DatasetView.model_validate_json(self.send("POST", path_of("datasets", name, "retry")).content)
+
+    def take_snapshot(self, name: str) -> SnapshotView:
+        return SnapshotView.model_validate_json(self.send("POST", path_of("datasets", name, "snapshots")).content)
+
+    def snapshot(self, name: str, digest: str) -> Snapshot:
+        """A snapshot with its list of shards."""
+        return Snapshot.model_validate_json(self.send("GET", path_of("datasets", name, "snapshots", digest)).content)
+
+    def watch_dataset(self, name: str) -> Iterator[DatasetView]:
+        """A dataset every second until it ends."""
+        while True:
+            dataset = self.dataset(name)
+            yield dataset
+            if dataset.state.is_final:
+                return
+            time.sleep(_DATASET_POLL_S)
+
+    def add_object_set(self, name: str, objects: Iterable[str]) -> ObjectSetView:
+        answer = self.send("POST", "/v1/object-sets", json={"name": name, "objects": list(objects)})
+        return ObjectSetView.model_validate_json(answer.content)
+
+    def object_sets(self) -> list[ObjectSetView]:
+        return TypeAdapter(list[ObjectSetView]).validate_json(self.send("GET", "/v1/object-sets").content)
+
+    def _pages(self, kind: type[View], path: str, **params: Any) -> Iterator[View]:
+        """What a list of the API holds, page after page."""
+        cursor: str | None = None
+        while True:
+            answer = self.send("GET", path, params={"limit": _PAGE, "cursor": cursor, **params})
+            page = Page[kind].model_validate_json(answer.content)  # type: ignore[valid-type]
+            yield from page.items
+            cursor = page.next
+            if cursor is None:
+                return
+
     def _comes_back(self, timeout_s: float = 30.0) -> bool:
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
@@ -237,6 +301,11 @@ class Client:
 def path_of(*parts: str) -> str:
     """Address of a thing of the API by its parts, whatever characters a name holds: `/v1/tags/good%20ones/remove`."""
     return "/v1/" + "/".join(quote(part, safe="") for part in parts)
+
+
+def _matrix_body(matrix: Matrix) -> dict[str, Any]:
+    """The body of a request; what is empty is left out, as an older service does not know all of it."""
+    return {name: value for name, value in matrix.model_dump(mode="json").items() if value not in ({}, "")}
 
 
 def _address(url: str) -> httpx.URL:

@@ -12,7 +12,6 @@ import typer
 from api.client import key_commands, project_commands, tag_commands, webhook_commands
 from api.client.add_commands import add_hand, add_network, add_object
 from api.client.client import Client, path_of
-from api.client.datasets import DatasetClient
 from api.client.job_options import pairs, validated
 from api.client.reports import (
     UrlOption,
@@ -335,7 +334,7 @@ networks_app.command("add", epilog="graspd networks add barrett.npz")(add_networ
 def sets(url: UrlOption = None, json: JsonFlag = False) -> None:
     """Sets of objects; `graspd objects add FOLDER` makes one."""
     with open_client(url) as client:
-        found = DatasetClient(client).object_sets()
+        found = client.object_sets()
     if json:
         emit({"sets": [one.model_dump(mode="json") for one in found]})
         return

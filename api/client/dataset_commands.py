@@ -14,7 +14,6 @@ from api.client.add_sets import name_of_set, upload_set
 from api.client.client import Client, path_of
 from api.client.dataset_reports import print_cells, print_dataset, print_estimate, watch_dataset
 from api.client.dataset_specs import SpecOption, Wanted, wanted
-from api.client.datasets import DatasetClient
 from api.client.job_options import validated, with_job_options
 from api.client.reports import UrlOption, YesOption, confirm, open_client, restore, say_deleted
 from api.formatting import count, minute, percent, size
@@ -62,7 +61,6 @@ def create(
     if not asked.name:
         raise InputError("say a name: graspd datasets create NAME, or name in the file of --spec")
     with open_client(url) as client:
-        datasets = DatasetClient(client)
         files, matrix = _matrix(client, asked)
         request = validated(DatasetRequest, {"name": asked.name, **matrix})
         found = _estimate(client, matrix, files)
@@ -77,9 +75,9 @@ def create(
             refused = _upload(client, files, name_of_set(Path(asked.objects)), console)
             matrix = asked.shared_out(matrix, len(files) - len(refused))
             request = validated(DatasetRequest, {"name": asked.name, **matrix, "objects": []})
-        dataset = datasets.create(request)
+        dataset = client.create_dataset(request)
         if wait:
-            dataset = watch_dataset(datasets, asked.name, plain_console(stderr=True))
+            dataset = watch_dataset(client, asked.name, plain_console(stderr=True))
     _emit(json, estimate=found, dataset=dataset, refused=refused)
     if not json:
         if refused:
@@ -120,7 +118,7 @@ def list_datasets(
 ) -> None:
     """Datasets, the newest first."""
     with open_client(url) as client:
-        page = DatasetClient(client).datasets(limit=limit)
+        page = client.datasets(limit=limit)
     if json:
         emit({"datasets": [dataset.model_dump(mode="json") for dataset in page.items], "next": page.next})
         return
@@ -153,8 +151,7 @@ def status(
 ) -> None:
     """The matrix: each hand and object with its state, yield and failures."""
     with open_client(url) as client:
-        datasets = DatasetClient(client)
-        dataset, cells = datasets.dataset(name), list(datasets.cells(name, state=state))
+        dataset, cells = client.dataset(name), list(client.cells(name, state=state))
     if json:
         emit({**dataset.model_dump(mode="json"), "matrix": [cell.model_dump(mode="json") for cell in cells]})
         return
@@ -167,7 +164,7 @@ def status(
 def cancel(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Stop a dataset; what is written stays."""
     with open_client(url) as client:
-        _show(DatasetClient(client).cancel(name), json=json)
+        _show(client.cancel_dataset(name), json=json)
 
 
 @group.command(epilog="graspd datasets delete kitchen")
@@ -183,7 +180,7 @@ def delete(
 ) -> None:
     """Take away a dataset that has ended, and the jobs that were planned for it alone."""
     with open_client(url) as client:
-        found = DatasetClient(client).dataset(name)
+        found = client.dataset(name)
         goes = f"{count(found.cells)} cell{'s' * (found.cells != 1)}, {count(found.grasps)} grasps"
         goes += f" ({size(found.size_bytes)})" + ", its snapshots" * with_snapshots
         confirm(f"Delete dataset {name} with {goes}?", f"dataset {name}", yes=yes)
@@ -203,9 +200,9 @@ def restore_dataset(name: NameArgument, url: UrlOption = None, json: JsonFlag = 
 def retry(name: NameArgument, wait: WaitOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Start again what failed or was cancelled; what is written is not made twice."""
     with open_client(url) as client:
-        dataset = DatasetClient(client).retry(name)
+        dataset = client.retry_dataset(name)
         if wait:
-            dataset = watch_dataset(DatasetClient(client), name, plain_console(stderr=True))
+            dataset = watch_dataset(client, name, plain_console(stderr=True))
     _show(dataset, json=json)
     _must_succeed(dataset, asked=wait)
 
@@ -215,7 +212,7 @@ def retry(name: NameArgument, wait: WaitOption = False, url: UrlOption = None, j
 def snapshot(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Write down which shards the dataset holds now; that list never changes."""
     with open_client(url) as client:
-        taken = DatasetClient(client).take_snapshot(name)
+        taken = client.take_snapshot(name)
     if json:
         emit(taken)
         return
@@ -240,12 +237,15 @@ def export(
     if format not in FORMATS:
         raise InputError(f"there is no format {format!r}; there are: {one_of(format, FORMATS)}")
     columns = (
-        TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[files]}"),
-        DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn(),
-    )  # fmt: skip
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TextColumn("{task.fields[files]}"),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+        TimeRemainingColumn(),
+    )
     with open_client(url) as client:
-        datasets = DatasetClient(client)
-        taken = datasets.snapshot(name, snapshot or datasets.take_snapshot(name).digest)
+        taken = client.snapshot(name, snapshot or client.take_snapshot(name).digest)
         console = plain_console(stderr=True)
         with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
             bar = progress.add_task(name, total=taken.size_bytes, files="")
@@ -253,7 +253,7 @@ def export(
             def show(done: int, files: int, fetched: int) -> None:
                 progress.update(bar, completed=fetched, files=f"{done}/{files}")
 
-            fetched = FORMATS[format](taken, out, datasets.fetch, show)
+            fetched = FORMATS[format](taken, out, lambda shard: client.fetch(path_of("shards", shard.id, "file")), show)
     told = {"dataset": name, "snapshot": taken.digest, "out": str(out), "files": len(taken.shards), "fetched": fetched}
     if json:
         emit({**told, "bytes": taken.size_bytes, "complete": taken.complete})
@@ -266,7 +266,7 @@ def _matrix(client: Client, asked: Wanted) -> tuple[Objects | None, dict[str, An
     objects = asked.objects
     names = [word.strip() for word in objects.split(",") if word.strip()]
     matrix: dict[str, Any] = {"hands": [w.strip() for w in asked.hands.split(",") if w.strip()], **asked.options}
-    known = {found.name: found.objects for found in DatasetClient(client).object_sets()}
+    known = {found.name: found.objects for found in client.object_sets()}
     path = Path(objects)
     # A set goes by its name also where the folder lies that it was added from; ./NAME is the folder.
     if objects not in known and (files := files_of_set(path)):
@@ -285,7 +285,7 @@ def _matrix(client: Client, asked: Wanted) -> tuple[Objects | None, dict[str, An
 def _estimate(client: Client, matrix: dict[str, Any], files: Objects | None) -> Estimate:
     """The cost; InputError for a name that nobody knows and that is not about to be uploaded."""
     asked = matrix | {"sets": []} if files is not None else matrix
-    found = DatasetClient(client).estimate(validated(Matrix, asked))
+    found = client.estimate(validated(Matrix, asked))
     unknown = [name for name in found.unknown if name not in (files or {})]
     if unknown:
         known = [one.name for kind in (AssetKind.HAND, AssetKind.OBJECT) for one in client.assets(kind)]
@@ -302,7 +302,7 @@ def _upload(client: Client, files: Objects, set_name: str, console: Console) -> 
     taken = [one["name"] for one in told if one["verdict"] != "refuse"]
     if not taken:
         raise InputError(f"none of the {len(told)} objects can be used; see above why")
-    DatasetClient(client).add_object_set(set_name, taken)
+    client.add_object_set(set_name, taken)
     return [one["name"] for one in told if one["verdict"] == "refuse"]
 
 

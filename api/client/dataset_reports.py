@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
-from api.client.datasets import DatasetClient
+from api.client.client import Client
 from api.formatting import count, duration, metric, percent, size, valid_yield
 from service.cli import plain_table
 from service.index.dataset_views import CellView, DatasetView
@@ -93,17 +93,19 @@ def print_cells(dataset: DatasetView, cells: Sequence[CellView], console: Consol
         console.print(f"{cell.hand} on {cell.object}: {cell.reason}", soft_wrap=True)
 
 
-def watch_dataset(client: DatasetClient, name: str, console: Console) -> DatasetView:
+def watch_dataset(client: Client, name: str, console: Console) -> DatasetView:
     """The dataset in its final state, with a bar of its tasks meanwhile."""
     columns = (
-        TextColumn("{task.description}", markup=False), BarColumn(bar_width=32),
-        TextColumn("{task.percentage:>3.0f} %"), TextColumn("{task.fields[rate]}", style="cyan"),
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=32),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TextColumn("{task.fields[rate]}", style="cyan"),
         TextColumn("{task.fields[left]}"),
-    )  # fmt: skip
+    )
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         bar = progress.add_task(name, total=1.0, rate="", left="")
         said = -1.0
-        for dataset in client.watch(name):
+        for dataset in client.watch_dataset(name):
             pace = metric(dataset.counted / dataset.seconds) if dataset.seconds else None
             rate = f"{pace} {dataset.options.standing}/s per worker" if pace is not None else ""
             left = f"{duration(dataset.eta_s)} left" if dataset.eta_s is not None else ""

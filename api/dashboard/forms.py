@@ -24,12 +24,30 @@ from service.model.states import AssetKind
 router = APIRouter(include_in_schema=False)
 
 DEFAULTS: Final[dict[str, Any]] = {
-    "hand": "allegro", "object": "mug", "grasps": 32, "fidelity": "standard", "seed": 0, "friction": 1.0,
-    "mass": "", "object_friction": "", "min_payload": 0.0, "shake": False,
-    "scene": "free", "faces": "drawn", "touch": 0.0, "neighbours": "", "scenes": 0, "views": 0, "stereo": False,
-    "width": 320, "height": 240, "want": "valid", "referee": "certificate",
-    "min_distance": 0.005, "robust": 0.0,
-}  # fmt: skip
+    "hand": "allegro",
+    "object": "mug",
+    "grasps": 32,
+    "fidelity": "standard",
+    "seed": 0,
+    "friction": 1.0,
+    "mass": "",
+    "object_friction": "",
+    "min_payload": 0.0,
+    "shake": False,
+    "scene": "free",
+    "faces": "drawn",
+    "touch": 0.0,
+    "neighbours": "",
+    "scenes": 0,
+    "views": 0,
+    "stereo": False,
+    "width": 320,
+    "height": 240,
+    "want": "valid",
+    "referee": "certificate",
+    "min_distance": 0.005,
+    "robust": 0.0,
+}
 #: Fields where a rule over several of them is told, by a word of the rule.
 _WHOLE: Final = {"robust": "robust", "payload": "min_payload", "shake": "shake", "mass": "mass"}
 

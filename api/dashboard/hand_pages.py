@@ -46,10 +46,17 @@ def hands_page(
     }
     networks = [] if cursor else assets.page(AssetKind.NETWORK, limit=PAGE_SIZE).items
     return render(
-        request, "hands.html", page="/hands", poll_s=2 * _CHECK_S, hands=page.items, numbers=numbers, next=page.next,
+        request,
+        "hands.html",
+        page="/hands",
+        poll_s=2 * _CHECK_S,
+        hands=page.items,
+        numbers=numbers,
+        next=page.next,
         self_tests={hand.digest: self_test_line(hand.facts) for hand in page.items},
-        networks=networks, network_hands={network.digest: hand_line(network.facts) for network in networks},
-    )  # fmt: skip
+        networks=networks,
+        network_hands={network.digest: hand_line(network.facts) for network in networks},
+    )
 
 
 @router.get("/{name}", dependencies=[Depends(may_read)])

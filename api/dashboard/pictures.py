@@ -82,6 +82,8 @@ def paint_segmentation(labels: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 _PAINTERS: Final = {
-    "rgb": lambda pixels: pixels, "rgb_hand": lambda pixels: pixels, "depth": paint_depth,
+    "rgb": lambda pixels: pixels,
+    "rgb_hand": lambda pixels: pixels,
+    "depth": paint_depth,
     "segmentation": paint_segmentation,
-}  # fmt: skip
+}

@@ -102,7 +102,8 @@ def chart_page(
         choices=[
             (title, field, axes, axis[in_scene])
             for title, field, axes, in_scene in (
-                ("Accuracy", "y", tradeoff.FREE, False), ("In scenes", "lifts", tradeoff.IN_SCENES, True),
+                ("Accuracy", "y", tradeoff.FREE, False),
+                ("In scenes", "lifts", tradeoff.IN_SCENES, True),
             )
             if any((one.scene is not None) == in_scene for one in measured)
         ],
@@ -110,7 +111,7 @@ def chart_page(
         objects=sorted({run.object for one in measured for run in one.runs}),
         hand=hand,
         object=object,
-    )  # fmt: skip
+    )
 
 
 @router.get("/stability", dependencies=[Depends(may_read)])

@@ -30,10 +30,16 @@ def get_grasp(shard_id: str, row: int, response: Response, grasps: GraspsOf) -> 
     dependencies=[Depends(may_read)],
     response_class=StreamingResponse,
     responses=responses(
-        401, 403, 404, 413, 422, 500, 503,
+        401,
+        403,
+        404,
+        413,
+        422,
+        500,
+        503,
         others={200: {"content": {media: {} for media in MEDIA_TYPES.values()}, "description": "The file"}},
     ),
-)  # fmt: skip
+)
 async def export_grasps(
     request: Request, tags: TagsOf, exports: ExportsOf, query: Annotated[GraspExportQuery, Query()]
 ) -> StreamingResponse:

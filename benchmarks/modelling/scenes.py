@@ -116,9 +116,7 @@ def judged(tables: list[OnTable]) -> list[Row]:
         with cpu() as clock:
             for one in tables:
                 grasps, placed = one.clear
-                scene = build(
-                    one.subject.hand, one.subject.obj, one.subject.pieces, MujocoOptions(), placed.supports
-                )  # fmt: skip
+                scene = build(one.subject.hand, one.subject.obj, one.subject.pieces, MujocoOptions(), placed.supports)
                 change(scene)
                 test = Lift(scene, placed)
                 held += [ask(test, grasps, row) for row in range(len(grasps))]

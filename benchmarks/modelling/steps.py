@@ -48,9 +48,14 @@ def _follow(
         distance, _, normal = probe.signed_distance(local + probe.obj.centre_of_mass)
         near = distance < 4 * world.step
         motion = step(
-            points[near] - place, normal[near] @ rotation.T, distance[near], weight[near], motion, world,
+            points[near] - place,
+            normal[near] @ rotation.T,
+            distance[near],
+            weight[near],
+            motion,
+            world,
             rotation @ world.inertia @ rotation.T,
-        )  # fmt: skip
+        )
         place, turned = place + motion[:3], turned + motion[3:]
         angle = float(np.linalg.norm(motion[3:]))
         if angle > 0:
@@ -61,9 +66,15 @@ def _follow(
 
 
 def step(
-    points: Floats, normals: Floats, distance: Floats, weight: Floats, s0: Floats, world: World, inertia: Floats,
+    points: Floats,
+    normals: Floats,
+    distance: Floats,
+    weight: Floats,
+    s0: Floats,
+    world: World,
+    inertia: Floats,
     passes: int = PASSES,
-) -> Floats:  # fmt: skip
+) -> Floats:
     """(6,) motion of the object under all contacts at once: compliant, with Coulomb friction."""
     mass = np.eye(6)
     mass[3:, 3:] = inertia

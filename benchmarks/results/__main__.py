@@ -48,9 +48,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not (given.enter or given.pages):
         places = {"DATA": given.data, "SOURCES": given.sources, "BEFORE": given.before}
         runner = Runner(
-            out, given.work, given.quick, given.again, given.one_revision,
+            out,
+            given.work,
+            given.quick,
+            given.again,
+            given.one_revision,
             {name: path.resolve() for name, path in places.items() if path},
-        )  # fmt: skip
+        )
         began, failed = time.monotonic(), 0
         for study in studies:
             say(f"{study.name}: ", end="")

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.results.studies import BY_NAME, STUDIES, Study, files_of
+from benchmarks.results.studies import BY_NAME, STUDIES, Study, files_of, is_raw
 from service.model.version import STAGE_REVISIONS
 
 REPOSITORY: Final = Path(__file__).resolve().parents[2]
@@ -64,8 +64,9 @@ def write(file: Path, text: str) -> None:
 
 
 def digests(study: Study, docs: Path) -> dict[str, str]:
-    """SHA-256 of each file of a study, by its path under the folder of the docs."""
-    return {str(file.relative_to(docs)): _sha256(file) for file in files_of(study, docs)}
+    """SHA-256 of each file of a study that git keeps, by its path under the folder of the docs."""
+    paths = {str(file.relative_to(docs)): file for file in files_of(study, docs)}
+    return {path: _sha256(file) for path, file in paths.items() if not is_raw(path)}
 
 
 def faults(docs: Path, records: Mapping[str, dict[str, Any]]) -> list[str]:
@@ -81,10 +82,11 @@ def faults(docs: Path, records: Mapping[str, dict[str, Any]]) -> list[str]:
 
 
 def there(docs: Path) -> set[str]:
-    """All figures and pictures under a folder of the docs, and what else the studies write there."""
+    """All figures and pictures under a folder of the docs, and what else the studies write there; raw results aside."""
     files = [file for place in ("results", "images") for file in (docs / place).rglob("*") if file.is_file()]
     files += [file for study in STUDIES for file in files_of(study, docs)]
-    return {str(file.relative_to(docs)) for file in files} - {MANIFEST, INDEX}
+    paths = {str(file.relative_to(docs)) for file in files} - {MANIFEST, INDEX}
+    return {path for path in paths if not is_raw(path)}
 
 
 def staleness(study: Study, record: Mapping[str, Any] | None) -> str:
@@ -116,14 +118,19 @@ def entered(study: Study, docs: Path) -> dict[str, Any]:
     commits = [_git("log", "-1", "--format=%cI %h", "--", f"docs/{path}") for path in files]
     changed = [path for path in files if _git("status", "--porcelain", "--", f"docs/{path}")]
     date, _, revision = ("", "", _git("rev-parse", "--short", "HEAD")) if changed else min(commits).partition(" ")
-    said = _said_by(docs / path for path in files)
+    said = _said_by(files_of(study, docs))
     return {
-        "told_by": "files and history", "command": said.get("command"), "revision": revision,
-        "stage_revisions": dict(STAGE_REVISIONS) if changed else stage_revisions_at(revision), "seeds": None,
-        "machine": said.get("device"), "versions": said.get("versions"),
+        "told_by": "files and history",
+        "command": said.get("command"),
+        "revision": revision,
+        "stage_revisions": dict(STAGE_REVISIONS) if changed else stage_revisions_at(revision),
+        "seeds": None,
+        "machine": said.get("device"),
+        "versions": said.get("versions"),
         "date": str(said.get("created") or said.get("card_made") or said.get("date") or date)[:10] or None,
-        "seconds": None, "files": files,
-    }  # fmt: skip
+        "seconds": None,
+        "files": files,
+    }
 
 
 def stage_revisions_at(revision: str) -> dict[str, int] | None:

@@ -23,15 +23,20 @@ def index(records: Mapping[str, dict[str, Any]]) -> str:
     """The page of all studies: files, date, revision, and whether today's algorithms would give the same."""
     revisions = ", ".join(f"{stage} {number}" for stage, number in STAGE_REVISIONS.items())
     lines = [
-        "# Where the figures come from", "",
+        "# Where the figures come from",
+        "",
         "`make results DATA=DIR` makes every file here and in `docs/images` again, study by study (`SOURCES=DIR`, "
         "`BEFORE=DIR` for those that need them; `QUICK=1` for little ones in `results-quick/`); what is recorded and "
-        "still holds is not run again. `python -m benchmarks.results --list` has the commands.", "",
+        "still holds is not run again. `python -m benchmarks.results --list` has the commands. Raw numbers (JSON, "
+        "CSV, SVG, checksums) stand beside the pages and are not in git; `--again --only NAME` makes those of a study.",
+        "",
         f"**Fresh** figures are of the algorithms of today ({revisions}); what follows from none of them has a dash. "
         "What was made before the [manifest](MANIFEST.json) was kept has the commit that brought it: it is of that "
-        "revision or an earlier one.", "",
-        "| study | what | files | date | revision | of today's algorithms |", "| --- | --- | --- | --- | --- | --- |",
-    ]  # fmt: skip
+        "revision or an earlier one.",
+        "",
+        "| study | what | files | date | revision | of today's algorithms |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
     for study in STUDIES:
         record = records.get(study.name)
         if record is None:

@@ -12,7 +12,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -20,15 +20,19 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
+from PIL import Image
+
 from benchmarks.results.manifest import REPOSITORY, digests, load, revision_of_today, save, staleness, write
-from benchmarks.results.studies import BROWSER, FIRST_JUDGE, GPU, SERVICE, TORCH, Study
+from benchmarks.results.studies import BROWSER, FIRST_JUDGE, GPU, SERVICE, TORCH, Study, files_of, is_raw
 from service.model.cores import available_cores
 from service.model.version import STAGE_REVISIONS
 from service.run.supervisor import Supervisor
 from service.settings import Settings
+from worker.rendering.pages.typography import png
 
 _PACKAGES: Final = ("graspd", "numpy", "warp-lang", "mujoco", "newton")
 _TEXTS: Final = {".json", ".md", ".csv", ".svg"}
+_LINK: Final = re.compile(r"\[([^\]]+)\]\(([^()\s#:]+)\)")
 _PLACE: Final = re.compile(r"\b(DATA|SOURCES|BEFORE|WORK|OUT)\b")
 _PROGRAMS: Final = {"graspd": (sys.executable, "-m", "graspd"), "python": (sys.executable,)}
 
@@ -88,16 +92,26 @@ class Runner:
         files = digests(study, self.out)
         if not files:
             return "FAILED: wrote no file"
-        for path in files:
-            self._without_places(self.out / path)
         older = [path for path in files if (self.out / path).stat().st_mtime < began]
-        self.records = load(self.out) | {study.name: {
-            "told_by": "run", "command": self._told(study), "revision": self.revision,
-            "stage_revisions": dict(STAGE_REVISIONS), "seeds": list(study.seeds) or None, "machine": machine(),
-            "versions": versions(), "date": datetime.now(UTC).date().isoformat(),
-            "seconds": round(time.time() - began, 1), "cpu_seconds": round(_spent() - spent, 1),
-            **({"older_files": older} if older else {}), "files": digests(study, self.out),
-        }}  # fmt: skip
+        for file in files_of(study, self.out):
+            self._without_places(file)
+            slim(file)
+        self.records = load(self.out) | {
+            study.name: {
+                "told_by": "run",
+                "command": self._told(study),
+                "revision": self.revision,
+                "stage_revisions": dict(STAGE_REVISIONS),
+                "seeds": list(study.seeds) or None,
+                "machine": machine(),
+                "versions": versions(),
+                "date": datetime.now(UTC).date().isoformat(),
+                "seconds": round(time.time() - began, 1),
+                "cpu_seconds": round(_spent() - spent, 1),
+                **({"older_files": older} if older else {}),
+                "files": digests(study, self.out),
+            }
+        }
         save(self.out, self.records)
         return f"made in {time.time() - began:.0f} s"
 
@@ -111,9 +125,13 @@ class Runner:
         with log.open("wb") as errors, self._service(study) as environment:
             for line in self.lines(study):
                 done = subprocess.run(
-                    self._words(line), cwd=REPOSITORY, env=environment, stdout=subprocess.PIPE, stderr=errors,
+                    self._words(line),
+                    cwd=REPOSITORY,
+                    env=environment,
+                    stdout=subprocess.PIPE,
+                    stderr=errors,
                     check=False,
-                )  # fmt: skip
+                )
                 errors.write(done.stdout)
                 if done.returncode:
                     return f"`{line}` ended with {done.returncode}; see {log}"
@@ -161,8 +179,30 @@ class Runner:
             places = {self.out: "docs", self.work: "WORK", **{path: name for name, path in self.places.items()}}
             for path, name in sorted(places.items(), key=lambda item: -len(str(item[0]))):
                 text = text.replace(str(path), name)
+            if file.suffix == ".md":
+                text = _LINK.sub(self._without_raw(file), text)
             if text != before:
                 write(file, text)
+
+    def _without_raw(self, page: Path) -> Callable[[re.Match[str]], str]:
+        """What a link of a page becomes: its words alone where it leads to a raw result, which git does not keep."""
+
+        def replaced(link: re.Match[str]) -> str:
+            target = (page.parent / link[2]).resolve()
+            raw = target.is_relative_to(self.out) and is_raw(str(target.relative_to(self.out)))
+            return f"`{link[1]}`" if raw else link[0]
+
+        return replaced
+
+
+def slim(file: Path) -> None:
+    """Give a PNG a palette of 256 colours where that takes fewer bytes: about a third of them."""
+    if file.suffix != ".png":
+        return
+    with Image.open(file) as picture:
+        smaller = b"" if picture.mode == "P" else png(picture.convert("RGB").quantize(256, kmeans=1))
+    if 0 < len(smaller) < file.stat().st_size:
+        file.write_bytes(smaller)
 
 
 def machine() -> str:

@@ -16,6 +16,10 @@ IN_SCENES: Final = ("synthesize", "scene")
 ALL: Final = ("synthesize", "scene", "render")
 #: Beside DATA, SOURCES and BEFORE: what a study may need.
 SERVICE, BROWSER, GPU, TORCH, FIRST_JUDGE = "a service", "a browser", "a GPU", "PyTorch", "mujoco-warp"
+#: What is written beside the pages and pictures that readers see: not in git, made again by the study.
+RAW: Final = frozenset({".json", ".csv", ".svg", ".sha256"})
+#: Written by hand, so kept.
+NOT_RAW: Final = frozenset({"results/pilot/assets.json"})
 #: Files that the study `predictor` leaves in WORK.
 NETWORK = "trained networks"
 
@@ -78,391 +82,614 @@ class Study:
 
 STUDIES: Final = (
     Study(
-        "bench", "grasps per second of the planner", ("results/bench.*",),
-        (f"graspd bench --hand {_ALLEGRO} --object {_mesh('025_mug')} --fidelity draft --fidelity standard "
-         "--fidelity fine --batch 1 --batch 8 --batch 32 --batch 128 --threads 1 --threads 2 --out OUT/results",),
+        "bench",
+        "grasps per second of the planner",
+        ("results/bench.*",),
+        (
+            f"graspd bench --hand {_ALLEGRO} --object {_mesh('025_mug')} --fidelity draft --fidelity standard "
+            "--fidelity fine --batch 1 --batch 8 --batch 32 --batch 128 --threads 1 --threads 2 --out OUT/results",
+        ),
         ("graspd bench --fidelity draft --batch 4 --threads 2 --repeats 1 --out OUT/results",),
         stages=(),
     ),
     Study(
-        "bench-points", "grasps per second over hand points and faces",
+        "bench-points",
+        "grasps per second over hand points and faces",
         ("results/bench-points/bench.json", "results/bench-points/bench.md"),
-        (f"graspd bench --hand {_ALLEGRO} --object {_mesh('025_mug')} --fidelity standard --batch 32 --threads 2 "
-         "--points 500 --points 1000 --points 4000 --face-error 0 --face-error 0.001 --face-error 0.003 "
-         "--out OUT/results/bench-points",),
-        ("graspd bench --fidelity draft --batch 4 --threads 2 --points 300 --repeats 1 "
-         "--out OUT/results/bench-points",),
+        (
+            f"graspd bench --hand {_ALLEGRO} --object {_mesh('025_mug')} --fidelity standard --batch 32 --threads 2 "
+            "--points 500 --points 1000 --points 4000 --face-error 0 --face-error 0.001 --face-error 0.003 "
+            "--out OUT/results/bench-points",
+        ),
+        (
+            "graspd bench --fidelity draft --batch 4 --threads 2 --points 300 --repeats 1 "
+            "--out OUT/results/bench-points",
+        ),
         stages=(),
     ),
     Study(
-        "chart", "speed against accuracy: methods, fidelities, knobs",
+        "chart",
+        "speed against accuracy: methods, fidelities, knobs",
         ("results/chart.*", "results/sweeps.png"),
-        (f"graspd chart --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('006_mustard_bottle')},{_mesh('025_mug')},"
-         f"{_mesh('035_power_drill')},{_mesh('011_banana')} --batch 32 --peer-batch 8 --repeats 2 --sweep "
-         "--out OUT/results",),
+        (
+            f"graspd chart --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('006_mustard_bottle')},{_mesh('025_mug')},"
+            f"{_mesh('035_power_drill')},{_mesh('011_banana')} --batch 32 --peer-batch 8 --repeats 2 --sweep "
+            "--out OUT/results",
+        ),
         ("graspd chart --quick --hands barrett --objects block --out OUT/results",),
     ),
     Study(
-        "scenes-chart", "planned in a scene, or filtered", ("results/scenes-chart/*",),
-        (f"graspd chart --scene table --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('025_mug')},"
-         f"{_mesh('006_mustard_bottle')},{_mesh('003_cracker_box')} --batch 24 --peer-batch 24 --threads 1 "
-         "--work WORK/scenes-chart --out OUT/results/scenes-chart",),
-        ("graspd chart --scene table --quick --hands barrett --objects block --work WORK/scenes-chart "
-         "--out OUT/results/scenes-chart",),
+        "scenes-chart",
+        "planned in a scene, or filtered",
+        ("results/scenes-chart/*",),
+        (
+            f"graspd chart --scene table --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('025_mug')},"
+            f"{_mesh('006_mustard_bottle')},{_mesh('003_cracker_box')} --batch 24 --peer-batch 24 --threads 1 "
+            "--work WORK/scenes-chart --out OUT/results/scenes-chart",
+        ),
+        (
+            "graspd chart --scene table --quick --hands barrett --objects block --work WORK/scenes-chart "
+            "--out OUT/results/scenes-chart",
+        ),
         IN_SCENES,
     ),
     Study(
-        "stability", "where integrators, gradients, starts and rates break", ("results/stability/*",),
-        ("graspd stability --only time_step --only stiffness --only contact_count --only gradient --only shapes "
-         "--only starts --only rates --only length --long --out OUT/results/stability",),
+        "stability",
+        "where integrators, gradients, starts and rates break",
+        ("results/stability/*",),
+        (
+            "graspd stability --only time_step --only stiffness --only contact_count --only gradient --only shapes "
+            "--only starts --only rates --only length --long --out OUT/results/stability",
+        ),
         ("graspd stability --quick --only time_step --only gradient --only shapes --out OUT/results/stability",),
     ),
     Study(
-        "hands-stability", "where hands, wrong models and other methods break", ("results/hands-stability/*",),
+        "hands-stability",
+        "where hands, wrong models and other methods break",
+        ("results/hands-stability/*",),
         ("graspd stability --only hands --only model_errors --only peers --out OUT/results/hands-stability",),
-        ("graspd stability --quick --only hands --only model_errors --only peers "
-         "--out OUT/results/hands-stability",),
+        ("graspd stability --quick --only hands --only model_errors --only peers --out OUT/results/hands-stability",),
     ),
     Study(
-        "scenes-stability", "where planning in scenes breaks", ("results/scenes-stability/*",),
-        ("graspd stability --only scene_height --only scene_wall --only scene_neighbours --only scene_size "
-         "--out OUT/results/scenes-stability",),
+        "scenes-stability",
+        "where planning in scenes breaks",
+        ("results/scenes-stability/*",),
+        (
+            "graspd stability --only scene_height --only scene_wall --only scene_neighbours --only scene_size "
+            "--out OUT/results/scenes-stability",
+        ),
         ("graspd stability --quick --only scene_height --hand barrett --out OUT/results/scenes-stability",),
         IN_SCENES,
     ),
     Study(
-        "quality", "every metric of raw grasps, by the letter of the protocol", ("results/quality-*",),
+        "quality",
+        "every metric of raw grasps, by the letter of the protocol",
+        ("results/quality-*",),
         ("python -m benchmarks.results_tables DATA --work WORK/cells --out OUT/results",),
         (f"python -m benchmarks.results_tables DATA --work WORK/cells {_LITTLE} --out OUT/results",),
         seeds=(7001,),
     ),
     Study(
-        "certificate", "what the referee's cheap levels cost and say", ("results/certificate.*",),
-        (f"python -m benchmarks.certificate DATA --work WORK/cells --objects {_EIGHT} "
-         "--out OUT/results/certificate.json",),
+        "certificate",
+        "what the referee's cheap levels cost and say",
+        ("results/certificate.*",),
+        (
+            f"python -m benchmarks.certificate DATA --work WORK/cells --objects {_EIGHT} "
+            "--out OUT/results/certificate.json",
+        ),
         (f"python -m benchmarks.certificate DATA --work WORK/cells {_LITTLE} --out OUT/results/certificate.json",),
-        seeds=(7001,), prints="results/certificate.md",
+        seeds=(7001,),
+        prints="results/certificate.md",
     ),
     Study(
-        "first-judge", "what the first judge says beside the certificate", ("results/first-judge.*",),
+        "first-judge",
+        "what the first judge says beside the certificate",
+        ("results/first-judge.*",),
         ("python -m benchmarks.first_judge DATA --work WORK/cells --out OUT/results/first-judge",),
         (f"python -m benchmarks.first_judge DATA --work WORK/cells {_LITTLE} --out OUT/results/first-judge",),
-        seeds=(7001,), needs=(FIRST_JUDGE,),
+        seeds=(7001,),
+        needs=(FIRST_JUDGE,),
     ),
     Study(
-        "robust", "verdicts in hands that differ from the nominal one", ("results/robust.*",),
+        "robust",
+        "verdicts in hands that differ from the nominal one",
+        ("results/robust.*",),
         ("python -m benchmarks.robust DATA --work WORK/cells --out OUT/results",),
         (f"python -m benchmarks.robust DATA --work WORK/cells {_LITTLE} --draws 1 --out OUT/results",),
         seeds=(7001, 9102),
     ),
     Study(
-        "foreign", "planned with one model of a hand, judged in another", ("results/foreign.*",),
-        (f"python -m benchmarks.foreign DATA --sources SOURCES --work WORK --objects {_SEVEN} "
-         "--out OUT/results/foreign",),
-        ("python -m benchmarks.foreign DATA --sources SOURCES --work WORK --grasps 2 --objects 056_tennis_ball "
-         "--out OUT/results/foreign",),
+        "foreign",
+        "planned with one model of a hand, judged in another",
+        ("results/foreign.*",),
+        (
+            f"python -m benchmarks.foreign DATA --sources SOURCES --work WORK --objects {_SEVEN} "
+            "--out OUT/results/foreign",
+        ),
+        (
+            "python -m benchmarks.foreign DATA --sources SOURCES --work WORK --grasps 2 --objects 056_tennis_ball "
+            "--out OUT/results/foreign",
+        ),
         seeds=(7020,),
     ),
     Study(
-        "success", "success and quality by hand and object, in one table", ("results/success.md",),
-        ("python -m benchmarks.success DATA 32",), ("python -m benchmarks.success DATA 1 Barrett",),
-        seeds=(101,), prints="results/success.md",
+        "success",
+        "success and quality by hand and object, in one table",
+        ("results/success.md",),
+        ("python -m benchmarks.success DATA 32",),
+        ("python -m benchmarks.success DATA 1 Barrett",),
+        seeds=(101,),
+        prints="results/success.md",
     ),
     Study(
-        "penetration", "how deep hands are, with and without the projection", ("results/penetration.md",),
+        "penetration",
+        "how deep hands are, with and without the projection",
+        ("results/penetration.md",),
         ("python -m benchmarks.penetration DATA",),
         ("python -m benchmarks.penetration DATA --objects 056_tennis_ball --grasps 4",),
-        seeds=(2,), prints="results/penetration.md",
+        seeds=(2,),
+        prints="results/penetration.md",
     ),
     Study(
-        "recipes", "what each part of the recipe buys", ("results/recipes.md",),
+        "recipes",
+        "what each part of the recipe buys",
+        ("results/recipes.md",),
         ("python -m benchmarks.recipes DATA",),
         ("python -m benchmarks.recipes DATA --objects 077_rubiks_cube --grasps 4",),
-        seeds=(101,), prints="results/recipes.md",
+        seeds=(101,),
+        prints="results/recipes.md",
     ),
     Study(
-        "tried", "hands chosen by merit, and by a short test", ("results/tried.*",),
+        "tried",
+        "hands chosen by merit, and by a short test",
+        ("results/tried.*",),
         ("python -m benchmarks.tried DATA --work WORK --out OUT/results",),
         (f"python -m benchmarks.tried DATA --work WORK {_LITTLE} --out OUT/results",),
         seeds=(2027,),
     ),
     Study(
-        "failures", "the failures that are left, with pictures", ("results/failures.*", "results/failures/*"),
+        "failures",
+        "the failures that are left, with pictures",
+        ("results/failures.*", "results/failures/*"),
         (f"python -m benchmarks.failures DATA --work WORK/cells --objects {_EIGHT} --out OUT/results",),
         (f"python -m benchmarks.failures DATA --work WORK/cells {_LITTLE} --out OUT/results",),
         seeds=(7001,),
     ),
     Study(
-        "diversity", "how different raw grasps are", ("results/diversity.md",),
+        "diversity",
+        "how different raw grasps are",
+        ("results/diversity.md",),
         (f"python -m benchmarks.diversity DATA --work WORK/cells --objects {_EIGHT}",),
         (f"python -m benchmarks.diversity DATA --work WORK/cells {_LITTLE}",),
-        seeds=(7001,), prints="results/diversity.md",
+        seeds=(7001,),
+        prints="results/diversity.md",
     ),
     Study(
-        "contact-threshold", "quality against the contact threshold", ("results/contact-threshold.*",),
+        "contact-threshold",
+        "quality against the contact threshold",
+        ("results/contact-threshold.*",),
         ("python -m benchmarks.contact_threshold DATA --work WORK/cells --out OUT/results",),
         (f"python -m benchmarks.contact_threshold DATA --work WORK/cells {_LITTLE} --out OUT/results",),
         seeds=(7001,),
     ),
     Study(
-        "published-picks", "published picks beside our verdicts", ("results/published-picks.*",),
+        "published-picks",
+        "published picks beside our verdicts",
+        ("results/published-picks.*",),
         ("python -m benchmarks.published_picks DATA --work WORK/picks --out OUT/results/published-picks",),
-        ("python -m benchmarks.published_picks DATA --work WORK/picks --objects 011_banana "
-         "--out OUT/results/published-picks",),
+        (
+            "python -m benchmarks.published_picks DATA --work WORK/picks --objects 011_banana "
+            "--out OUT/results/published-picks",
+        ),
         stages=(),
     ),
     Study(
-        "scenes-grasps", "planned in scenes, by hand and object", ("results/scenes-grasps.*",),
-        ("python -m benchmarks.scene_grasps DATA --work WORK --grasps 16 --per-face 2 --filtered 96 "
-         "--page OUT/results/scenes-grasps.md --json OUT/results/scenes-grasps.json",),
-        (f"python -m benchmarks.scene_grasps DATA --work WORK {_LITTLE} "
-         "--page OUT/results/scenes-grasps.md --json OUT/results/scenes-grasps.json",),
-        IN_SCENES, seeds=(404,),
+        "scenes-grasps",
+        "planned in scenes, by hand and object",
+        ("results/scenes-grasps.*",),
+        (
+            "python -m benchmarks.scene_grasps DATA --work WORK --grasps 16 --per-face 2 --filtered 96 "
+            "--page OUT/results/scenes-grasps.md --json OUT/results/scenes-grasps.json",
+        ),
+        (
+            f"python -m benchmarks.scene_grasps DATA --work WORK {_LITTLE} "
+            "--page OUT/results/scenes-grasps.md --json OUT/results/scenes-grasps.json",
+        ),
+        IN_SCENES,
+        seeds=(404,),
     ),
     Study(
-        "clutter", "grasps of a target among neighbours, within a time", ("results/clutter.*",),
+        "clutter",
+        "grasps of a target among neighbours, within a time",
+        ("results/clutter.*",),
         ("python -m benchmarks.clutter DATA --json OUT/results/clutter.json",),
-        ("python -m benchmarks.clutter DATA --hand barrett --targets 077_rubiks_cube --scenes 1 --neighbours 1 "
-         "--seconds 5 --json OUT/results/clutter.json",),
-        IN_SCENES, prints="results/clutter.md",
+        (
+            "python -m benchmarks.clutter DATA --hand barrett --targets 077_rubiks_cube --scenes 1 --neighbours 1 "
+            "--seconds 5 --json OUT/results/clutter.json",
+        ),
+        IN_SCENES,
+        prints="results/clutter.md",
     ),
     Study(
-        "chain", "what a valid grasp costs, stage by stage", ("results/chain.*",),
+        "chain",
+        "what a valid grasp costs, stage by stage",
+        ("results/chain.*",),
         ("python -m benchmarks.chain BEFORE . DATA --json OUT/results/chain.json",),
         ("python -m benchmarks.chain BEFORE . DATA --grasps 32 --pairs allegro:mug --json OUT/results/chain.json",),
-        stages=(), prints="results/chain.md",
+        stages=(),
+        prints="results/chain.md",
     ),
     Study(
-        "cold-start", "how long the first grasp takes", ("results/cold-start.md",),
-        ("python -m benchmarks.cold_start .",), ("python -m benchmarks.cold_start . --runs 1 --no-service",),
-        stages=(), prints="results/cold-start.md",
+        "cold-start",
+        "how long the first grasp takes",
+        ("results/cold-start.md",),
+        ("python -m benchmarks.cold_start .",),
+        ("python -m benchmarks.cold_start . --runs 1 --no-service",),
+        stages=(),
+        prints="results/cold-start.md",
     ),
     Study(
-        "weight", "what an install weighs and how long imports take", ("results/weight.*",),
+        "weight",
+        "what an install weighs and how long imports take",
+        ("results/weight.*",),
         ("python -m benchmarks.weight --json OUT/results/weight.json",),
         ("python -m benchmarks.weight --json OUT/results/weight.json --runs 1 --no-wheel",),
-        stages=(), prints="results/weight.md",
+        stages=(),
+        prints="results/weight.md",
     ),
     Study(
-        "fleet", "how many workers one keeper serves", ("results/fleet.*",),
+        "fleet",
+        "how many workers one keeper serves",
+        ("results/fleet.*",),
         ("python -m benchmarks.fleet --seconds 8 --tasks 4000 --json OUT/results/fleet.json",),
         ("python -m benchmarks.fleet --workers 8 --seconds 2 --tasks 100 --sqlite --json OUT/results/fleet.json",),
-        stages=(), prints="results/fleet.md",
+        stages=(),
+        prints="results/fleet.md",
     ),
     Study(
-        "week", "a week of a thousand nodes that come and go", ("results/week.*",),
+        "week",
+        "a week of a thousand nodes that come and go",
+        ("results/week.*",),
         ("python -m benchmarks.week --json OUT/results/week.json",),
         ("python -m benchmarks.week --nodes 20 --days 1 --json OUT/results/week.json",),
-        stages=(), seeds=(0,), prints="results/week.md",
+        stages=(),
+        seeds=(0,),
+        prints="results/week.md",
     ),
     Study(
-        "cost-model", "what a million grasps cost", ("results/cost-model.md",),
-        ("python -m benchmarks.cost_model",), ("python -m benchmarks.cost_model",),
-        stages=(), prints="results/cost-model.md",
+        "cost-model",
+        "what a million grasps cost",
+        ("results/cost-model.md",),
+        ("python -m benchmarks.cost_model",),
+        ("python -m benchmarks.cost_model",),
+        stages=(),
+        prints="results/cost-model.md",
     ),
     Study(
-        "service", "what the service costs around the engine", ("results/service-tables.md",),
-        ("python -m benchmarks.large_index --data-dir WORK/large-index",
-         "python -m benchmarks.service_load api --data-dir WORK/large-index",
-         *(f"python -m benchmarks.service_load {what}" for what in ("queue", "workers", "indexer"))),
-        stages=(), prints="results/service-tables.md",
+        "service",
+        "what the service costs around the engine",
+        ("results/service-tables.md",),
+        (
+            "python -m benchmarks.large_index --data-dir WORK/large-index",
+            "python -m benchmarks.service_load api --data-dir WORK/large-index",
+            *(f"python -m benchmarks.service_load {what}" for what in ("queue", "workers", "indexer")),
+        ),
+        stages=(),
+        prints="results/service-tables.md",
     ),
+    Study("service-page", "the same with its conditions", ("results/service.md",), (), stages=()),
     Study(
-        "service-page", "the same with its conditions", ("results/service.md",), (), stages=(),
-    ),
-    Study(
-        "matrix", "four hands on fourteen objects, killed in the middle", ("results/matrix.md",),
+        "matrix",
+        "four hands on fourteen objects, killed in the middle",
+        ("results/matrix.md",),
         ("python -m benchmarks.matrix DATA --data-dir WORK/matrix --out OUT/results/matrix.md",),
     ),
     Study(
-        "predictor", "networks that learned from grasps on tables",
+        "predictor",
+        "networks that learned from grasps on tables",
         ("results/predictor.json", "results/predictor-barrett.png", "results/predictor-allegro.png"),
-        ("graspd datasets create --spec examples/tables/tables.toml --objects DATA/objects --yes --wait",
-         "graspd datasets export tables -o WORK/tables",
-         "bash examples/train_grasp_predictor/data.sh DATA/objects WORK",
-         "graspd datasets create tables-raw --hands barrett --objects DATA/objects --grasps 256 --want raw "
-         "--scene table --faces all --views 2 --yes --wait",
-         "graspd datasets export tables-raw -o WORK/raw",
-         f"{_TRAIN} --hand barrett --network WORK/barrett.npz --sheet OUT/results/predictor-barrett.png "
-         "--raw WORK/raw --ablations",
-         f"{_TRAIN} --hand allegro --network WORK/allegro.npz --sheet OUT/results/predictor-allegro.png"),
-        stages=ALL, seeds=(0, 1, 2), needs=(SERVICE, TORCH),
+        (
+            "graspd datasets create --spec examples/tables/tables.toml --objects DATA/objects --yes --wait",
+            "graspd datasets export tables -o WORK/tables",
+            "bash examples/train_grasp_predictor/data.sh DATA/objects WORK",
+            "graspd datasets create tables-raw --hands barrett --objects DATA/objects --grasps 256 --want raw "
+            "--scene table --faces all --views 2 --yes --wait",
+            "graspd datasets export tables-raw -o WORK/raw",
+            f"{_TRAIN} --hand barrett --network WORK/barrett.npz --sheet OUT/results/predictor-barrett.png "
+            "--raw WORK/raw --ablations",
+            f"{_TRAIN} --hand allegro --network WORK/allegro.npz --sheet OUT/results/predictor-allegro.png",
+        ),
+        stages=ALL,
+        seeds=(0, 1, 2),
+        needs=(SERVICE, TORCH),
+    ),
+    Study("predictor-page", "the same with its conditions", ("results/predictor.md",), (), stages=ALL),
+    Study(
+        "learned",
+        "seeds from a network against the planner's own",
+        ("results/learned.*",),
+        (
+            "python -m benchmarks.learned --network WORK/barrett.npz WORK/allegro.npz --data DATA --seeds 3 "
+            "--out OUT/results",
+        ),
+        stages=IN_SCENES,
+        seeds=(404,),
+        needs=(NETWORK,),
     ),
     Study(
-        "predictor-page", "the same with its conditions", ("results/predictor.md",), (), stages=ALL,
-    ),
-    Study(
-        "learned", "seeds from a network against the planner's own", ("results/learned.*",),
-        ("python -m benchmarks.learned --network WORK/barrett.npz WORK/allegro.npz --data DATA --seeds 3 "
-         "--out OUT/results",),
-        stages=IN_SCENES, seeds=(404,), needs=(NETWORK,),
-    ),
-    Study(
-        "modelling", "what graspd leaves out: its cost and its effect", ("results/modelling.json",),
+        "modelling",
+        "what graspd leaves out: its cost and its effect",
+        ("results/modelling.json",),
         ("python -m benchmarks.modelling --data DATA --out OUT/results",),
         ("python -m benchmarks.modelling --only drops --grasps 2 --out OUT/results",),
         ALL,
+        prints="results/modelling.md",
     ),
     Study(
-        "scene-ways", "what stands in the way of grasps in scenes", ("results/scene-ways.md",),
-        ("python -m benchmarks.scene_ways",), ("python -m benchmarks.scene_ways --count 1",),
-        IN_SCENES, prints="results/scene-ways.md",
+        "scene-ways",
+        "what stands in the way of grasps in scenes",
+        ("results/scene-ways.md",),
+        ("python -m benchmarks.scene_ways",),
+        ("python -m benchmarks.scene_ways --count 1",),
+        IN_SCENES,
+        prints="results/scene-ways.md",
     ),
     Study(
-        "grippers", "what grippers hold of objects that fit", ("results/grippers.*",),
+        "grippers",
+        "what grippers hold of objects that fit",
+        ("results/grippers.*",),
         ("python -m benchmarks.grippers DATA --sources SOURCES --out OUT/results",),
         ("python -m benchmarks.grippers DATA --sources SOURCES --only robotiq-2f-85 --grasps 1 --out OUT/results",),
         seeds=(404,),
     ),
     Study(
-        "masses", "table lifts of objects with their own masses", ("results/masses.md",),
+        "masses",
+        "table lifts of objects with their own masses",
+        ("results/masses.md",),
         ("python -m benchmarks.masses DATA --page OUT/results/masses.md",),
         ("python -m benchmarks.masses DATA --hands barrett --objects 025_mug --grasps 2 --page OUT/results/masses.md",),
-        IN_SCENES, seeds=(1200,),
+        IN_SCENES,
+        seeds=(1200,),
     ),
     Study(
-        "flat", "table lifts of flat and thin things", ("results/flat.md",),
+        "flat",
+        "table lifts of flat and thin things",
+        ("results/flat.md",),
         ("python -m benchmarks.flat DATA --page OUT/results/flat.md",),
         ("python -m benchmarks.flat DATA --hands barrett --things 60x60x10 --grasps 2 --page OUT/results/flat.md",),
-        IN_SCENES, seeds=(1300,),
+        IN_SCENES,
+        seeds=(1300,),
     ),
     Study(
-        "corners", "lifts beside walls and among neighbours", ("results/corners.md",),
+        "corners",
+        "lifts beside walls and among neighbours",
+        ("results/corners.md",),
         ("python -m benchmarks.corners DATA --hands barrett --grasps 8 --page OUT/results/corners.md",),
-        ("python -m benchmarks.corners DATA --hands barrett --places wall --gaps 10 --grasps 2 "
-         "--page OUT/results/corners.md",),
-        IN_SCENES, seeds=(1400,),
+        (
+            "python -m benchmarks.corners DATA --hands barrett --places wall --gaps 10 --grasps 2 "
+            "--page OUT/results/corners.md",
+        ),
+        IN_SCENES,
+        seeds=(1400,),
     ),
     Study(
-        "rolling", "rest poses that topple or roll", ("results/rolling.md",),
+        "rolling",
+        "rest poses that topple or roll",
+        ("results/rolling.md",),
         ("python -m benchmarks.rolling DATA --page OUT/results/rolling.md",),
         ("python -m benchmarks.rolling DATA --objects 025_mug --variants 2 --page OUT/results/rolling.md",),
-        IN_SCENES, seeds=(5,),
+        IN_SCENES,
+        seeds=(5,),
     ),
     Study(
-        "second-lift", "valid grasps in a lift test of its own", ("results/second_lift.md",),
+        "second-lift",
+        "valid grasps in a lift test of its own",
+        ("results/second_lift.md",),
         ("python -m benchmarks.second_lift DATA --grasps 12 --page OUT/results/second_lift.md",),
-        ("python -m benchmarks.second_lift DATA --hands barrett --objects 025_mug --grasps 2 "
-         "--page OUT/results/second_lift.md",),
-        IN_SCENES, seeds=(1400,),
+        (
+            "python -m benchmarks.second_lift DATA --hands barrett --objects 025_mug --grasps 2 "
+            "--page OUT/results/second_lift.md",
+        ),
+        IN_SCENES,
+        seeds=(1400,),
     ),
     Study(
-        "payload", "payload of grasps: error and price", ("results/payload.md", "results/payload-free.md"),
-        ("python -m benchmarks.payload DATA --page OUT/results/payload.md",
-         "python -m benchmarks.payload DATA --free --page OUT/results/payload-free.md"),
-        ("python -m benchmarks.payload DATA --hands barrett --objects 025_mug --grasps 2 "
-         "--page OUT/results/payload.md",
-         "python -m benchmarks.payload DATA --hands barrett --objects 025_mug --grasps 2 --free "
-         "--page OUT/results/payload-free.md"),
-        IN_SCENES, seeds=(1500,),
+        "payload",
+        "payload of grasps: error and price",
+        ("results/payload.md", "results/payload-free.md"),
+        (
+            "python -m benchmarks.payload DATA --page OUT/results/payload.md",
+            "python -m benchmarks.payload DATA --free --page OUT/results/payload-free.md",
+        ),
+        (
+            "python -m benchmarks.payload DATA --hands barrett --objects 025_mug --grasps 2 "
+            "--page OUT/results/payload.md",
+            "python -m benchmarks.payload DATA --hands barrett --objects 025_mug --grasps 2 --free "
+            "--page OUT/results/payload-free.md",
+        ),
+        IN_SCENES,
+        seeds=(1500,),
     ),
     Study(
-        "published-hands", "the self-test's verdict, and what published hands lift", ("results/published_hands.*",),
+        "published-hands",
+        "the self-test's verdict, and what published hands lift",
+        ("results/published_hands.*",),
         ("python -m benchmarks.published_hands SOURCES --data DATA --grasps 12 --out OUT/results",),
         ("python -m benchmarks.published_hands SOURCES --data DATA --only robotiq-2f-85 --grasps 2 --out OUT/results",),
-        IN_SCENES, seeds=(404,),
+        IN_SCENES,
+        seeds=(404,),
     ),
     Study(
-        "hands-gallery", "published hands, each tried on plain objects",
+        "hands-gallery",
+        "published hands, each tried on plain objects",
         ("results/hands-gallery.json", "hands-gallery.md", "images/hands-gallery/*"),
         ("python -m benchmarks.gallery --sources SOURCES --out OUT",),
         ("python -m benchmarks.gallery --sources SOURCES --only robotiq-2f-85 --grasps 3 --out OUT",),
     ),
     Study(
-        "pilot", "the card of a dataset of 10,080 grasps",
-        ("results/pilot/README.md", "results/pilot/card.json", "results/pilot/checksums.sha256", "results/pilot/*.png",
-         "results/pilot/*.jpg"),
-        ("graspd datasets create pilot --spec examples/million/million.toml --objects DATA/objects -n 240 --yes --wait",
-         "graspd datasets snapshot pilot",
-         "graspd datasets card pilot -o OUT/results/pilot --licence CC-BY-4.0 --assets docs/results/pilot/assets.json"),
-        ("graspd datasets create pilot --hands barrett --objects block -n 4 --fidelity draft --yes --wait",
-         "graspd datasets snapshot pilot", "graspd datasets card pilot -o OUT/results/pilot --licence CC-BY-4.0"),
-        ALL, seeds=(0,), needs=(SERVICE,),
+        "pilot",
+        "the card of a dataset of 10,080 grasps",
+        (
+            "results/pilot/README.md",
+            "results/pilot/card.json",
+            "results/pilot/checksums.sha256",
+            "results/pilot/*.png",
+            "results/pilot/*.jpg",
+        ),
+        (
+            "graspd datasets create pilot --spec examples/million/million.toml --objects "
+            "DATA/objects -n 240 --yes --wait",
+            "graspd datasets snapshot pilot",
+            "graspd datasets card pilot -o OUT/results/pilot --licence CC-BY-4.0 --assets "
+            "docs/results/pilot/assets.json",
+        ),
+        (
+            "graspd datasets create pilot --hands barrett --objects block -n 4 --fidelity draft --yes --wait",
+            "graspd datasets snapshot pilot",
+            "graspd datasets card pilot -o OUT/results/pilot --licence CC-BY-4.0",
+        ),
+        ALL,
+        seeds=(0,),
+        needs=(SERVICE,),
     ),
     Study(
-        "tables", "the card of ten thousand grasps on tables",
-        ("results/tables/README.md", "results/tables/card.json", "results/tables/checksums.sha256",
-         "results/tables/*.png", "results/tables/*.jpg"),
-        ("graspd datasets create --spec examples/tables/tables.toml --objects DATA/objects --yes --wait",
-         "graspd datasets snapshot tables",
-         "graspd datasets card tables -o OUT/results/tables --licence CC-BY-4.0 "
-         "--assets docs/results/pilot/assets.json"),
-        ("graspd datasets create --spec examples/tables/tables.toml --hands barrett --objects block -n 4 "
-         "--fidelity draft --yes --wait",
-         "graspd datasets snapshot tables", "graspd datasets card tables -o OUT/results/tables --licence CC-BY-4.0"),
-        ALL, seeds=(0,), needs=(SERVICE,),
+        "tables",
+        "the card of ten thousand grasps on tables",
+        (
+            "results/tables/README.md",
+            "results/tables/card.json",
+            "results/tables/checksums.sha256",
+            "results/tables/*.png",
+            "results/tables/*.jpg",
+        ),
+        (
+            "graspd datasets create --spec examples/tables/tables.toml --objects DATA/objects --yes --wait",
+            "graspd datasets snapshot tables",
+            "graspd datasets card tables -o OUT/results/tables --licence CC-BY-4.0 "
+            "--assets docs/results/pilot/assets.json",
+        ),
+        (
+            "graspd datasets create --spec examples/tables/tables.toml --hands barrett --objects block -n 4 "
+            "--fidelity draft --yes --wait",
+            "graspd datasets snapshot tables",
+            "graspd datasets card tables -o OUT/results/tables --licence CC-BY-4.0",
+        ),
+        ALL,
+        seeds=(0,),
+        needs=(SERVICE,),
     ),
+    Study("pilot-assets", "licences and sources of the pilot's objects", ("results/pilot/assets.json",), (), stages=()),
     Study(
-        "pilot-assets", "licences and sources of the pilot's objects", ("results/pilot/assets.json",), (), stages=(),
-    ),
-    Study(
-        "gpu", "speed and accuracy on a GPU", ("results/gpu.*",),
-        ("python -m benchmarks.on_gpu DATA --batches 32 256 1024 4096 --grasps 32 --json OUT/results/gpu.json "
-         "--page OUT/results/gpu.md",),
+        "gpu",
+        "speed and accuracy on a GPU",
+        ("results/gpu.*",),
+        (
+            "python -m benchmarks.on_gpu DATA --batches 32 256 1024 4096 --grasps 32 --json OUT/results/gpu.json "
+            "--page OUT/results/gpu.md",
+        ),
         needs=(GPU,),
     ),
     Study(
-        "chart-gpu", "speed against accuracy on a GPU", ("results/chart-gpu/*",),
-        (f"graspd chart --methods fast_graspd --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('025_mug')},"
-         f"{_mesh('006_mustard_bottle')} --fidelities draft,standard,fine --batch 256 --repeats 1 --device cuda:0 "
-         "--out OUT/results/chart-gpu",),
+        "chart-gpu",
+        "speed against accuracy on a GPU",
+        ("results/chart-gpu/*",),
+        (
+            f"graspd chart --methods fast_graspd --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('025_mug')},"
+            f"{_mesh('006_mustard_bottle')} --fidelities draft,standard,fine --batch 256 --repeats 1 --device cuda:0 "
+            "--out OUT/results/chart-gpu",
+        ),
         needs=(GPU,),
     ),
     Study(
-        "demo", "the pictures of README", ("images/demo-*.png",),
-        ("graspd demo --out WORK/demo", "cp WORK/demo/grasps.png OUT/images/demo-grasps.png",
-         "cp WORK/demo/views.png OUT/images/demo-views.png"),
-        ("graspd demo --out WORK/demo --hand barrett --object block -n 4 --scenes 1 --views 1 --fidelity draft",
-         "cp WORK/demo/grasps.png OUT/images/demo-grasps.png"),
-        ALL, seeds=(0,),
+        "demo",
+        "the pictures of README",
+        ("images/demo-*.png",),
+        (
+            "graspd demo --out WORK/demo",
+            "cp WORK/demo/grasps.png OUT/images/demo-grasps.png",
+            "cp WORK/demo/views.png OUT/images/demo-views.png",
+        ),
+        (
+            "graspd demo --out WORK/demo --hand barrett --object block -n 4 --scenes 1 --views 1 --fidelity draft",
+            "cp WORK/demo/grasps.png OUT/images/demo-grasps.png",
+        ),
+        ALL,
+        seeds=(0,),
     ),
     Study(
-        "lift", "the film of README: a hand on its way to lift a mug", ("images/lift.webp",),
-        (f"graspd synth --hand {_ALLEGRO} --object {_mesh('025_mug')} --scene table --faces all --scenes 8 -n 24 "
-         "--seed 5 -o WORK/lift.h5",
-         "graspd pictures WORK/lift.h5 --animate --row 13 -o OUT/images/lift.webp"),
-        ("graspd synth --hand barrett --object block --scene table --scenes 1 -n 1 -o WORK/lift.h5",
-         "graspd pictures WORK/lift.h5 --animate --size 80 -o OUT/images/lift.webp"),
-        IN_SCENES, seeds=(5,),
+        "lift",
+        "the film of README: a hand on its way to lift a mug",
+        ("images/lift.webp",),
+        (
+            f"graspd synth --hand {_ALLEGRO} --object {_mesh('025_mug')} --scene table --faces all --scenes 8 -n 24 "
+            "--seed 5 -o WORK/lift.h5",
+            "graspd pictures WORK/lift.h5 --animate --row 13 -o OUT/images/lift.webp",
+        ),
+        (
+            "graspd synth --hand barrett --object block --scene table --scenes 1 -n 1 -o WORK/lift.h5",
+            "graspd pictures WORK/lift.h5 --animate --size 80 -o OUT/images/lift.webp",
+        ),
+        IN_SCENES,
+        seeds=(5,),
     ),
     Study(
-        "grasp-pictures", "grasps of all kinds of objects", ("images/grasps/*",),
+        "grasp-pictures",
+        "grasps of all kinds of objects",
+        ("images/grasps/*",),
         ("bash benchmarks/grasp_gallery.sh DATA OUT/images/grasps",),
         seeds=(4,),
     ),
     Study(
-        "scene-pictures", "scenes, hands on their way, neighbours", ("images/scenes/*",),
-        (*_on_its_way("shadow", "bottle", "table"), *_on_its_way("allegro", "mug", "bin"),
-         *_on_its_way("barrett", "mug", "shelf"),
-         *_on_its_way("allegro", "block", "examples/scenes/beside_a_box.yaml"),
-         "graspd gallery --object mug --object bottle --object block "
-         f"--object mustard={_mesh('006_mustard_bottle')} --object soup_can={_mesh('005_tomato_soup_can')} "
-         f"--object drill={_mesh('035_power_drill')} -o OUT/images/scenes"),
-        ("graspd synth --hand barrett --object block --scene table --scenes 1 -n 1 -o WORK/way.h5",
-         "graspd pictures WORK/way.h5 --way -n 1 --size 120 --palette -o OUT/images/scenes/table.png"),
+        "scene-pictures",
+        "scenes, hands on their way, neighbours",
+        ("images/scenes/*",),
+        (
+            *_on_its_way("shadow", "bottle", "table"),
+            *_on_its_way("allegro", "mug", "bin"),
+            *_on_its_way("barrett", "mug", "shelf"),
+            *_on_its_way("allegro", "block", "examples/scenes/beside_a_box.yaml"),
+            "graspd gallery --object mug --object bottle --object block "
+            f"--object mustard={_mesh('006_mustard_bottle')} --object soup_can={_mesh('005_tomato_soup_can')} "
+            f"--object drill={_mesh('035_power_drill')} -o OUT/images/scenes",
+        ),
+        (
+            "graspd synth --hand barrett --object block --scene table --scenes 1 -n 1 -o WORK/way.h5",
+            "graspd pictures WORK/way.h5 --way -n 1 --size 120 --palette -o OUT/images/scenes/table.png",
+        ),
         ALL,
     ),
     Study(
-        "asset-pictures", "hands and objects as they are checked",
+        "asset-pictures",
+        "hands and objects as they are checked",
         ("images/hands-*.png", "images/objects-*.png"),
-        (f"graspd hands check {_ALLEGRO} --no-self-test --picture OUT/images/hands-guess.png",
-         f"graspd hands check {_SHADOW} --no-self-test --picture OUT/images/hands-shadow.png",
-         f"graspd hands check {_SHADOW} --root world --no-self-test --picture OUT/images/hands-forearm.png",
-         f"graspd objects check {_mesh('011_banana')} --density 950 --picture OUT/images/objects-banana.png",
-         f"graspd objects check {_mesh('koala')} --scale-to 0.14 --picture OUT/images/objects-koala.png"),
+        (
+            f"graspd hands check {_ALLEGRO} --no-self-test --picture OUT/images/hands-guess.png",
+            f"graspd hands check {_SHADOW} --no-self-test --picture OUT/images/hands-shadow.png",
+            f"graspd hands check {_SHADOW} --root world --no-self-test --picture OUT/images/hands-forearm.png",
+            f"graspd objects check {_mesh('011_banana')} --density 950 --picture OUT/images/objects-banana.png",
+            f"graspd objects check {_mesh('koala')} --scale-to 0.14 --picture OUT/images/objects-koala.png",
+        ),
         (f"graspd objects check {_mesh('011_banana')} --picture OUT/images/objects-banana.png",),
         stages=(),
     ),
     Study(
-        "dashboard", "the pages of the dashboard", ("images/dashboard-*.png",),
+        "dashboard",
+        "the pages of the dashboard",
+        ("images/dashboard-*.png",),
         ("python -m tests.browser.screenshots --out OUT/images",),
         ("python -m tests.browser.screenshots --out OUT/images",),
         needs=(BROWSER,),
     ),
-)  # fmt: skip
+)
 BY_NAME: Final = {study.name: study for study in STUDIES}
 
 
 def files_of(study: Study, docs: Path) -> list[Path]:
-    """What there is of a study's files under a folder of the docs."""
-    return sorted({file for glob in study.files for file in docs.glob(glob) if file.is_file()})
+    """What there is of a study's files under a folder of the docs, raw results too."""
+    globs = (*study.files, study.prints) if study.prints else study.files
+    return sorted({file for glob in globs for file in docs.glob(glob) if file.is_file()})
+
+
+def is_raw(path: str) -> bool:
+    """Whether a file, by its path under the folder of the docs, is a raw result that git does not keep."""
+    return Path(path).suffix in RAW and path not in NOT_RAW

@@ -162,9 +162,15 @@ def main(
 
 
 def _proposers(
-    study: Study, wanted: Mapping[str, Callable[[str], Taught]], rows: Sequence[Row], *, seeds: int, steps: int,
-    network: Path | None, ablations: bool,
-) -> Iterator[tuple[str, int, Row, Proposer]]:  # fmt: skip
+    study: Study,
+    wanted: Mapping[str, Callable[[str], Taught]],
+    rows: Sequence[Row],
+    *,
+    seeds: int,
+    steps: int,
+    network: Path | None,
+    ablations: bool,
+) -> Iterator[tuple[str, int, Row, Proposer]]:
     """Each source and seed that `rows` do not have: what is known of it, and what proposes."""
     done = {(row["hand"], row["source"], row["seed"]) for row in rows}
     main = study.makers()
@@ -224,9 +230,12 @@ def _by(made: ProposalNetwork, spreads: Sequence[float]) -> Proposer:
         shown = slice(0, SHOWN)
         points, normals = sight.points[shown], sight.normals[shown]
         each = count // len(spreads)
-        return joined(*(
-            propose(made, points, normals, table_height=0.0, count=each, rng=rng, spread=spread) for spread in spreads
-        ))  # fmt: skip
+        return joined(
+            *(
+                propose(made, points, normals, table_height=0.0, count=each, rng=rng, spread=spread)
+                for spread in spreads
+            )
+        )
 
     return proposer
 
@@ -234,9 +243,16 @@ def _by(made: ProposalNetwork, spreads: Sequence[float]) -> Proposer:
 def _as_file(hand: HandModel, trained: Trained, about: str) -> ProposalNetwork:
     weights = {name: value.numpy() for name, value in trained.network.state_dict().items()}
     return ProposalNetwork(
-        hand=hand.name, hand_digest=hand.digest, joint_names=hand.joint_names, points=SHOWN, steps=16, about=about,
-        mean=trained.mean, std=trained.std, weights=weights,
-    )  # fmt: skip
+        hand=hand.name,
+        hand_digest=hand.digest,
+        joint_names=hand.joint_names,
+        points=SHOWN,
+        steps=16,
+        about=about,
+        mean=trained.mean,
+        std=trained.std,
+        weights=weights,
+    )
 
 
 def _line(source: str, seed: int, facts: Row, rows: Sequence[Row]) -> str:

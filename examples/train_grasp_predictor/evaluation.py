@@ -66,11 +66,16 @@ def examined(
         best = np.arange(0, len(lifted.lift), TAKEN)
         outcomes = np.bincount(lifted.outcome, minlength=len(LiftOutcome))
         row: Row = {
-            "object": exam.object, "kind": exam.kind, "pictures": len(exam.seen), "tried": len(lifted.lift),
-            "lift": float(lifted.lift.mean()), "best": float(lifted.lift[best].mean()),
-            "hard": float(lifted.hard.mean()), "table": table,
+            "object": exam.object,
+            "kind": exam.kind,
+            "pictures": len(exam.seen),
+            "tried": len(lifted.lift),
+            "lift": float(lifted.lift.mean()),
+            "best": float(lifted.lift[best].mean()),
+            "hard": float(lifted.hard.mean()),
+            "table": table,
             "outcomes": {LiftOutcome(k).name.lower(): int(n) for k, n in enumerate(outcomes) if n},
-        }  # fmt: skip
+        }
         if epsilon:
             row["epsilon"] = float(np.nanmean(lifted.epsilon))
         yield exam, row, ready, lifted

@@ -60,8 +60,12 @@ class Hands:
             points.append(apply(bodies, surface.position))
             normals.append(quat_rotate(bodies[..., 3:], np.broadcast_to(surface.normal, points[-1].shape)))
         pose = hands.hand_pose
-        return cls(_tensor(np.stack(points, axis=1)), _tensor(np.stack(normals, axis=1)), _tensor(pose[:, :3]),
-                   _tensor(quat_to_matrix(pose[:, 3:])))  # fmt: skip
+        return cls(
+            _tensor(np.stack(points, axis=1)),
+            _tensor(np.stack(normals, axis=1)),
+            _tensor(pose[:, :3]),
+            _tensor(quat_to_matrix(pose[:, 3:])),
+        )
 
     def __len__(self) -> int:
         return len(self.place)
@@ -100,14 +104,19 @@ class Tries:
 
     def and_those(self, others: Tries) -> Tries:
         """These tries and others."""
-        hands = Hands(*(torch.cat([part, more]) for part, more in zip(
-            vars(self.hands).values(), vars(others.hands).values(), strict=True
-        )))  # fmt: skip
+        hands = Hands(
+            *(
+                torch.cat([part, more])
+                for part, more in zip(vars(self.hands).values(), vars(others.hands).values(), strict=True)
+            )
+        )
         return Tries(
-            torch.cat([self.points, others.points]), torch.cat([self.normals, others.normals]),
-            torch.cat([self.picture, others.picture + len(self.points)]), hands,
+            torch.cat([self.points, others.points]),
+            torch.cat([self.normals, others.normals]),
+            torch.cat([self.picture, others.picture + len(self.points)]),
+            hands,
             torch.cat([self.lifted, others.lifted]),
-        )  # fmt: skip
+        )
 
     def __len__(self) -> int:
         return len(self.lifted)
@@ -123,9 +132,14 @@ class Evaluator(nn.Module):
         self.of_hand = _points(int(self.body.shape[1]) + 14)
         self.of_object = _points(9)
         self.verdict = nn.Sequential(
-            nn.Linear(512, 128), nn.ReLU(), nn.Dropout(0.3), nn.Linear(128, 64), nn.ReLU(), nn.Dropout(0.2),
+            nn.Linear(512, 128),
+            nn.ReLU(),
+            nn.Dropout(0.3),
+            nn.Linear(128, 64),
+            nn.ReLU(),
+            nn.Dropout(0.2),
             nn.Linear(64, 1),
-        )  # fmt: skip
+        )
 
     def forward(self, points: torch.Tensor, normals: torch.Tensor, hands: Hands) -> torch.Tensor:
         """(N,) from points (N, P, 3) of objects with normals."""

@@ -69,8 +69,9 @@ def made_ready(hand: HandModel, proposed: Proposals, sight: Sight) -> Ready:
             opened[tight] = wider(hand, proposed.pregrasp[tight], share)
             room[tight] = _room_on_the_way(hand, part_of(first, tight), opened[tight])
     hands = _raised(first, CLEAR_M - room)
-    lowest = np.minimum(obstacle_room(hand, Posture(hands.hand_pose, hands.joints), [table()]),
-                        _room_on_the_way(hand, hands, opened))  # fmt: skip
+    lowest = np.minimum(
+        obstacle_room(hand, Posture(hands.hand_pose, hands.joints), [table()]), _room_on_the_way(hand, hands, opened)
+    )
     clear = (lowest >= 0.5 * CLEAR_M) & _passes(hand, hands, opened, sight)
     return Ready(hands, opened, at_grasp < 0.0, clear)
 
@@ -168,17 +169,26 @@ def carried_out(
     pose, path, grasp, squeeze, opened = (
         np.concatenate([part(one) for one in ready])
         for part in (
-            lambda one: one.hands.hand_pose, lambda one: way_in(one.hands), lambda one: one.hands.joints,
-            lambda one: one.hands.squeeze, lambda one: one.opened,
+            lambda one: one.hands.hand_pose,
+            lambda one: way_in(one.hands),
+            lambda one: one.hands.joints,
+            lambda one: one.hands.squeeze,
+            lambda one: one.opened,
         )
-    )  # fmt: skip
+    )
     own = compose(back, pose)
     raised = pose.copy()
     raised[:, :3] += RISE_M * UP
     grasps = GraspSet(
-        Posture(own, grasp), Posture(own, opened), Posture(own, squeeze), np.full(len(own), np.nan),
-        approach=compose(back[:, None], path), coming=opened, lift=Posture(compose(back, raised), squeeze), scene=index,
-    )  # fmt: skip
+        Posture(own, grasp),
+        Posture(own, opened),
+        Posture(own, squeeze),
+        np.full(len(own), np.nan),
+        approach=compose(back[:, None], path),
+        coming=opened,
+        lift=Posture(compose(back, raised), squeeze),
+        scene=index,
+    )
     placed = Placed(table().obstacles, lying, index)
     lifts = judge_lifts(hand, obj, grasps, placed, pieces=pieces)
     lift, hard = lifts.outcome == LiftOutcome.LIFTED, np.zeros(len(own), bool)

@@ -36,9 +36,15 @@ def valid_grasps(shards: Shards, obj: str) -> GraspSet | None:
 
 
 def filtered(
-    hand: HandModel, obj: ObjectModel, free: GraspSet, scenes: Sequence[Scene], object_pose: Floats,
-    wanted: NDArray[np.intp], *, seed: int,
-) -> Taught:  # fmt: skip
+    hand: HandModel,
+    obj: ObjectModel,
+    free: GraspSet,
+    scenes: Sequence[Scene],
+    object_pose: Floats,
+    wanted: NDArray[np.intp],
+    *,
+    seed: int,
+) -> Taught:
     """As many grasps as other data have in the same scenes, as far as there are.
 
     What a scene has no grasp for is made up for in the others of the object.

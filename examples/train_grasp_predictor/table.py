@@ -12,10 +12,14 @@ Row = dict[str, Any]
 
 #: Column -> kind of exam, figure, digits.
 _COLUMNS: Final = {
-    "lift": (OBJECT, "lift"), "first proposal": (OBJECT, "best"), "half friction": (OBJECT, "hard"),
-    "into the table": (OBJECT, "table"), "ε": (OBJECT, "epsilon"), "lift, unseen faces": (FACE, "lift"),
+    "lift": (OBJECT, "lift"),
+    "first proposal": (OBJECT, "best"),
+    "half friction": (OBJECT, "hard"),
+    "into the table": (OBJECT, "table"),
+    "ε": (OBJECT, "epsilon"),
+    "lift, unseen faces": (FACE, "lift"),
     "half friction, faces": (FACE, "hard"),
-}  # fmt: skip
+}
 
 
 def markdown(rows: Sequence[Row]) -> str:

@@ -1,6 +1,8 @@
 """Connection to the index database: SQLite in WAL mode or PostgreSQL, whose tables are made when it is first opened.
 
 There are no migrations: the index follows from the store. `graspd index rebuild` makes one of another revision anew.
+Columns of metrics that the table of grasps lacks are added when it is opened, so a new metric needs no other revision.
+Grasps whose shards lack it hold NULL. A column whose metric is gone stays.
 """
 
 from __future__ import annotations
@@ -17,10 +19,10 @@ from typing import Any, Final, TypeVar
 from sqlalchemy import URL, Connection, Engine, MetaData, create_engine, event, inspect, make_url, text
 from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlchemyError
 
-from service.index.metric_columns import add_missing
 from service.index.sqlite_file import Identity, SqliteFile
-from service.index.tables import metadata
+from service.index.tables import grasps, metadata
 from service.model.errors import IndexDamaged, IndexUnavailable, InputError
+from service.model.metrics import indexed
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -244,7 +246,7 @@ def _make_tables(engine: Engine, *, anew: bool) -> str:
             metadata.create_all(connection)
             connection.exec_driver_sql(f"CREATE TABLE {REVISION_TABLE} (version_num VARCHAR(32) NOT NULL)")
             connection.execute(text(f"INSERT INTO {REVISION_TABLE} VALUES (:revision)"), {"revision": REVISION})
-        if added := add_missing(connection):
+        if added := _add_missing_metrics(connection):
             log.info("the index has new columns of grasps: %s", ", ".join(added))
     return dropped
 
@@ -303,3 +305,18 @@ def mapped() -> Iterator[None]:
 def _line(error: Exception) -> str:
     original = getattr(error, "orig", None) or error
     return (str(original).strip().splitlines() or [type(original).__name__])[0]
+
+
+def _add_missing_metrics(connection: Connection) -> list[str]:
+    """Add the columns and indexes that are missing, within the caller's transaction; the names of the columns added."""
+    found = inspect(connection)
+    there = {column["name"] for column in found.get_columns(grasps.name)}
+    missing = [metric.name for metric in indexed() if metric.name not in there]
+    for name in missing:
+        kind = grasps.c[name].type.compile(connection.dialect)
+        connection.exec_driver_sql(f"ALTER TABLE {grasps.name} ADD COLUMN {name} {kind}")
+    made = {index["name"] for index in found.get_indexes(grasps.name)}
+    for index in grasps.indexes:
+        if index.name not in made:
+            index.create(connection)
+    return missing

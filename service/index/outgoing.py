@@ -7,12 +7,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sqlalchemy import Connection, delete, func, select, update
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Column,
+    Connection,
+    Float,
+    Index,
+    Integer,
+    String,
+    Table,
+    Text,
+    delete,
+    func,
+    select,
+    update,
+)
 
 from service.index.bulk import upsert
 from service.index.database import Database
-from service.index.dataset_tables import datasets
-from service.index.event_tables import deliveries, ends, webhooks
+from service.index.tables import datasets, metadata
 from service.index.views import DeliveryView, EndView, WebhookView
 from service.model.clock import timestamp
 from service.model.errors import NotFoundError
@@ -22,6 +36,45 @@ from service.model.webhooks import MOST_WAITING, WAITS_S, Webhook
 #: Ends and deliveries older than this are forgotten [s].
 KEPT_S: Final = 30 * 86400.0
 _AT_ONCE: Final = 500
+#: Live: an index that is rebuilt goes on with a feed of its own.
+ends: Final = Table(
+    "ends",
+    metadata,
+    Column("seq", BigInteger, primary_key=True, autoincrement=False),
+    Column("kind", String(8), nullable=False),
+    Column("subject", String(64), nullable=False),
+    Column("state", String(10), nullable=False),
+    Column("at", String(32), nullable=False),
+    Column("project", String(32), nullable=False, server_default=""),
+    Column("owner", String(64), nullable=False, server_default=""),
+    Index("ends_of_project", "project", "seq"),
+)
+webhooks: Final = Table(
+    "webhooks",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    Column("url", Text, nullable=False),
+    Column("states", JSON, nullable=False),
+    Column("created", String(32), nullable=False),
+    Column("owner", String(64), nullable=False, server_default=""),
+    Column("project", String(32), nullable=False, server_default=""),
+    # Live: ends up to here have deliveries.
+    Column("seen", BigInteger, nullable=False, server_default="0"),
+)
+#: Live: a log.
+deliveries: Final = Table(
+    "deliveries",
+    metadata,
+    Column("webhook", String(32), primary_key=True),
+    Column("seq", BigInteger, primary_key=True, autoincrement=False),
+    Column("state", String(10), nullable=False),
+    Column("attempts", Integer, nullable=False),
+    Column("due", Float, nullable=False),
+    Column("tried", String(32)),
+    Column("status", Integer),
+    Column("detail", String(300), nullable=False, server_default=""),
+    Index("deliveries_due", "state", "due"),
+)
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,7 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Select, case, exists, or_, select
 
-from service.index.dataset_tables import datasets, object_sets
-from service.index.tables import assets, attempts, jobs, tasks
-from service.index.tag_tables import tags
+from service.index.tables import assets, attempts, datasets, jobs, object_sets, tags, tasks
 from service.model.projects import Reach
 
 Tests = tuple[ColumnElement[bool], ...]

@@ -1,20 +1,25 @@
-"""A sample of an index that is too large to be compared whole: shards and jobs, from both sides."""
+"""How an index stands, seen from outside (nothing is made or moved aside, as opening it would), and a sample of one
+that is too large to be compared whole: shards and jobs, from both sides."""
 
 from __future__ import annotations
 
 import secrets
+import sqlite3
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 from typing import Any, Final
 
-from sqlalchemy import Column, Table, select
+from sqlalchemy import URL, Column, Table, make_url, select, text
 
+from service.index.database import REVISION, REVISION_TABLE, UNUSABLE, connect_postgres, mapped, revision_of, unusable
 from service.index.index import Index
 from service.index.tables import jobs, shards
 from service.model import names
-from service.model.errors import DamagedError, NotFoundError
+from service.model.errors import DamagedError, IndexDamaged, IndexUnavailable, NotFoundError
 from service.model.records import JobRecord
 from service.model.states import Stage
 from service.store.deletions import pending
@@ -25,6 +30,7 @@ from service.store.store import Store
 #: Rows of a kind from each side.
 _SIZE: Final = 100
 _READERS: Final = 16
+_TIMEOUT_S: Final = 5.0
 
 
 @dataclass(frozen=True)
@@ -111,3 +117,78 @@ def _has_job(store: Store, job: str) -> bool:
     except (NotFoundError, DamagedError):
         return False
     return True
+
+
+@dataclass(frozen=True)
+class IndexCondition:
+    """What the database says of itself."""
+
+    kind: str
+    """sqlite or postgresql, with its version."""
+    revision: str
+    """Of its tables; "" where it has none yet."""
+    newest: str
+    """Revision that this graspd knows."""
+    connections: tuple[int, int] = (0, 0)
+    """Used, and the most there may be; zeros where nobody counts."""
+    may_write: bool = True
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether opening it changes nothing."""
+        return bool(self.revision) and self.revision == self.newest
+
+
+def look(url: str | URL) -> IndexCondition | None:
+    """None where the file of an SQLite index does not exist yet.
+
+    Raises:
+        InputError: the URL names no known database, or one of another encoding than UTF-8.
+        IndexUnavailable: it does not answer.
+        IndexDamaged: the file makes no sense.
+    """
+    try:
+        parsed = make_url(url)
+        if parsed.get_backend_name() == "sqlite":
+            return _look_at_file(Path(str(parsed.database)))
+        return _look_at_postgres(url)
+    except UNUSABLE as error:
+        raise unusable(error) from None
+
+
+def _look_at_file(path: Path) -> IndexCondition | None:
+    if not path.exists():
+        return None
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=_TIMEOUT_S)) as connection:
+            said = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+            if said != "ok":
+                raise IndexDamaged(f"the index {path} is damaged: {said}")
+            tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+            query = f"SELECT version_num FROM {REVISION_TABLE}"
+            rows = connection.execute(query).fetchall() if REVISION_TABLE in tables else []
+    except sqlite3.DatabaseError as error:
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
+            raise IndexDamaged(f"the index {path} is damaged: {error}") from None
+        raise IndexUnavailable(f"the index {path} cannot be read: {error}") from None
+    return IndexCondition(f"SQLite {sqlite3.sqlite_version}", rows[0][0] if rows else "", REVISION)
+
+
+def _look_at_postgres(url: str | URL) -> IndexCondition:
+    engine = connect_postgres(url)
+    try:
+        with mapped(), engine.connect() as connection:
+
+            def ask(question: str) -> str:
+                return str(connection.scalar(text(question)))
+
+            return IndexCondition(
+                f"PostgreSQL {ask('SHOW server_version')}",
+                revision_of(connection),
+                REVISION,
+                (int(ask("SELECT count(*) FROM pg_stat_activity")), int(ask("SHOW max_connections"))),
+                ask("SELECT pg_is_in_recovery()") == "False"
+                and ask("SELECT has_schema_privilege(current_schema(), 'CREATE')") == "True",
+            )
+    finally:
+        engine.dispose()

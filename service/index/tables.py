@@ -1,7 +1,7 @@
 """Tables of the index. `LIVE_COLUMNS` hold the present moment (progress, queue marks); the rest follows from the store.
 
 A change here needs another `REVISION` in `database`; a test holds the two together. Metrics of grasps need none: see
-`metric_columns`.
+`database`. Of datasets `applied` and `planned` say how far the planner is; tags are names that users give to grasps.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from sqlalchemy import (
 from service.model.metrics import Indexed, indexed
 
 metadata: Final = MetaData()
-
 jobs: Final = Table(
     "jobs",
     metadata,
@@ -58,7 +57,6 @@ jobs: Final = Table(
     Index("jobs_by_pair", "hand", "object"),
     Index("jobs_of_project", "project", "created", "id"),
 )
-
 tasks: Final = Table(
     "tasks",
     metadata,
@@ -95,7 +93,6 @@ tasks: Final = Table(
     Index("tasks_in_queue", "queued", "ready"),
     Index("tasks_finished", "finished"),
 )
-
 attempts: Final = Table(
     "attempts",
     metadata,
@@ -113,7 +110,6 @@ attempts: Final = Table(
     Index("attempts_of_job", "job_id", "ended"),
     Index("attempts_by_kind", "stage", "kind"),
 )
-
 shards: Final = Table(
     "shards",
     metadata,
@@ -152,10 +148,8 @@ shards: Final = Table(
     Index("shards_made", "created", "kind", "count", "valid", "seconds"),
     Index("shards_charged", "created", "charged", "kind", "device", "count", "valid", "seconds", "size_bytes"),
 )
-
 #: Metrics by which grasps are bounded and sorted.
 METRICS: Final = tuple(metric.name for metric in indexed(Indexed.SORTED))
-
 grasps: Final = Table(
     "grasps",
     metadata,
@@ -178,7 +172,6 @@ grasps: Final = Table(
     Index("grasps_by_object", "object", "epsilon", "shard_id", "row"),
     sqlite_with_rowid=False,
 )
-
 assets: Final = Table(
     "assets",
     metadata,
@@ -202,7 +195,6 @@ assets: Final = Table(
     Column("not_before", Float, nullable=False, default=0.0),
     Index("assets_by_name", "kind", "name", "created"),
 )
-
 workers: Final = Table(
     "workers",
     metadata,
@@ -219,7 +211,6 @@ workers: Final = Table(
     Column("seen", String(32), nullable=False),
     Column("reason", String(300), nullable=False, server_default=""),
 )
-
 #: What shards that are gone had cost, a row for each project, day and device: what is deleted was used all the same.
 spent: Final = Table(
     "spent",
@@ -232,11 +223,9 @@ spent: Final = Table(
     Column("tasks", BigInteger, nullable=False),
     Column("seconds", Float, nullable=False),
 )
-
 notes: Final = Table(
     "notes", metadata, Column("name", String(64), primary_key=True), Column("value", JSON, nullable=False)
 )
-
 damage: Final = Table(
     "damage",
     metadata,
@@ -245,7 +234,6 @@ damage: Final = Table(
     Column("shard", String(64), nullable=False),
     Column("found", String(32), nullable=False),
 )
-
 #: Columns of the present moment, and tables that hold nothing else: a rebuild starts them afresh.
 LIVE_COLUMNS: Final = frozenset(
     {
@@ -262,3 +250,81 @@ LIVE_COLUMNS: Final = frozenset(
     }
 )
 LIVE_TABLES: Final = frozenset({"workers", "notes", "damage", "spent", "ends", "deliveries"})
+datasets: Final = Table(
+    "datasets",
+    metadata,
+    Column("name", String(64), primary_key=True),
+    Column("digest", String(32), nullable=False),
+    Column("hands", JSON, nullable=False),
+    Column("objects", JSON, nullable=False),
+    Column("options", JSON, nullable=False),
+    Column("revisions", JSON, nullable=False),
+    Column("cells", Integer, nullable=False),
+    Column("created", String(32), nullable=False),
+    Column("owner", String(64), nullable=False, server_default=""),
+    Column("project", String(32), nullable=False, server_default=""),
+    Column("cancelled", Boolean, nullable=False),
+    Column("events", Integer, nullable=False),
+    Column("applied", Integer, nullable=False, default=0),
+    Column("planned", Boolean, nullable=False, default=False),
+    # Number of events for which its end was told; -1: it was not.
+    Column("told", Integer, nullable=False, server_default="-1"),
+    Column("neighbours", String(300), nullable=False, server_default=""),
+    Column("network_digest", String(32), nullable=False, server_default=""),
+    Index("datasets_newest", "created", "name"),
+)
+dataset_cells: Final = Table(
+    "dataset_cells",
+    metadata,
+    Column("dataset", String(64), primary_key=True),
+    Column("position", Integer, primary_key=True),
+    Column("hand", String(64), nullable=False),
+    Column("object", String(64), nullable=False),
+    Column("hand_digest", String(32), nullable=False),
+    Column("object_digest", String(32), nullable=False),
+    Column("job_id", String(32), nullable=False),
+    Column("fidelity", String(64), nullable=True),
+    Column("choice", JSON(none_as_null=True)),
+    Index("dataset_cells_by_job", "job_id"),
+)
+dataset_snapshots: Final = Table(
+    "dataset_snapshots",
+    metadata,
+    Column("dataset", String(64), primary_key=True),
+    Column("digest", String(32), primary_key=True),
+    Column("created", String(32), nullable=False),
+    Column("complete", Boolean, nullable=False),
+    Column("shards", Integer, nullable=False),
+    Column("grasps", Integer, nullable=False),
+    Column("valid", Integer, nullable=False),
+    Column("size_bytes", BigInteger, nullable=False),
+)
+object_sets: Final = Table(
+    "object_sets",
+    metadata,
+    Column("name", String(64), primary_key=True),
+    Column("digest", String(32), primary_key=True),
+    Column("objects", JSON, nullable=False),
+    Column("created", String(32), nullable=False),
+    Column("project", String(32), nullable=False, server_default=""),
+)
+tags: Final = Table(
+    "tags",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    Column("name", String(64), nullable=False),
+    Column("created", String(32), nullable=False),
+    Column("changed", String(32), nullable=False),
+    Column("owner", String(64), nullable=False, server_default=""),
+    Column("project", String(32), nullable=False, server_default=""),
+    Index("tags_by_name", "name", "project"),
+)
+#: Grasps that a tag names. Some may be gone: their shards left with the last job that needed them.
+tagged: Final = Table(
+    "tagged",
+    metadata,
+    Column("tag", String(32), primary_key=True),
+    Column("shard_id", String(32), primary_key=True),
+    Column("row", Integer, primary_key=True),
+    Index("tagged_grasps", "shard_id", "row"),
+)

@@ -11,8 +11,7 @@ from sqlalchemy import Connection, case, delete, func, select, tuple_
 from service.index.bulk import upsert
 from service.index.database import Database, chunks
 from service.index.reach import seen_shards, seen_tags
-from service.index.tables import grasps
-from service.index.tag_tables import tagged, tags
+from service.index.tables import grasps, tagged, tags
 from service.index.views import TagView
 from service.model.errors import NotFoundError
 from service.model.projects import EVERYTHING, Reach

@@ -101,17 +101,19 @@ class JobOptions(Model):
     )
     friction: float = Field(1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics")
     mass: Mass | None = Field(
-        None, exclude_if=lambda value: value is None,
+        None,
+        exclude_if=lambda value: value is None,
         description=f"mass of the object [kg]; by default its own, {MASS_KG:g} kg where it has none",
-    )  # fmt: skip
+    )
     density: Density | None = Field(
         None, exclude_if=lambda value: value is None, description="density of the object [kg/m^3], in place of the mass"
-    )  # fmt: skip
+    )
     object_friction: Friction | None = Field(
-        None, exclude_if=lambda value: value is None,
+        None,
+        exclude_if=lambda value: value is None,
         description="Coulomb coefficient of contacts in simulation; by default the object's own, "
         f"{FRICTION:g} where it has none",
-    )  # fmt: skip
+    )
     want: Literal["valid", "raw"] = Field(
         "valid",
         description="whether `grasps` counts grasps that are valid (sound ones where the referee is none), or all that "
@@ -133,32 +135,47 @@ class JobOptions(Model):
         "none: nobody, grasps are sound at best",
     )
     audits: int = Field(
-        AUDITS, ge=0, le=10_000,
+        AUDITS,
+        ge=0,
+        le=10_000,
         description=f"valid grasps of the job that are judged again by the letter: the default, {AUDITS}, are "
         "spread over the job, one of 64, and take a twentieth of its time; of any other number the first ones",
-    )  # fmt: skip
+    )
     robustness: int = Field(0, ge=0, le=20, description="verdicts under noise that each valid grasp gets")
     robust: float = Field(
-        0.0, ge=0, le=1, allow_inf_nan=False, exclude_if=lambda value: value == 0,
+        0.0,
+        ge=0,
+        le=1,
+        allow_inf_nan=False,
+        exclude_if=lambda value: value == 0,
         description="share of models around the nominal one in which a grasp must hold to count; 0: none is wanted. "
         "Where raw grasps are wanted all are kept, whatever their share",
-    )  # fmt: skip
+    )
     robust_models: int = Field(
-        0, ge=0, le=MOST_MODELS, exclude_if=lambda value: value == 0,
+        0,
+        ge=0,
+        le=MOST_MODELS,
+        exclude_if=lambda value: value == 0,
         description=f"models in which each valid grasp is judged too; 0: {MODELS} where a share is wanted, else none",
-    )  # fmt: skip
+    )
     payload: bool = Field(
-        False, exclude_if=lambda value: not value,
+        False,
+        exclude_if=lambda value: not value,
         description="whether the heaviest mass that each valid grasp lifts is measured",
-    )  # fmt: skip
+    )
     min_payload: float = Field(
-        0.0, ge=0, le=MOST_KG, allow_inf_nan=False, exclude_if=lambda value: value == 0,
+        0.0,
+        ge=0,
+        le=MOST_KG,
+        allow_inf_nan=False,
+        exclude_if=lambda value: value == 0,
         description="mass that a grasp must lift to count [kg]; 0: none is wanted. It is measured where one is",
-    )  # fmt: skip
+    )
     shake: bool = Field(
-        False, exclude_if=lambda value: not value,
+        False,
+        exclude_if=lambda value: not value,
         description="whether each valid grasp, lifted, is shaken: 2 cm, 3 Hz, along x and y of its scene",
-    )  # fmt: skip
+    )
     options: dict[
         Annotated[str, Field(max_length=40)],
         Annotated[int, Field(ge=-(2**53), le=2**53)]

@@ -216,8 +216,27 @@ class TaskRefused(TaskError):
 ERRORS: Final[dict[str, type[GraspdError]]] = {
     error.slug: error
     for error in (
-        InputError, NotFoundError, ConflictError, MeshError, HandError, SceneError, LoadError, LimitError, QuotaError,
-        UnavailableError, QueueUnavailable, StoreUnavailable, IndexUnavailable, IndexDamaged, RateError, BusyError,
-        DamagedError, DamagedShard, TaskError, TaskCancelled, TaskRefused, GraspdError,
+        InputError,
+        NotFoundError,
+        ConflictError,
+        MeshError,
+        HandError,
+        SceneError,
+        LoadError,
+        LimitError,
+        QuotaError,
+        UnavailableError,
+        QueueUnavailable,
+        StoreUnavailable,
+        IndexUnavailable,
+        IndexDamaged,
+        RateError,
+        BusyError,
+        DamagedError,
+        DamagedShard,
+        TaskError,
+        TaskCancelled,
+        TaskRefused,
+        GraspdError,
     )
-}  # fmt: skip
+}

@@ -19,9 +19,11 @@ class Fidelity(Model):
     coarse_points: int = Field(256, ge=16, le=8192, description="hand surface points in the first phase")
     fine_points: int = Field(2000, ge=16, le=32768, description="hand surface points in the second phase")
     object_points: int = Field(
-        4000, ge=16, le=65536,
+        4000,
+        ge=16,
+        le=65536,
         description="object surface points tested against the links; around a free object thrice as many, up to 12,000",
-    )  # fmt: skip
+    )
     face_error_m: float = Field(3e-4, ge=0, le=0.01, description="simplification error bound of the object [m]")
     coarse_iterations: int = Field(100, ge=0, le=100_000)
     fine_iterations: int = Field(40, ge=0, le=100_000)
@@ -42,21 +44,47 @@ class Fidelity(Model):
 
 FIDELITIES: Final[dict[str, Fidelity]] = {
     "draft": Fidelity(
-        name="draft", starts=2, finalists=1, coarse_points=200, fine_points=800, object_points=2000, face_error_m=1e-3,
-        coarse_iterations=60, fine_iterations=20, polish_iterations=6,
+        name="draft",
+        starts=2,
+        finalists=1,
+        coarse_points=200,
+        fine_points=800,
+        object_points=2000,
+        face_error_m=1e-3,
+        coarse_iterations=60,
+        fine_iterations=20,
+        polish_iterations=6,
     ),
     "standard": Fidelity(name="standard"),
     "fine": Fidelity(
-        name="fine", starts=6, finalists=3, coarse_points=400, fine_points=4000, object_points=8000, face_error_m=1e-4,
-        coarse_iterations=120, fine_iterations=60, polish_iterations=15,
+        name="fine",
+        starts=6,
+        finalists=3,
+        coarse_points=400,
+        fine_points=4000,
+        object_points=8000,
+        face_error_m=1e-4,
+        coarse_iterations=120,
+        fine_iterations=60,
+        polish_iterations=15,
     ),
     # As the paper writes it: plain descent with one rate, one sweep of contacts, no penetration penalty, no selection.
     "paper": Fidelity(
-        name="paper", starts=1, finalists=1, coarse_points=2000, coarse_iterations=200, fine_iterations=0, patience=0,
-        polish_iterations=0, contact_solver="gauss_seidel", optimizer="gd", leak="two_sided", phong_alpha=0.75,
+        name="paper",
+        starts=1,
+        finalists=1,
+        coarse_points=2000,
+        coarse_iterations=200,
+        fine_iterations=0,
+        patience=0,
+        polish_iterations=0,
+        contact_solver="gauss_seidel",
+        optimizer="gd",
+        leak="two_sided",
+        phong_alpha=0.75,
     ),
     "control": Fidelity(name="control", simulate=False),
-}  # fmt: skip
+}
 
 
 #: Stands in a request for the cheapest fidelity that meets its target; a stored job has that fidelity instead.

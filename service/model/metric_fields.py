@@ -56,9 +56,13 @@ def with_fields(**parts: Mapping[str, Any]) -> Callable[[type[M]], type[M]]:
                 fields |= dict(parts.get(name, {})) | {name: (field.annotation, field)}
         fields |= dict(parts.get("last", {}))
         anew = create_model(
-            model.__name__, __base__=base, __cls_kwargs__=dict(model.model_config),
-            __module__=model.__module__, __doc__=model.__doc__, **fields,
-        )  # fmt: skip
+            model.__name__,
+            __base__=base,
+            __cls_kwargs__=dict(model.model_config),
+            __module__=model.__module__,
+            __doc__=model.__doc__,
+            **fields,
+        )
         return cast(type[M], anew)
 
     return made

@@ -3,7 +3,7 @@
 Shards (`service.store.columns`), manifests, the index, the API, the dashboard, a dataset's card and the docs read this
 table. A new metric is a row here and the function that computes it (`MEASURES` in `worker.quality.table`); make it
 `optional`, since older shards lack it. The index gets its column when it is opened next
-(`service.index.metric_columns`). What says yes or no of a grasp is a verdict and no metric.
+(`service.index.database`). What says yes or no of a grasp is a verdict and no metric.
 """
 
 from __future__ import annotations
@@ -88,78 +88,180 @@ class GraspMetric:
 
 GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
-        "epsilon", "1", "radius of the largest ball in the L1 grasp wrench space (Ferrari-Canny)",
-        title="ε (Ferrari-Canny)", short="ε", swept=True, indexed=Indexed.OFFERED, digits=2, plot="whole",
-    ),
-    GraspMetric(
-        "wrench_volume", "1", "volume of the L1 grasp wrench space; nan: not measured at this threshold",
-        title="Wrench space volume", short="Vol", swept=True, indexed=Indexed.SORTED, digits=1,
-    ),
-    GraspMetric(
-        "contact_area_cm2", "cm^2", "hand surface closer to the object than the threshold",
-        title="Contact area", swept=True, indexed=Indexed.OFFERED, digits=0, plot="whole",
-    ),
-    GraspMetric(
-        "intersection_volume_cm3", "cm^3", "volume shared by hand and object", title="Intersection volume",
-        short="Intersection", indexed=Indexed.OFFERED, less_is_better=True, digits=3, plot="cut",
-    ),
-    GraspMetric(
-        "penetration_depth_mm", "mm", "deepest hand-object penetration", title="Penetration",
-        indexed=Indexed.OFFERED, less_is_better=True, digits=2, plot="cut",
-    ),
-    GraspMetric(
-        "self_penetration_depth_mm", "mm", "deepest hand-hand penetration", title="Self-penetration",
-        indexed=Indexed.SORTED, less_is_better=True, digits=2,
-    ),
-    GraspMetric(
-        "simulated_displacement_cm", "cm", "object's way in the displacement test; nan: not tested, or it blew up",
-        title="Simulated displacement", short="Displacement", optional=True, less_is_better=True, digits=2, plot="cut",
-    ),
-    GraspMetric(
-        "robustness", "1", "share of verdicts that survive 1 mm and 1 degree of noise on the object",
-        title="Verdicts that survive noise", short="Robustness", optional=True, indexed=Indexed.KEPT,
-        bounds=(0, 1), digits=2, plot="whole",
-    ),
-    GraspMetric(
-        "robust_share", "1", "share of the models around the nominal one in which it holds too; where judging ended "
-        "early, what it is at least, or at most below the wanted one; nan: not judged there",
-        title="Models survived", short="Robust", optional=True, indexed=Indexed.OFFERED, bounds=(0, 1), digits=2,
+        "epsilon",
+        "1",
+        "radius of the largest ball in the L1 grasp wrench space (Ferrari-Canny)",
+        title="ε (Ferrari-Canny)",
+        short="ε",
+        swept=True,
+        indexed=Indexed.OFFERED,
+        digits=2,
         plot="whole",
     ),
     GraspMetric(
-        "payload_kg", "kg", "heaviest mass that it lifts out of its scene, or holds under the six pushes, from the "
+        "wrench_volume",
+        "1",
+        "volume of the L1 grasp wrench space; nan: not measured at this threshold",
+        title="Wrench space volume",
+        short="Vol",
+        swept=True,
+        indexed=Indexed.SORTED,
+        digits=1,
+    ),
+    GraspMetric(
+        "contact_area_cm2",
+        "cm^2",
+        "hand surface closer to the object than the threshold",
+        title="Contact area",
+        swept=True,
+        indexed=Indexed.OFFERED,
+        digits=0,
+        plot="whole",
+    ),
+    GraspMetric(
+        "intersection_volume_cm3",
+        "cm^3",
+        "volume shared by hand and object",
+        title="Intersection volume",
+        short="Intersection",
+        indexed=Indexed.OFFERED,
+        less_is_better=True,
+        digits=3,
+        plot="cut",
+    ),
+    GraspMetric(
+        "penetration_depth_mm",
+        "mm",
+        "deepest hand-object penetration",
+        title="Penetration",
+        indexed=Indexed.OFFERED,
+        less_is_better=True,
+        digits=2,
+        plot="cut",
+    ),
+    GraspMetric(
+        "self_penetration_depth_mm",
+        "mm",
+        "deepest hand-hand penetration",
+        title="Self-penetration",
+        indexed=Indexed.SORTED,
+        less_is_better=True,
+        digits=2,
+    ),
+    GraspMetric(
+        "simulated_displacement_cm",
+        "cm",
+        "object's way in the displacement test; nan: not tested, or it blew up",
+        title="Simulated displacement",
+        short="Displacement",
+        optional=True,
+        less_is_better=True,
+        digits=2,
+        plot="cut",
+    ),
+    GraspMetric(
+        "robustness",
+        "1",
+        "share of verdicts that survive 1 mm and 1 degree of noise on the object",
+        title="Verdicts that survive noise",
+        short="Robustness",
+        optional=True,
+        indexed=Indexed.KEPT,
+        bounds=(0, 1),
+        digits=2,
+        plot="whole",
+    ),
+    GraspMetric(
+        "robust_share",
+        "1",
+        "share of the models around the nominal one in which it holds too; where judging ended "
+        "early, what it is at least, or at most below the wanted one; nan: not judged there",
+        title="Models survived",
+        short="Robust",
+        optional=True,
+        indexed=Indexed.OFFERED,
+        bounds=(0, 1),
+        digits=2,
+        plot="whole",
+    ),
+    GraspMetric(
+        "payload_kg",
+        "kg",
+        "heaviest mass that it lifts out of its scene, or holds under the six pushes, from the "
         "object's own on; nan: not measured",
-        title="Payload", optional=True, indexed=Indexed.OFFERED, bounds=(0, 100), digits=2, plot="cut",
+        title="Payload",
+        optional=True,
+        indexed=Indexed.OFFERED,
+        bounds=(0, 100),
+        digits=2,
+        plot="cut",
     ),
     GraspMetric(
-        "shake_margin", "1", "worst displacement or rotation in the hand over its limit, shaken after the lift: below "
+        "shake_margin",
+        "1",
+        "worst displacement or rotation in the hand over its limit, shaken after the lift: below "
         "1 it survives; nan: not shaken",
-        title="Motion when shaken", short="Shaken", optional=True, indexed=Indexed.OFFERED, less_is_better=True,
-        digits=2, plot="cut",
+        title="Motion when shaken",
+        short="Shaken",
+        optional=True,
+        indexed=Indexed.OFFERED,
+        less_is_better=True,
+        digits=2,
+        plot="cut",
     ),
     GraspMetric(
-        "clearance_m", "m", "least room of the hand among supports: coming, closing and lifting",
-        title="Clearance in its scene", short="Clearance", optional=True, indexed=Indexed.OFFERED,
-        bounds=(-1, 1), digits=4,
+        "clearance_m",
+        "m",
+        "least room of the hand among supports: coming, closing and lifting",
+        title="Clearance in its scene",
+        short="Clearance",
+        optional=True,
+        indexed=Indexed.OFFERED,
+        bounds=(-1, 1),
+        digits=4,
     ),
     GraspMetric(
-        "contact_links", "1", "hand bodies within 2 mm of the object", title="Links in contact", whole=True,
-        indexed=Indexed.KEPT, digits=0,
+        "contact_links",
+        "1",
+        "hand bodies within 2 mm of the object",
+        title="Links in contact",
+        whole=True,
+        indexed=Indexed.KEPT,
+        digits=0,
     ),
     GraspMetric(
-        "grasp_type", "enum", "0 not told, 1 power, 2 precision, 3 lateral: by what of the hand touches", title="Type",
-        whole=True, code=True, optional=True, indexed=Indexed.SORTED, bounds=(0, 3),
+        "grasp_type",
+        "enum",
+        "0 not told, 1 power, 2 precision, 3 lateral: by what of the hand touches",
+        title="Type",
+        whole=True,
+        code=True,
+        optional=True,
+        indexed=Indexed.SORTED,
+        bounds=(0, 3),
     ),
     GraspMetric(
-        "approach_cell", "1", "cell of 48 equal ones on the sphere, from which the palm comes, in the object's frame: "
-        "band of height times 12 plus azimuth", title="Cell of the approach", whole=True, code=True, optional=True,
-        indexed=Indexed.KEPT, bounds=(0, 47),
+        "approach_cell",
+        "1",
+        "cell of 48 equal ones on the sphere, from which the palm comes, in the object's frame: "
+        "band of height times 12 plus azimuth",
+        title="Cell of the approach",
+        whole=True,
+        code=True,
+        optional=True,
+        indexed=Indexed.KEPT,
+        bounds=(0, 47),
     ),
     GraspMetric(
-        "stability_loss", "1", "planner's L_stable; nan: the planner has none", title="Stability loss",
-        indexed=Indexed.SORTED, bounds=(-math.inf, math.inf), less_is_better=True,
+        "stability_loss",
+        "1",
+        "planner's L_stable; nan: the planner has none",
+        title="Stability loss",
+        indexed=Indexed.SORTED,
+        bounds=(-math.inf, math.inf),
+        less_is_better=True,
     ),
-)  # fmt: skip
+)
 
 
 def indexed(least: Indexed = Indexed.KEPT) -> tuple[GraspMetric, ...]:

@@ -106,9 +106,13 @@ def scene_of(
         if isinstance(option, SceneDocument):
             touch = option.touch if touch == TOUCH else touch
             return SceneSpec(
-                kind="file", supports=option.supports, target=option.target, faces=faces, touch=touch,
+                kind="file",
+                supports=option.supports,
+                target=option.target,
+                faces=faces,
+                touch=touch,
                 neighbours=(*option.neighbours, *beside),
-            )  # fmt: skip
+            )
         return SceneSpec(kind=option, faces=faces, touch=touch, neighbours=tuple(beside))
     except ValidationError as error:
         raise ValueError(first_mistake(error)) from None

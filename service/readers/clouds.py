@@ -13,7 +13,6 @@ from service.model import transforms
 from service.model.errors import InputError
 from service.readers.cloud_views import COLUMNS, CloudView
 from service.readers.depth_noise import DepthNoise, noise_of
-from service.readers.graspness import TOUCH_M, graspness
 from service.readers.pictures import Pictures, Place, Scenes
 from service.store.shards import Shard
 
@@ -22,13 +21,14 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 #: From a base shard and K of its rows to points (K, H, 3) on the hand's surface in the object's frame [m].
 HandSurface = Callable[[Shard, Ints], Floats]
-
 Frame = Literal["camera", "table", "object"]
 FRAMES: Final[tuple[Frame, ...]] = ("camera", "table", "object")
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 #: Beginnings of the keys that have a row for each grasp.
 OF_GRASPS: Final = ("pregrasp/", "grasp/", "squeeze/", "quality/")
 _NOWHERE: Final = np.array([0.0, 0, 0, 1, 0, 0, 0])
+#: The hand touches a point when its surface is at most this far from it [m]: the middle contact threshold of shards.
+TOUCH_M: Final = 0.005
 
 
 class Clouds(Sequence[dict[str, Any]]):
@@ -138,9 +138,12 @@ class Clouds(Sequence[dict[str, Any]]):
             empty = np.zeros((self.points, 3), np.float32)
             none = np.zeros(self.points, np.uint8)
             return {
-                "cloud/points": empty, "cloud/normals": empty.copy(), "cloud/object": none,
-                "cloud/pixel": np.zeros((self.points, 3), np.int32), "cloud/seen": 0,
-            }  # fmt: skip
+                "cloud/points": empty,
+                "cloud/normals": empty.copy(),
+                "cloud/object": none,
+                "cloud/pixel": np.zeros((self.points, 3), np.int32),
+                "cloud/seen": 0,
+            }
         normals = transforms.quat_rotate(into[3:], _of(views, pixel, CloudView.normals))
         return {
             "cloud/points": transforms.apply(into, _of(views, pixel, CloudView.points)).astype(np.float32),
@@ -211,3 +214,38 @@ def _words(place: Place) -> tuple[int, int]:
     """Numbers that follow from what a picture is of, whatever its file is called."""
     name = f"{place.file.hand}/{place.file.object}/{place.file.batch}"
     return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8]), place.row
+
+
+def graspness(points: NDArray[Any], hands: NDArray[Any], *, touch_m: float = TOUCH_M) -> Floats:
+    """Share of the grasps whose hand touches a point.
+
+    Wang et al. 2021 (Graspness Discovery in Clutters, eq. 1) count, of a parallel gripper's poses laid out around each
+    point, those that hold and are clear. A hand with fingers touches in several places, and its grasps are found, not
+    laid out: of the valid grasps of a scene, those count for a point that touch it.
+
+    Args:
+        points: (P, 3) in the object's frame [m].
+        hands: (K, H, 3) points on the surface of the hand in each grasp, in the same frame [m].
+        touch_m: largest distance of a touch [m]. It should be more than half the distance of the hand's points.
+
+    Returns:
+        (P,) between 0 and 1; 0 where there are no grasps.
+
+    Raises:
+        InputError: SciPy is absent.
+    """
+    try:
+        from scipy.spatial import cKDTree
+    except ModuleNotFoundError:
+        raise InputError("graspness needs SciPy; install it: pip install 'graspd[worker]'") from None
+
+    found = np.zeros(len(points))
+    if len(hands) == 0 or len(points) == 0:
+        return found
+    tree = cKDTree(points)
+    for hand in hands:
+        near = hand[(hand >= points.min(axis=0) - touch_m).all(1) & (hand <= points.max(axis=0) + touch_m).all(1)]
+        if len(near):
+            touched = tree.query_ball_point(near, touch_m)
+            found[np.unique(np.concatenate(touched).astype(np.intp))] += 1
+    return found / len(hands)

@@ -195,20 +195,30 @@ NOISES: Final[Mapping[str, DepthNoise]] = MappingProxyType(
         # steps of 1/32 px (subpixel linearity), 126 px searched (its 17 cm: issue 999), 99 % filled (data sheet).
         # Handa et al. shift by half a pixel.
         "stereo": DepthNoise(
-            424.0, 0.05, disparity_px=0.08, disparity_step_px=1 / 32, lateral_px=0.5, most_disparity_px=126.0,
+            424.0,
+            0.05,
+            disparity_px=0.08,
+            disparity_step_px=1 / 32,
+            lateral_px=0.5,
+            most_disparity_px=126.0,
             dropout=0.01,
         ),
         # Kinect v1: f = 585 px, 75 mm, steps of 1/8 px (Khoshelham); noise of Nguyen, eq. 2 and 4, lateral eq. 1.
         "structured_light": DepthNoise(
-            585.0, 0.075, axial_m=0.0012, axial_square=0.0019, axial_from_m=0.4, axial_angle=0.0001,
-            disparity_step_px=1 / 8, lateral_px=0.8, lateral_angle_px=0.035,
+            585.0,
+            0.075,
+            axial_m=0.0012,
+            axial_square=0.0019,
+            axial_from_m=0.4,
+            axial_angle=0.0001,
+            disparity_step_px=1 / 8,
+            lateral_px=0.8,
+            lateral_angle_px=0.035,
         ),
         # Azure Kinect, narrow field: f = 504 px, millimetres (Microsoft); 0.5 mm to 0.5 m, 1 mm at 1 m (Toelgyessy).
-        "tof": DepthNoise(
-            504.0, axial_m=0.0005, axial_slope=0.001, axial_from_m=0.5, depth_step_m=0.001, mixed=True,
-        ),
+        "tof": DepthNoise(504.0, axial_m=0.0005, axial_slope=0.001, axial_from_m=0.5, depth_step_m=0.001, mixed=True),
     }
-)  # fmt: skip
+)
 
 
 def noise_of(given: str | DepthNoise | None) -> DepthNoise | None:

@@ -51,9 +51,12 @@ class Place:
     def names(self) -> dict[str, Any]:
         """What samples say of where they come from."""
         return {
-            "hand": self.file.hand, "object": self.file.object, "shard_id": self.file.id, "row": self.row,
+            "hand": self.file.hand,
+            "object": self.file.object,
+            "shard_id": self.file.id,
+            "row": self.row,
             "scene": self.scene,
-        }  # fmt: skip
+        }
 
 
 class Pictures(Sequence[dict[str, Any]]):

@@ -22,8 +22,13 @@ Test = Callable[[Mapping[str, Array], Mapping[str, Any]], Mask]
 
 _METRICS: Final = {metric.name: metric for metric in GRASP_METRICS}
 _OPERATORS: Final[dict[str, Callable[[Any, Any], Any]]] = {
-    "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "=": operator.eq, "!=": operator.ne,
-}  # fmt: skip
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "=": operator.eq,
+    "!=": operator.ne,
+}
 #: Columns of flags, which are 1 where it is so.
 _FLAGS: Final = {
     "held": "quality/success",

@@ -119,8 +119,9 @@ def set_log_aside(settings: Settings, why: str) -> None:
         _private_folder(aside)
         for one in found:
             one.rename(aside / one.name)
-        log.warning("the log of Redis is moved to %s: %s; it starts empty, and what is unfinished is queued again",
-                    aside, why)  # fmt: skip
+        log.warning(
+            "the log of Redis is moved to %s: %s; it starts empty, and what is unfinished is queued again", aside, why
+        )
 
 
 def lock_file(path: Path, what: str) -> IO[str]:

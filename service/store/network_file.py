@@ -135,9 +135,15 @@ def to_bytes(network: ProposalNetwork) -> bytes:
     joints = len(network.joint_names)
     try:
         meta = _Meta(
-            schema=SCHEMA, hand=network.hand, hand_digest=network.hand_digest, joint_names=network.joint_names,
-            points=network.points, steps=network.steps, sizes=sizes(joints), about=network.about,
-        )  # fmt: skip
+            schema=SCHEMA,
+            hand=network.hand,
+            hand_digest=network.hand_digest,
+            joint_names=network.joint_names,
+            points=network.points,
+            steps=network.steps,
+            sizes=sizes(joints),
+            about=network.about,
+        )
     except ValidationError as error:
         raise InputError(f"the network cannot be written: {refusal(error)}") from None
     arrays = {name: np.asarray(array, np.float32) for name, array in _arrays(network).items()}
@@ -185,17 +191,33 @@ def from_bytes(data: bytes, what: str) -> ProposalNetwork:
             if found != sorted(f"{name}.npy" for name in [_META, *expected]):
                 raise InputError(f"{what}: its arrays are not those of {SCHEMA}: {_difference(found, expected)}")
             arrays = {name: _read(archive, name, shape, what) for name, shape in expected.items()}
-    except (OSError, ValueError, EOFError, KeyError, MemoryError, NotImplementedError, RuntimeError,
-            zipfile.BadZipFile, zlib.error) as error:  # fmt: skip
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        KeyError,
+        MemoryError,
+        NotImplementedError,
+        RuntimeError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
         raise InputError(f"{what} is no .npz file of {SCHEMA}: {error}") from None
     _check(arrays, joints, what)
     for array in arrays.values():
         array.flags.writeable = False
     weights = {name: arrays[name] for name in weight_shapes(joints)}
     return ProposalNetwork(
-        meta.hand, meta.hand_digest, meta.joint_names, weights, arrays["mean"], arrays["std"], meta.points, meta.steps,
+        meta.hand,
+        meta.hand_digest,
+        meta.joint_names,
+        weights,
+        arrays["mean"],
+        arrays["std"],
+        meta.points,
+        meta.steps,
         about=meta.about,
-    )  # fmt: skip
+    )
 
 
 def check_size(size: int, what: str) -> None:

@@ -101,9 +101,18 @@ def fail(parts: Parts, record: JobRecord, reason: str) -> None:
     task = next(plan(record))
     now = timestamp()
     attempt = AttemptRecord(
-        task_id=task.id, job_id=record.id, stage=task.stage, number=1, kind="MeshError", reason=reason,
-        trace=None, worker="worker-1", started=now, ended=now, last=True,
-    )  # fmt: skip
+        task_id=task.id,
+        job_id=record.id,
+        stage=task.stage,
+        number=1,
+        kind="MeshError",
+        reason=reason,
+        trace=None,
+        worker="worker-1",
+        started=now,
+        ended=now,
+        last=True,
+    )
     put_record(parts.store, names.attempt(task.id, 1), attempt)
     parts.index.write.add_attempt(attempt)
 
@@ -112,9 +121,18 @@ def add_worker(parts: Parts, name: str = "worker-1", state: str = "idle") -> Non
     """A worker that lives."""
     now = timestamp()
     beat = WorkerBeat(
-        name=name, host="here", pid=1, device="cpu", device_name="x86_64, 2 cores", stages=tuple(Stage),
-        version="0.1.0", state=state, task_id="", started=now, seen=now,
-    )  # fmt: skip
+        name=name,
+        host="here",
+        pid=1,
+        device="cpu",
+        device_name="x86_64, 2 cores",
+        stages=tuple(Stage),
+        version="0.1.0",
+        state=state,
+        task_id="",
+        started=now,
+        seen=now,
+    )
     parts.index.live.set_workers([beat], forget_before="2000-01-01T00:00:00Z")
 
 
@@ -134,9 +152,11 @@ def _base(random: np.random.Generator, count: int, request: JobRequest) -> Array
     for name, scale in (("contact_area_cm2", 9.0), ("epsilon", 0.25), ("wrench_volume", 0.8)):
         arrays[f"quality/{name}"] = random.gamma(4.0, scale / 4, (count, len(thresholds)))
     for name, scale in (
-        ("intersection_volume_cm3", 0.3), ("penetration_depth_mm", 0.8), ("self_penetration_depth_mm", 0.1),
+        ("intersection_volume_cm3", 0.3),
+        ("penetration_depth_mm", 0.8),
+        ("self_penetration_depth_mm", 0.1),
         ("stability_loss", 0.05),
-    ):  # fmt: skip
+    ):
         arrays[f"quality/{name}"] = random.gamma(2.0, scale / 2, count)
     arrays["quality/contact_links"] = random.integers(2, 9, count).astype(np.int32)
     # Drawn from a generator of their own, so that what stands below is what it was without them.

@@ -17,8 +17,7 @@ from fastapi import FastAPI, Request
 from api.access.keys import KeyFile, Scope
 from api.app import create_app
 from api.catalog import events
-from api.middleware.protocol import TimedProtocol
-from api.server import bind, configuration
+from api.server import TimedProtocol, bind, configuration
 from service.pipeline.backends import Parts
 from service.settings import Settings
 from tests.api.factories import add_job

@@ -83,9 +83,10 @@ def test_a_length_of_4400_digits_is_too_large(http: TestClient) -> None:
 
 
 @pytest.mark.parametrize(
-    "body", [b"[" * 100_000, b'{"\\ud800": 1}', b'{"hand": "\\ud800"}', b'{"hand": ' + b"9" * 5000 + b"}", b"\xff"],
+    "body",
+    [b"[" * 100_000, b'{"\\ud800": 1}', b'{"hand": "\\ud800"}', b'{"hand": ' + b"9" * 5000 + b"}", b"\xff"],
     ids=shown,
-)  # fmt: skip
+)
 @pytest.mark.parametrize("path", ["/v1/jobs", "/v1/datasets", "/v1/object-sets", "/v1/datasets/estimate"])
 def test_a_body_made_to_break_the_reader_is_refused(http: TestClient, path: str, body: bytes) -> None:
     answer = http.post(path, content=body, headers={"Content-Type": "application/json"})
@@ -100,22 +101,46 @@ def test_the_answer_to_a_thousand_mistakes_is_short(http: TestClient) -> None:
 
 
 @pytest.mark.parametrize(
-    "options", ["5", "[1]", "null", DEEP, '{"a": ' + DEEP + "}", '{"\\ud800": 1}', '{"facts": "\\udfff"}', "{" * 60_000,
-                '{"facts": 5}', '{"facts": null}', '{"facts": [1]}', '{"file": 5}', '{"licence": ["x"]}',
-                '{"density": 1' + "0" * 400 + "}", '{"density": NaN}', '{"facts": {"x": "' + "x" * 20_000 + '"}}'],
+    "options",
+    [
+        "5",
+        "[1]",
+        "null",
+        DEEP,
+        '{"a": ' + DEEP + "}",
+        '{"\\ud800": 1}',
+        '{"facts": "\\udfff"}',
+        "{" * 60_000,
+        '{"facts": 5}',
+        '{"facts": null}',
+        '{"facts": [1]}',
+        '{"file": 5}',
+        '{"licence": ["x"]}',
+        '{"density": 1' + "0" * 400 + "}",
+        '{"density": NaN}',
+        '{"facts": {"x": "' + "x" * 20_000 + '"}}',
+    ],
     ids=shown,
-)  # fmt: skip
+)
 def test_upload_options_that_are_no_short_object_are_refused(http: TestClient, options: str) -> None:
     answer = http.post("/v1/objects", files={"file": ("box.stl", STL)}, data={"options": options})
     assert answer.status_code == 422, answer.text
 
 
 @pytest.mark.parametrize(
-    "description", [b"[" * 100_000, b"5", b"null", b"", b"\xff\xfe",
-                    b'{"file": "box.stl", "facts": {"x": ' + DEEP.encode() + b"}}",
-                    b'{"file": "box.stl", "facts": {"x": "\\ud800"}}', b" " * 10_000_000 + b'{"file": "box.stl"}'],
+    "description",
+    [
+        b"[" * 100_000,
+        b"5",
+        b"null",
+        b"",
+        b"\xff\xfe",
+        b'{"file": "box.stl", "facts": {"x": ' + DEEP.encode() + b"}}",
+        b'{"file": "box.stl", "facts": {"x": "\\ud800"}}',
+        b" " * 10_000_000 + b'{"file": "box.stl"}',
+    ],
     ids=shown,
-)  # fmt: skip
+)
 def test_an_asset_json_made_to_break_the_reader_is_refused(http: TestClient, description: bytes) -> None:
     answer = http.post("/v1/objects", files={"file": ("x.zip", _zipped({"asset.json": description, "box.stl": STL}))})
     assert answer.status_code == 422, answer.text

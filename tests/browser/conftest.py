@@ -24,9 +24,15 @@ __all__ = ["app", "furnished", "parts", "settings"]
 
 #: SwiftShader draws WebGL without a GPU; the rest keeps the browser from calling home.
 ARGUMENTS = (
-    "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-)  # fmt: skip
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
 #: Longest wait for something on a page, on a machine that is busy with other things.
 SHOWN_MS = 1000 * PATIENCE_S
 

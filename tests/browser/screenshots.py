@@ -36,12 +36,20 @@ SHOWN_MS: Final = 60_000
 LAPTOP: Final = (1440, 900)
 PHONE: Final = (390, 844)
 VIEWED: Final[dict[str, Any]] = {
-    "hand": "allegro", "object": "mug", "grasps": 64, "scenes": 2, "views": 2, "stereo": True,
-}  # fmt: skip
+    "hand": "allegro",
+    "object": "mug",
+    "grasps": 64,
+    "scenes": 2,
+    "views": 2,
+    "stereo": True,
+}
 DATASET: Final[dict[str, Any]] = {
-    "name": "kitchen-1", "hands": ["allegro", "barrett"], "objects": ["mug", "bottle", "block"], "grasps": 32,
+    "name": "kitchen-1",
+    "hands": ["allegro", "barrett"],
+    "objects": ["mug", "bottle", "block"],
+    "grasps": 32,
     "fidelity": "draft",
-}  # fmt: skip
+}
 LONG: Final[dict[str, Any]] = {"hand": "shadow", "object": "mug", "grasps": 640, "fidelity": "draft"}
 
 
@@ -52,6 +60,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=REPOSITORY / "docs" / "images")
     parser.add_argument("--only", default="", help="names of pictures, with commas between")
     given = parser.parse_args(arguments)
+    if missing := [str(file.relative_to(REPOSITORY)) for file in (*CHARTS, MAPS) if not file.is_file()]:
+        parser.error(
+            f"{', '.join(missing)} missing: python -m benchmarks.results --again --only chart scenes-chart stability"
+        )
     with tempfile.TemporaryDirectory() as scratch:
         wanted = Settings(data_dir=given.data_dir or Path(scratch), port=0)
         with Supervisor(wanted, workers=1) as supervisor:
@@ -129,9 +141,12 @@ def photograph(address: str, places: dict[str, str], folder: Path, only: set[str
             if only and name not in only:
                 continue
             context: Any = browser.new_context(
-                base_url=address, viewport={"width": width, "height": height}, color_scheme=scheme,
-                device_scale_factor=2 if width < 500 else 1, reduced_motion="reduce",
-            )  # fmt: skip
+                base_url=address,
+                viewport={"width": width, "height": height},
+                color_scheme=scheme,
+                device_scale_factor=2 if width < 500 else 1,
+                reduced_motion="reduce",
+            )
             page = context.new_page()
             page.goto(path)
             page.wait_for_selector(ready, timeout=SHOWN_MS)

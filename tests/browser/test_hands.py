@@ -32,11 +32,14 @@ BASE = (
 )
 #: A claw whose fingers stand to one side of its palm: graspd guesses that it faces along them, and is told otherwise.
 CLAW = robot(
-    link("palm", BASE), link("a", BAR + SEEN), link("b", BAR + SEEN), link("c", BAR + SEEN),
+    link("palm", BASE),
+    link("a", BAR + SEEN),
+    link("b", BAR + SEEN),
+    link("c", BAR + SEEN),
     joint("ja", "palm", "a", origin="0.04 0 0.015", limit='<limit lower="-0.4" upper="1.4" effort="1" velocity="2"/>'),
     joint("jb", "palm", "b", origin="-0.04 0 0.015"),
     joint("jc", "palm", "c", origin="-0.04 0.03 0.015"),
-)  # fmt: skip
+)
 
 
 def checked(parts: Parts, name: str) -> None:

@@ -35,11 +35,20 @@ CHART = {
     "created": "2026-11-21T12:00:00Z",
     "device": "cpu",
     "runs": [
-        {"method": "fast_graspd", "fidelity": fidelity, "hand": "allegro", "object": "mug", "valid_per_second": speed,
-         "seconds_to_first_valid": 2.0, "gsr": share, "epsilon": 0.4, "pd_mm": 0.2}
+        {
+            "method": "fast_graspd",
+            "fidelity": fidelity,
+            "hand": "allegro",
+            "object": "mug",
+            "valid_per_second": speed,
+            "seconds_to_first_valid": 2.0,
+            "gsr": share,
+            "epsilon": 0.4,
+            "pd_mm": 0.2,
+        }
         for fidelity, speed, share in (("draft", 9.0, 0.6), ("standard", 4.0, 0.8), ("fine", 1.5, 0.85))
     ],
-}  # fmt: skip
+}
 
 
 @pytest.fixture
@@ -60,12 +69,29 @@ def places(parts: Parts) -> list[str]:
     fail(parts, gone, "a reason")
     deletion.delete_job(parts, gone.id)
     return [
-        "/", "/datasets", "/datasets/kitchen", "/datasets/kitchen?state=queued", f"/jobs/{record.id}",
+        "/",
+        "/datasets",
+        "/datasets/kitchen",
+        "/datasets/kitchen?state=queued",
+        f"/jobs/{record.id}",
         "/compare?one=kitchen&other=kitchen",
-        f"/jobs/{waiting.id}", "/grasps", "/grasps?view=table", "/grasps?min_epsilon=99", f"/grasps/{shard}/0",
-        "/hands", "/hands/shadow", "/workers", "/chart", "/stability", "/submit", "/problems", "/login", "/deleted",
-        "/grasps?tag=good+ones", "/usage",
-    ]  # fmt: skip
+        f"/jobs/{waiting.id}",
+        "/grasps",
+        "/grasps?view=table",
+        "/grasps?min_epsilon=99",
+        f"/grasps/{shard}/0",
+        "/hands",
+        "/hands/shadow",
+        "/workers",
+        "/chart",
+        "/stability",
+        "/submit",
+        "/problems",
+        "/login",
+        "/deleted",
+        "/grasps?tag=good+ones",
+        "/usage",
+    ]
 
 
 def test_a_job_page_follows_its_job_without_a_reload(page: Any, parts: Parts) -> None:

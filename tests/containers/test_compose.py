@@ -65,18 +65,41 @@ def until(met: Callable[[], object], what: str, project: Project, seconds: float
 
 def test_profiles_of_the_env_file_bring_s3_and_postgresql(project: Project) -> None:
     assert set(project.compose("config", "--services").split()) == {
-        "api", "keeper", "worker-cpu", "redis", "postgres", "s3",
-    }  # fmt: skip
+        "api",
+        "keeper",
+        "worker-cpu",
+        "redis",
+        "postgres",
+        "s3",
+    }
 
 
 def test_any_user_plans_on_a_read_only_disk(project: Project) -> None:
     """No cache volume, no network, a user that the image does not know; it says where its cache is instead."""
     wanted = "--hand allegro --object mug --grasps 2 --fidelity draft --out /tmp/out.h5"
     done = subprocess.run(
-        ["docker", "run", "--rm", "--network", "none", "--read-only", "--tmpfs", "/tmp:size=1g", "--user", "4321:4321",
-         "--cap-drop", "ALL", "graspd-worker-cpu:test", "synth", *wanted.split()],
-        capture_output=True, text=True, timeout=PATIENCE_S, check=False,
-    )  # fmt: skip
+        [
+            "docker",
+            "run",
+            "--rm",
+            "--network",
+            "none",
+            "--read-only",
+            "--tmpfs",
+            "/tmp:size=1g",
+            "--user",
+            "4321:4321",
+            "--cap-drop",
+            "ALL",
+            "graspd-worker-cpu:test",
+            "synth",
+            *wanted.split(),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
     said = done.stdout + done.stderr
     assert done.returncode == 0 and "Traceback" not in said, said[-3000:]
     assert "kept in /tmp/graspd-cache-4321" in said, said[-3000:]
@@ -114,8 +137,14 @@ def test_a_job_over_http_outlives_two_killed_workers(project: Project) -> None:
             project,
         )
         assert httpx.get(f"{url}/v1/jobs", trust_env=False).status_code == 401
-        wanted = {"hand": "allegro", "object": "mug", "grasps": 32 * BATCHES, "fidelity": "draft", "want": "raw",
-                  "referee": "none"}  # fmt: skip
+        wanted = {
+            "hand": "allegro",
+            "object": "mug",
+            "grasps": 32 * BATCHES,
+            "fidelity": "draft",
+            "want": "raw",
+            "referee": "none",
+        }
         job = client.post("/v1/jobs", json=wanted)
         assert job.status_code == 202, job.text
         place = job.headers["location"]

@@ -1,18 +1,13 @@
-"""Files for clusters: in step with commands, settings, images and secrets.
-
-Their own tools read them in `make clusters`; the batch scripts run in tests/system/test_slurm.py.
-"""
+"""Files for clusters: in step with commands and settings; the batch scripts run in tests/system/test_slurm.py."""
 
 from __future__ import annotations
 
-import ast
 import re
 import shlex
 import subprocess
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import kubernetes_validate
 import pytest
 import yaml
@@ -21,13 +16,12 @@ import graspd.cli
 from service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.deploy.slurm import directives
-from tests.deploy.test_dockerfile import DOCKERFILE
 
-CLUSTERS = REPOSITORY / "docker" / "clusters"
+BURST = REPOSITORY / "docker" / "kubernetes" / "burst.yaml"
 SLURM = REPOSITORY / "docker" / "slurm"
 PAGE = (REPOSITORY / "docs" / "clusters.md").read_text()
 SETTINGS = {f"GRASPD_{name.upper()}" for name in Settings.model_fields}
-FILES = sorted([*CLUSTERS.iterdir(), *SLURM.iterdir()])
+FILES = [BURST, *sorted(SLURM.iterdir())]
 
 
 def options_of(command: str) -> set[str]:
@@ -36,10 +30,8 @@ def options_of(command: str) -> set[str]:
     return {option for parameter in loaded.params for option in parameter.opts}
 
 
-@pytest.mark.parametrize("file", [file for file in FILES if file.suffix != ".pyc"], ids=lambda file: file.name)
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)
 def test_every_file_is_on_the_page_and_uses_settings_and_options_that_exist(file: Path) -> None:
-    if file.is_dir():
-        return
     assert f"docker/{file.parent.name}/{file.name}" in PAGE
     text = file.read_text()
     # `GRASPD=` is the command itself.
@@ -68,21 +60,8 @@ def test_the_fake_refuses_an_option_that_slurm_does_not_know(tmp_path: Path) -> 
         directives(script)
 
 
-def test_the_apptainer_image_stands_on_the_python_of_the_docker_images() -> None:
-    text = (SLURM / "graspd.def").read_text()
-    (base,) = re.findall(r"^From: (\S+)$", text, re.MULTILINE)
-    assert f"FROM {base} AS base" in DOCKERFILE.read_text()
-    copied = re.findall(r"^    (\S+) /opt/\S+$", text, re.MULTILINE)
-    assert copied == ["dist", "docker/constraints.txt"]
-    assert (REPOSITORY / "docker" / "constraints.txt").is_file()
-    extras = re.search(r'"graspd\[([\w,]+)\] @ file:', text)
-    assert extras is not None
-    known = re.findall(r"^([\w-]+) = \[", (REPOSITORY / "pyproject.toml").read_text(), re.MULTILINE)
-    assert set(extras[1].split(",")) <= set(known)
-
-
 def test_the_kubernetes_job_is_valid_and_runs_as_the_workers_do() -> None:
-    document = yaml.safe_load((CLUSTERS / "kubernetes-burst.yaml").read_text())
+    document = yaml.safe_load(BURST.read_text())
     kubernetes_validate.validate(document, "1.30", strict=True)
     manifests = (REPOSITORY / "docker" / "kubernetes" / "fixed-cpu" / "workers.yaml").read_text()
     fixed = next(yaml.safe_load_all(manifests))
@@ -95,46 +74,9 @@ def test_the_kubernetes_job_is_valid_and_runs_as_the_workers_do() -> None:
     assert ours["restartPolicy"] == "Never", "a pod failure policy needs it"
 
 
-#: Fields of a task in OSMO's specification of workflows, and of a resource.
-OSMO_TASK = {"name", "image", "command", "args", "environment", "credentials", "resource", "files", "inputs", "outputs"}
-OSMO_RESOURCE = {"cpu", "gpu", "memory", "storage", "platform"}
-
-
-def test_the_osmo_workflow_has_a_task_for_each_worker() -> None:
-    text = (CLUSTERS / "osmo.yaml").read_text()
-    body, _, defaults = text.partition("default-values:")
-    values = yaml.safe_load(f"default-values:{defaults}")["default-values"]
-    rendered = jinja2.Environment(undefined=jinja2.StrictUndefined).from_string(body).render(**values | {"workers": 3})
-    workflow = yaml.safe_load(rendered)["workflow"]
-    assert [task["name"] for task in workflow["tasks"]] == ["worker-0", "worker-1", "worker-2"]
-    for task in workflow["tasks"]:
-        assert task.keys() <= OSMO_TASK
-        assert all(isinstance(word, str) for word in [*task["command"], *task["args"]])
-        assert all(isinstance(value, str) for value in task["environment"].values())
-        assert "GRASPD_REDIS_URL" not in task["environment"], "a secret comes from a credential"
-        assert "GRASPD_REDIS_URL" in task["credentials"]["graspd"]
-    assert workflow["resources"]["default"].keys() <= OSMO_RESOURCE
-
-
-def test_the_skypilot_task_keeps_its_secrets_out_of_the_file() -> None:
-    task = yaml.safe_load((CLUSTERS / "skypilot.yaml").read_text())
-    assert set(task["secrets"].values()) == {None}
-    assert "GRASPD_REDIS_URL" in task["secrets"]
-    assert task["resources"]["use_spot"] is True
-    assert "num_nodes" not in task, "a node that is taken away would restart all"
-    for line in task["run"].splitlines():
-        subprocess.run(["bash", "-n", "-c", line], check=True)
-
-
-def test_the_ray_launcher_is_python_and_ties_the_worker_to_its_process() -> None:
-    source = (CLUSTERS / "ray_workers.py").read_text()
-    ast.parse(source)
-    assert '"service.run.launch", str(os.getpid())' in source
-
-
 def test_commands_of_the_page_are_shell() -> None:
     blocks = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
-    assert len(blocks) >= 5
+    assert len(blocks) >= 4
     for block in blocks:
         subprocess.run(["bash", "-n", "-c", block], check=True)
         for line in block.splitlines():

@@ -26,8 +26,9 @@ SOUND = Kernel("simulation.kernels.surface", "gather", 90, 71, 0, 0)
 def test_registers_stack_and_spills_of_each_kernel_are_read() -> None:
     found = list(gpu_check._told(SAID, "worker.simulation.kernels.surface", 90))
     assert [(k.name, k.registers, k.stack_bytes, k.spilled_bytes) for k in found] == [
-        ("gather_object", 71, 16, 12), ("small", 12, 0, 0),
-    ]  # fmt: skip
+        ("gather_object", 71, 16, 12),
+        ("small", 12, 0, 0),
+    ]
 
 
 @pytest.mark.parametrize(

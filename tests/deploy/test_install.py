@@ -114,8 +114,9 @@ def test_up_without_any_extra_says_what_to_install(tmp_path: Path, monkeypatch: 
     monkeypatch.setenv("GRASPD_DATA_DIR", str(tmp_path / "data"))
     done = without_engine("up", "--workers", "0", absent="httpx,fastapi,warp,newton")
     assert (done.returncode, done.stderr) == (
-        1, "graspd: `graspd up` is not part of this install; run pip install 'graspd[all]'\n",
-    )  # fmt: skip
+        1,
+        "graspd: `graspd up` is not part of this install; run pip install 'graspd[all]'\n",
+    )
     assert not (tmp_path / "data").exists()
 
 

@@ -26,9 +26,24 @@ _READY_S = 120.0
 
 def served(folder: Path, api: int, plain: int, secure: int) -> Path:
     """The configuration on loopback ports, with a certificate for one day, as a whole nginx.conf."""
-    make = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj", f"/CN={NAME}",
-            "-addext", f"subjectAltName=DNS:{NAME}", "-keyout", str(folder / "key.pem"),
-            "-out", str(folder / "cert.pem")]  # fmt: skip
+    make = [
+        "openssl",
+        "req",
+        "-x509",
+        "-newkey",
+        "rsa:2048",
+        "-nodes",
+        "-days",
+        "1",
+        "-subj",
+        f"/CN={NAME}",
+        "-addext",
+        f"subjectAltName=DNS:{NAME}",
+        "-keyout",
+        str(folder / "key.pem"),
+        "-out",
+        str(folder / "cert.pem"),
+    ]
     subprocess.run(make, check=True, capture_output=True)
     text = (REPOSITORY / "docker" / "nginx.conf").read_text()
     for old, new in {

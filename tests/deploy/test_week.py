@@ -9,9 +9,14 @@ import pytest
 from benchmarks.week import HARSH, KEEPER_TASKS_PER_S, Rates, Told, Week, table, task_seconds
 
 NOTHING = Rates(
-    reclaimed_per_day=0, killed_per_day=0, cut_off_per_day=0, zone_per_week=0, keeper_killed_per_day=0,
-    redis_restarts_per_week=0, store_outages_per_week=0,
-)  # fmt: skip
+    reclaimed_per_day=0,
+    killed_per_day=0,
+    cut_off_per_day=0,
+    zone_per_week=0,
+    keeper_killed_per_day=0,
+    redis_restarts_per_week=0,
+    store_outages_per_week=0,
+)
 DAY_S = 86_400.0
 
 

@@ -238,12 +238,22 @@ def _block_seen(vertices: Floats) -> tuple[Floats, Floats, Floats]:
 def test_the_table_says_what_seeds_differ_by() -> None:
     rows = [
         {
-            "hand": "barrett", "source": "scenes in the loop", "seed": seed, "grasps": 640, "views": 100,
-            "object": name, "kind": kind, "lift": lift, "best": lift, "hard": 0.1, "table": 0.0, "epsilon": 0.3,
+            "hand": "barrett",
+            "source": "scenes in the loop",
+            "seed": seed,
+            "grasps": 640,
+            "views": 100,
+            "object": name,
+            "kind": kind,
+            "lift": lift,
+            "best": lift,
+            "hard": 0.1,
+            "table": 0.0,
+            "epsilon": 0.3,
         }
         for seed, lift in ((0, 0.5), (1, 0.7))
         for name, kind in (("mug", OBJECT), ("can", FACE))
-    ]  # fmt: skip
+    ]
     text = markdown(rows)
     assert "| scenes in the loop | 640 | 100 | 0.60 ± 0.14 |" in text
     assert "| can, unseen face | 0.60 |" in text

@@ -126,9 +126,11 @@ def test_a_verdict_is_of_how_hand_and_object_lie_to_one_another_and_to_the_table
     turn, there = np.array([np.cos(0.5), 0.0, 0.0, np.sin(0.5)]), np.array([0.4, -0.3, 0.0])
     pose = transforms.compose(np.array([*there, *turn]), hands.hand_pose)
     elsewhere = Sight(
-        sight.scene, transforms.quat_rotate(turn, sight.points) + there, transforms.quat_rotate(turn, sight.normals),
+        sight.scene,
+        transforms.quat_rotate(turn, sight.points) + there,
+        transforms.quat_rotate(turn, sight.normals),
         sight.object_pose,
-    )  # fmt: skip
+    )
     same = scores(evaluator, hand, elsewhere, dataclasses.replace(hands, hand_pose=pose))
     # float32, and points whose nearest one is a tie.
     np.testing.assert_allclose(scores(evaluator, hand, sight, hands), same, atol=1e-3)

@@ -65,9 +65,13 @@ def test_a_hand_is_added_corrected_and_used_as_the_page_says(environment: dict[s
         if program != "graspd" or arguments[:2] == ["hands", "check"]:
             continue
         done = subprocess.run(
-            [sys.executable, "-m", "graspd", *arguments], capture_output=True, text=True, check=False, env=environment,
+            [sys.executable, "-m", "graspd", *arguments],
+            capture_output=True,
+            text=True,
+            check=False,
+            env=environment,
             cwd=tmp_path,
-        )  # fmt: skip
+        )
         assert done.returncode == 0, done.stderr[-2000:]
     (curl,) = [shlex.split(line) for line in lines if line.startswith("curl ")]
     url = next(part for part in curl if part.startswith("http"))

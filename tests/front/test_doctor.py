@@ -22,9 +22,12 @@ QUICK = "disk,data-folder,limits,versions,redis,store,index,port,keys"
 def run(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "graspd", "doctor", *arguments],
-        capture_output=True, text=True, check=False, timeout=120,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
         env={**os.environ, "GRASPD_DATA_DIR": str(folder), "GRASPD_PORT": str(free_ports(1)[0]), **environment},
-    )  # fmt: skip
+    )
 
 
 def test_a_fresh_machine_is_well_and_nothing_is_made_on_it(tmp_path: Path) -> None:

@@ -49,16 +49,20 @@ def test_a_file_that_is_opened_does_not_take_the_place_of_a_closed_output(tmp_pa
 @pytest.mark.parametrize(
     ("error", "line"),
     [
-        (OSError(errno.ENOSPC, "No space left on device", "/srv/x.h5"),
-         "/srv/x.h5: No space left on device; make room, or name another place"),
-        (PermissionError(errno.EACCES, "Permission denied", "/srv/x.h5"),
-         "/srv/x.h5: Permission denied; name another place, or let this user write there"),
+        (
+            OSError(errno.ENOSPC, "No space left on device", "/srv/x.h5"),
+            "/srv/x.h5: No space left on device; make room, or name another place",
+        ),
+        (
+            PermissionError(errno.EACCES, "Permission denied", "/srv/x.h5"),
+            "/srv/x.h5: Permission denied; name another place, or let this user write there",
+        ),
         (NotADirectoryError(errno.ENOTDIR, "Not a directory", "a/b"), "a/b: Not a directory"),
         (OSError("Can't write data\n(file write failed)"), "Can't write data (file write failed)"),
         (OSError(errno.EIO, "I/O error at http://me:secret@host/"), "I/O error at http://***@host/"),
         (MemoryError(), "there is not enough memory; give it more, or ask for less at once"),
     ],
-)  # fmt: skip
+)
 def test_a_refusal_of_the_system_names_the_thing_and_the_fix(
     error: BaseException, line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import json
 import shlex
+import subprocess
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 import graspd.cli
 from benchmarks.results import manifest, page
 from benchmarks.results.__main__ import main
 from benchmarks.results.manifest import DOCS, INDEX, digests, faults, load, staleness, there
 from benchmarks.results.running import Runner
-from benchmarks.results.studies import BY_NAME, STUDIES, Study
+from benchmarks.results.studies import BY_NAME, STUDIES, Study, is_raw
 from service.model.version import STAGE_REVISIONS
 from tests.conftest import REPOSITORY
 
+MOST_BYTES, MOST_LINES = 8_000_000, 6_000
 ADD = Study(
-    "add", "a sum", ("results/sum.json",),
-    ("python -c \"import sys; open(sys.argv[1], 'w').write(str(1 + 1)); print('done')\" OUT/results/sum.json",),
+    "add",
+    "a sum",
+    ("results/total.txt",),
+    ("python -c \"import sys; open(sys.argv[1], 'w').write(str(1 + 1)); print('done')\" OUT/results/total.txt",),
     prints="results/sum.md",
-)  # fmt: skip
+)
 
 
 def runner(folder: Path, **options: bool) -> Runner:
@@ -32,6 +37,42 @@ def runner(folder: Path, **options: bool) -> Runner:
 def test_the_manifest_holds_every_figure_and_picture_as_it_is() -> None:
     """After a change by hand: python -m benchmarks.results --enter NAME."""
     assert faults(DOCS, load(DOCS)) == []
+
+
+def test_git_keeps_what_readers_see_and_no_raw_results() -> None:
+    listed = subprocess.run(["git", "ls-files", "docs"], cwd=REPOSITORY, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("no checkout of git")
+    files = [REPOSITORY / name for name in listed.stdout.split() if (REPOSITORY / name).is_file()]
+    results = [file for file in files if file.is_relative_to(DOCS / "results")]
+    raw = {path for file in results if is_raw(path := str(file.relative_to(DOCS)))}
+    assert raw == {manifest.MANIFEST}
+    assert sum(file.stat().st_size for file in files) <= MOST_BYTES
+    texts = [file for file in results if file.suffix not in {".png", ".jpg"}]
+    assert sum(file.read_text().count("\n") for file in texts) <= MOST_LINES
+
+
+def test_a_page_keeps_no_link_to_a_raw_result_and_a_picture_gets_a_palette(tmp_path: Path) -> None:
+    draws = "from PIL import Image; Image.merge('RGB', [Image.effect_noise((99, 99), 50)] * 3).save(sys.argv[2])"
+    writes = "open(sys.argv[1], 'w').write('[all](raw.json), [seen](seen.png)')"
+    line = f'python -c "import sys; {writes}; {draws}" OUT/results/page.md OUT/results/seen.png'
+    assert runner(tmp_path).run(Study("add", "a page", ("results/page.md", "results/seen.png"), (line,))) != "holds"
+    assert (tmp_path / "docs/results/page.md").read_text() == "`all`, [seen](seen.png)"
+    with Image.open(tmp_path / "docs/results/seen.png") as picture:
+        assert picture.mode == "P"
+
+
+def test_raw_results_stand_beside_the_pages_and_not_in_the_manifest(tmp_path: Path) -> None:
+    raw = Study(
+        "add",
+        "a sum",
+        ("results/sum.json",),
+        (*ADD.run, ADD.run[0].replace("total.txt", "sum.json")),
+        prints=ADD.prints,
+    )
+    runner(tmp_path).run(raw)
+    assert (tmp_path / "docs/results/sum.json").is_file()
+    assert set(load(tmp_path / "docs")["add"]["files"]) == {"results/sum.md"}
 
 
 def test_each_file_belongs_to_one_study() -> None:
@@ -104,12 +145,12 @@ def test_every_command_of_the_list_is_there() -> None:
 
 def test_a_study_that_holds_is_not_run_again(tmp_path: Path) -> None:
     assert runner(tmp_path).run(ADD).startswith("made")
-    assert (tmp_path / "docs/results/sum.json").read_text() == "2"
+    assert (tmp_path / "docs/results/total.txt").read_text() == "2"
     assert (tmp_path / "docs/results/sum.md").read_text().endswith("done\n")
     assert runner(tmp_path).run(ADD) == "holds"
-    (tmp_path / "docs/results/sum.json").write_text("3")
+    (tmp_path / "docs/results/total.txt").write_text("3")
     assert runner(tmp_path).run(ADD).startswith("made")
-    assert (tmp_path / "docs/results/sum.json").read_text() == "2"
+    assert (tmp_path / "docs/results/total.txt").read_text() == "2"
 
 
 def test_older_algorithms_are_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,7 +173,13 @@ def test_what_a_study_lacks_is_said(tmp_path: Path) -> None:
 
 def test_folders_of_this_machine_are_not_in_the_figures(tmp_path: Path) -> None:
     tells = "import sys, json; json.dump(sys.argv[1:], open(sys.argv[2], 'w'))"
-    says = Study("add", "a sum", ("results/where.json",), (f'python -c "{tells}" DATA/hands OUT/results/where.json',))
+    says = Study(
+        "add",
+        "a sum",
+        ("results/where.json",),
+        (f'python -c "{tells}" DATA/hands OUT/results/where.json',),
+        prints="results/where.md",
+    )
     made = runner(tmp_path)
     made.places["DATA"] = tmp_path / "data"
     made.run(says)

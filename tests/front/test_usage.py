@@ -24,13 +24,17 @@ NOBODY = {"GRASPD_API_URL": "http://127.0.0.1:9"}
         ("submit", "missing option --hand; see `graspd submit --help`"),
         ("submit --hand", "option --hand requires an argument"),
         ("submit --hand allegro --object mug -n 0", "--grasps: must be at least 1"),
-        ("submit --hand allegro --object mug --grasps many", "--grasps: must be a whole number; see `graspd submit "
-         "--help`"),
-        ("jobs --state runing", "--state: must be one of queued, running, succeeded, failed, cancelled; did you mean "
-         "running?"),
+        (
+            "submit --hand allegro --object mug --grasps many",
+            "--grasps: must be a whole number; see `graspd submit --help`",
+        ),
+        (
+            "jobs --state runing",
+            "--state: must be one of queued, running, succeeded, failed, cancelled; did you mean running?",
+        ),
         ("export x.h5 --format mjcf -o out", "there is no export format 'mjcf'"),
     ],
-)  # fmt: skip
+)
 def test_a_mistake_is_one_line(command: str, line: str) -> None:
     done = CliRunner().invoke(build(), command.split(), prog_name="graspd", env=NOBODY)
     assert done.exit_code == 2

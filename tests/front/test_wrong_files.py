@@ -62,9 +62,12 @@ COMMANDS = (
 )
 #: Sent to the service as they are: what they hold is its business.
 ABSENT = (
-    "hands add FILE.urdf", "objects add FILE.stl", "networks add FILE.npz", "submit --hand FILE.urdf --object mug",
+    "hands add FILE.urdf",
+    "objects add FILE.stl",
+    "networks add FILE.npz",
+    "submit --hand FILE.urdf --object mug",
     "submit --hand allegro --object FILE.stl",
-)  # fmt: skip
+)
 
 
 def refused(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:

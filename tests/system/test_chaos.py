@@ -240,9 +240,14 @@ def test_random_kills_lose_nothing_and_repeat_nothing(
         url = request.getfixturevalue("postgres_server").database()
         places = {"store_url": request.getfixturevalue("s3_url"), "index_url": url}
     system = start(
-        workers=2, api=True, environment={"FAKE_SECONDS": "0.05"}, lease_s=2.0, task_attempts=20, retry_backoff_s=0.1,
+        workers=2,
+        api=True,
+        environment={"FAKE_SECONDS": "0.05"},
+        lease_s=2.0,
+        task_attempts=20,
+        retry_backoff_s=0.1,
         **places,
-    )  # fmt: skip
+    )
     rng = random.Random(0)
     jobs = [system.submit(wanted(grasps=32 * batches // 10, seed=seed)) for seed in range(10)]
     everyone: set[int] = set()

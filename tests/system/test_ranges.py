@@ -44,8 +44,9 @@ def test_the_range_of_a_killed_worker_is_made_again_and_its_result_appears_once(
     record = read_record(JobRecord, system.parts.store, names.job_record(job))
     made = [load_shard(system.parts.store, Stage.SYNTHESIZE, task.output) for task in plan(record)]
     assert [(shard.attributes["batch"], shard.attributes["batch_rows"]) for shard in made] == [
-        (0, "[32, 32, 32]"), (3, "[32, 32]"),
-    ]  # fmt: skip
+        (0, "[32, 32, 32]"),
+        (3, "[32, 32]"),
+    ]
     rows = np.concatenate([shard["grasp/joint_positions"] for shard in made])
     assert len(np.unique(rows, axis=0)) == 160, "no batch is there twice"
 
@@ -69,6 +70,8 @@ def test_a_range_that_kills_its_worker_takes_no_other_one_down(start: Start) -> 
     assert done.state is State.FAILED
     tasks = sorted(system.parts.index.jobs.tasks(job=job).items, key=lambda task: task.batch)
     assert [(task.batch, task.state) for task in tasks] == [
-        (0, State.SUCCEEDED), (2, State.FAILED), (4, State.SUCCEEDED),
-    ]  # fmt: skip
+        (0, State.SUCCEEDED),
+        (2, State.FAILED),
+        (4, State.SUCCEEDED),
+    ]
     assert [attempt.task_id for attempt in system.parts.index.jobs.attempts(job=job)] == [tasks[1].id] * 3

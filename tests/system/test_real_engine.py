@@ -28,7 +28,7 @@ def test_a_worker_killed_in_mid_synthesis_leaves_the_same_grasps(start: Callable
     system.until(
         lambda: {a.name for kind in AssetKind for a in index.assets.page(kind=kind).items} >= {"barrett", "block"},
         "the built-in assets are published",
-    )  # fmt: skip
+    )
 
     def is_under_way(job: str) -> bool:
         tasks = index.jobs.tasks(job=job, state=State.RUNNING).items

@@ -108,8 +108,13 @@ def test_the_service_of_a_lost_node_starts_anew_elsewhere_and_the_workers_find_i
     add_assets_to(shared)
     real = command(tmp_path / "bin" / "real" / "graspd", "graspd")
     fakes = command(tmp_path / "bin" / "fake" / "graspd", "tests.fakes")
-    quick = {"GRASPD_LEASE_S": "2", "GRASPD_KEEPER_INTERVAL_S": "0.3", "GRASPD_PORT": "0", "GRASPD_TASK_S": "0",
-             "JOIN_HOST": "127.0.0.1"}  # fmt: skip
+    quick = {
+        "GRASPD_LEASE_S": "2",
+        "GRASPD_KEEPER_INTERVAL_S": "0.3",
+        "GRASPD_PORT": "0",
+        "GRASPD_TASK_S": "0",
+        "JOIN_HOST": "127.0.0.1",
+    }
     nodes = [environment(shared, GRASPD=str(real), TMPDIR=str(tmp_path / node), **quick) for node in ("node1", "node2")]
     for node in ("node1", "node2"):
         (tmp_path / node).mkdir()

@@ -39,8 +39,11 @@ def alone(pair):
 def assert_same(batches, others) -> None:
     for one, other in zip(batches, others, strict=True):
         assert (one.tried, one.rejected, one.planned, one.verdict_key) == (
-            other.tried, other.rejected, other.planned, other.verdict_key,
-        )  # fmt: skip
+            other.tried,
+            other.rejected,
+            other.planned,
+            other.verdict_key,
+        )
         columns = one.grasps.to_columns() | one.columns
         for name, values in (other.grasps.to_columns() | other.columns).items():
             np.testing.assert_array_equal(columns[name], values, err_msg=name)

@@ -218,9 +218,13 @@ def _mixed(card: Row) -> list[str]:
     making = card["making"]
     told = []
     for key, what in (
-        ("methods", "methods"), ("levels", "levels of the referee"), ("friction", "friction coefficients"),
-        ("code_versions", "versions of graspd"), ("wants", "wishes (raw and valid)"), ("devices", "devices"),
-    ):  # fmt: skip
+        ("methods", "methods"),
+        ("levels", "levels of the referee"),
+        ("friction", "friction coefficients"),
+        ("code_versions", "versions of graspd"),
+        ("wants", "wishes (raw and valid)"),
+        ("devices", "devices"),
+    ):
         if len(making[key]) > 1:
             told.append(
                 f"**Mixed {what}**: {', '.join(map(str, making[key]))}. Attributes of each shard tell them apart."

@@ -1,12 +1,11 @@
-"""A card as a page: `README.md` with the YAML head that dataset hubs read."""
+"""A card as a page: `README.md` with the YAML head that dataset hubs read, and what to cite as BibTeX."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
-from worker.cards.citations import citations
 from worker.cards.findings import findings
 from worker.cards.tables import (
     cells_table,
@@ -20,10 +19,14 @@ from worker.cards.tables import (
 from worker.quality import gate as gates
 
 Row = Mapping[str, Any]
-
 #: Sizes as hubs class them.
-_SIZES: Final = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"),
-                 (10_000_000, "1M<n<10M"))  # fmt: skip
+_SIZES: Final = (
+    (1_000, "n<1K"),
+    (10_000, "1K<n<10K"),
+    (100_000, "10K<n<100K"),
+    (1_000_000, "100K<n<1M"),
+    (10_000_000, "1M<n<10M"),
+)
 #: A longer table of objects is folded.
 _UNFOLDED: Final = 20
 _LEVELS: Final = {
@@ -42,6 +45,45 @@ _NOT_MODELLED: Final = """\
 - Pictures have procedural materials and no textures, sensor noise, lens distortion or motion blur. They were counted
   here, not looked at.
 - ε and contact area depend on the contact threshold more than on anything else: compare only at the same one."""
+_ENTRIES: Final = {
+    "fast_graspd": """@inproceedings{turpin2023fastgraspd,
+  title     = {Fast-Grasp'D: Dexterous Multi-finger Grasp Generation Through Differentiable Simulation},
+  author    = {Turpin, Dylan and Zhong, Tao and Zhang, Shutong and Zhu, Guanglei and Liu, Jingzhou and Singh, Ritvik and
+               Heiden, Eric and Macklin, Miles and Tsogkas, Stavros and Dickinson, Sven and Garg, Animesh},
+  booktitle = {IEEE International Conference on Robotics and Automation (ICRA)},
+  year      = {2023}
+}""",
+    "graspd2022": """@inproceedings{turpin2022graspd,
+  title     = {Grasp'D: Differentiable Contact-rich Grasp Synthesis for Multi-fingered Hands},
+  author    = {Turpin, Dylan and Wang, Liquan and Heiden, Eric and Chen, Yun-Chun and Macklin, Miles and
+               Tsogkas, Stavros and Dickinson, Sven and Garg, Animesh},
+  booktitle = {European Conference on Computer Vision (ECCV)},
+  year      = {2022}
+}""",
+    "graspit": """@article{ciocarlie2009hand,
+  title   = {Hand Posture Subspaces for Dexterous Robotic Grasping},
+  author  = {Ciocarlie, Matei T. and Allen, Peter K.},
+  journal = {The International Journal of Robotics Research},
+  volume  = {28},
+  number  = {7},
+  year    = {2009}
+}""",
+    "dfc": """@inproceedings{wang2023dexgraspnet,
+  title     = {DexGraspNet: A Large-Scale Robotic Dexterous Grasp Dataset for General Objects Based on Simulation},
+  author    = {Wang, Ruicheng and Zhang, Jialiang and Chen, Jiayi and Xu, Yinzhen and Li, Puhao and Liu, Tengyu and
+               Wang, He},
+  booktitle = {IEEE International Conference on Robotics and Automation (ICRA)},
+  year      = {2023}
+}""",
+    "autograsp": """@article{miller2004graspit,
+  title   = {GraspIt! A Versatile Simulator for Robotic Grasping},
+  author  = {Miller, Andrew T. and Allen, Peter K.},
+  journal = {IEEE Robotics \\& Automation Magazine},
+  volume  = {11},
+  number  = {4},
+  year    = {2004}
+}""",
+}
 
 
 def front_matter(card: Row) -> str:
@@ -61,10 +103,20 @@ def front_matter(card: Row) -> str:
 def page(card: Row, plots: Mapping[str, str]) -> str:
     """The whole page; `plots` are file names and what they show."""
     sections = (
-        front_matter(card), f"# {card['name']}", _summary(card, plots), _composition(card), _making(card),
-        _validity(card, plots), _quality(card, plots), _coverage(card, plots), _biases(card), _licence(card),
-        _opening(card), _citing(card), _files(card, plots),
-    )  # fmt: skip
+        front_matter(card),
+        f"# {card['name']}",
+        _summary(card, plots),
+        _composition(card),
+        _making(card),
+        _validity(card, plots),
+        _quality(card, plots),
+        _coverage(card, plots),
+        _biases(card),
+        _licence(card),
+        _opening(card),
+        _citing(card),
+        _files(card, plots),
+    )
     return "\n\n".join(section for section in sections if section) + "\n"
 
 
@@ -282,3 +334,14 @@ def _count(number: int, what: str) -> str:
 
 def _millimetres(value: float | None) -> str:
     return "not recorded" if value is None else f"{1e3 * value:g} mm"
+
+
+def citations(methods: Iterable[str], name: str, version: str, year: str, snapshot: str) -> str:
+    """BibTeX of the methods' papers and of the dataset itself; `snapshot` may be empty."""
+    note = f",\n  note   = {{snapshot {snapshot}}}" if snapshot else ""
+    key = "".join(letter for letter in name if letter.isalnum()) or "dataset"
+    own = f"""@misc{{{key}{year},
+  title  = {{{name}: grasps made by graspd {version}}},
+  year   = {{{year}}}{note}
+}}"""
+    return "\n\n".join([*(_ENTRIES[method] for method in methods if method in _ENTRIES), own])

@@ -232,9 +232,13 @@ def _sizes(card: Row, tally: Tally) -> Any:
         for number, hand in enumerate(_hands(card)):
             own = [cell for cell in rows if cell["hand"] == hand]
             axes.scatter(
-                [1e3 * sizes[cell["object"]][place] for cell in own], [100 * cell["of_judged"] for cell in own],
-                s=22, color=COLOURS[number % len(COLOURS)], label=hand, alpha=0.85,
-            )  # fmt: skip
+                [1e3 * sizes[cell["object"]][place] for cell in own],
+                [100 * cell["of_judged"] for cell in own],
+                s=22,
+                color=COLOURS[number % len(COLOURS)],
+                label=hand,
+                alpha=0.85,
+            )
         axes.set_xlabel(f"{what} extent of the object, mm", fontsize=9)
         axes.tick_params(labelsize=8)
         axes.set_xlim(0, None)

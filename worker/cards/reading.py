@@ -23,12 +23,17 @@ from worker.cards.contents import Contents
 #: Columns of which a card is made; those that a shard lacks are left out.
 COLUMNS: Final[dict[str, tuple[str, ...]]] = {
     "base": (
-        "grasp/hand_pose", "grasp/joint_positions", "quality/thresholds_m", *(metric.path for metric in GRASP_METRICS),
-        *standing.COLUMNS, "quality/audit", "quality/lift_hard",
+        "grasp/hand_pose",
+        "grasp/joint_positions",
+        "quality/thresholds_m",
+        *(metric.path for metric in GRASP_METRICS),
+        *standing.COLUMNS,
+        "quality/audit",
+        "quality/lift_hard",
     ),
     "scene": ("grasp/base_index", "grasp/hand_pose", "grasp/valid", "grasp/rejection", "scene/object_pose"),
     "views": (),
-}  # fmt: skip
+}
 _STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
 _AT_ONCE: Final = 64
 _THREADS: Final = 8
@@ -71,9 +76,14 @@ def _piece(contents: Contents, file: ShardFile, size: int | None) -> Piece:
     if manifest is not None:
         said = {**_unopened(file, manifest).said, **said}
     return Piece(
-        file, columns, said, size or path.stat().st_size, rows,
-        manifest.info if manifest else {}, manifest.stage_revision if manifest else None,
-    )  # fmt: skip
+        file,
+        columns,
+        said,
+        size or path.stat().st_size,
+        rows,
+        manifest.info if manifest else {},
+        manifest.stage_revision if manifest else None,
+    )
 
 
 def _manifest(contents: Contents, file: ShardFile) -> ShardManifest | None:
@@ -88,10 +98,16 @@ def _manifest(contents: Contents, file: ShardFile) -> ShardManifest | None:
 
 def _unopened(file: ShardFile, manifest: ShardManifest) -> Piece:
     said: dict[str, Any] = {
-        "seconds": manifest.seconds, "device": manifest.device, "worker": manifest.worker, "seed": manifest.seed,
-        "created": manifest.created, "code_version": manifest.code_version, "method": manifest.request.method,
-        "fidelity": json_attribute(manifest.request.knobs.model_dump(mode="json")), "want": manifest.request.want,
-    }  # fmt: skip
+        "seconds": manifest.seconds,
+        "device": manifest.device,
+        "worker": manifest.worker,
+        "seed": manifest.seed,
+        "created": manifest.created,
+        "code_version": manifest.code_version,
+        "method": manifest.request.method,
+        "fidelity": json_attribute(manifest.request.knobs.model_dump(mode="json")),
+        "want": manifest.request.want,
+    }
     if file.kind == "base":
         said["tried"] = manifest.tried
     return Piece(file, {}, said, manifest.size_bytes, manifest.count, manifest.info, manifest.stage_revision)

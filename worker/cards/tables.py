@@ -25,21 +25,35 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]], *, words: int =
 
 def hands_table(card: Row) -> str:
     rows = [
-        [hand["name"], hand["description"] or "-", hand["licence"] or "not recorded", hand["source"] or "not recorded",
-         _code(hand["digest"]), _number(hand["dofs"]), _number(hand["fingertips"]), f"{hand['valid']:,}"]
+        [
+            hand["name"],
+            hand["description"] or "-",
+            hand["licence"] or "not recorded",
+            hand["source"] or "not recorded",
+            _code(hand["digest"]),
+            _number(hand["dofs"]),
+            _number(hand["fingertips"]),
+            f"{hand['valid']:,}",
+        ]
         for hand in card["composition"]["hands"]
-    ]  # fmt: skip
+    ]
     head = ("hand", "what", "licence", "source", "digest", "dofs", "fingertips", "valid grasps")
     return markdown(head, rows, words=5)
 
 
 def objects_table(card: Row) -> str:
     rows = [
-        [obj["name"], obj["licence"] or "not recorded", obj["source"] or "not recorded", _code(obj["digest"]),
-         _size(obj["extents_m"]), "-" if obj["volume_m3"] is None else f"{1e6 * obj['volume_m3']:.0f}",
-         f"{obj['valid']:,}"]
+        [
+            obj["name"],
+            obj["licence"] or "not recorded",
+            obj["source"] or "not recorded",
+            _code(obj["digest"]),
+            _size(obj["extents_m"]),
+            "-" if obj["volume_m3"] is None else f"{1e6 * obj['volume_m3']:.0f}",
+            f"{obj['valid']:,}",
+        ]
         for obj in card["composition"]["objects"]
-    ]  # fmt: skip
+    ]
     return markdown(("object", "licence", "source", "digest", "size, mm", "cm³", "valid grasps"), rows, words=4)
 
 
@@ -51,12 +65,29 @@ def validity_table(card: Row) -> str:
         of_judged = interval(row["of_judged"]) if row["judged"] or not row["tried"] else "not judged"
         each = 1000 * row["seconds"] / row["valid"] if row["valid"] and row["seconds"] else None
         rows.append(
-            [name, f"{row['tried']:,}", f"{row['valid']:,}", of_judged, _rejected(row["rejected"]),
-             f"{row['audited']:,}", str(row["audit_dropped"]) if row["audited"] else "-",
-             interval(row["false_valid"]), "not recorded" if each is None else f"{each:,.0f}"]
-        )  # fmt: skip
-    head = ("hand", "tried", "valid", "valid of judged (95 %)", "why not", "audited", "overturned",
-            "false valid (95 %)", "worker s per 1,000")  # fmt: skip
+            [
+                name,
+                f"{row['tried']:,}",
+                f"{row['valid']:,}",
+                of_judged,
+                _rejected(row["rejected"]),
+                f"{row['audited']:,}",
+                str(row["audit_dropped"]) if row["audited"] else "-",
+                interval(row["false_valid"]),
+                "not recorded" if each is None else f"{each:,.0f}",
+            ]
+        )
+    head = (
+        "hand",
+        "tried",
+        "valid",
+        "valid of judged (95 %)",
+        "why not",
+        "audited",
+        "overturned",
+        "false valid (95 %)",
+        "worker s per 1,000",
+    )
     return markdown(head, rows)
 
 
@@ -81,25 +112,49 @@ def cells_table(card: Row) -> str:
     for cell in card["cells"]:
         median = cell["median"]
         rows.append(
-            [cell["hand"], cell["object"], "-" if cell["asked"] is None else f"{cell['asked']:,}",
-             f"{cell['tried']:,}", f"{cell['valid']:,}", percent(cell["of_judged"]),
-             *(_fixed(median.get(name), QUALITY_NAMES[name][1]) for name in _SHOWN),
-             percent(cell["clear_of_table"]), _fixed(cell["diversity"], 2),
-             percent(1 - cell["directions"]["empty"] / card["directions"]["cells"]) if cell["directions"] else "-",
-             _bits(cell["directions"]), _bits(cell.get("types")),
-             cell["missing_because"] or ""]
-        )  # fmt: skip
-    head = ["hand", "object", "asked", "tried", "valid", "of judged", *(QUALITY_NAMES[name][0] for name in _SHOWN),
-            "clear of table", "D", "directions used", "entropy of directions, bit", "of types, bit",
-            "missing because"]  # fmt: skip
+            [
+                cell["hand"],
+                cell["object"],
+                "-" if cell["asked"] is None else f"{cell['asked']:,}",
+                f"{cell['tried']:,}",
+                f"{cell['valid']:,}",
+                percent(cell["of_judged"]),
+                *(_fixed(median.get(name), QUALITY_NAMES[name][1]) for name in _SHOWN),
+                percent(cell["clear_of_table"]),
+                _fixed(cell["diversity"], 2),
+                percent(1 - cell["directions"]["empty"] / card["directions"]["cells"]) if cell["directions"] else "-",
+                _bits(cell["directions"]),
+                _bits(cell.get("types")),
+                cell["missing_because"] or "",
+            ]
+        )
+    head = [
+        "hand",
+        "object",
+        "asked",
+        "tried",
+        "valid",
+        "of judged",
+        *(QUALITY_NAMES[name][0] for name in _SHOWN),
+        "clear of table",
+        "D",
+        "directions used",
+        "entropy of directions, bit",
+        "of types, bit",
+        "missing because",
+    ]
     if not any(row[-1] for row in rows):
         head, rows = head[:-1], [row[:-1] for row in rows]
     return markdown(head, rows, words=2)
 
 
 _SHOWN: Final = (
-    "epsilon", "contact_area_cm2", "intersection_volume_cm3", "penetration_depth_mm", "simulated_displacement_cm"
-)  # fmt: skip
+    "epsilon",
+    "contact_area_cm2",
+    "intersection_volume_cm3",
+    "penetration_depth_mm",
+    "simulated_displacement_cm",
+)
 
 
 def interval(found: Row | None) -> str:

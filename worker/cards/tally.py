@@ -1,4 +1,5 @@
-"""Sums over the shards of a dataset. Grasps become a few float32 columns of a cell, so that millions fit in memory."""
+"""Sums over the shards of a dataset. Grasps become a few float32 columns of a cell, so that millions fit in memory;
+`JointUse` says how much of its range each joint of a hand uses."""
 
 from __future__ import annotations
 
@@ -16,13 +17,76 @@ from service.store import standing
 from service.store.manifests import INDEX_THRESHOLD_M
 from worker.cards.contents import AssetFacts, Contents, Pair
 from worker.cards.directions import ELEVATION_BINS, elevations
-from worker.cards.joints import JointUse
 from worker.cards.reading import Piece
 from worker.grasps import Posture
 
+Floats = NDArray[np.float64]
+
+
+#: Bins between a joint's limits.
+BINS: Final = 200
+
+
+#: A joint is at a limit where it is nearer than this share of its range.
+_AT: Final = 0.01
+
+
+@dataclass
+class JointUse:
+    """Histograms of the joints of one hand between their limits; joints without known limits are left out."""
+
+    names: tuple[str, ...]
+    lower: Floats
+    upper: Floats
+    counts: NDArray[np.int64]
+    """(J, BINS) grasps."""
+
+    @classmethod
+    def of(cls, names: tuple[str, ...], facts: Mapping[str, Any]) -> JointUse:
+        """Nothing yet, for those joints that the facts of the hand give limits for."""
+        lower, upper = dict(facts.get("lower", {})), dict(facts.get("upper", {}))
+        known = tuple(name for name in names if name in lower and upper[name] > lower[name])
+        return cls(
+            known,
+            np.array([lower[name] for name in known]),
+            np.array([upper[name] for name in known]),
+            np.zeros((len(known), BINS), np.int64),
+        )
+
+    def add(self, names: tuple[str, ...], positions: Floats) -> None:
+        """Grasps (N, joints) of these names; a position outside the limits counts at the limit."""
+        for row, name in enumerate(self.names):
+            if name not in names:
+                continue
+            share = (positions[:, names.index(name)] - self.lower[row]) / (self.upper[row] - self.lower[row])
+            places = np.clip((share * BINS).astype(np.int64), 0, BINS - 1)
+            self.counts[row] += np.bincount(places, minlength=BINS)
+
+    def shares(self) -> dict[str, dict[str, float]]:
+        """Of each joint, as shares of its range: 5, 50 and 95 percentile, what lies between 1 and 99 percent of the
+        grasps (`used`); and the shares of grasps at its lower and upper limit."""
+        found = {}
+        near = max(1, round(_AT * BINS))
+        for name, counts in zip(self.names, self.counts, strict=True):
+            if not (total := int(counts.sum())):
+                continue
+            below = np.cumsum(counts) / total
+            low, p5, middle, p95, high = (
+                (np.searchsorted(below, q) + 0.5) / BINS for q in (0.01, 0.05, 0.5, 0.95, 0.99)
+            )
+            found[name] = {
+                "p5": float(p5),
+                "median": float(middle),
+                "p95": float(p95),
+                "used": float(high - low),
+                "at_lower": float(counts[:near].sum() / total),
+                "at_upper": float(counts[-near:].sum() / total),
+            }
+        return found
+
+
 Array = NDArray[Any]
 Floats32 = NDArray[np.float32]
-
 #: Grasps of a cell on which its diversity is measured, the first ones.
 SAMPLED: Final = 512
 #: So many arrays of a cell are packed into one.
@@ -109,8 +173,20 @@ class Tally:
         return [cell for (_, name), cell in self.cells.items() if name == obj]
 
 
-_ATTRIBUTES: Final = ("method", "fidelity", "seed", "want", "device", "worker", "code_version", "verdict_level", "mu",
-                      "source", "verdict_key", "scene")  # fmt: skip
+_ATTRIBUTES: Final = (
+    "method",
+    "fidelity",
+    "seed",
+    "want",
+    "device",
+    "worker",
+    "code_version",
+    "verdict_level",
+    "mu",
+    "source",
+    "verdict_key",
+    "scene",
+)
 
 
 def tally_of(contents: Contents, pieces: Iterable[Piece]) -> Tally:

@@ -90,9 +90,14 @@ def chart(
         hands, objects, fidelities = (_first(text) for text in (hands, objects, fidelities))
         batches, peer_batch, repeats, models_around = [4], 2, 1, 2
     chosen = settings_of(
-        _parts(methods), known_fidelities(_parts(fidelities)), batches=batches, peer_batch=peer_batch,
-        options=option or [], quick=quick, run=on,
-    )  # fmt: skip
+        _parts(methods),
+        known_fidelities(_parts(fidelities)),
+        batches=batches,
+        peer_batch=peer_batch,
+        options=option or [],
+        quick=quick,
+        run=on,
+    )
     models, things = [hand_from_path(part) for part in _parts(hands)], _things(_parts(objects))
     said = {"command": shlex.join(["graspd", *(_short(word) for word in sys.argv[1:])]), "remark": remark}
 
@@ -110,9 +115,8 @@ def chart(
         result = scene_chart(models, things, chosen, place, models=models_around, work=work, say=_say, keep=keep) | said
     if sweep:
         result["sweeps"] = turn(
-            models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, run=on,
-            knobs=knob or (), say=_say,
-        )  # fmt: skip
+            models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, run=on, knobs=knob or (), say=_say
+        )
     _finish(result, out, data_dir, publish=publish, json=json)
 
 

@@ -51,8 +51,18 @@ def clouds(
     found = pictures.clouds(
         points, noise=camera, frame=frame, fuse=fuse, scene=scene, voxel_m=voxel, hand_surface=surface, seed=seed
     )
-    said = {"source": source, "points": points, "noise": noise, "frame": found.frame, "fuse": fuse, "scene": scene,
-            "voxel_m": voxel, "graspness": graspness, "unjudged": unjudged, "seed": seed}  # fmt: skip
+    said = {
+        "source": source,
+        "points": points,
+        "noise": noise,
+        "frame": found.frame,
+        "fuse": fuse,
+        "scene": scene,
+        "voxel_m": voxel,
+        "graspness": graspness,
+        "unjudged": unjudged,
+        "seed": seed,
+    }
     done = write_clouds(found, out, said)
     if json:
         emit({"folder": str(out), **done})

@@ -28,9 +28,18 @@ app = typer.Typer(add_completion=False)
 
 #: Columns of the printed table: key, heading, digits.
 _COLUMNS: Final = (
-    ("n", "n", 0), ("gsr", "GSR", 2), ("sgs", "SGS", 2), ("pd_mm", "PD", 2), ("spd_mm", "SPD", 2), ("ca_cm2", "CA", 1),
-    ("iv_cm3", "IV", 2), ("epsilon", "ε", 2), ("wrench_volume", "Vol", 2), ("sd_cm", "SD", 2), ("diversity", "D", 2),
-)  # fmt: skip
+    ("n", "n", 0),
+    ("gsr", "GSR", 2),
+    ("sgs", "SGS", 2),
+    ("pd_mm", "PD", 2),
+    ("spd_mm", "SPD", 2),
+    ("ca_cm2", "CA", 1),
+    ("iv_cm3", "IV", 2),
+    ("epsilon", "ε", 2),
+    ("wrench_volume", "Vol", 2),
+    ("sd_cm", "SD", 2),
+    ("diversity", "D", 2),
+)
 
 
 @app.command(name="evaluate", epilog="graspd evaluate grasps.h5 --level letter")
@@ -97,9 +106,13 @@ def evaluate_command(
     other = None if judge_hand is None else hand_from_path(judge_hand, drag=True)
     twins = _joint_map(joint_map)
     rows: list[dict[str, Any]] = []
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(),
-               TextColumn("{task.completed:.0f}/{task.total:.0f}"), TimeElapsedColumn(),
-               TimeRemainingColumn())  # fmt: skip
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=plain_console(stderr=True), disable=json, transient=True) as bar:
         task = bar.add_task("reading", total=1)
         listed = [one for path in files for one in expand(path)]

@@ -230,6 +230,11 @@ def _summary(file: Path) -> dict[str, Any]:
     both = (said >= 0) & standing.judged(shard.arrays)
     agree = float((said == shard.arrays["quality/success"])[both].mean()) if both.any() else None
     return {
-        "file": str(file), "object": shard.attributes["object"], "grasps": len(valid), "valid": int(valid.sum()),
-        "sound": int(sound.sum()), "published": int((said >= 0).sum()), "agreement_published": agree,
-    }  # fmt: skip
+        "file": str(file),
+        "object": shard.attributes["object"],
+        "grasps": len(valid),
+        "valid": int(valid.sum()),
+        "sound": int(sound.sum()),
+        "published": int((said >= 0).sum()),
+        "agreement_published": agree,
+    }

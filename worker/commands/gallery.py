@@ -63,8 +63,11 @@ def gallery(
     files = paint(
         [hand_from_path(name) for name in hand or ["allegro", "barrett", "shadow"]],
         [_object(name) for name in object or ["mug", "bottle", "block"]],
-        output, device=Device(device).resolve(), seed=seed, say=lambda line: typer.echo(line, err=True),
-    )  # fmt: skip
+        output,
+        device=Device(device).resolve(),
+        seed=seed,
+        say=lambda line: typer.echo(line, err=True),
+    )
     if json:
         emit({"files": [str(file) for file in files]})
     else:

@@ -69,9 +69,14 @@ class GraspAnimation:
         one, placed = np.array([row]), placed_of_shard(self.shard)
         grasps = GraspSet.from_columns(self.shard.arrays).take(one)
         return executions(
-            self.hand, self.obj, grasps, rows=one, placed=None if placed is None else placed.take(one),
-            tool=tool_frame(None, self.hand.root_link, {}), quality={},
-        )  # fmt: skip
+            self.hand,
+            self.obj,
+            grasps,
+            rows=one,
+            placed=None if placed is None else placed.take(one),
+            tool=tool_frame(None, self.hand.root_link, {}),
+            quality={},
+        )
 
     def _drawn(self, row: np.intp, way: Sequence[Waypoint]) -> NDArray[np.uint8]:
         width = self.width or WIDTH

@@ -24,9 +24,7 @@ from worker.run import Run
 
 Kind = Literal["one side", "three sides", "way"]
 #: Edge of a grasp's picture [px] and rays a pixel. Tracing costs what goes with both: three sides half of one alone.
-LOOKS: Final[dict[Kind, tuple[int, int]]] = {
-    "one side": (300, SAMPLES), "three sides": (160, 8), "way": (300, SAMPLES)
-}  # fmt: skip
+LOOKS: Final[dict[Kind, tuple[int, int]]] = {"one side": (300, SAMPLES), "three sides": (160, 8), "way": (300, SAMPLES)}
 
 
 @dataclass(frozen=True)
@@ -84,15 +82,27 @@ class GraspSheet:
             return self._drawn([[_named(way_of(self.shard, int(row)), "grasp")] for row in self.rows], sides)[:, :, 0]
         shown = Posture.from_columns(self.shard.arrays).take(self.rows)
         return grasp_pictures(
-            self.hand, self.obj, shown.hand_pose, shown.joint_positions, self.size, THREE_SIDES[:sides], run=self.run,
+            self.hand,
+            self.obj,
+            shown.hand_pose,
+            shown.joint_positions,
+            self.size,
+            THREE_SIDES[:sides],
+            run=self.run,
             samples=LOOKS[self.kind][1],
-        )  # fmt: skip
+        )
 
     def _drawn(self, frames: list[list[Waypoint]], sides: int) -> NDArray[np.uint8]:
         return way_pictures(
-            self.hand, self.obj, frames, around_of(self.shard, self.rows), self.size, sides=sides, run=self.run,
+            self.hand,
+            self.obj,
+            frames,
+            around_of(self.shard, self.rows),
+            self.size,
+            sides=sides,
+            run=self.run,
             samples=LOOKS[self.kind][1],
-        )  # fmt: skip
+        )
 
 
 def around_of(shard: Shard, rows: NDArray[np.intp]) -> Around:

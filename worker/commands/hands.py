@@ -70,9 +70,17 @@ def check(
 ) -> None:
     """Say whether a hand can be used, what was guessed, and what it holds of plain objects. Needs no server."""
     options = hand_options(
-        urdf=urdf, xacro=xacro, palm=palm, approach=approach, root=root, pre_shape=pre_shape, closing=closing,
-        fingertips=fingertips, fix=fix, drop=drop,
-    )  # fmt: skip
+        urdf=urdf,
+        xacro=xacro,
+        palm=palm,
+        approach=approach,
+        root=root,
+        pre_shape=pre_shape,
+        closing=closing,
+        fingertips=fingertips,
+        fix=fix,
+        drop=drop,
+    )
     with _bar("reading     ", quiet=json) as run:
         report = report_hand(file, options, run)
     if picture and report["verdict"] != "refuse":

@@ -90,10 +90,17 @@ def render(
     with _progress(json) as bar:
         task = bar.add_task("rendering", total=None)
         result = render_views(
-            obj, np.asarray(scene["scene/object_pose"], float), views=views, stereo=stereo, width=size[0],
-            height=size[1], seed=number, baseline_m=baseline, extras=extras,
+            obj,
+            np.asarray(scene["scene/object_pose"], float),
+            views=views,
+            stereo=stereo,
+            width=size[0],
+            height=size[1],
+            seed=number,
+            baseline_m=baseline,
+            extras=extras,
             run=Run(used, progress=partial(_show, bar, task)),
-        )  # fmt: skip
+        )
     seconds = perf_counter() - started
     inherited = (*INHERITED, "neighbours", "neighbour_digests", "neighbour_sources")
     kept = {key: scene.attributes[key] for key in (*inherited, "scene") if key in scene.attributes}
@@ -194,9 +201,12 @@ def _drawn_in(base: Shard, hand: str | None) -> DrawnHand | None:
         return None
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
     return DrawnHand(
-        hand_of_shard(base, hand), rows, compose(np.asarray(base["scene/object_pose"], float), poses), joints,
+        hand_of_shard(base, hand),
+        rows,
+        compose(np.asarray(base["scene/object_pose"], float), poses),
+        joints,
         wrists_of(base, rows),
-    )  # fmt: skip
+    )
 
 
 def _drawn(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand | None:
@@ -223,6 +233,11 @@ def _show(bar: Progress, task: TaskID, done: float, total: float, message: str) 
 
 def _progress(quiet: bool) -> Progress:
     return Progress(
-        TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-        console=plain_console(stderr=True), disable=quiet, transient=True,
-    )  # fmt: skip
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=plain_console(stderr=True),
+        disable=quiet,
+        transient=True,
+    )

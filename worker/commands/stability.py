@@ -21,9 +21,22 @@ from service.model.version import PACKAGE_VERSION
 app = typer.Typer()
 
 STUDIES: Final = (
-    "time_step", "stiffness", "contact_count", "gradient", "shapes", "starts", "rates", "length",
-    "hands", "model_errors", "peers", "scene_height", "scene_wall", "scene_neighbours", "scene_size",
-)  # fmt: skip
+    "time_step",
+    "stiffness",
+    "contact_count",
+    "gradient",
+    "shapes",
+    "starts",
+    "rates",
+    "length",
+    "hands",
+    "model_errors",
+    "peers",
+    "scene_height",
+    "scene_wall",
+    "scene_neighbours",
+    "scene_size",
+)
 
 
 @app.command(epilog="graspd stability --only gradient --only starts --out stability --publish")

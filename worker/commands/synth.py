@@ -140,16 +140,24 @@ def synth(
     if payload is None:
         payload = scene != "free" and referee != "none" and (mass is not None or density is not None)
     matter = {
-        "mass": mass, "density": density, "object_friction": object_friction, "payload": payload,
-        "min_payload": min_payload, "shake": shake,
-    }  # fmt: skip
+        "mass": mass,
+        "density": density,
+        "object_friction": object_friction,
+        "payload": payload,
+        "min_payload": min_payload,
+        "shake": shake,
+    }
     request = _request(want, budget, referee, robust, robust_models, matter).model_copy(
         update={
-            "grasps": grasps, "method": method, "seed": seed,
+            "grasps": grasps,
+            "method": method,
+            "seed": seed,
             "options": of_this_machine(method, parsed_options(option or [])),
-            "friction": friction, "min_distance": min_distance, "fidelity": chosen_fidelity(fidelity, contact_solver),
+            "friction": friction,
+            "min_distance": min_distance,
+            "fidelity": chosen_fidelity(fidelity, contact_solver),
         }
-    )  # fmt: skip
+    )
     mesh = object_options(
         units=units, scale_to=scale_to, keep_largest=keep_largest, compound=compound, allow_open=allow_open
     )
@@ -158,10 +166,21 @@ def synth(
     with told_to_stop() as stop, _bar(quiet=json) as progress:
         try:
             made = synthesized(
-                hand, object_, request, place=place, scenes=scenes, mesh=mesh, device=device, threads=threads,
-                first_judge=settings.first_judge, join=join, processes=settings.processes, progress=progress,
-                cancelled=lambda: bool(stop), partial=True,
-            )  # fmt: skip
+                hand,
+                object_,
+                request,
+                place=place,
+                scenes=scenes,
+                mesh=mesh,
+                device=device,
+                threads=threads,
+                first_judge=settings.first_judge,
+                join=join,
+                processes=settings.processes,
+                progress=progress,
+                cancelled=lambda: bool(stop),
+                partial=True,
+            )
         except TaskCancelled:
             fail(f"interrupted before any grasp was judged: {out} is not written", 128 + stop[0])
         shard = write_shard("base", made.arrays, {**made.attributes, "shard_id": id_of_columns(made.arrays)})
@@ -187,7 +206,7 @@ def _request(want: str, budget: float, referee: str, robust: float, models: int,
     try:
         return JobOptions(
             want=want, budget=budget, referee=referee, audits=0, robust=robust, robust_models=models, **matter
-        )  # fmt: skip
+        )
     except ValidationError as error:
         raise InputError(refusal(error)) from None
 
@@ -202,8 +221,13 @@ def _bar(*, quiet: bool) -> Iterator[Report]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     began = time.perf_counter()
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[rate]}"),
-               TimeElapsedColumn(), TimeRemainingColumn())  # fmt: skip
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=plain_console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None, rate="")
 

@@ -1,7 +1,11 @@
-"""Warp, started quietly: on a machine without a GPU its C++ side says so on stderr at every start."""
+"""Warp, started quietly: on a machine without a GPU its C++ side says so on stderr at every start.
+
+Compiled kernels are kept where Warp would, or where this user can write.
+"""
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 import tempfile
@@ -11,22 +15,20 @@ from typing import Any
 
 import warp as wp
 
+from service import user_cache
 from worker.engines.baked import lay_out
-from worker.engines.kernel_cache import kernel_cache
-
-#: The release of Warp within which `kept_hashes` and `late_parsing` work, as their tests say; another one hashes and
-#: parses its own way, which takes a tenth of a second longer.
-KNOWN_WARP = "1.19.0"
 
 _HARMLESS = b"Could not find or load the NVIDIA CUDA driver"
 _lock = threading.Lock()
 _started = False
+log = logging.getLogger(__name__)
 
 
 def _default_of_each_thread() -> None:
     """Let every thread have a default device of its own. Warp has one for all: a `ScopedDevice` of one thread would put
-    the arrays that another makes meanwhile onto its device, and leave its own behind as the default."""
-    from warp._src.context import Runtime, runtime
+    the arrays that another makes meanwhile onto its device, and leave its own behind as the default. Until every
+    array is made with its device named, this is the one place that touches Warp's internals."""
+    from warp._src.context import Runtime, runtime  # noqa: TID251
 
     first, own = runtime.default_device, threading.local()
 
@@ -40,13 +42,6 @@ def _default_of_each_thread() -> None:
             own.device = device
 
     runtime.__class__ = Threaded
-
-
-def _start_sooner() -> None:
-    from worker.engines import kept_hashes, late_parsing
-
-    kept_hashes.install()
-    late_parsing.install()
 
 
 def start() -> None:
@@ -72,7 +67,25 @@ def start() -> None:
                 if _HARMLESS not in line:
                     os.write(2, line)
         _default_of_each_thread()
-        if wp.config.version == KNOWN_WARP:
-            _start_sooner()
         lay_out(Path(wp.config.kernel_cache_dir))
         _started = True
+
+
+def kernel_cache() -> Path | None:
+    """Folder to tell Warp of; None where its own choice (`$WARP_CACHE_PATH`, or the home folder) can be written.
+
+    Containers run as any user, and on a root file system that may be read-only.
+    """
+    named = os.environ.get("WARP_CACHE_PATH", "")
+    cache = os.environ.get("XDG_CACHE_HOME") or Path(os.environ.get("HOME") or "/") / ".cache"
+    wanted = Path(named) if named else Path(cache) / "warp"
+    try:
+        wanted.mkdir(parents=True, exist_ok=True)
+        if os.access(wanted, os.W_OK | os.X_OK):
+            return None
+        trouble = "it cannot be written"
+    except OSError as error:
+        trouble = error.strerror or str(error)
+    folder = user_cache.folder("warp")
+    log.warning("no kernels can be kept in %s (%s); they are kept in %s", wanted, trouble, folder)
+    return folder

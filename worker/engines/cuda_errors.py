@@ -1,7 +1,7 @@
 """What went wrong on a GPU: no memory for a launch, which a smaller one may mend; or a device that is lost.
 
 After an illegal access, a reset or a bus error nothing runs any more in the CUDA context of a process. Warp only writes
-a line to stderr and goes on with whatever lies in memory, so the device is asked before results leave the process.
+a line to stderr and goes on with whatever lies in memory, so the device is waited for before results leave the process.
 """
 
 from __future__ import annotations
@@ -13,8 +13,6 @@ from service.model.errors import GraspdError
 
 #: How Warp and the driver say that memory is short on a GPU.
 _NO_MEMORY: Final = re.compile(r"Failed to allocate \d+ bytes.*'cuda:\d+'|CUDA error 2\b|out of memory", re.DOTALL)
-#: cudaErrorMemoryAllocation: the one error that leaves the context as it was.
-_OUT_OF_MEMORY: Final = 2
 
 
 class DeviceLost(GraspdError):
@@ -32,15 +30,14 @@ def check_device(device: str) -> None:
     """Wait for what was launched on a device.
 
     Raises:
-        DeviceLost: an error that its CUDA context does not outlive came up since it was asked last.
+        DeviceLost: CUDA reports an error that its context does not outlive.
     """
-    if device.startswith("cuda") and (code := _pending_error(device)) not in (0, _OUT_OF_MEMORY):
-        raise DeviceLost(f"CUDA error {code} on {device}: nothing runs there any more in this process")
-
-
-def _pending_error(device: str) -> int:
-    """The error code of CUDA since the last call, once all is done that was launched; 0: none."""
+    if not device.startswith("cuda"):
+        return
     import warp as wp
-    from warp._src.context import runtime
 
-    return int(runtime.core.wp_cuda_context_check(wp.get_device(device).context))
+    try:
+        wp.synchronize_device(device)
+    except RuntimeError as error:
+        if not is_out_of_memory(error):
+            raise DeviceLost(f"{error}; nothing runs there any more in this process") from error

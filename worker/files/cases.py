@@ -47,9 +47,11 @@ class Case:
     def centred(self) -> Case:
         """The same about the middle of the object, where measurements do not depend on the file's origin."""
         return replace(
-            self, obj=self.obj.centred, grasps=self.grasps.moved(np.negative(self.obj.centre)),
+            self,
+            obj=self.obj.centred,
+            grasps=self.grasps.moved(np.negative(self.obj.centre)),
             placed=None if self.placed is None else self.placed.centred(self.obj),
-        )  # fmt: skip
+        )
 
 
 def expand(path: Path) -> list[Path]:
@@ -100,12 +102,15 @@ def _shard(path: Path, hand: str | None, obj: str | None) -> Case:
     _check_joints(path, model, grasps.grasp)
     said = shard.attributes
     return Case(
-        path.name, model, thing, grasps,
+        path.name,
+        model,
+        thing,
+        grasps,
         friction=float(said["mu"]) if "mu" in said else None,  # type: ignore[arg-type]
         seconds=float(said["seconds"]) if "seconds" in said else None,  # type: ignore[arg-type]
         judged=said.get("verdict_level", "none") != "none",
         placed=placed_of_shard(shard),
-    )  # fmt: skip
+    )
 
 
 def _reference(path: Path, hand: str | None, obj: str | None) -> Case:

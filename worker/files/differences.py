@@ -17,9 +17,18 @@ from worker.files.subsets import base_shards
 Row = dict[str, Any]
 #: Root attributes of base shards that are compared.
 _SETTINGS: Final = (
-    "method", "fidelity", "seed", "want", "mu", "verdict_level", "verdict_key", "scene", "code_version",
-    "hand_digest", "object_digest",
-)  # fmt: skip
+    "method",
+    "fidelity",
+    "seed",
+    "want",
+    "mu",
+    "verdict_level",
+    "verdict_key",
+    "scene",
+    "code_version",
+    "hand_digest",
+    "object_digest",
+)
 #: Grasps that agree in pose and joints to so many digits (metres, radians) are one.
 _DIGITS: Final = 6
 
@@ -79,10 +88,15 @@ def difference(first: Shards, second: Shards) -> Row:
             continue
         rows.append(
             {
-                "hand": pair[0], "object": pair[1], "first": mine.total(), "second": theirs.total(),
-                "valid_first": a.valid[pair], "valid_second": b.valid[pair], "common": (mine & theirs).total(),
+                "hand": pair[0],
+                "object": pair[1],
+                "first": mine.total(),
+                "second": theirs.total(),
+                "valid_first": a.valid[pair],
+                "valid_second": b.valid[pair],
+                "common": (mine & theirs).total(),
             }
-        )  # fmt: skip
+        )
     settings = {
         name: {"first": sorted(a.settings.get(name, ())), "second": sorted(b.settings.get(name, ()))}
         for name in _SETTINGS

@@ -84,9 +84,14 @@ def evaluate(
     mu = friction or case.friction or DEFAULT_FRICTION
     table = measure(case.hand, case.obj, case.grasps, friction=mu, thresholds_m=[THRESHOLD_M], run=run)
     row: dict[str, Any] = {
-        "n": len(case.grasps), "protocol": protocol, "level": None, "hard": hard, "mu": mu, "mass_kg": case.obj.mass,
+        "n": len(case.grasps),
+        "protocol": protocol,
+        "level": None,
+        "hard": hard,
+        "mu": mu,
+        "mass_kg": case.obj.mass,
         "object_friction": case.obj.friction,
-    }  # fmt: skip
+    }
     row |= _success(case, None, 0.0)
     try:
         pieces = decompose(case.obj, cache=cache)
@@ -106,9 +111,15 @@ def evaluate(
 
 
 def _pushed(
-    case: Case, level: Level, judge_hand: SameHand | None, in_others: InOthers, *, hard: bool, pieces: ConvexPieces,
+    case: Case,
+    level: Level,
+    judge_hand: SameHand | None,
+    in_others: InOthers,
+    *,
+    hard: bool,
+    pieces: ConvexPieces,
     run: Run,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """What six pushes say, in the nominal model and in others."""
     verdicts = judge(case.hand, case.obj, case.grasps, level=level, hard=hard, pieces=pieces, run=run)
     row = _success(case, verdicts, verdicts.seconds)
@@ -195,12 +206,16 @@ def _lifted(verdicts: LiftVerdicts, clear: NDArray[np.bool_]) -> dict[str, Any]:
         "verdict_key": verdicts.terms,
         "verdicts": [
             {
-                "row": row, "held": bool(one), "outcomes": [LiftOutcome(int(what)).name.lower()],
-                "margin": _plain(margin) if math.isfinite(margin) else None, "reason": reason, "clear": bool(free),
+                "row": row,
+                "held": bool(one),
+                "outcomes": [LiftOutcome(int(what)).name.lower()],
+                "margin": _plain(margin) if math.isfinite(margin) else None,
+                "reason": reason,
+                "clear": bool(free),
             }
             for row, (one, what, margin, reason, free) in enumerate(rows)
         ],
-    }  # fmt: skip
+    }
 
 
 def in_models(found: Robustness, verdicts: list[dict[str, Any]]) -> dict[str, Any]:
@@ -265,9 +280,7 @@ def _plain(value: float) -> float:
 
 
 #: Numbers of a row that several rows have a median of.
-_MEDIANS: Final = (
-    "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "epsilon", "wrench_volume", "cdc_mm", "sd_cm", "diversity",
-)  # fmt: skip
+_MEDIANS: Final = ("pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "epsilon", "wrench_volume", "cdc_mm", "sd_cm", "diversity")
 
 
 def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:

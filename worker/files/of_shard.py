@@ -186,6 +186,15 @@ def made_of(source: Shard) -> dict[str, Attribute]:
 
 #: What every later shard says about the job it comes from.
 INHERITED: Final = (
-    "hand", "hand_digest", "hand_source", "object", "object_digest", "object_source", "object_options", "method",
-    "fidelity", "batch", "root_link",
-)  # fmt: skip
+    "hand",
+    "hand_digest",
+    "hand_source",
+    "object",
+    "object_digest",
+    "object_source",
+    "object_options",
+    "method",
+    "fidelity",
+    "batch",
+    "root_link",
+)

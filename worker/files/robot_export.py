@@ -127,9 +127,14 @@ def _found(source: Path, shard: Shard, description: Description, wishes: Wishes,
     rows = best_of(shard.arrays, len(mask), mask) if wishes.best else np.flatnonzero(mask)
     tool = tool_frame(wishes.tool, case.hand.root_link, description.links)
     found = executions(
-        case.hand, case.obj, case.grasps.take(rows), rows=rows, tool=tool, quality=_quality(shard, rows),
+        case.hand,
+        case.obj,
+        case.grasps.take(rows),
+        rows=rows,
+        tool=tool,
+        quality=_quality(shard, rows),
         placed=None if case.placed is None else case.placed.take(rows),
-    )  # fmt: skip
+    )
     if lost := len(rows) - len(found):
         written.notes.append(f"{lost} of {len(rows)} {word} have no straight way of 10 cm free of the object: left out")
     return found

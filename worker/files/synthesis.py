@@ -74,11 +74,14 @@ class Synthesized:
             return f"interrupted: {len(self.arrays['quality/valid'])} of {request.grasps} grasps were there"
         limit, narrow = self.limit, self.batches[0].narrow
         reason = shortfall(
-            len(self.arrays["quality/valid"]), request.grasps, request.counted,
-            sum(batch.tried for batch in self.batches), request.budget,
+            len(self.arrays["quality/valid"]),
+            request.grasps,
+            request.counted,
+            sum(batch.tried for batch in self.batches),
+            request.budget,
             totals(batch.outcomes for batch in self.batches),
             limit.line if limit is not None and limit.hopeless else "",
-        )  # fmt: skip
+        )
         if limit is not None and not limit.hopeless:
             reason = f"{reason}; {limit.line}"
         return f"{reason}; {narrow}" if reason and narrow else reason
@@ -121,10 +124,11 @@ class Synthesized:
         told |= self._diversity()
         if request.models:
             told |= {
-                "robust_models": request.models, "robust_wanted": request.robust,
+                "robust_models": request.models,
+                "robust_wanted": request.robust,
                 "robust_share": self._mean("robust_share", 4),
                 "fragile": sum(batch.rejected.get("fragile", 0) for batch in self.batches),
-            }  # fmt: skip
+            }
         if self.place.kind != "free":
             told |= {"scene": self.place.kind, "scenes": len(self.arrays["scene/object_pose"])} | self._shares()
             told["rolling_scenes"] = self.rolling
@@ -302,10 +306,17 @@ def _attributes(
     hand: HandModel, obj: ObjectModel, request: JobOptions, batches: list[Certified], device: str, seconds: float
 ) -> dict[str, Attribute]:
     attributes: dict[str, Attribute] = {
-        "hand": hand.name, "hand_digest": hand.digest, "object": obj.name, "object_digest": obj.digest,
-        "method": request.method, "fidelity": json_attribute(request.knobs.model_dump(mode="json")),
-        "seed": request.seed, "batch": 0, "device": device, "seconds": round(seconds, 4),
-    }  # fmt: skip
+        "hand": hand.name,
+        "hand_digest": hand.digest,
+        "object": obj.name,
+        "object_digest": obj.digest,
+        "method": request.method,
+        "fidelity": json_attribute(request.knobs.model_dump(mode="json")),
+        "seed": request.seed,
+        "batch": 0,
+        "device": device,
+        "seconds": round(seconds, 4),
+    }
     tried = sum(batch.tried for batch in batches)
     outcomes = totals(batch.outcomes for batch in batches)
     return attributes | base_attributes(

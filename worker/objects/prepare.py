@@ -1,8 +1,14 @@
-"""An object from its files: read, repaired, simplified, with normals, hull and mass properties."""
+"""An object from its files: read, repaired, simplified, with normals, hull and mass properties.
+
+What one command has prepared on this machine, every later one reads in milliseconds.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+import platform
+import zipfile
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -10,22 +16,26 @@ from typing import Any, Final
 
 import numpy as np
 
-from service.model.digests import digest_files, digest_variant
+from service import user_cache
+from service.model.digests import digest_files, digest_json, digest_variant
 from service.model.errors import MeshError, NotFoundError
+from service.model.libraries import version_of
 from service.model.states import AssetKind
 from service.model.suggestions import did_you_mean
 from service.store.assets import builtin_files, builtin_names, unpack_file
 from worker.objects.formats import READERS, read_mesh
-from worker.objects.kept import kept_or_made
 from worker.objects.mass import mass_properties
 from worker.objects.model import Floats, Ints, ObjectModel
 from worker.objects.normals import corner_normals
 from worker.objects.options import OF_MATTER, ObjectOptions, parse_options
+from worker.objects.packed import from_bytes, to_bytes
 from worker.objects.repair import Repaired, repair
 from worker.objects.simplify import simplify
 
 #: Names of files that say nothing of what is in them: the objects of such a set differ by their folders.
 PLAIN_STEMS: Final = ("clean", "mesh", "model", "textured", "nontextured", "simplified")
+#: Libraries whose results go into a prepared object.
+_LIBRARIES: Final = ("numpy", "scipy", "manifold3d", "fast-simplification")
 
 
 def load_object(
@@ -178,3 +188,33 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
 def name_of(path: Path) -> str:
     """Name of the object in a mesh file: the file's, or its folder's where files of all objects are called the same."""
     return path.resolve().parent.name if path.stem.lower() in PLAIN_STEMS else path.stem
+
+
+def kept_or_made(terms: tuple[str, ...], data: bytes, make: Callable[[], ObjectModel]) -> ObjectModel:
+    """A prepared object from the user's cache, else made and kept there.
+
+    Args:
+        terms: all that the object follows from, besides the bytes of its mesh and the code that prepares it.
+        data: the mesh as it was given.
+        make: prepares it; what it raises is not kept.
+    """
+    address = digest_json([*terms, hashlib.sha256(data).hexdigest(), revision()])
+    file = user_cache.folder("objects") / f"{address}.npz"
+    if (held := user_cache.load(file)) is not None:
+        try:
+            return from_bytes(held, name="", digest="")
+        except (ValueError, KeyError, TypeError, OSError, EOFError, zipfile.BadZipFile):
+            pass
+    obj = make()
+    user_cache.keep(file, to_bytes(obj))
+    return obj
+
+
+@lru_cache(maxsize=1)
+def revision() -> str:
+    """Digest of what prepares: this package's source, its libraries, and the kind of processor, whose last bits may
+    differ. So a change to how objects are prepared leaves no old one in use, and nobody has to remember a number."""
+    whole = hashlib.sha256()
+    for file in sorted(Path(__file__).parent.rglob("*.py")):
+        whole.update(file.read_bytes())
+    return digest_json([whole.hexdigest(), *map(version_of, _LIBRARIES), platform.machine()])

@@ -1,7 +1,11 @@
-"""What a render has before its cameras: what the seed decides about each scene, and the stages it is traced on."""
+"""What a render has before its cameras: what the seed decides about each scene, and the stages it is traced on.
+
+Materials and lights are random but pleasing.
+"""
 
 from __future__ import annotations
 
+import colorsys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -9,6 +13,7 @@ from typing import Final
 import numpy as np
 from cachetools import LRUCache
 
+from service.model.colours import Colour, hexadecimal, linear
 from service.model.scene_spec import Box as BoxSupport
 from service.model.scene_spec import HalfSpace
 from service.model.transforms import apply
@@ -16,8 +21,8 @@ from worker.objects.model import Floats, ObjectModel
 from worker.rendering.camera_file import SAMPLED, GivenCameras
 from worker.rendering.cameras import intrinsics, narrow_field, sample_hemisphere, stereo_pair
 from worker.rendering.hands import DrawnHand
-from worker.rendering.palette import lamp, object_look, table_look
-from worker.rendering.scenery import Box, Look, Pictures, Shot, Solid
+from worker.rendering.kernels.shading import GRAIN, PLAIN, SPECKLE, TILES
+from worker.rendering.scenery import Box, Lamp, Look, Pictures, Shot, Solid
 from worker.rendering.standing import TABLE, Supports, seen_share, slab_poses, slabs
 from worker.rendering.tracer import Tracer
 from worker.run import Run
@@ -29,6 +34,9 @@ _SEEN: Final = 0.8
 _AWAY_M: Final = -50.0
 _NOWHERE: Final = np.zeros((0, 3))
 _stages: LRUCache[tuple[object, ...], Tracer] = LRUCache(4)
+_WOODS: Final = [("#b98a5a", "#8a5c34"), ("#d9b98c", "#b98f5e"), ("#7b5233", "#523320"), ("#a9978a", "#85736a")]
+_STONES: Final = [("#c9c6c0", "#8f8b85"), ("#6f7478", "#45494d"), ("#d8d3c8", "#b5ad9f"), ("#86908a", "#5d6761")]
+_CLOTHS: Final = ["#cfd3d6", "#e4ded2", "#9fb0b8", "#6d7f86", "#b7bda5", "#494f57", "#c9a98b"]
 
 
 @dataclass(frozen=True)
@@ -102,10 +110,14 @@ class Setting:
         self.shot = Shot(
             world=np.repeat(np.arange(len(poses), dtype=np.int32), plan.placements * plan.eyes),
             extrinsics=np.concatenate([scene.extrinsics for scene in scenes]),
-            intrinsics=plan.intrinsics, width=plan.width, height=plan.height, samples=samples,
+            intrinsics=plan.intrinsics,
+            width=plan.width,
+            height=plan.height,
+            samples=samples,
             toward_lamp=_toward_lamp(np.random.default_rng([seed, 2**31])),
-            turn=np.array([scene.turn for scene in scenes]), lamps=[scene.lamp for scene in scenes],
-        )  # fmt: skip
+            turn=np.array([scene.turn for scene in scenes]),
+            lamps=[scene.lamp for scene in scenes],
+        )
 
     def shoot(self, run: Run, *, normals: bool = False) -> Pictures:
         """The pictures; `Pictures.shape` is 0 for supports, 1 for the object, 2 + m for neighbour m."""
@@ -169,8 +181,10 @@ class _Scene:
         others = [object_look(rng) for _ in objects[1:]]
         walls = table_look(rng) if len(supports) > 1 else table
         self.looks: list[Look] = [
-            *(table if k == 0 or isinstance(s, HalfSpace) else walls for k, s in enumerate(supports)), thing, *others
-        ]  # fmt: skip
+            *(table if k == 0 or isinstance(s, HalfSpace) else walls for k, s in enumerate(supports)),
+            thing,
+            *others,
+        ]
 
 
 def _unhidden(draw: Callable[[], Sequence[Floats]], supports: Supports, points: Floats) -> Sequence[Floats]:
@@ -202,3 +216,50 @@ def _kept(key: tuple[object, ...], solids: Callable[[], Sequence[Solid | Box]], 
     if key not in _stages:
         _stages[key] = Tracer(solids(), device)
     return _stages[key]
+
+
+def hsv(hue: float, saturation: float, value: float) -> Colour:
+    """Linear RGB of hue, saturation, value in 0..1."""
+    return linear(*colorsys.hsv_to_rgb(hue % 1.0, saturation, value))
+
+
+def table_look(rng: np.random.Generator) -> Look:
+    """Wood, stone, tiles or a plain cloth."""
+    kind = int(rng.integers(4))
+    scale = float(rng.uniform(0.7, 1.5))
+    if kind == 0:
+        base, second = _WOODS[rng.integers(len(_WOODS))]
+        return Look(hexadecimal(base), hexadecimal(second), GRAIN, scale, float(rng.uniform(0.45, 0.8)))
+    if kind == 1:
+        base, second = _STONES[rng.integers(len(_STONES))]
+        return Look(hexadecimal(base), hexadecimal(second), SPECKLE, scale, float(rng.uniform(0.5, 0.8)))
+    base = _CLOTHS[rng.integers(len(_CLOTHS))]
+    if kind == 2:
+        return Look(hexadecimal(base), hexadecimal("#8b8883"), TILES, scale, float(rng.uniform(0.45, 0.7)))
+    return Look(hexadecimal(base), pattern=PLAIN, roughness=float(rng.uniform(0.7, 0.95)))
+
+
+def object_look(rng: np.random.Generator) -> Look:
+    """Glazed, painted, brushed or speckled, any hue."""
+    hue, kind = float(rng.uniform()), int(rng.integers(4))
+    base = hsv(hue, float(rng.uniform(0.3, 0.75)), float(rng.uniform(0.5, 0.9)))
+    if kind == 0:
+        return Look(base, roughness=float(rng.uniform(0.2, 0.35)))
+    if kind == 1:
+        return Look(hsv(hue, 0.15, 0.75), roughness=float(rng.uniform(0.35, 0.55)), metalness=1.0)
+    if kind == 2:
+        second = hsv(hue + float(rng.uniform(-0.08, 0.08)), 0.6, 0.45)
+        return Look(base, second, SPECKLE, float(rng.uniform(1.0, 3.0)), float(rng.uniform(0.4, 0.7)))
+    return Look(base, roughness=float(rng.uniform(0.5, 0.8)))
+
+
+def lamp(rng: np.random.Generator) -> Lamp:
+    """Warm to cool light of changing strength before a soft backdrop."""
+    warmth, strength = float(rng.uniform(-1, 1)), float(rng.uniform(0.85, 1.15))
+    tint = hsv(float(rng.uniform()), 0.12, float(rng.uniform(0.45, 0.8)))
+    return Lamp(
+        key=(strength * (1.5 + 0.15 * warmth), strength * 1.45, strength * (1.4 - 0.2 * warmth)),
+        sky=(0.58 - 0.06 * warmth, 0.6, 0.64 + 0.06 * warmth),
+        backdrop_low=(0.45 * tint[0], 0.45 * tint[1], 0.45 * tint[2]),
+        backdrop_high=tint,
+    )

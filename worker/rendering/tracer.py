@@ -22,7 +22,6 @@ from worker.rendering.annotate import box_corners
 from worker.rendering.cameras import Floats
 from worker.rendering.kernels import exposure, rays
 from worker.rendering.kernels.shading import Light, Material
-from worker.rendering.passes import light_passes
 from worker.rendering.scenery import Box, Look, Pictures, Shot, Solid
 from worker.run import ALONE, Run
 
@@ -32,6 +31,13 @@ PIXELS_OF_A_GPU: Final = 4_000_000
 #: By which bounds are wider than their solid, so that rounding in float32 costs no ray [m].
 _SLACK_M: Final = 1e-5
 _PLACED: Final[Any] = rays.Placed
+#: Radius of the lamp's disc seen from the table [rad].
+LAMP_RADIUS: Final = np.radians(3.5)
+#: Sine of the elevation above which the sky shines.
+SKY_EDGE: Final = 0.35
+_GOLDEN: Final = np.pi * (3.0 - np.sqrt(5.0))
+#: Steps of the R2 sequence (Roberts 2018): few points, evenly spread.
+_R2: Final = np.array([0.7548776662466927, 0.5698402909980532])
 
 
 @dataclass
@@ -139,12 +145,19 @@ class _Film:
         shape = wp.empty(size, dtype=wp.int32, device=device)
         normal = wp.empty(size if shot.normals else (0, 0, 0), dtype=wp.vec3f, device=device)
         inputs = [
-            tracer._placed, tracer._corner_normals, tracer._materials,
+            tracer._placed,
+            tracer._corner_normals,
+            tracer._materials,
             wp.array(world, dtype=wp.int32, device=device),
             wp.array(self._cameras[views], dtype=wp.transformf, device=device),
             _structs([shot.lamps[w] for w in world], Light, device),
-            wp.vec2f(k[0, 0], k[1, 1]), wp.vec2f(k[0, 2], k[1, 2]), self._passes, self._toward, shot.shaded, threads,
-        ]  # fmt: skip
+            wp.vec2f(k[0, 0], k[1, 1]),
+            wp.vec2f(k[0, 2], k[1, 2]),
+            self._passes,
+            self._toward,
+            shot.shaded,
+            threads,
+        ]
 
         def rows(first: int) -> None:
             wp.launch(
@@ -180,3 +193,48 @@ def _structs(things: Sequence[Any], struct: Any, device: str) -> Any:
 
 def _xyzw(poses: Floats) -> NDArray[np.float32]:
     return np.asarray(poses[..., [0, 1, 2, 4, 5, 6, 3]], np.float32)
+
+
+@dataclass(frozen=True)
+class LightPass:
+    """One ray through every pixel, one directional light."""
+
+    shift: tuple[float, float]
+    """Of the ray from the pixel's centre [px]."""
+    toward: Floats
+    """(3,) unit direction to the light."""
+    lamp_weight: float
+    """Weights that make the mean over all passes one lamp and one sky."""
+    sky_weight: float
+
+
+def light_passes(samples: int, toward_lamp: Floats) -> list[LightPass]:
+    """Passes by turns from the lamp's disc and from the sky; pass 0 goes through the pixel centres."""
+    lamp_passes, sky_passes = (samples + 1) // 2, samples // 2
+    # An open horizontal surface receives 1 from the whole sky.
+    sky = 2.0 / (1.0 + SKY_EDGE) * samples / max(1, sky_passes)
+    passes = []
+    for k in range(samples):
+        across, down = (0.5 + k * _R2) % 1.0 - 0.5
+        shift = (float(across), float(down))
+        if k % 2 == 0:
+            toward = _on_disc(toward_lamp, k // 2, lamp_passes)
+            passes.append(LightPass(shift, toward, samples / lamp_passes, 0.0))
+        else:
+            passes.append(LightPass(shift, _on_sky(k // 2, sky_passes), 0.0, sky))
+    return passes
+
+
+def _on_disc(axis: Floats, k: int, count: int) -> Floats:
+    radius, angle = LAMP_RADIUS * np.sqrt((k + 0.5) / count), _GOLDEN * k
+    side = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    direction = axis + radius * (np.cos(angle) * side + np.sin(angle) * np.cross(axis, side))
+    return np.asarray(direction / np.linalg.norm(direction))
+
+
+def _on_sky(k: int, count: int) -> Floats:
+    # Uniform over the sky above the horizon haze: low lights would draw long streaks.
+    height, angle = 1.0 - (1.0 - SKY_EDGE) * (k + 0.5) / count, _GOLDEN * k
+    level = np.sqrt(1.0 - height**2)
+    return np.array([level * np.cos(angle), level * np.sin(angle), height])

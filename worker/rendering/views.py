@@ -97,9 +97,7 @@ def render(
     beside = (extras.neighbours or Neighbours((), np.zeros((len(poses), 0, 7)))).centred
     obj, poses = obj.centred, to_centre(poses, obj.centre)
     placed = np.concatenate([poses[:, None], beside.poses], axis=1)
-    setting = Setting(
-        [obj, *beside.objects], placed, plan, seed=seed, samples=samples, supports=extras.supports
-    )  # fmt: skip
+    setting = Setting([obj, *beside.objects], placed, plan, seed=seed, samples=samples, supports=extras.supports)
     pictures = setting.shoot(run, normals="normals" in extras.channels)
     result = annotate(setting, pictures, obj, extras.channels)
     if "occlusion" in extras.channels:

@@ -69,16 +69,19 @@ def list_cells(faces: Any, mesh: Any, field: Any, low: Any, size: float, within:
     radius = wp.zeros(int(np.prod(shape)), dtype=wp.float32)
     count = wp.zeros(len(radius), dtype=wp.int32)
     wp.launch(
-        nearest.count_faces, len(radius), inputs=[mesh.id, cells.faces, low, size, field, within],
+        nearest.count_faces,
+        len(radius),
+        inputs=[mesh.id, cells.faces, low, size, field, within],
         outputs=[radius, count],
-    )  # fmt: skip
+    )
     first = np.concatenate([[0], np.cumsum(count.numpy())])
     cells.first = wp.array(first, dtype=wp.int32)
     cells.face = wp.empty(int(first[-1]), dtype=wp.int32)
     cells.key = wp.empty(int(first[-1]), dtype=wp.float32)
     wp.launch(
-        nearest.list_faces, len(radius),
+        nearest.list_faces,
+        len(radius),
         inputs=[mesh.id, cells.faces, low, size, wp.vec3i(*shape), radius, cells.first],
         outputs=[cells.face, cells.key],
-    )  # fmt: skip
+    )
     return cells

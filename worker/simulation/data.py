@@ -169,9 +169,11 @@ class Data:
         with wp.ScopedDevice(self.device):
             share = wp.empty(n, dtype=wp.float32)
             wp.launch(
-                penalties.near_share, n,
-                inputs=[reach, float(REFERENCE_POINTS), c.count, c.distance, c.weight], outputs=[share],
-            )  # fmt: skip
+                penalties.near_share,
+                n,
+                inputs=[reach, float(REFERENCE_POINTS), c.count, c.distance, c.weight],
+                outputs=[share],
+            )
         return share.numpy().astype(float)
 
     def state(self, n: int) -> HandState:

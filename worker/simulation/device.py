@@ -167,9 +167,7 @@ class DeviceObject:
             centred = wp.array(samples - obj.centre_of_mass, dtype=wp.vec3)
             bvh = wp.Bvh(centred, centred)
             cells = sorted_samples(samples - obj.centre_of_mass)
-        return cls(
-            model=obj, device=device, surface=skin, mesh=mesh, samples=centred, bvh=bvh, sorted_samples=cells
-        )  # fmt: skip
+        return cls(model=obj, device=device, surface=skin, mesh=mesh, samples=centred, bvh=bvh, sorted_samples=cells)
 
     def thinned(self, count: int) -> DeviceObject:
         """The same object with its first `count` samples: farthest-point samples are even at any length."""

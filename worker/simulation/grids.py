@@ -76,9 +76,11 @@ def _sampled(skin: Any, shape: tuple[int, ...]) -> Any:
     """The distances at the corners of the grid."""
     field = wp.empty(shape, dtype=wp.float32)
     wp.launch(
-        surface.sample_field, dim=shape, inputs=[skin, skin.field_origin, skin.field_cell, 4 * FIELD_REACH],
+        surface.sample_field,
+        dim=shape,
+        inputs=[skin, skin.field_origin, skin.field_cell, 4 * FIELD_REACH],
         outputs=[field],
-    )  # fmt: skip
+    )
     return field
 
 
@@ -96,7 +98,10 @@ def _fits(kept: Arrays, shape: tuple[int, ...], faces: int) -> bool:
     field, first, face, key = (kept[name] for name in kinds)
     count = int(np.prod([n - 1 for n in shape]))
     return bool(
-        field.shape == shape and first.shape == (count + 1,) and face.shape == key.shape == (int(first[-1]),)
-        and first[0] == 0 and (np.diff(first) >= 0).all()
+        field.shape == shape
+        and first.shape == (count + 1,)
+        and face.shape == key.shape == (int(first[-1]),)
+        and first[0] == 0
+        and (np.diff(first) >= 0).all()
         and (len(face) == 0 or (face.min() >= 0 and face.max() < faces))
-    )  # fmt: skip
+    )

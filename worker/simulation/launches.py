@@ -97,7 +97,7 @@ def _packed(command: Any) -> Callable[[], object]:
     """What runs a recorded launch on the CPU.
 
     Warp packs the arguments anew each time, under the interpreter's lock: a twentieth of an iteration of a few hands,
-    for which other threads wait. They are packed here once, as `warp._src.context.invoke` does it."""
+    for which other threads wait. They are packed here once, as Warp does it."""
     if not command.device.is_cpu or command.adjoint or command.block_dim > 1:
         return partial(command.launch)
     bounds, *values = command.params

@@ -87,9 +87,13 @@ class Model:
 
     @staticmethod
     def create(
-        hand: DeviceHand, obj: DeviceObject, points: SurfacePoints, self_points: SurfacePoints, options: LossOptions,
+        hand: DeviceHand,
+        obj: DeviceObject,
+        points: SurfacePoints,
+        self_points: SurfacePoints,
+        options: LossOptions,
         obstacles: DeviceObstacles | None = None,
-    ) -> Model:  # fmt: skip
+    ) -> Model:
         """Upload the points to the hand's device.
 
         Raises:
@@ -101,14 +105,19 @@ class Model:
         motions = initial_motions(options.velocities, options.step, obj.model.gyration_radius)
         with wp.ScopedDevice(hand.device):
             return Model(
-                hand=hand, obj=obj, options=options, obstacles=obstacles, count=len(points),
+                hand=hand,
+                obj=obj,
+                options=options,
+                obstacles=obstacles,
+                count=len(points),
                 point_body=wp.array(points.body, dtype=wp.int32),
                 point_position=wp.array(points.position, dtype=wp.vec3),
                 point_weight=wp.array(weight, dtype=wp.float32),
                 body_points=body_points(self_points, hand.model.bodies),
                 self_scale=REFERENCE_SELF_POINTS / max(len(self_points), 1),
-                physics=_physics(obj, options), motions=wp.array(motions, dtype=contact.vec6),
-            )  # fmt: skip
+                physics=_physics(obj, options),
+                motions=wp.array(motions, dtype=contact.vec6),
+            )
 
     @property
     def device(self) -> str:

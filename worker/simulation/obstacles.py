@@ -83,10 +83,12 @@ def _solid_distances(hand: HandModel, postures: Posture, scene: Surroundings) ->
         rotation: Any = wp.array(to_xyzw(bodies[..., 3:]), dtype=wp.quat)
         least = wp.full((len(bodies), hand.bodies), FAR_M, dtype=wp.float32)
         launch(
-            solid_kernels.distances, (len(bodies), len(hand.pieces)),
+            solid_kernels.distances,
+            (len(bodies), len(hand.pieces)),
             inputs=[obstacles.features, device.pieces, obstacles.solids, position, rotation, FAR_M],
-            outputs=[least], device="cpu",
-        )  # fmt: skip
+            outputs=[least],
+            device="cpu",
+        )
     return least.numpy().astype(float)
 
 

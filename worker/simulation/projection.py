@@ -111,10 +111,11 @@ class Projection:
         d, o = self.data, self.options
         out = record_placement(self.model, d, within=max(o.near, o.hold))
         out.add(
-            kernels.keep_best, d.capacity,
+            kernels.keep_best,
+            d.capacity,
             inputs=[d.depths.points, d.depths.object, d.depths.links, d.depths.obstacles, wp.float64(BETTER_M), now],
             outputs=[d.active, self.residuals.count, best, self._depth],
-        )  # fmt: skip
+        )
         return out
 
     def _states(self, state: HandState) -> Any:
@@ -136,43 +137,79 @@ class Projection:
         m, d, o, r = self.model, self.data, self.options, self.residuals
         c, pose = d.contacts, [d.body_p, d.body_q]
         out.add(
-            kernels.point_residuals, (d.capacity, m.lanes),
-            inputs=[m.lane, d.active, c.count, c.body, c.point, c.normal, c.distance,
-                    o.near, o.target, o.hold, o.hold_target, o.hold_weight],
+            kernels.point_residuals,
+            (d.capacity, m.lanes),
+            inputs=[
+                m.lane,
+                d.active,
+                c.count,
+                c.body,
+                c.point,
+                c.normal,
+                c.distance,
+                o.near,
+                o.target,
+                o.hold,
+                o.hold_target,
+                o.hold_weight,
+            ],
             outputs=[r],
-        )  # fmt: skip
+        )
         out.add(
-            kernels.sample_residuals, (d.capacity, m.pieces),
-            inputs=[m.hand.pieces, m.obj.sorted_samples, d.active, *pose, o.sample_near, o.target], outputs=[r],
-        )  # fmt: skip
+            kernels.sample_residuals,
+            (d.capacity, m.pieces),
+            inputs=[m.hand.pieces, m.obj.sorted_samples, d.active, *pose, o.sample_near, o.target],
+            outputs=[r],
+        )
         out.add(
-            kernels.self_residuals, (d.capacity, m.pieces),
-            inputs=[m.hand.pieces, m.body_points, d.active, *pose, o.self_near, o.self_target], outputs=[r],
-        )  # fmt: skip
+            kernels.self_residuals,
+            (d.capacity, m.pieces),
+            inputs=[m.hand.pieces, m.body_points, d.active, *pose, o.self_near, o.self_target],
+            outputs=[r],
+        )
         if m.obstacles is not None:
             out.add(
-                obstacles.residuals, (d.capacity, m.pieces),
-                inputs=[m.obstacles.features, m.obstacles.solids, d.active, d.scene, *pose, o.obstacle_near,
-                        o.obstacle_target],
+                obstacles.residuals,
+                (d.capacity, m.pieces),
+                inputs=[
+                    m.obstacles.features,
+                    m.obstacles.solids,
+                    d.active,
+                    d.scene,
+                    *pose,
+                    o.obstacle_near,
+                    o.obstacle_target,
+                ],
                 outputs=[r],
-            )  # fmt: skip
+            )
         if m.obstacles is not None and m.obstacles.any_solid:
             out.add(
-                solids.residuals, (d.capacity, m.pieces),
-                inputs=[m.obstacles.features, m.hand.pieces, m.obstacles.solids, d.active, d.scene, *pose,
-                        o.obstacle_near, o.obstacle_target],
+                solids.residuals,
+                (d.capacity, m.pieces),
+                inputs=[
+                    m.obstacles.features,
+                    m.hand.pieces,
+                    m.obstacles.solids,
+                    d.active,
+                    d.scene,
+                    *pose,
+                    o.obstacle_near,
+                    o.obstacle_target,
+                ],
                 outputs=[r],
-            )  # fmt: skip
+            )
         out.add(
-            kernels.normal_equations, (d.capacity, self._lanes),
+            kernels.normal_equations,
+            (d.capacity, self._lanes),
             inputs=[m.hand.tree, self._lane, d.active, d.pivot, d.body_p, d.axis, r],
             outputs=[self._row, self.matrix, self.vector],
-        )  # fmt: skip
+        )
 
     def _add_step(self, out: Launches, now: Any) -> None:
         d, o = self.data, self.options
         out.add(
-            kernels.step, d.capacity,
+            kernels.step,
+            d.capacity,
             inputs=[*self._limits, self._scale, wp.float64(o.damping), wp.float64(o.step), d.active, self.residuals],
             outputs=[self._factor, self._move, self.matrix, self.vector, now, d.pivot, d.rotation, d.q],
-        )  # fmt: skip
+        )

@@ -67,11 +67,21 @@ def record_iteration(m: Model, d: Data, optimizer: str, *, patience: int = 0) ->
 def add_poses(out: Launches, m: Model, d: Data) -> None:
     """Poses of all bodies; what an iteration accumulates is set to zero."""
     out.add(
-        kinematics.forward, d.capacity,
+        kinematics.forward,
+        d.capacity,
         inputs=[m.hand.tree, d.active, d.pivot, d.rotation, d.q],
-        outputs=[d.body_p, d.body_q, d.axis, d.wrench, d.contacts.count, d.contacts.near_count,
-                 d.depths.points, d.depths.object, d.depths.links],
-    )  # fmt: skip
+        outputs=[
+            d.body_p,
+            d.body_q,
+            d.axis,
+            d.wrench,
+            d.contacts.count,
+            d.contacts.near_count,
+            d.depths.points,
+            d.depths.object,
+            d.depths.links,
+        ],
+    )
 
 
 def add_distances(out: Launches, m: Model, d: Data, *, within: float | None = None) -> None:
@@ -79,12 +89,36 @@ def add_distances(out: Launches, m: Model, d: Data, *, within: float | None = No
     found, o = d.marked or d.contacts, m.options
     nearness = [o.band, o.exact_below, o.band] if within is None else [o.band, within, within]
     out.add(
-        surface.gather, (d.capacity, m.lanes),
-        inputs=[m.obj.surface, *nearness, NEAR_GAP, m.lane, m.point_body, m.point_position, m.point_weight,
-                d.active, d.iteration, d.schedule.dilation, d.dilation_scale, d.body_p, d.body_q],
-        outputs=[found.count, found.body, found.point, found.normal, found.distance, found.weight, found.gradient,
-                 found.near_count, found.near, found.mark],
-    )  # fmt: skip
+        surface.gather,
+        (d.capacity, m.lanes),
+        inputs=[
+            m.obj.surface,
+            *nearness,
+            NEAR_GAP,
+            m.lane,
+            m.point_body,
+            m.point_position,
+            m.point_weight,
+            d.active,
+            d.iteration,
+            d.schedule.dilation,
+            d.dilation_scale,
+            d.body_p,
+            d.body_q,
+        ],
+        outputs=[
+            found.count,
+            found.body,
+            found.point,
+            found.normal,
+            found.distance,
+            found.weight,
+            found.gradient,
+            found.near_count,
+            found.near,
+            found.mark,
+        ],
+    )
     if d.marked is not None:
         _add_packing(out, d, d.marked)
 
@@ -95,11 +129,20 @@ def _add_packing(out: Launches, d: Data, marked: Marked) -> None:
     counts = [marked.kept_in, marked.near_in]
     out.add(packing.count_marks, marked.kept_in.shape, inputs=[d.active, marked.mark], outputs=counts)
     out.add(
-        packing.pack, marked.mark.shape,
-        inputs=[d.active, marked.mark, *counts, marked.body, marked.point, marked.normal, marked.distance,
-                marked.weight],
+        packing.pack,
+        marked.mark.shape,
+        inputs=[
+            d.active,
+            marked.mark,
+            *counts,
+            marked.body,
+            marked.point,
+            marked.normal,
+            marked.distance,
+            marked.weight,
+        ],
         outputs=[c.count, c.body, c.point, c.normal, c.distance, c.weight, c.gradient, c.near_count, c.near],
-    )  # fmt: skip
+    )
 
 
 def add_contact(out: Launches, m: Model, d: Data) -> None:
@@ -107,19 +150,34 @@ def add_contact(out: Launches, m: Model, d: Data) -> None:
     o, c = m.options, d.contacts
     if not o.simulate:
         out.add(
-            penalties.attract, (d.capacity, m.count),
-            inputs=[o.leak, o.leak_length, d.active, c.count, c.distance, c.weight], outputs=[c.gradient],
-        )  # fmt: skip
+            penalties.attract,
+            (d.capacity, m.count),
+            inputs=[o.leak, o.leak_length, d.active, c.count, c.distance, c.weight],
+            outputs=[c.gradient],
+        )
         return
     if o.contact_solver == "direct":
         _add_direct(out, m, d)
         return
     out.add(
-        SOLVERS[o.contact_solver], (d.capacity, o.velocities),
-        inputs=[m.physics, m.motions, o.passes, d.active, d.iteration, d.schedule.dilation, d.dilation_scale,
-                c.count, c.point, c.normal, c.distance, c.weight],
+        SOLVERS[o.contact_solver],
+        (d.capacity, o.velocities),
+        inputs=[
+            m.physics,
+            m.motions,
+            o.passes,
+            d.active,
+            d.iteration,
+            d.schedule.dilation,
+            d.dilation_scale,
+            c.count,
+            c.point,
+            c.normal,
+            c.distance,
+            c.weight,
+        ],
         outputs=[d.states, d.loss, d.end, c.gradient],
-    )  # fmt: skip
+    )
 
 
 def _add_direct(out: Launches, m: Model, d: Data) -> None:
@@ -128,14 +186,17 @@ def _add_direct(out: Launches, m: Model, d: Data) -> None:
     schedule = [d.active, d.iteration, d.schedule.dilation, d.dilation_scale]
     contacts = [c.count, c.point, c.normal, c.distance, c.weight]
     out.add(
-        SOLVERS["direct"], (d.capacity, m.options.velocities),
+        SOLVERS["direct"],
+        (d.capacity, m.options.velocities),
         inputs=[m.physics, m.motions, m.options.passes, *schedule, *contacts, c.near_count, c.near],
         outputs=[d.loss, d.end, d.adjoint],
-    )  # fmt: skip
+    )
     out.add(
-        contact.direct_gradient, (d.capacity, m.lanes),
-        inputs=[m.physics, m.lane, *schedule, *contacts, d.end, d.adjoint], outputs=[c.gradient],
-    )  # fmt: skip
+        contact.direct_gradient,
+        (d.capacity, m.lanes),
+        inputs=[m.physics, m.lane, *schedule, *contacts, d.end, d.adjoint],
+        outputs=[c.gradient],
+    )
 
 
 def add_penalties(out: Launches, m: Model, d: Data, *, room: float = 0.0) -> None:
@@ -144,54 +205,111 @@ def add_penalties(out: Launches, m: Model, d: Data, *, room: float = 0.0) -> Non
     add_self_penalty(out, m, d, m.options.self_margin)
     c = d.contacts
     out.add(
-        penalties.points_to_bodies, (d.capacity, m.lanes),
-        inputs=[0.0, m.options.pull, m.options.pull_length, m.lane, d.active, d.iteration, d.schedule.penetration,
-                c.count, c.body, c.point, c.normal, c.distance, c.weight, c.gradient],
+        penalties.points_to_bodies,
+        (d.capacity, m.lanes),
+        inputs=[
+            0.0,
+            m.options.pull,
+            m.options.pull_length,
+            m.lane,
+            d.active,
+            d.iteration,
+            d.schedule.penetration,
+            c.count,
+            c.body,
+            c.point,
+            c.normal,
+            c.distance,
+            c.weight,
+            c.gradient,
+        ],
         outputs=[d.wrench, d.depths.points],
-    )  # fmt: skip
+    )
     if m.obstacles is not None:
         out.add(obstacles.clear, d.capacity, inputs=[d.active], outputs=[d.depths.obstacles])
         out.add(
-            obstacles.penalty, (d.capacity, m.pieces),
-            inputs=[m.obstacles.features, m.obstacles.solids, d.active, d.scene, d.iteration, d.schedule.penetration,
-                    d.body_p, d.body_q, room],
+            obstacles.penalty,
+            (d.capacity, m.pieces),
+            inputs=[
+                m.obstacles.features,
+                m.obstacles.solids,
+                d.active,
+                d.scene,
+                d.iteration,
+                d.schedule.penetration,
+                d.body_p,
+                d.body_q,
+                room,
+            ],
             outputs=[d.wrench, d.depths.obstacles],
-        )  # fmt: skip
+        )
     if m.obstacles is not None and m.obstacles.any_solid:
         out.add(
-            solids.penalty, (d.capacity, m.pieces),
-            inputs=[m.obstacles.features, m.hand.pieces, m.obstacles.solids, d.active, d.scene, d.iteration,
-                    d.schedule.penetration, d.body_p, d.body_q, room],
+            solids.penalty,
+            (d.capacity, m.pieces),
+            inputs=[
+                m.obstacles.features,
+                m.hand.pieces,
+                m.obstacles.solids,
+                d.active,
+                d.scene,
+                d.iteration,
+                d.schedule.penetration,
+                d.body_p,
+                d.body_q,
+                room,
+            ],
             outputs=[d.wrench, d.depths.obstacles],
-        )  # fmt: skip
+        )
 
 
 def add_object_penalty(out: Launches, m: Model, d: Data) -> None:
     """The object's samples inside links."""
     out.add(
-        pieces.object_in_pieces, (d.capacity, m.pieces),
-        inputs=[m.hand.pieces, m.obj.sorted_samples, REFERENCE_SAMPLES / len(m.obj.samples),
-                d.active, d.iteration, d.schedule.object_penetration, d.body_p, d.body_q],
+        pieces.object_in_pieces,
+        (d.capacity, m.pieces),
+        inputs=[
+            m.hand.pieces,
+            m.obj.sorted_samples,
+            REFERENCE_SAMPLES / len(m.obj.samples),
+            d.active,
+            d.iteration,
+            d.schedule.object_penetration,
+            d.body_p,
+            d.body_q,
+        ],
         outputs=[d.wrench, d.depths.object],
-    )  # fmt: skip
+    )
 
 
 def add_self_penalty(out: Launches, m: Model, d: Data, margin: float) -> None:
     """Links inside links, or nearer than `margin` [m]."""
     out.add(
-        pieces.pieces_in_pieces, (d.capacity, m.pieces),
-        inputs=[m.hand.pieces, m.body_points, m.self_scale, margin,
-                d.active, d.iteration, d.schedule.self_penetration, d.body_p, d.body_q],
+        pieces.pieces_in_pieces,
+        (d.capacity, m.pieces),
+        inputs=[
+            m.hand.pieces,
+            m.body_points,
+            m.self_scale,
+            margin,
+            d.active,
+            d.iteration,
+            d.schedule.self_penetration,
+            d.body_p,
+            d.body_q,
+        ],
         outputs=[d.wrench, d.depths.links],
-    )  # fmt: skip
+    )
 
 
 def add_root_gradient(out: Launches, m: Model, d: Data) -> None:
     """The gradient with respect to root and joints, from what bodies accumulated."""
     out.add(
-        kinematics.backward, d.capacity,
-        inputs=[m.hand.tree, d.active, d.pivot, d.body_p, d.axis], outputs=[d.wrench, d.gradient],
-    )  # fmt: skip
+        kinematics.backward,
+        d.capacity,
+        inputs=[m.hand.tree, d.active, d.pivot, d.body_p, d.axis],
+        outputs=[d.wrench, d.gradient],
+    )
 
 
 def add_gradient(out: Launches, m: Model, d: Data) -> None:
@@ -199,9 +317,11 @@ def add_gradient(out: Launches, m: Model, d: Data) -> None:
     add_root_gradient(out, m, d)
     o = m.options
     out.add(
-        penalties.joints, (d.capacity, m.dofs),
-        inputs=[m.hand.lower, m.hand.upper, o.range_weight, o.limit_weight, d.active, d.q], outputs=[d.gradient],
-    )  # fmt: skip
+        penalties.joints,
+        (d.capacity, m.dofs),
+        inputs=[m.hand.lower, m.hand.upper, o.range_weight, o.limit_weight, d.active, d.q],
+        outputs=[d.gradient],
+    )
 
 
 def add_step(
@@ -219,8 +339,9 @@ def add_step(
         out.add(optimizers.gradient_descent, d.capacity, inputs=[*inputs, clamp], outputs=state)
     if patience:
         out.add(
-            optimizers.converge, d.capacity,
+            optimizers.converge,
+            d.capacity,
             inputs=[d.loss, d.depths.points, d.depths.object, d.depths.links, patience],
             outputs=[d.best, d.waited, d.active],
-        )  # fmt: skip
+        )
     out.add(optimizers.advance, 1, inputs=[], outputs=[d.iteration])

@@ -1,9 +1,10 @@
 """Hands, objects and networks of the tasks, loaded from the store once and kept while the worker goes on with the same
-pair."""
+pair. Objects are repaired and simplified once, by the worker that meets them first, and lie prepared in the store."""
 
 from __future__ import annotations
 
 import threading
+import zipfile
 from collections.abc import Callable, Hashable
 from contextlib import suppress
 from typing import TypeVar, cast
@@ -11,24 +12,28 @@ from typing import TypeVar, cast
 from cachetools import LRUCache
 
 from service.model import names
-from service.model.errors import MeshError
+from service.model.digests import digest_json
+from service.model.errors import DamagedError, MeshError, NotFoundError
 from service.model.messages import TaskMessage
 from service.model.states import AssetKind
+from service.model.version import STAGE_REVISIONS
 from service.store.attributes import Attribute
 from service.store.library import load_asset_files
 from service.store.network_check import network_bytes
 from service.store.network_file import ProposalNetwork, from_bytes
+from service.store.seals import get_sealed, put_sealed
 from service.store.store import Store
 from worker.files.of_shard import NEIGHBOUR_FACE_ERROR_M
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
+from worker.objects import packed
 from worker.objects.matter import as_asked
 from worker.objects.model import ObjectModel
+from worker.objects.prepare import load_object
 from worker.planners.learned.known import keep
 from worker.stages.hand_files import load_hand_files
 from worker.stages.models import SHOWN_ERROR_M, publish_model
 from worker.stages.pieces import pieces_of
-from worker.stages.prepared import prepared_object
 
 T = TypeVar("T")
 #: Loaded assets kept: a worker in a hands x objects dataset alternates between a few.
@@ -115,3 +120,33 @@ def _cached(key: Hashable, load: Callable[[], T]) -> T:
         if key not in _cache:
             _cache[key] = load()
         return cast("T", _cache[key])
+
+
+def prepared_object(store: Store, digest: str, *, name: str, face_error_m: float) -> ObjectModel:
+    """An object as `load_object` makes it, from the store if it was prepared to this bound before.
+
+    Raises:
+        MeshError: the mesh cannot be used.
+        StoreUnavailable: the store does not answer.
+    """
+    key = names.object_prepared(digest, _address(face_error_m))
+    try:
+        return packed.from_bytes(get_sealed(store, key), name=name, digest=digest)
+    except NotFoundError:
+        pass
+    except (DamagedError, ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
+        # What cannot be read is made again; it cannot be replaced, and costs no more than it did without a store.
+        return _load(store, digest, name=name, face_error_m=face_error_m)
+    obj = _load(store, digest, name=name, face_error_m=face_error_m)
+    put_sealed(store, key, packed.to_bytes(obj))
+    return obj
+
+
+def _address(face_error_m: float) -> str:
+    # Whatever changes a prepared mesh changes the grasps on it, and with them the revision of their stage.
+    return digest_json({"face_error_m": face_error_m, "revision": STAGE_REVISIONS["synthesize"]})
+
+
+def _load(store: Store, digest: str, *, name: str, face_error_m: float) -> ObjectModel:
+    files = load_asset_files(store, AssetKind.OBJECT, digest)
+    return load_object(files, name=name, digest=digest, face_error_m=face_error_m)

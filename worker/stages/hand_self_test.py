@@ -107,17 +107,29 @@ class SelfTest:
     def facts(self) -> dict[str, Any]:
         """As a check reports it."""
         return {
-            "gsr": self.gsr, "n": self.n, "table": self.table, "table_n": self.table_n, "width_m": self.width_m,
-            "by_object": self.by_object, "says": self.line, "limit": self.limit and self.limit.facts(),
-        }  # fmt: skip
+            "gsr": self.gsr,
+            "n": self.n,
+            "table": self.table,
+            "table_n": self.table_n,
+            "width_m": self.width_m,
+            "by_object": self.by_object,
+            "says": self.line,
+            "limit": self.limit and self.limit.facts(),
+        }
 
 
 def failed(reason: str, says: str = "suspicious") -> dict[str, Any]:
     """The facts of a hand that could not be tried at all."""
     return {
-        "gsr": 0.0, "n": 0, "table": 0.0, "table_n": 0, "width_m": 0.0, "by_object": {}, "says": f"{says}: {reason}",
+        "gsr": 0.0,
+        "n": 0,
+        "table": 0.0,
+        "table_n": 0,
+        "width_m": 0.0,
+        "by_object": {},
+        "says": f"{says}: {reason}",
         "limit": None,
-    }  # fmt: skip
+    }
 
 
 def tried_softly(hand: Callable[[], HandModel], run: Run = ALONE) -> dict[str, Any]:
@@ -226,9 +238,14 @@ def _lifted(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: Run) 
     both = joined([grasps, strong])
     assert both.scene is not None
     limit = limit_of(
-        hand, about, both, pieces=decompose(about), placed=scenes.centred(obj).placed(both.scene), least=1,
+        hand,
+        about,
+        both,
+        pieces=decompose(about),
+        placed=scenes.centred(obj).placed(both.scene),
+        least=1,
         run=run.quiet(),
-    )  # fmt: skip
+    )
     return found.planned, found.shares["lift_share"], limit and replace(limit, grasps=count)
 
 
@@ -272,8 +289,7 @@ def plain_objects(width: float) -> dict[str, ObjectModel]:
     }
     return {
         name: load_object(
-            {f"{name}.stl": bytes(mesh.export(file_type="stl"))},
-            name=name, digest=f"{number:032x}", face_error_m=3e-4,
+            {f"{name}.stl": bytes(mesh.export(file_type="stl"))}, name=name, digest=f"{number:032x}", face_error_m=3e-4
         )
         for number, (name, mesh) in enumerate(meshes.items())
-    }  # fmt: skip
+    }

@@ -32,9 +32,11 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     extras = Extras(channels=request.channels)
     if request.in_scene:
         extras = Extras(
-            channels=request.channels, supports=supports_in(request.place), drawn=_drawn(shard, message, context),
+            channels=request.channels,
+            supports=supports_in(request.place),
+            drawn=_drawn(shard, message, context),
             neighbours=_beside(shard, message, context),
-        )  # fmt: skip
+        )
         said = {"base_shard": message.inputs[0], "scene": json_attribute(request.place.told())}
         said |= beside_attributes(message)
     context.check()
@@ -67,6 +69,9 @@ def _drawn(base: Shard, message: TaskMessage, context: TaskContext) -> DrawnHand
         return None
     poses = np.asarray(base["scene/object_pose"], float)
     return DrawnHand(
-        hand, rows, compose(poses, np.asarray(base["grasp/hand_pose"], float)[rows]),
-        np.asarray(base["grasp/joint_positions"], float)[rows], wrists_of(base, rows),
-    )  # fmt: skip
+        hand,
+        rows,
+        compose(poses, np.asarray(base["grasp/hand_pose"], float)[rows]),
+        np.asarray(base["grasp/joint_positions"], float)[rows],
+        wrists_of(base, rows),
+    )

@@ -67,9 +67,10 @@ def _before_grasps(message: TaskMessage, context: TaskContext) -> Output:
     except MeshError as error:
         raise SceneError(str(error)) from None
     said: dict[str, Attribute] = {
-        "scene": json_attribute(place.told()), "root_link": hand.root_link,
+        "scene": json_attribute(place.told()),
+        "root_link": hand.root_link,
         **beside_attributes(message),
-    }  # fmt: skip
+    }
     return Output({**scenes, **_NO_GRASPS}, said)
 
 

@@ -31,9 +31,17 @@ Say = Callable[[str], None]
 
 
 def bench(
-    hand: HandModel, load: Load, *, fidelities: Sequence[Fidelity], batches: Sequence[int], threads: Sequence[int],
-    device: str, repeats: int, joins: Sequence[int] = (1,), say: Say = lambda line: None,
-) -> dict[str, Any]:  # fmt: skip
+    hand: HandModel,
+    load: Load,
+    *,
+    fidelities: Sequence[Fidelity],
+    batches: Sequence[int],
+    threads: Sequence[int],
+    device: str,
+    repeats: int,
+    joins: Sequence[int] = (1,),
+    say: Say = lambda line: None,
+) -> dict[str, Any]:
     """One run per fidelity x batch x joins x threads.
 
     Args:
@@ -49,7 +57,7 @@ def bench(
 
     Returns:
         `device`, `runs[]` with the keys of the command line's contract, `start` with cold and warm seconds,
-        `host_ms_per_grasp`, `kernels`.
+        `host_ms_per_grasp` (None on a GPU, for which threads spin while they wait), `kernels`.
     """
     first = fidelities[0]
     start = _start_times(hand, load(first.face_error_m), first, device)
@@ -65,13 +73,14 @@ def bench(
             )
     pair = pairs.pair_of(hand, load(first.face_error_m), first, device)
     launch = min(LARGE, max(batches) * max(joins))
+    host = None if wp.get_device(device).is_cuda else host_ms(hand, load(first.face_error_m), first, launch)
     return {
         "device": device_name(device),
         "hand": hand.name,
         "object": load(first.face_error_m).name,
         "versions": {"graspd": PACKAGE_VERSION, "warp": wp.config.version},
         "start": start,
-        "host_ms_per_grasp": round(host_ms(hand, load(first.face_error_m), first, launch, device), 3),
+        "host_ms_per_grasp": None if host is None else round(host, 3),
         "kernels": kernel_shares(pair, first, min(32, max(batches))),
         "runs": runs,
     }
@@ -88,9 +97,15 @@ def _start_times(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: 
 
 
 def _run(
-    hand: HandModel, obj: ObjectModel, fidelity: Fidelity, batch: int, join: int, threads: int, device: str,
+    hand: HandModel,
+    obj: ObjectModel,
+    fidelity: Fidelity,
+    batch: int,
+    join: int,
+    threads: int,
+    device: str,
     repeats: int,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     seconds, run = [], Run(threads=threads, device=device)
     for seed in range(repeats + 1):
         began = time.perf_counter()

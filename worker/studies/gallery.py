@@ -71,9 +71,12 @@ def _views(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes:
         rows.append(scene_cells(seen))
         names.append([obj.name])
     return label_page(
-        rows, ["left", "right", "depth", "normals", "segmentation", "boxes"], names,
-        title="What the cameras see", subtitle="one scene per object; stereo pair with 60 mm baseline",
-    )  # fmt: skip
+        rows,
+        ["left", "right", "depth", "normals", "segmentation", "boxes"],
+        names,
+        title="What the cameras see",
+        subtitle="one scene per object; stereo pair with 60 mm baseline",
+    )
 
 
 def _hands(hands: Sequence[HandModel], objects: Sequence[ObjectModel], device: str, seed: int, say: Say) -> bytes:
@@ -98,10 +101,12 @@ def _hands(hands: Sequence[HandModel], objects: Sequence[ObjectModel], device: s
         rows.append(cells)
         names.append(below)
     return label_page(
-        rows, [hand.name for hand in hands], names,
+        rows,
+        [hand.name for hand in hands],
+        names,
         title="Grasps on the table",
         subtitle="a hand that stays clear of the table all the way; an object alone: none of those tried fits",
-    )  # fmt: skip
+    )
 
 
 def _fitting(hand: HandModel, obj: ObjectModel, device: str, seed: int) -> tuple[DrawnHand, Floats, int, int]:
@@ -160,9 +165,12 @@ def _neighbours(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes
         hidden = float(np.asarray(seen["box/occlusion_ratio"])[0])
         names.append([f"{first.name}, {100 * hidden:.0f} % hidden"])
     return label_page(
-        rows, ["left", "right", "depth", "normals", "segmentation", "boxes"], names,
-        title="Several objects", subtitle="labels 3, 4, ... are the neighbours; boxes are the grasped object's",
-    )  # fmt: skip
+        rows,
+        ["left", "right", "depth", "normals", "segmentation", "boxes"],
+        names,
+        title="Several objects",
+        subtitle="labels 3, 4, ... are the neighbours; boxes are the grasped object's",
+    )
 
 
 def _past(poses: Floats, obj: ObjectModel, beside: Neighbours) -> GivenCameras:

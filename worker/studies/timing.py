@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any, Final
 
 import numpy as np
@@ -99,46 +97,20 @@ def _timed(
     return {name: float(np.median(values)) for name, values in found.items()}, data.state(len(state.pivot))
 
 
-def host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int, device: str) -> float:
-    """Processor time of one thread outside the planner's kernels for a raw grasp [ms]: starts, merits, projection, the
-    postures around the grasp, copies, launches. On a GPU the kernels take none of it, so it bounds the grasps per
-    second from above; a kernel that runs on the CPU all the same counts there.
+def host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int) -> float:
+    """Processor time of one thread outside the planner's kernels for a raw grasp on the CPU [ms]: starts, merits,
+    projection, the postures around the grasp, copies, launches.
 
     Args:
         hand: the hand.
         obj: the object.
         fidelity: the knobs.
         count: grasps of the batch; another one before it warms caches up.
-        device: Warp device.
     """
-    run = Run(device, threads=1)
+    run = Run("cpu", threads=1)
     plan(hand, obj, Wanted(count, fidelity, seed=1), run)
-    with _waiting(device) if wp.get_device(device).is_cuda else kernel_seconds() as elsewhere:
+    with kernel_seconds() as elsewhere:
         began = time.thread_time()
         plan(hand, obj, Wanted(count, fidelity, seed=0), run)
         total = time.thread_time() - began
     return 1e3 * (total - sum(elsewhere)) / count
-
-
-@contextmanager
-def _waiting(device: str) -> Iterator[list[float]]:
-    """Processor seconds in which this thread waits for a GPU before it reads or writes what lies there: Warp spins."""
-    spent: list[float] = []
-    originals = {name: getattr(wp.array, name) for name in ("numpy", "assign")}
-
-    def waits_first(original: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*given: Any, **named: Any) -> Any:
-            began = time.thread_time()
-            wp.synchronize_device(device)
-            spent.append(time.thread_time() - began)
-            return original(*given, **named)
-
-        return call
-
-    for name, original in originals.items():
-        setattr(wp.array, name, waits_first(original))
-    try:
-        yield spent
-    finally:
-        for name, original in originals.items():
-            setattr(wp.array, name, original)

@@ -113,9 +113,13 @@ class Models:
             self.contacts.remove()
         shown = near & contacts
         self.contacts = self._scene.add_point_cloud(
-            "/grasp/object/contacts", points[shown].astype(np.float32), _colours(distance[shown]),
-            point_size=0.0022, point_shape="circle", precision="float32",
-        )  # fmt: skip
+            "/grasp/object/contacts",
+            points[shown].astype(np.float32),
+            _colours(distance[shown]),
+            point_size=0.0022,
+            point_shape="circle",
+            precision="float32",
+        )
         return distance
 
 

@@ -125,11 +125,9 @@ def twins(both: Sequence[Distribution | None]) -> list[TwinBar]:
     shares = [[n / each.count for n in each.counts] if each is not None else [0.0] * bins for each in both]
     most, width = max(map(max, shares)) or 1.0, (first.high - first.low) / bins
     return [
-        TwinBar(
-            10.0 * at, 60 * a / most, 60 * b / most, first.low + at * width, first.low + (at + 1) * width, (a, b)
-        )
+        TwinBar(10.0 * at, 60 * a / most, 60 * b / most, first.low + at * width, first.low + (at + 1) * width, (a, b))
         for at, (a, b) in enumerate(zip(*shares, strict=True))
-    ]  # fmt: skip
+    ]
 
 
 def _share(value: float, low: float, high: float) -> float:

@@ -8,8 +8,19 @@ from dataclasses import dataclass
 from sqlalchemy import Connection, delete, exists, func, insert, or_, select, update
 
 from service.index.database import Database
-from service.index.dataset_tables import dataset_cells, dataset_snapshots, datasets, object_sets
-from service.index.tables import assets, attempts, grasps, jobs, shards, spent, tasks
+from service.index.tables import (
+    assets,
+    attempts,
+    dataset_cells,
+    dataset_snapshots,
+    datasets,
+    grasps,
+    jobs,
+    object_sets,
+    shards,
+    spent,
+    tasks,
+)
 from service.index.views import AssetView
 from service.model.errors import NotFoundError
 from service.model.states import AssetKind, Lane, State

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from sqlalchemy import exists, or_, select
 
 from service.index.database import Database
-from service.index.dataset_tables import dataset_cells, datasets
-from service.index.tables import jobs
+from service.index.tables import dataset_cells, datasets, jobs
 from service.model.dataset_records import Cell, Member
 from service.model.domain import JobOptions
 from service.model.records import Choice

@@ -10,12 +10,11 @@ from typing import Any, Final
 from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, literal, select, tuple_
 
 from service.index.database import Database
-from service.index.dataset_tables import dataset_cells, dataset_snapshots, datasets
 from service.index.dataset_views import CellView, DatasetView, SnapshotView
 from service.index.queries import cursors
 from service.index.queries.outcomes import outcomes_of
 from service.index.reach import seen_datasets
-from service.index.tables import attempts, jobs, shards, tasks
+from service.index.tables import attempts, dataset_cells, dataset_snapshots, datasets, jobs, shards, tasks
 from service.index.views import Page
 from service.model.dataset_records import SnapshotShard
 from service.model.domain import JobOptions

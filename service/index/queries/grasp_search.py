@@ -6,6 +6,8 @@ takes an order's index to the end for a filter that almost nothing passes. There
 1. A condition leaves few rows: its index gives them, and they are sorted.
 2. Else the rows are looked at in the wanted order, a bounded number of them, until the page is full.
 3. A filter that hardly any row passes, though many pass each of its conditions: all rows are read, once.
+
+The language that chooses grasps (`service.model.where`) is asked of the rows by `truth`.
 """
 
 from __future__ import annotations
@@ -15,21 +17,53 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sqlalchemy import ColumnElement, Connection, Float, Select, String, Subquery, exists, func, select, tuple_
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Float,
+    Select,
+    String,
+    Subquery,
+    and_,
+    exists,
+    func,
+    not_,
+    or_,
+    select,
+    tuple_,
+)
 from sqlalchemy.sql.operators import in_op, is_
 
-from service.index.dataset_tables import dataset_cells
 from service.index.filters import GraspFilter, GraspSort
-from service.index.queries.grasp_where import truth
-from service.index.tables import grasps, jobs, shards, tasks
-from service.index.tag_tables import tagged
+from service.index.tables import dataset_cells, grasps, jobs, shards, tagged, tasks
+from service.model.errors import InputError
+from service.model.metrics import indexed
 from service.model.states import Stage
-from service.model.where import Node, parsed
+from service.model.where import Flag, Joined, Node, Not, OfMetric, OfType, parsed
 
 #: So many rows are fetched by an index and sorted in less time than all of a million are read.
 SORTED_AT_ONCE: Final = 40_000
 #: Rows looked at in the wanted order: a few first, since most filters fill a page from them.
 LOOKED_AT: Final = (1000, 20_000)
+#: Columns by name, of the table of grasps or of rows drawn from it.
+Columns = Any
+_METRICS: Final = frozenset(metric.name for metric in indexed())
+_OPERATORS: Final[dict[str, Callable[[Any, Any], ColumnElement[bool]]]] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "=": operator.eq,
+    "!=": operator.ne,
+}
+_FLAGS: Final[dict[str, Callable[[Columns], ColumnElement[bool]]]] = {
+    "judged": lambda grasps: grasps.success.is_not(None),
+    "valid": lambda grasps: grasps.valid.is_(True),
+    "held": lambda grasps: grasps.success.is_(True),
+    # What judges a grasp that was planned in a scene is the lift.
+    "lift": lambda grasps: and_(grasps.scene_kind != "free", grasps.success.is_(True)),
+    "lift_hard": lambda grasps: grasps.lift_hard.is_(True),
+}
 
 
 @dataclass(frozen=True)
@@ -277,3 +311,35 @@ def _plain(column: ColumnElement[Any]) -> ColumnElement[Any]:
     if isinstance(column.type, Float):
         return column + 0.0
     return column.concat("") if isinstance(column.type, String) else column
+
+
+def truth(node: Node, grasps: Columns) -> ColumnElement[bool]:
+    """An expression in SQL: true or false of each row, never unknown, so that `not` is what is not so.
+
+    Raises:
+        InputError: it asks for what the index does not hold.
+    """
+    if isinstance(node, Joined):
+        return (or_ if node.word == "or" else and_)(*(truth(part, grasps) for part in node.parts))
+    if isinstance(node, Not):
+        return not_(truth(node.part, grasps))
+    if isinstance(node, Flag):
+        if node.name not in _FLAGS:
+            raise _unknown(node.name)
+        # A test for truth is false of NULL.
+        return _FLAGS[node.name](grasps)
+    if isinstance(node, OfMetric):
+        if node.name not in _METRICS:
+            raise _unknown(node.name)
+        return _known(grasps[node.name], node.op, node.bound)
+    if isinstance(node, OfType):
+        return _known(grasps.grasp_type, node.op, int(node.kind))
+    return _OPERATORS[node.op](grasps[node.name], node.word)
+
+
+def _known(column: Any, op: str, value: float) -> ColumnElement[bool]:
+    return and_(column.is_not(None), _OPERATORS[op](column, value))
+
+
+def _unknown(name: str) -> InputError:
+    return InputError(f"the index does not hold {name!r}, the shards do: `graspd grasps where` reads them")

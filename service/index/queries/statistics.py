@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from sqlalchemy import ColumnElement, Connection, Integer, cast, func, select
 
 from service.index.database import Database
-from service.index.dataset_tables import dataset_cells
 from service.index.filters import GraspFilter, Metric
 from service.index.queries.grasp_search import conditions, sql_conditions
-from service.index.tables import grasps, shards, tasks
+from service.index.tables import dataset_cells, grasps, shards, tasks
 
 
 @dataclass(frozen=True)

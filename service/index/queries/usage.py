@@ -28,9 +28,14 @@ class Usage:
         """
         day = func.substr(shards.c.created, 1, 10).label("day")
         made = select(
-            shards.c.charged, day, shards.c.device, _base(shards.c.count), _base(shards.c.valid), func.count(),
+            shards.c.charged,
+            day,
+            shards.c.device,
+            _base(shards.c.count),
+            _base(shards.c.valid),
+            func.count(),
             func.sum(shards.c.seconds),
-        ).where(shards.c.created >= since, shards.c.created < f"{until}T99")  # fmt: skip
+        ).where(shards.c.created >= since, shards.c.created < f"{until}T99")
         gone = select(spent).where(spent.c.day >= since, spent.c.day <= until)
         if not reach.everything:
             made = made.where(shards.c.charged == reach.project)

@@ -9,10 +9,9 @@ from typing import Final
 
 from sqlalchemy import func, make_url, select
 
-from service.index.condition import IndexCondition, look
 from service.index.index import Index
 from service.index.rebuild import differences
-from service.index.sample import compare, draw
+from service.index.sample import IndexCondition, compare, draw, look
 from service.index.tables import shards
 from service.model.errors import IndexDamaged, InputError, QueueUnavailable, UnavailableError
 from service.model.finding import Finding, bad, good, skipped, warning

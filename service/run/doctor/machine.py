@@ -33,9 +33,26 @@ _MEMORY_LOW: Final = 2 * _GIB
 _FILES_LOW: Final = 1024
 #: File systems of a network: locks of SQLite and sockets do not work there, or only at times.
 _NETWORK: Final = {
-    "nfs", "nfs4", "cifs", "smb3", "smbfs", "lustre", "gpfs", "beegfs", "ceph", "glusterfs", "9p", "afs", "wekafs",
-    "panfs", "orangefs", "fuse.sshfs", "fuse.s3fs", "fuse.glusterfs", "fuse.ceph-fuse",
-}  # fmt: skip
+    "nfs",
+    "nfs4",
+    "cifs",
+    "smb3",
+    "smbfs",
+    "lustre",
+    "gpfs",
+    "beegfs",
+    "ceph",
+    "glusterfs",
+    "9p",
+    "afs",
+    "wekafs",
+    "panfs",
+    "orangefs",
+    "fuse.sshfs",
+    "fuse.s3fs",
+    "fuse.glusterfs",
+    "fuse.ceph-fuse",
+}
 #: Extras whose libraries the running service imports; the others are tools.
 _ROOMS: Final = ("api", "worker", "embedded", "postgres", "otel", "usd", "arm", "view")
 
@@ -100,8 +117,9 @@ def data_folder(settings: Settings, *, mounts: Path = Path("/proc/self/mounts"))
         return bad(
             name, f"{there} cannot be written by user {os.getuid()}", f"chown it, or set GRASPD_DATA_DIR: {folder}"
         )
-    kept_here = [what for what, url in (("the index (SQLite)", settings.index_url), ("Redis", settings.redis_url))
-                 if url is None]  # fmt: skip
+    kept_here = [
+        what for what, url in (("the index (SQLite)", settings.index_url), ("Redis", settings.redis_url)) if url is None
+    ]
     kind = filesystem(there, mounts)
     if kind in _NETWORK and kept_here:
         return warning(
@@ -126,8 +144,11 @@ def filesystem(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
     except OSError:
         return ""
     # The last one mounted over the longest path is the one that is seen. Blanks are written as \040.
-    found = [(len(at.parts), number, kind) for number, (_, where, kind, *_) in enumerate(lines)
-             if folder.is_relative_to(at := Path(where.replace("\\040", " ")))]  # fmt: skip
+    found = [
+        (len(at.parts), number, kind)
+        for number, (_, where, kind, *_) in enumerate(lines)
+        if folder.is_relative_to(at := Path(where.replace("\\040", " ")))
+    ]
     return max(found)[2] if found else ""
 
 

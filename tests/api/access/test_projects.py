@@ -105,9 +105,15 @@ class World:
         assert tag.status_code == 200, tag.text
         add_worker(self.parts)
         self.said |= {
-            "job_id": job, "failed": failed, "waiting": waiting, "shard_id": shard, "views": views,
-            "digest": snapshot, "webhook": hook["id"], "webhook_secret": hook["secret"],
-        }  # fmt: skip
+            "job_id": job,
+            "failed": failed,
+            "waiting": waiting,
+            "shard_id": shard,
+            "views": views,
+            "digest": snapshot,
+            "webhook": hook["id"],
+            "webhook_secret": hook["secret"],
+        }
 
     def post(self, path: str, headers: Headers, **content: Any) -> Any:
         return self.client.post(path, headers=headers, **content)

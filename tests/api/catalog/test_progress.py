@@ -25,17 +25,38 @@ class Clock:
 
 def task(done: float) -> TaskView:
     return TaskView(
-        id="t", job_id="j", stage=Stage.SYNTHESIZE, batch=0, count=32, state=State.RUNNING, shard_id="s", attempt=1,
-        worker="w", device="cpu", done=done, total=100.0, message="phase 1", reason=None, seconds=None, finished=None,
-    )  # fmt: skip
+        id="t",
+        job_id="j",
+        stage=Stage.SYNTHESIZE,
+        batch=0,
+        count=32,
+        state=State.RUNNING,
+        shard_id="s",
+        attempt=1,
+        worker="w",
+        device="cpu",
+        done=done,
+        total=100.0,
+        message="phase 1",
+        reason=None,
+        seconds=None,
+        finished=None,
+    )
 
 
 def job(*stages: StageProgress, state: State = State.RUNNING) -> JobView:
     return JobView(
-        id="j", state=state, lane=Lane.INTERACTIVE, request=JobRequest(hand="allegro", object="mug", grasps=64),
-        hand_digest="", object_digest="", created="2026-01-01T00:00:00Z", finished=None, reason=None,
+        id="j",
+        state=state,
+        lane=Lane.INTERACTIVE,
+        request=JobRequest(hand="allegro", object="mug", grasps=64),
+        hand_digest="",
+        object_digest="",
+        created="2026-01-01T00:00:00Z",
+        finished=None,
+        reason=None,
         stages=list(stages),
-    )  # fmt: skip
+    )
 
 
 def test_the_rate_of_a_running_batch_is_what_it_did_since_it_was_first_seen() -> None:

@@ -32,9 +32,19 @@ def client_of(handler: Handler) -> Client:
 
 def job(state: State) -> Job:
     return Job(
-        id="a" * 32, state=state, hand="allegro", object="mug", method="fast_graspd", fidelity="standard",
-        requested=32, grasps=0, valid=0, progress=0.0, created="2026-01-01T00:00:00Z", stages=[],
-    )  # fmt: skip
+        id="a" * 32,
+        state=state,
+        hand="allegro",
+        object="mug",
+        method="fast_graspd",
+        fidelity="standard",
+        requested=32,
+        grasps=0,
+        valid=0,
+        progress=0.0,
+        created="2026-01-01T00:00:00Z",
+        stages=[],
+    )
 
 
 def event(name: str, state: State) -> bytes:
@@ -82,9 +92,19 @@ def test_lists_are_read_to_their_last_page() -> None:
         cursor = request.url.params.get("cursor")
         name = {None: "one", "2": "two"}[cursor]
         asset = {
-            "kind": "hand", "name": name, "digest": "d", "filename": "h.urdf", "files": [], "size_bytes": 1,
-            "created": "", "builtin": True, "verdict": "accept", "message": None, "repairs": [], "facts": {},
-        }  # fmt: skip
+            "kind": "hand",
+            "name": name,
+            "digest": "d",
+            "filename": "h.urdf",
+            "files": [],
+            "size_bytes": 1,
+            "created": "",
+            "builtin": True,
+            "verdict": "accept",
+            "message": None,
+            "repairs": [],
+            "facts": {},
+        }
         return httpx.Response(200, json={"items": [asset], "next": "2" if cursor is None else None})
 
     with client_of(handler) as client:
@@ -112,10 +132,26 @@ def test_a_download_that_breaks_leaves_no_file(tmp_path: Path) -> None:
         raise httpx.ReadError("connection lost", request=request)
 
     shard = Shard(
-        id="a", kind="base", stage=Stage.SYNTHESIZE, key="k", sha256="", size_bytes=1, count=1, hand="h", object="o",
-        hand_digest="", object_digest="", batch=0, seed=0, inputs=[], device="cpu", worker="w", seconds=1.0,
-        created="", file="/v1/shards/a/file",
-    )  # fmt: skip
+        id="a",
+        kind="base",
+        stage=Stage.SYNTHESIZE,
+        key="k",
+        sha256="",
+        size_bytes=1,
+        count=1,
+        hand="h",
+        object="o",
+        hand_digest="",
+        object_digest="",
+        batch=0,
+        seed=0,
+        inputs=[],
+        device="cpu",
+        worker="w",
+        seconds=1.0,
+        created="",
+        file="/v1/shards/a/file",
+    )
     with client_of(broken) as client, pytest.raises(UnavailableError, match="connection lost"):
         client.download(shard, tmp_path / "a.h5")
     assert list(tmp_path.iterdir()) == []
@@ -147,9 +183,19 @@ def test_a_quota_that_is_used_up_is_reported_at_once() -> None:
 
 
 @pytest.mark.parametrize(
-    "url", ["http://::1:8000", "http://[::1", "http://127.0\r.0.1:8000", "localhost:8000", "ftp://host", "http://", "",
-            "http://host:port", "http://me:pass/word@host:8000"]
-)  # fmt: skip
+    "url",
+    [
+        "http://::1:8000",
+        "http://[::1",
+        "http://127.0\r.0.1:8000",
+        "localhost:8000",
+        "ftp://host",
+        "http://",
+        "",
+        "http://host:port",
+        "http://me:pass/word@host:8000",
+    ],
+)
 def test_an_address_that_cannot_be_used_is_one_line_with_the_fix(url: str) -> None:
     with pytest.raises(InputError, match=r"address of the API .* cannot be used; give http://HOST:PORT") as refused:
         Client(url)
@@ -183,9 +229,10 @@ def test_names_in_addresses_are_quoted() -> None:
 
     client = client_of(answer)
     for ask in (
-        lambda: client.job("a b"), lambda: client.asset(AssetKind.OBJECT, "a/b?c#d"),
+        lambda: client.job("a b"),
+        lambda: client.asset(AssetKind.OBJECT, "a/b?c#d"),
         lambda: client.delete(path_of("tags", "good ones")),
-    ):  # fmt: skip
+    ):
         with pytest.raises(NotFoundError):
             ask()
     assert asked == [b"/v1/jobs/a%20b", b"/v1/objects/a%2Fb%3Fc%23d", b"/v1/tags/good%20ones"]

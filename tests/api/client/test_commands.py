@@ -305,11 +305,25 @@ def test_an_idempotency_key_binds_to_its_request(service: Supervisor) -> None:
 
 def test_the_keys_that_scripts_rely_on_are_there() -> None:
     job = JobDetail(
-        id="a" * 32, state=State.SUCCEEDED, hand="allegro", object="mug", method="fast_graspd", fidelity="standard",
-        requested=32, grasps=32, valid=20, progress=1.0, created="2026-01-01T00:00:00Z", stages=[],
-        request=JobRequest(hand="allegro", object="mug"), hand_digest="b" * 32, object_digest="c" * 32,
-        attempts=[], mean=MeanMetrics(epsilon=0.1), shards=[],
-    )  # fmt: skip
+        id="a" * 32,
+        state=State.SUCCEEDED,
+        hand="allegro",
+        object="mug",
+        method="fast_graspd",
+        fidelity="standard",
+        requested=32,
+        grasps=32,
+        valid=20,
+        progress=1.0,
+        created="2026-01-01T00:00:00Z",
+        stages=[],
+        request=JobRequest(hand="allegro", object="mug"),
+        hand_digest="b" * 32,
+        object_digest="c" * 32,
+        attempts=[],
+        mean=MeanMetrics(epsilon=0.1),
+        shards=[],
+    )
     summary = job_summary(job)
     assert {"job", "state", "grasps", "valid", "stages", "mean", "shards"} <= set(summary)
     assert set(summary["mean"]) == {"epsilon", "contact_area_cm2", "intersection_volume_cm3"}

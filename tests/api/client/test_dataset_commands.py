@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from api.client.client import Client
-from api.client.datasets import DatasetClient
 from service.model.states import State
 from service.run.supervisor import Supervisor
 from tests import waiting
@@ -20,7 +19,7 @@ CREATE = ("datasets", "create", "kitchen", "--hands", "allegro,barrett", "--obje
 def until(service: Supervisor, name: str, state: State) -> None:
     """Wait until the keeper has brought every cell to a state."""
     with Client(service.api_url) as client:
-        cells = DatasetClient(client).cells
+        cells = client.cells
         waiting.until(
             lambda: all(cell.planned and cell.state is state for cell in cells(name)), f"all of {name} is {state}"
         )
@@ -87,12 +86,14 @@ def test_a_set_goes_by_its_name_beside_the_folder_it_was_added_from(
     graspd: Shell, service: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with Client(service.api_url) as client:
-        DatasetClient(client).add_object_set("kit", ["mug", "block"])
+        client.add_object_set("kit", ["mug", "block"])
     (tmp_path / "kit").mkdir()
     (tmp_path / "kit" / "cup.stl").write_bytes(b"solid cup\nendsolid cup\n")
     monkeypatch.chdir(tmp_path)
-    cells = {place: graspd.json("datasets", "estimate", "--hands", "allegro", "--objects", place)["cells"]
-             for place in ("kit", "./kit")}  # fmt: skip
+    cells = {
+        place: graspd.json("datasets", "estimate", "--hands", "allegro", "--objects", place)["cells"]
+        for place in ("kit", "./kit")
+    }
     assert cells == {"kit": 2, "./kit": 1}
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from api.client.hand_files import upload_of
+from api.client.add_commands import upload_of
 from service.model.errors import InputError
 from service.store.assets import unpack
 

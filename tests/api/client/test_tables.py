@@ -21,22 +21,42 @@ NAME = "[red]mug[/] :mug: " + "a-very-long-name-of-an-object-that-somebody-gave-
 ID = "0123456789ab"
 CREATED = "2026-11-26T03:14:11.123456Z"
 JOB = SimpleNamespace(
-    id=ID + "0" * 20, state=State.SUCCEEDED, hand=NAME, object=NAME, progress=1.0, valid=100_000, grasps=100_000,
-    requested=100_000, standing="valid", created=CREATED,
-)  # fmt: skip
+    id=ID + "0" * 20,
+    state=State.SUCCEEDED,
+    hand=NAME,
+    object=NAME,
+    progress=1.0,
+    valid=100_000,
+    grasps=100_000,
+    requested=100_000,
+    standing="valid",
+    created=CREATED,
+)
 DATASET = SimpleNamespace(
-    name=NAME, state=State.SUCCEEDED, cells=1000, progress=1.0, counted=10**6, asked=10**6, size_bytes=10**9 + 1,
-    created=CREATED, options=JobOptions(),
-)  # fmt: skip
+    name=NAME,
+    state=State.SUCCEEDED,
+    cells=1000,
+    progress=1.0,
+    counted=10**6,
+    asked=10**6,
+    size_bytes=10**9 + 1,
+    created=CREATED,
+    options=JobOptions(),
+)
 ASSET = SimpleNamespace(
     name=NAME, filename=NAME, size_bytes=10**6, builtin=False, verdict="ok", facts={}, digest=ID + "0" * 52
-)  # fmt: skip
+)
 TAG = {"name": NAME, "grasps": 10**6, "changed": CREATED}
 WEBHOOK = {"id": ID, "url": "https://example.org/" + NAME, "states": ["failed", "succeeded"], "created": CREATED}
 DELIVERY = {
-    "kind": "job", "subject": ID, "ended": "succeeded", "state": "delivered", "attempts": 3, "tried": CREATED,
+    "kind": "job",
+    "subject": ID,
+    "ended": "succeeded",
+    "state": "delivered",
+    "attempts": 3,
+    "tried": CREATED,
     "detail": NAME,
-}  # fmt: skip
+}
 
 
 class Service:
@@ -66,7 +86,6 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
 
     for module in ("commands", "dataset_commands", "tag_commands", "webhook_commands"):
         monkeypatch.setattr(f"api.client.{module}.open_client", opened)
-    monkeypatch.setattr("api.client.dataset_commands.DatasetClient", lambda client: client)
 
     def run(*arguments: str) -> list[str]:
         done = CliRunner().invoke(build(), arguments, env={"COLUMNS": "80"})

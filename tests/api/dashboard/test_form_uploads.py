@@ -90,8 +90,9 @@ def test_a_refused_file_is_checked_again_in_other_units_without_being_sent_again
     assert jobs(parts) == ["part"]
     assert meant.digest != first.digest
     assert json.loads(load_asset_files(parts.store, AssetKind.OBJECT, meant.digest)["asset.json"]) == {
-        "file": "part.stl", "units": "mm",
-    }  # fmt: skip
+        "file": "part.stl",
+        "units": "mm",
+    }
 
 
 def test_units_stay_chosen_on_a_page_in_error(http: TestClient, parts: Parts) -> None:
@@ -143,9 +144,11 @@ def test_what_a_form_holds_must_be_there(http: TestClient, parts: Parts) -> None
 
 #: What the check of a mesh in millimetres tells beside its message.
 TOO_LARGE = {
-    "problem": "the mesh is 60 m long", "units_suggested": ["mm", "cm"], "lengths_m": {"mm": 0.06, "cm": 0.6},
+    "problem": "the mesh is 60 m long",
+    "units_suggested": ["mm", "cm"],
+    "lengths_m": {"mm": 0.06, "cm": 0.6},
     "options_suggested": [{"scale_to": None}],
-}  # fmt: skip
+}
 
 
 def fixes_of(page: str) -> dict[str, str]:
@@ -161,8 +164,10 @@ def test_a_refusal_is_told_in_words_with_buttons(http: TestClient, parts: Parts)
     for page in (whole, part):
         assert "the mesh is 60 m long" in page and "a thing of 60 m" not in page
         assert list(fixes_of(page)) == [
-            "Read it as millimetres: 60 mm long", "Read it as centimetres: 600 mm long", "Scale it to this size",
-        ]  # fmt: skip
+            "Read it as millimetres: 60 mm long",
+            "Read it as centimetres: 600 mm long",
+            "Scale it to this size",
+        ]
     assert "<html" not in part
 
 
@@ -183,8 +188,9 @@ def test_the_button_of_a_fix_checks_the_file_again_and_submits_nothing(
     assert fields_of(again.text)["object"] == "part"
     meant = parts.index.assets.get(AssetKind.OBJECT, "part")
     assert json.loads(load_asset_files(parts.store, AssetKind.OBJECT, meant.digest)["asset.json"]) == {
-        "file": "part.stl", **said,
-    }  # fmt: skip
+        "file": "part.stl",
+        **said,
+    }
 
 
 @pytest.mark.parametrize("typed", ["", "wide"])

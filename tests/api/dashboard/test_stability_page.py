@@ -24,11 +24,19 @@ def a_map(name: str = "stiffness", **changes: object) -> StabilityMap:
         for k, outcome in zip((2, 3, 4), outcomes, strict=True)
     ]
     fields = {
-        "name": name, "title": f"A map of {name}", "x": "stiffness [N/m]", "y": "time step [s]", "measure": "energy",
-        "bounds": "weak: 1.02", "cells": cells, "shows": "hands sink in", "guard": "`direct` has none",
-        "guard_test": "tests/test_it.py::test_it", "lines": {"penalty": [(100.0, 0.01), (10000.0, 1e-4)]},
+        "name": name,
+        "title": f"A map of {name}",
+        "x": "stiffness [N/m]",
+        "y": "time step [s]",
+        "measure": "energy",
+        "bounds": "weak: 1.02",
+        "cells": cells,
+        "shows": "hands sink in",
+        "guard": "`direct` has none",
+        "guard_test": "tests/test_it.py::test_it",
+        "lines": {"penalty": [(100.0, 0.01), (10000.0, 1e-4)]},
         "reach": "the soft ones",
-    }  # fmt: skip
+    }
     return StabilityMap(**{**fields, **changes})  # type: ignore[arg-type]
 
 
@@ -71,8 +79,9 @@ def test_a_cell_that_was_not_measured_is_left_open() -> None:
 def test_the_bar_of_what_is_within_reach_is_whole() -> None:
     shares = draw(a_map()).reached
     assert [(share.outcome, share.count, share.x, share.width) for share in shares] == [
-        ("good", 2, 0.0, 50.0), ("weak", 2, 50.0, 50.0),
-    ]  # fmt: skip
+        ("good", 2, 0.0, 50.0),
+        ("weak", 2, 50.0, 50.0),
+    ]
 
 
 def test_the_page_shows_the_maps_that_were_published_last(http: TestClient, parts: Parts) -> None:
@@ -85,9 +94,18 @@ def test_the_page_shows_the_maps_that_were_published_last(http: TestClient, part
 
 @pytest.mark.parametrize(
     "words",
-    ["energy", "weak: 1.02", "hands sink in", "direct has none", "tests/test_it.py::test_it", "the soft ones",
-     "mesh inside out (fine)", "time step [s] 0.01: broken; note 4", "graspd stability"],
-)  # fmt: skip
+    [
+        "energy",
+        "weak: 1.02",
+        "hands sink in",
+        "direct has none",
+        "tests/test_it.py::test_it",
+        "the soft ones",
+        "mesh inside out (fine)",
+        "time step [s] 0.01: broken; note 4",
+        "graspd stability",
+    ],
+)
 def test_beneath_a_map_stands_what_it_means(http: TestClient, parts: Parts, words: str) -> None:
     publish(parts.store, "stability", a_record())
     assert words in http.get("/stability").text

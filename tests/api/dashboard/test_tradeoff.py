@@ -69,8 +69,9 @@ def test_speeds_in_scenes_are_what_was_lifted_over_the_seconds_of_all_pairs() ->
     runs = [lifted("draft", 16), lifted("draft", 0, object="block"), lifted("draft", 4, way=FILTERED)]
     drawn = draw(Measured.model_validate(scenes_of("table", *runs)), axis="lift")
     assert [(point.method, point.speed, point.accuracy) for point in drawn.points] == [
-        ("fast_graspd, filtered", 1.0, pytest.approx(20.0)), ("fast_graspd", 2.0, pytest.approx(40.0)),
-    ]  # fmt: skip
+        ("fast_graspd, filtered", 1.0, pytest.approx(20.0)),
+        ("fast_graspd", 2.0, pytest.approx(40.0)),
+    ]
     assert drawn.nothing == []
 
 

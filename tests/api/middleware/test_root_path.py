@@ -114,9 +114,14 @@ def test_what_is_no_address_of_this_host_stays() -> None:
 
 @pytest.mark.parametrize(
     ("where", "expected"),
-    [("/x?a=/b#c", "/graspd/x?a=/b#c"), ("http://me/x", "http://me/graspd/x"), ("http://you/x", "http://you/x"),
-     ("x", "x"), ("?x", "?x")],
-)  # fmt: skip
+    [
+        ("/x?a=/b#c", "/graspd/x?a=/b#c"),
+        ("http://me/x", "http://me/graspd/x"),
+        ("http://you/x", "http://you/x"),
+        ("x", "x"),
+        ("?x", "?x"),
+    ],
+)
 def test_a_redirect_to_this_host_gets_the_prefix(where: str, expected: str) -> None:
     assert RootPath(create_app, prefix=PREFIX)._below(where, "me") == expected  # type: ignore[arg-type]
 

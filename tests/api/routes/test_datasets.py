@@ -82,9 +82,11 @@ def test_with_auto_cells_in_scenes_are_chosen_by_the_chart_of_such_scenes(http: 
     assert http.post("/v1/datasets", json=wanted).status_code == 202
     cells = http.get("/v1/datasets/kitchen/cells").json()["items"]
     assert [(cell["hand"], cell["object"], cell["fidelity"], cell["choice"]["measured_on"]) for cell in cells] == [
-        ("allegro", "mug", "standard", "hand and object"), ("allegro", "block", "draft", "hand"),
-        ("barrett", "mug", "standard", "hand"), ("barrett", "block", "standard", "hand"),
-    ]  # fmt: skip
+        ("allegro", "mug", "standard", "hand and object"),
+        ("allegro", "block", "draft", "hand"),
+        ("barrett", "mug", "standard", "hand"),
+        ("barrett", "block", "standard", "hand"),
+    ]
     assert {cell["choice"]["chart"] for cell in cells} == {key}
 
 

@@ -77,7 +77,7 @@ def test_a_name_may_be_given_and_one_that_is_taken_is_refused(http: TestClient) 
         ({"name": "../up", "closing": {}}, "name"),
         ({"root": "palm"}, "root"),
     ],
-)  # fmt: skip
+)
 def test_what_a_hand_does_not_have_is_refused_and_leaves_nothing(
     http: TestClient, body: dict[str, Any], says: str
 ) -> None:
@@ -148,10 +148,14 @@ def test_the_page_has_a_field_for_all_that_was_guessed_and_works_without_scripts
 @pytest.mark.parametrize(
     ("field", "value", "says"),
     [
-        ("approach_x", "far", "no number"), ("closing.0", "7", "must be -1, 0 or 1"), ("palm_link", "<b>", "&lt;b&gt;"),
-        ("name", "a b", "name"), ("preshape.1", "9", "outside its limits"), ("fingertip", "elbow", "elbow"),
+        ("approach_x", "far", "no number"),
+        ("closing.0", "7", "must be -1, 0 or 1"),
+        ("palm_link", "<b>", "&lt;b&gt;"),
+        ("name", "a b", "name"),
+        ("preshape.1", "9", "outside its limits"),
+        ("fingertip", "elbow", "elbow"),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_form_is_shown_again_with_what_is_wrong(http: TestClient, field: str, value: str, says: str) -> None:
     answer = http.post("/hands/barrett", data={"palm_link": "palm", "fingertip": "finger_1_distal_link", field: value})
     assert answer.status_code == 422

@@ -128,9 +128,16 @@ def test_a_job_that_the_network_does_not_fit_is_refused_in_a_line(
     upload(http, of_hand(http))
     for path, body in (
         ("/v1/jobs", JOB | changes),
-        ("/v1/datasets", {**{k: v for k, v in (JOB | changes).items() if k not in ("hand", "object")},
-                          "name": "d", "hands": [(JOB | changes)["hand"]], "objects": ["mug"]}),
-    ):  # fmt: skip
+        (
+            "/v1/datasets",
+            {
+                **{k: v for k, v in (JOB | changes).items() if k not in ("hand", "object")},
+                "name": "d",
+                "hands": [(JOB | changes)["hand"]],
+                "objects": ["mug"],
+            },
+        ),
+    ):
         answer = http.post(path, json=body)
         assert answer.status_code == status, answer.text
         assert words in json.dumps(answer.json(), ensure_ascii=False) and "\n" not in answer.json()["detail"]

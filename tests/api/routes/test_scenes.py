@@ -43,12 +43,34 @@ def test_the_document_offers_scenes_and_keeps_the_defaults(http: TestClient) -> 
     fields = http.get("/openapi.json").json()["components"]["schemas"]["JobRequest"]["properties"]
     defaults = {name: field["default"] for name, field in fields.items() if "default" in field}
     assert defaults == {
-        "grasps": 32, "method": "fast_graspd", "fidelity": "standard", "seed": 0, "scene": "free", "faces": "drawn",
-        "neighbours": [], "touch": 0.0, "scenes": 0, "views": 0, "stereo": False, "width": 320, "height": 240,
-        "channels": [], "friction": 1.0, "want": "valid", "budget": 4.0, "referee": "certificate",
-        "audits": 8, "robustness": 0, "target": "", "min_distance": 0.005, "robust": 0.0, "robust_models": 0,
-        "payload": False, "min_payload": 0.0, "shake": False,
-    }  # fmt: skip
+        "grasps": 32,
+        "method": "fast_graspd",
+        "fidelity": "standard",
+        "seed": 0,
+        "scene": "free",
+        "faces": "drawn",
+        "neighbours": [],
+        "touch": 0.0,
+        "scenes": 0,
+        "views": 0,
+        "stereo": False,
+        "width": 320,
+        "height": 240,
+        "channels": [],
+        "friction": 1.0,
+        "want": "valid",
+        "budget": 4.0,
+        "referee": "certificate",
+        "audits": 8,
+        "robustness": 0,
+        "target": "",
+        "min_distance": 0.005,
+        "robust": 0.0,
+        "robust_models": 0,
+        "payload": False,
+        "min_payload": 0.0,
+        "shake": False,
+    }
 
 
 @pytest.mark.parametrize(

@@ -164,10 +164,13 @@ def test_a_project_has_tags_of_its_own_and_a_key_changes_only_what_is_its(parts:
     people = {
         name: {"Authorization": f"Bearer {keys.add(name, scope, project=project)}"}
         for name, scope, project in [
-            ("old", Scope.SUBMIT, ""), ("new", Scope.SUBMIT, ""), ("eve", Scope.READ, ""), ("root", Scope.ADMIN, ""),
+            ("old", Scope.SUBMIT, ""),
+            ("new", Scope.SUBMIT, ""),
+            ("eve", Scope.READ, ""),
+            ("root", Scope.ADMIN, ""),
             ("bob", Scope.SUBMIT, "blue"),
         ]
-    }  # fmt: skip
+    }
     body = {"name": "good", "grasps": named(made.shard_id, 1)}
     with TestClient(create_app(parts.settings, parts), base_url="https://graspd.example") as http:
 

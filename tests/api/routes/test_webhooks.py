@@ -210,8 +210,13 @@ def test_a_project_is_told_of_its_own_ends_alone(
 
 def hooks(parts: Parts, count: int, project: str, host: str) -> None:
     for number in range(count):
-        hook = Webhook(id=f"{project}{number:031}", url=f"https://{host}/{number}", states=("succeeded",),
-                       created=f"2026-01-01T00:00:{number % 60:02}Z", project=project)  # fmt: skip
+        hook = Webhook(
+            id=f"{project}{number:031}",
+            url=f"https://{host}/{number}",
+            states=("succeeded",),
+            created=f"2026-01-01T00:00:{number % 60:02}Z",
+            project=project,
+        )
         parts.index.outgoing.add(hook)
 
 

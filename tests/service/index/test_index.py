@@ -288,9 +288,15 @@ def _submit_as(parts: Parts, key: str, seed: int) -> None:
     """A bulk job of 20 batches, none of them in the queue yet."""
     hand, obj = (parts.index.assets.get(kind, name).digest for kind, name in _PAIR)
     record = JobRecord(
-        id=f"{seed:032x}", request=request(grasps=640, seed=seed), revisions=dict(STAGE_REVISIONS), hand_digest=hand,
-        object_digest=obj, lane=Lane.BULK, created=timestamp(), origin=Origin(key=key),
-    )  # fmt: skip
+        id=f"{seed:032x}",
+        request=request(grasps=640, seed=seed),
+        revisions=dict(STAGE_REVISIONS),
+        hand_digest=hand,
+        object_digest=obj,
+        lane=Lane.BULK,
+        created=timestamp(),
+        origin=Origin(key=key),
+    )
     put_record(parts.store, names.job_record(record.id), record)
     parts.index.write.add_job(record)
 
@@ -483,9 +489,17 @@ def test_text_that_a_database_would_refuse_stops_nothing(parts: Parts) -> None:
     parts.index.live.set_progress({task.id: (1.0, 2.0, "half\0way")})
     assert parts.index.jobs.task(task.id).message == "halfway"
     attempt = AttemptRecord(
-        task_id=task.id, job_id=job.id, stage=task.stage, number=1, kind="K" * 100, reason="a\0b", trace="\0",
-        worker=long, ended=timestamp(), last=True,
-    )  # fmt: skip
+        task_id=task.id,
+        job_id=job.id,
+        stage=task.stage,
+        number=1,
+        kind="K" * 100,
+        reason="a\0b",
+        trace="\0",
+        worker=long,
+        ended=timestamp(),
+        last=True,
+    )
     put_record(parts.store, names.attempt(task.id, 1), attempt)
     parts.index.write.add_attempt(attempt)
     assert parts.index.jobs.get(job.id).reason == "ab"

@@ -24,9 +24,15 @@ def enter(parts: Parts, project: str, seed: int, *, key: str = "", batches: int 
     """A bulk job of a project, none of it in the queue; `where` is the first digit of its id."""
     hand, obj = (parts.index.assets.get(kind, name).digest for kind, name in _PAIR)
     record = JobRecord(
-        id=f"{where:x}{seed:031x}", request=request(grasps=32 * batches, seed=seed), hand_digest=hand,
-        object_digest=obj, lane=Lane.BULK, created=timestamp(), origin=Origin(key=key or project), project=project,
-    )  # fmt: skip
+        id=f"{where:x}{seed:031x}",
+        request=request(grasps=32 * batches, seed=seed),
+        hand_digest=hand,
+        object_digest=obj,
+        lane=Lane.BULK,
+        created=timestamp(),
+        origin=Origin(key=key or project),
+        project=project,
+    )
     put_record(parts.store, names.job_record(record.id), record)
     parts.index.write.add_job(record)
     return record

@@ -49,9 +49,13 @@ def enter(parts: Parts, place: int, seed: int, *, batches: int = 1) -> JobRecord
         for kind, name in ((AssetKind.HAND, "gripper"), (AssetKind.OBJECT, "ball"))
     )
     record = JobRecord(
-        id=f"{place:x}{seed:031x}", request=request(grasps=32 * batches, seed=seed), hand_digest=hand,
-        object_digest=obj, lane=Lane.BULK, created=timestamp(),
-    )  # fmt: skip
+        id=f"{place:x}{seed:031x}",
+        request=request(grasps=32 * batches, seed=seed),
+        hand_digest=hand,
+        object_digest=obj,
+        lane=Lane.BULK,
+        created=timestamp(),
+    )
     put_record(parts.store, names.job_record(record.id), record)
     parts.index.write.add_job(record)
     return record

@@ -7,8 +7,8 @@ import logging
 import pytest
 from pydantic import ValidationError
 
-from service.index.condition import look
 from service.index.index import Index
+from service.index.sample import look
 from service.logs import JsonLines, _TextLines
 from service.model.errors import GraspdError, InputError
 from service.model.redaction import without_secrets

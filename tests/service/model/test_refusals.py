@@ -41,8 +41,10 @@ class Kind(BaseModel):
         ({"share": 1}, "share: must be less than 1"),
         ({"share": "half"}, "share: must be a number"),
         ({"on": "perhaps"}, "on: must be true or false"),
-        ({"name": "a/b"}, "name: must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes "
-         "and underscores"),
+        (
+            {"name": "a/b"},
+            "name: must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores",
+        ),
         ({"fidelity": "standart"}, "fidelity: must be one of draft, standard, fine; did you mean standard?"),
         ({"fidelity": 3}, "fidelity: must be one of draft, standard, fine"),
         ({"text": "long"}, "text: must have at most 3 characters"),
@@ -50,7 +52,7 @@ class Kind(BaseModel):
         ({"names": ["a", "b"]}, "names: must have at most 1 item"),
         ({"knob": 1}, "knob: is not known"),
     ],
-)  # fmt: skip
+)
 def test_the_first_mistake_is_one_line(given: dict[str, Any], line: str) -> None:
     with pytest.raises(ValidationError) as refused:
         Kind.model_validate(given)

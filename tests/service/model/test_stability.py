@@ -19,9 +19,22 @@ def a_map(*cells: MapCell) -> StabilityMap:
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0.0, "0"), (0.333, "0.33"), (1.05, "1.1"), (3.0, "3.0"), (43.21, "43"), (999.0, "999"), (3.4e3, "3k"),
-     (5.2e5, "520k"), (7.4e6, "7e6"), (3.3e-5, "3e-5"), (-0.25, "-0.25"), (math.inf, "∞"), (math.nan, "")],
-)  # fmt: skip
+    [
+        (0.0, "0"),
+        (0.333, "0.33"),
+        (1.05, "1.1"),
+        (3.0, "3.0"),
+        (43.21, "43"),
+        (999.0, "999"),
+        (3.4e3, "3k"),
+        (5.2e5, "520k"),
+        (7.4e6, "7e6"),
+        (3.3e-5, "3e-5"),
+        (-0.25, "-0.25"),
+        (math.inf, "∞"),
+        (math.nan, ""),
+    ],
+)
 def test_a_number_on_a_cell_is_short(value: float, text: str) -> None:
     assert short(value) == text
 
@@ -33,20 +46,32 @@ def test_no_number_on_a_cell_has_more_than_five_letters(value: float) -> None:
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(1e-5, "1e-5"), (3e-4, "3e-4"), (0.001, "0.001"), (30.0, "30"), (1e5, "1e5"), (12345.0, "12345"), (0.0, "0"),
-     ("draft", "draft")],
-)  # fmt: skip
+    [
+        (1e-5, "1e-5"),
+        (3e-4, "3e-4"),
+        (0.001, "0.001"),
+        (30.0, "30"),
+        (1e5, "1e5"),
+        (12345.0, "12345"),
+        (0.0, "0"),
+        ("draft", "draft"),
+    ],
+)
 def test_a_tick_is_short_and_says_all(value: float | str, text: str) -> None:
     assert tick(value) == text
 
 
 def test_what_still_breaks_are_the_broken_cells_that_a_job_can_come_to() -> None:
     one = a_map(
-        MapCell("a", 1.0, "draft", 0.0, "broken", reached=True), MapCell("a", 1.0, "fine", 0.0, "broken", reached=True),
-        MapCell("a", 3.0, "draft", 0.0, "broken", reached=True), MapCell("a", 3.0, "fine", 0.0, "broken", reached=True),
-        MapCell("a", 9.0, "fine", 0.0, "broken", reached=True), MapCell("a", 9.0, "draft", 0.9, "good", reached=True),
-        MapCell("b", 1.0, "draft", 0.0, "broken"), MapCell("b", 2.0, "draft", 0.0, "refused", reached=True),
-    )  # fmt: skip
+        MapCell("a", 1.0, "draft", 0.0, "broken", reached=True),
+        MapCell("a", 1.0, "fine", 0.0, "broken", reached=True),
+        MapCell("a", 3.0, "draft", 0.0, "broken", reached=True),
+        MapCell("a", 3.0, "fine", 0.0, "broken", reached=True),
+        MapCell("a", 9.0, "fine", 0.0, "broken", reached=True),
+        MapCell("a", 9.0, "draft", 0.9, "good", reached=True),
+        MapCell("b", 1.0, "draft", 0.0, "broken"),
+        MapCell("b", 2.0, "draft", 0.0, "refused", reached=True),
+    )
     assert one.still_breaks() == ["a 1, 3 (draft, fine); 9 (fine)"]
     assert counts(one.reached()) == {"good": 1, "weak": 0, "broken": 5, "refused": 1}
 

@@ -74,9 +74,7 @@ def write(folder: Path) -> Path:
         base |= {f"{posture}/hand_pose": poses(), f"{posture}/joint_positions": draw.normal(size=(GRASPS, JOINTS))}
     for name in ("contact_area_cm2", "epsilon", "wrench_volume"):
         base[f"quality/{name}"] = draw.random((GRASPS, 2))
-    for name in (
-        "intersection_volume_cm3", "penetration_depth_mm", "self_penetration_depth_mm", "stability_loss",
-    ):  # fmt: skip
+    for name in ("intersection_volume_cm3", "penetration_depth_mm", "self_penetration_depth_mm", "stability_loss"):
         base[f"quality/{name}"] = one
     base["quality/contact_links"] = one
     base |= {"scene/object_pose": POSES, "grasp/scene_index": SCENE_OF_GRASP, "quality/lift_hard": VALID}

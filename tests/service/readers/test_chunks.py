@@ -36,11 +36,13 @@ def test_every_row_of_every_column_is_what_h5py_reads(views: Path) -> None:
 def test_what_is_packed_in_another_way_is_read_by_the_library(tmp_path: Path) -> None:
     values = np.arange(2 * 6 * 5, dtype=np.float32).reshape(2, 6, 5)
     ways = {
-        "whole": {}, "two": {"chunks": (2, 6, 5), "compression": "gzip"},
+        "whole": {},
+        "two": {"chunks": (2, 6, 5), "compression": "gzip"},
         "lzf": {"chunks": (1, 6, 5), "compression": "lzf"},
-        "bare": {"chunks": (1, 6, 5)}, "plain": {"chunks": (1, 6, 5), "compression": "gzip"},
+        "bare": {"chunks": (1, 6, 5)},
+        "plain": {"chunks": (1, 6, 5), "compression": "gzip"},
         "summed": {"chunks": (1, 6, 5), "compression": "gzip", "fletcher32": True},
-    }  # fmt: skip
+    }
     with h5py.File(tmp_path / "other.h5", "w") as file:
         for name, options in ways.items():
             file.create_dataset(name, data=values, **options)

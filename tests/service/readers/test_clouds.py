@@ -11,8 +11,7 @@ import pytest
 from service.model import transforms
 from service.model.errors import InputError
 from service.readers import Pictures, open_shards
-from service.readers.clouds import Clouds
-from service.readers.graspness import graspness
+from service.readers.clouds import Clouds, graspness
 from service.store.shards import read_shard
 from tests.service.readers import box_scenes
 from tests.service.readers.box_scenes import EYES, POSES, SCENE_OF_GRASP, SIZE, VALID
@@ -107,8 +106,10 @@ def test_labels_stand_in_each_frame_and_are_the_valid_grasps_of_the_scene(pictur
             own = np.asarray(base[f"{posture}/hand_pose"], float)[rows]
             in_table = transforms.pose_to_matrix(POSES[sample["scene"]]) @ transforms.pose_to_matrix(own)
             np.testing.assert_array_equal(sample[f"{posture}/hand_pose_object"], own)
-            found = {frame: transforms.pose_to_matrix(sample[f"{posture}/hand_pose{frame}"])
-                     for frame in ("_table", "_camera", "")}  # fmt: skip
+            found = {
+                frame: transforms.pose_to_matrix(sample[f"{posture}/hand_pose{frame}"])
+                for frame in ("_table", "_camera", "")
+            }
             np.testing.assert_allclose(found["_table"], in_table, atol=1e-12)
             np.testing.assert_allclose(found["_camera"], sample["camera/extrinsics"] @ in_table, atol=1e-12)
             np.testing.assert_array_equal(found[""], found["_camera"])
@@ -189,9 +190,17 @@ def test_graspness_of_a_cloud_is_that_of_its_true_points(pictures: Pictures) -> 
 
 
 @pytest.mark.parametrize(
-    "options", [{"noise": "lidar"}, {"frame": "moon"}, {"fuse": True, "frame": "camera"}, {"postures": ["rest"]},
-                {"points": 0}, {"voxel_m": -1.0}, {"seed": -1}]
-)  # fmt: skip
+    "options",
+    [
+        {"noise": "lidar"},
+        {"frame": "moon"},
+        {"fuse": True, "frame": "camera"},
+        {"postures": ["rest"]},
+        {"points": 0},
+        {"voxel_m": -1.0},
+        {"seed": -1},
+    ],
+)
 def test_what_no_cloud_can_be_is_refused(pictures: Pictures, options: dict[str, Any]) -> None:
     with pytest.raises(InputError):
         pictures.clouds(**options)

@@ -178,13 +178,28 @@ def _put_snapshot(parts: Parts, dataset: str, shards: Shards, *, created: str) -
     digest = hashlib.sha256(created.encode()).hexdigest()[:32]
     listed = tuple(
         SnapshotShard(
-            id=file.id, kind=file.kind, key=file.key, sha256=file.sha256, size_bytes=1, count=1, valid=1,
-            hand=file.hand, object=file.object, batch=file.batch,
+            id=file.id,
+            kind=file.kind,
+            key=file.key,
+            sha256=file.sha256,
+            size_bytes=1,
+            count=1,
+            valid=1,
+            hand=file.hand,
+            object=file.object,
+            batch=file.batch,
         )
         for file in shards
-    )  # fmt: skip
+    )
     taken = Snapshot(
-        dataset=dataset, dataset_digest="a" * 32, digest=digest, complete=True, grasps=1, valid=1, size_bytes=1,
-        created=created, shards=listed,
-    )  # fmt: skip
+        dataset=dataset,
+        dataset_digest="a" * 32,
+        digest=digest,
+        complete=True,
+        grasps=1,
+        valid=1,
+        size_bytes=1,
+        created=created,
+        shards=listed,
+    )
     put_record(parts.store, dataset_snapshot(dataset, digest), taken)

@@ -65,9 +65,18 @@ def test_the_record_of_a_service_that_is_gone_is_not_believed(folder: Path) -> N
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "[]", "3", '{"api_url": 5, "pid": 1}', '{"api_url": "file:///x", "pid": 1}',
-             '{"api_url": "http://x", "pid": "1"}', '{"api_url": "http://x", "pid": ' + "9" * 40 + "}"]
-)  # fmt: skip
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        "3",
+        '{"api_url": 5, "pid": 1}',
+        '{"api_url": "file:///x", "pid": 1}',
+        '{"api_url": "http://x", "pid": "1"}',
+        '{"api_url": "http://x", "pid": ' + "9" * 40 + "}",
+    ],
+)
 def test_a_record_that_makes_no_sense_is_no_record(folder: Path, text: str) -> None:
     (folder / "api.json").write_text(text)
     assert recorded_address(folder) is None

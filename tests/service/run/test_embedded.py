@@ -126,9 +126,15 @@ def cut(file: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "harm"),
-    [("*.base.rdb", make_newer), ("*.base.rdb", scribble), ("*.base.rdb", cut), ("*.base.rdb", Path.unlink),
-     ("*.incr.aof", scribble), ("*.manifest", scribble)],
-)  # fmt: skip
+    [
+        ("*.base.rdb", make_newer),
+        ("*.base.rdb", scribble),
+        ("*.base.rdb", cut),
+        ("*.base.rdb", Path.unlink),
+        ("*.incr.aof", scribble),
+        ("*.manifest", scribble),
+    ],
+)
 def test_a_log_of_writes_that_redis_cannot_read_gives_way_to_an_empty_one(
     tmp_path: Path, name: str, harm: Callable[[Path], None], caplog: pytest.LogCaptureFixture
 ) -> None:

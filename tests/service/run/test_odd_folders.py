@@ -15,9 +15,21 @@ from service.store.store import open_store
 from tests.waiting import PATIENCE_S
 
 NAMES = [
-    "100%", "a%20b", "a#b", "what?", "a b", "größe ÅΩ", "a\nb", "q'u\"o\\te", "a&b=c;d", "[1]", "a:b@c", "{x}", "~",
+    "100%",
+    "a%20b",
+    "a#b",
+    "what?",
+    "a b",
+    "größe ÅΩ",
+    "a\nb",
+    "q'u\"o\\te",
+    "a&b=c;d",
+    "[1]",
+    "a:b@c",
+    "{x}",
+    "~",
     "$HOME",
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("name", NAMES)

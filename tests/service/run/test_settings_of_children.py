@@ -20,7 +20,7 @@ VALUES: dict[str, Any] = {
     **dict.fromkeys(_TEXTS, _ODD),
     **dict.fromkeys(_SECRETS, SecretStr(f"{_ODD} and at least sixteen")),
     **{name: Path(f"/srv/{_ODD}/{name}") for name in _PATHS},
-    "proxy_groups": {"lab, the \"first\"": "vision:submit", "ü": ":admin", "*": ":read"},
+    "proxy_groups": {'lab, the "first"': "vision:submit", "ü": ":admin", "*": ":read"},
     "metrics_need_key": False,
     "log_level": "DEBUG",
     "log_format": "json",
@@ -30,7 +30,7 @@ VALUES: dict[str, Any] = {
     "api_root_path": "/graspd",
     "lease_s": 4 / 3,
     "quota_jobs_per_day": 7,
-}  # fmt: skip
+}
 
 
 def value_of(name: str) -> Any:

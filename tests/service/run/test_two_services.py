@@ -64,8 +64,9 @@ def test_a_command_of_a_second_service_on_a_store_is_refused(
     done = run(command, tmp_path / "second", GRASPD_STORE_URL=first.store.url, GRASPD_REDIS_URL=beside)
     said = done.stderr.splitlines()[-1]
     assert (done.returncode, said.partition(" graspd service")[0]) == (
-        1, f"graspd: the store {first.store.url} belongs to another"
-    )  # fmt: skip
+        1,
+        f"graspd: the store {first.store.url} belongs to another",
+    )
 
 
 def test_the_doctor_says_so(first: Parts, redis_server: str, tmp_path: Path) -> None:

@@ -19,8 +19,12 @@ def test_a_flat_folder_gives_one_object_a_mesh() -> None:
 
 
 def test_a_folder_an_object_takes_the_best_mesh_of_each() -> None:
-    found = names("ycb/003_cracker_box/google_16k/nontextured.stl", "ycb/003_cracker_box/google_16k/textured.obj",
-                  "ycb/025_mug/google_16k/textured.obj", "ycb/025_mug/google_16k/textured.mtl")  # fmt: skip
+    found = names(
+        "ycb/003_cracker_box/google_16k/nontextured.stl",
+        "ycb/003_cracker_box/google_16k/textured.obj",
+        "ycb/025_mug/google_16k/textured.obj",
+        "ycb/025_mug/google_16k/textured.mtl",
+    )
     assert found == {"003_cracker_box": ["nontextured.stl"], "025_mug": ["textured.obj"]}
 
 

@@ -30,8 +30,9 @@ def test_a_verdict_counts_only_where_there_is_one(verdict: int, valid: list[bool
 
 def test_a_grasp_that_was_judged_and_dropped_is_neither() -> None:
     columns = {
-        "quality/valid": np.zeros(1, np.uint8), "quality/sound": np.ones(1, np.uint8),
+        "quality/valid": np.zeros(1, np.uint8),
+        "quality/sound": np.ones(1, np.uint8),
         "quality/success": np.zeros(1, np.int8),
-    }  # fmt: skip
+    }
     assert not standing.chosen(columns).any()
     assert not standing.chosen(columns, unjudged=True).any()

@@ -36,9 +36,15 @@ NAME = "kitchen"
 #: Of the last joint of this hand the card must say that it never moves.
 STILL_HAND, STILL_JOINT = "barrett", "finger_1_spread"
 BARRETT = (
-    "finger_1_spread", "finger_1_medial", "finger_1_distal", "finger_2_spread", "finger_2_medial", "finger_2_distal",
-    "finger_3_medial", "finger_3_distal",
-)  # fmt: skip
+    "finger_1_spread",
+    "finger_1_medial",
+    "finger_1_distal",
+    "finger_2_spread",
+    "finger_2_medial",
+    "finger_2_distal",
+    "finger_3_medial",
+    "finger_3_distal",
+)
 SECONDS = {Stage.SYNTHESIZE: 2.0, Stage.SCENE: 0.5, Stage.RENDER: 1.5}
 Array = NDArray[Any]
 
@@ -92,9 +98,16 @@ def dataset(
 def _fail(parts: Parts, record: JobRecord) -> None:
     task = next(plan(record))
     attempt = AttemptRecord(
-        task_id=task.id, job_id=record.id, stage=task.stage, number=1, kind="MeshError", reason="the mesh is torn",
-        worker="w", ended=timestamp(), last=True,
-    )  # fmt: skip
+        task_id=task.id,
+        job_id=record.id,
+        stage=task.stage,
+        number=1,
+        kind="MeshError",
+        reason="the mesh is torn",
+        worker="w",
+        ended=timestamp(),
+        last=True,
+    )
     put_record(parts.store, names.attempt(task.id, 1), attempt)
     parts.index.write.add_attempt(attempt)
 
@@ -116,9 +129,13 @@ def _finish(parts: Parts, record: JobRecord, change: Callable[[str, str, dict[st
             tried = made + made // 4 + 1
             joints = BARRETT if record.request.hand == "barrett" else _ALLEGRO
             attributes: dict[str, Any] = {
-                "joint_names": list(joints), "mu": 1.0, "want": "valid", "tried": tried,
-                "verdict_level": "certificate", "verdict_key": "k",
-            }  # fmt: skip
+                "joint_names": list(joints),
+                "mu": 1.0,
+                "want": "valid",
+                "tried": tried,
+                "verdict_level": "certificate",
+                "verdict_key": "k",
+            }
             if place:
                 # At half the friction every other grasp of a scene lifts.
                 base["quality/lift_hard"] = (np.arange(made) % 2).astype(np.int8)
@@ -154,9 +171,12 @@ def _base(rng: np.random.Generator, hand: str, count: int, batch: int) -> dict[s
     for name, scale in (("contact_area_cm2", 40.0), ("epsilon", 0.3), ("wrench_volume", 3.0)):
         columns[f"quality/{name}"] = rng.gamma(9.0, scale / 9, (count, 2))
     for name, scale in (
-        ("intersection_volume_cm3", 0.01), ("penetration_depth_mm", 0.3), ("self_penetration_depth_mm", 0.01),
-        ("simulated_displacement_cm", 0.05), ("stability_loss", 0.05),
-    ):  # fmt: skip
+        ("intersection_volume_cm3", 0.01),
+        ("penetration_depth_mm", 0.3),
+        ("self_penetration_depth_mm", 0.01),
+        ("simulated_displacement_cm", 0.05),
+        ("stability_loss", 0.05),
+    ):
         columns[f"quality/{name}"] = rng.gamma(2.0, scale / 2, count)
     columns["quality/contact_links"] = rng.integers(2, 9, count).astype(np.int32)
     columns["quality/valid"] = np.ones(count, np.uint8)

@@ -18,8 +18,8 @@ from tests.worker.cards.conftest import Case, case
 from tests.worker.cards.makers import SECONDS, STILL_HAND, STILL_JOINT, Array
 from worker.cards.directions import cell_counts, elevations
 from worker.cards.findings import findings
-from worker.cards.joints import JointUse
 from worker.cards.numbers import share
+from worker.cards.tally import JointUse
 
 
 def changed(tmp_path: Path, change: Any, **options: Any) -> Case:

@@ -51,10 +51,16 @@ def base(tmp_path_factory) -> Path:
         "quality/success": np.ones(GRASPS, np.int8),
     }
     attributes = {
-        "hand": "allegro", "hand_digest": hand.digest, "object": "block", "object_digest": obj.digest,
-        "method": "none", "fidelity": json_attribute({"face_error_m": 3e-4}), "seed": 5, "batch": 0,
+        "hand": "allegro",
+        "hand_digest": hand.digest,
+        "object": "block",
+        "object_digest": obj.digest,
+        "method": "none",
+        "fidelity": json_attribute({"face_error_m": 3e-4}),
+        "seed": 5,
+        "batch": 0,
         "joint_names": list(hand.joint_names),
-    }  # fmt: skip
+    }
     path = tmp_path_factory.mktemp("shards") / "base.h5"
     path.write_bytes(write_shard("base", arrays, attributes))
     return path
@@ -264,10 +270,13 @@ def test_another_neighbour_than_the_shards_is_refused(base):
 
 def test_hands_of_grasps_in_scenes_are_drawn_with_their_wrists(base: Path):
     shard, wrist = read_shard(base), 0.1 * np.arange(2.0 * GRASPS).reshape(GRASPS, 2)
-    shard.arrays.update({
-        "scene/object_pose": np.tile([0.0, 0, 0, 1, 0, 0, 0], (GRASPS, 1)), "grasp/scene_index": np.arange(GRASPS),
-        "grasp/wrist_positions": wrist,
-    })  # fmt: skip
+    shard.arrays.update(
+        {
+            "scene/object_pose": np.tile([0.0, 0, 0, 1, 0, 0, 0], (GRASPS, 1)),
+            "grasp/scene_index": np.arange(GRASPS),
+            "grasp/wrist_positions": wrist,
+        }
+    )
     shard.attributes["scene"] = json_attribute({"kind": "table"})
     around, drawn = grasp_sheet.around_of(shard, np.array([2, 0])), render._drawn_in(shard, None)
     assert np.array_equal(around.wrist, wrist[[2, 0]])

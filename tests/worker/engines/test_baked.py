@@ -36,8 +36,11 @@ def run(code: str, **places: str) -> str:
 
 def files(folder: Path) -> dict[str, tuple[int, int]]:
     """Inode and time of every file by its path in the folder."""
-    return {str(file.relative_to(folder)): (file.stat().st_ino, file.stat().st_mtime_ns)
-            for file in folder.rglob("*") if file.is_file()}  # fmt: skip
+    return {
+        str(file.relative_to(folder)): (file.stat().st_ino, file.stat().st_mtime_ns)
+        for file in folder.rglob("*")
+        if file.is_file()
+    }
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,9 @@ import logging
 
 import numpy as np
 import pytest
+import warp as wp
 
 from service.model.fidelity import FIDELITIES
-from worker.engines import cuda_errors
 from worker.engines.cuda_errors import DeviceLost, check_device, is_out_of_memory
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
@@ -42,12 +42,16 @@ def test_only_a_gpu_without_memory_is_out_of_memory(error: Exception, expected: 
 def test_a_device_is_lost_by_any_error_but_want_of_memory(
     monkeypatch: pytest.MonkeyPatch, code: int, lost: bool
 ) -> None:
-    monkeypatch.setattr(cuda_errors, "_pending_error", lambda device: code)
+    def synchronize(device: str) -> None:
+        if code:
+            raise RuntimeError(f"Failed to synchronize device {device}: Warp CUDA error {code}: what happened")
+
+    monkeypatch.setattr(wp, "synchronize_device", synchronize)
     check_device("cpu")
     if not lost:
         check_device("cuda:1")
         return
-    with pytest.raises(DeviceLost, match=f"CUDA error {code} on cuda:1"):
+    with pytest.raises(DeviceLost, match=f"cuda:1: Warp CUDA error {code}"):
         check_device("cuda:1")
 
 

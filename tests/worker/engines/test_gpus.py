@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 
 from service.model.errors import InputError
-from worker.engines import devices, gpus
-from worker.engines.devices import Device
-from worker.engines.gpus import Gpu, take
+from worker.engines import devices
+from worker.engines.devices import Device, Gpu, take
 
 FOUR = [Gpu(f"cuda:{k}", f"GPU-{k:04}", "H200") for k in range(4)]
 
@@ -23,9 +22,9 @@ FOUR = [Gpu(f"cuda:{k}", f"GPU-{k:04}", "H200") for k in range(4)]
 def own_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Locks of this test alone; a lock that is taken twice here is as one of two processes."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(gpus, "_held", [])
+    monkeypatch.setattr(devices, "_held", [])
     yield
-    for lock in gpus._held:
+    for lock in devices._held:
         lock.close()
 
 
@@ -50,7 +49,7 @@ def test_a_number_decides(tmp_path: Path, number: int, name: str) -> None:
 def test_the_gpu_of_a_killed_process_is_free_again(tmp_path: Path) -> None:
     script = (
         "import sys, time, pathlib\n"
-        "from worker.engines.gpus import Gpu, take\n"
+        "from worker.engines.devices import Gpu, take\n"
         "two = [Gpu('cuda:0', 'a'), Gpu('cuda:1', 'b')]\n"
         "print(take(two, pathlib.Path(sys.argv[1])).name, flush=True)\n"
         "time.sleep(600)\n"

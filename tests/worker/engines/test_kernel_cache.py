@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from service import user_cache
-from worker.engines.kernel_cache import kernel_cache
+from worker.engines.backend import kernel_cache
 
 
 @pytest.fixture

@@ -30,10 +30,8 @@ def columns(seed: int) -> dict[str, Any]:
     found |= {f"quality/{name}": rng.random((COUNT, 1)) for name in ("epsilon", "wrench_volume", "contact_area_cm2")}
     found |= {
         f"quality/{name}": rng.random(COUNT)
-        for name in (
-            "intersection_volume_cm3", "penetration_depth_mm", "self_penetration_depth_mm", "stability_loss",
-        )
-    }  # fmt: skip
+        for name in ("intersection_volume_cm3", "penetration_depth_mm", "self_penetration_depth_mm", "stability_loss")
+    }
     return found | {
         "quality/contact_links": np.full(COUNT, 3, np.int32),
         "quality/valid": np.ones(COUNT, np.uint8),
@@ -65,8 +63,9 @@ def folder(tmp_path: Path) -> Path:
 
 def test_a_subset_holds_what_the_expression_chooses_and_nothing_else(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "subset"
-    told = json.loads(run("grasps", "where", "type = precision and epsilon >= 0.2", "--from", folder, "-o", out,
-                          "--json").stdout)  # fmt: skip
+    told = json.loads(
+        run("grasps", "where", "type = precision and epsilon >= 0.2", "--from", folder, "-o", out, "--json").stdout
+    )
     every = Grasps(open_shards(folder), ["quality/epsilon", "grasp/hand_pose"])
     chosen = Grasps(open_shards(out), ["quality/epsilon", "grasp/hand_pose", "quality/grasp_type"])
     poses = {sample["grasp/hand_pose"].tobytes() for sample in every}

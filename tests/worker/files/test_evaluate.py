@@ -25,9 +25,20 @@ from worker.hands.surface import piece_distance
 from worker.quality.postures import pregrasp, squeeze
 
 CONTRACT = {
-    "n", "protocol", "gsr", "osr", "sgs", "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "epsilon", "wrench_volume", "sd_cm",
+    "n",
+    "protocol",
+    "gsr",
+    "osr",
+    "sgs",
+    "pd_mm",
+    "spd_mm",
+    "ca_cm2",
+    "iv_cm3",
+    "epsilon",
+    "wrench_volume",
+    "sd_cm",
     "diversity",
-}  # fmt: skip
+}
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 HAND = pad_hand()
 

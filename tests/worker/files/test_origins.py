@@ -95,9 +95,13 @@ def test_pictures_are_the_same(made: Any, boxes: dict[str, Path], tmp_path: Path
     for at in ("origin", place):
         grasp = made[at, "free"].arrays
         pictures = grasp_pictures(
-            load_case(file_of(made[at, "free"], tmp_path / f"{at}.h5")).hand, object_from_path(boxes[at]),
-            grasp["grasp/hand_pose"][:1], grasp["grasp/joint_positions"][:1], (48, 48), samples=2,
-        )  # fmt: skip
+            load_case(file_of(made[at, "free"], tmp_path / f"{at}.h5")).hand,
+            object_from_path(boxes[at]),
+            grasp["grasp/hand_pose"][:1],
+            grasp["grasp/joint_positions"][:1],
+            (48, 48),
+            samples=2,
+        )
         seen.append(pictures)
     np.testing.assert_array_equal(*seen)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from api.client.hand_files import upload_of
+from api.client.add_commands import upload_of
 from api.uploads import files_of_upload
 from service.model.errors import HandError
 from service.model.states import AssetKind

@@ -14,7 +14,7 @@ from PIL import Image
 from tests.worker.hands.urdfs import BOX, joint, link, robot
 from worker.hands.load import load_hand
 from worker.objects.formats import read_mesh
-from worker.objects.formats.glb_colours import material_colour
+from worker.objects.formats.glb import material_colour
 from worker.rendering.hands import hand_parts
 
 #: sRGB of a byte, rounded twice.
@@ -97,9 +97,11 @@ def test_a_texture_that_promises_too_much_is_not_unpacked() -> None:
     material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
     picture = large()
     document = {
-        "materials": [material], "textures": [{"source": 0}], "images": [{"bufferView": 0}],
+        "materials": [material],
+        "textures": [{"source": 0}],
+        "images": [{"bufferView": 0}],
         "bufferViews": [{"byteLength": len(picture)}],
-    }  # fmt: skip
+    }
     assert np.isnan(material_colour(document, picture, {"material": 0})).all()
 
 

@@ -54,14 +54,21 @@ def glb(mesh: Mesh, node: dict[str, object] | None = None) -> bytes:
     points = mesh[0].astype("<f4").tobytes()
     index = mesh[1].astype("<u2").tobytes()
     document = {
-        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, **(node or {})}],
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, **(node or {})}],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
         "buffers": [{"byteLength": len(points) + len(index)}],
-        "bufferViews": [{"buffer": 0, "byteOffset": 0, "byteLength": len(points)},
-                        {"buffer": 0, "byteOffset": len(points), "byteLength": len(index)}],
-        "accessors": [{"bufferView": 0, "componentType": 5126, "count": len(mesh[0]), "type": "VEC3"},
-                      {"bufferView": 1, "componentType": 5123, "count": 3 * len(mesh[1]), "type": "SCALAR"}],
-    }  # fmt: skip
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": len(points)},
+            {"buffer": 0, "byteOffset": len(points), "byteLength": len(index)},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": len(mesh[0]), "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5123, "count": 3 * len(mesh[1]), "type": "SCALAR"},
+        ],
+    }
     return pack_glb(document, points + index)
 
 
@@ -72,9 +79,11 @@ def pack_glb(document: dict[str, object], binary: bytes) -> bytes:
     total = 12 + 8 + len(text) + 8 + len(binary)
     return (
         struct.pack("<4sII", b"glTF", 2, total)
-        + struct.pack("<I4s", len(text), b"JSON") + text
-        + struct.pack("<I4s", len(binary), b"BIN\0") + binary
-    )  # fmt: skip
+        + struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", len(binary), b"BIN\0")
+        + binary
+    )
 
 
 FILES = {
@@ -135,10 +144,11 @@ def test_a_header_that_promises_too_much_allocates_nothing() -> None:
 
 def test_a_glb_accessor_beyond_its_buffer_is_refused() -> None:
     document = {
-        "nodes": [{"mesh": 0}], "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
         "bufferViews": [{"buffer": 0, "byteLength": 64}],
         "accessors": [{"bufferView": 0, "componentType": 5126, "count": 4_000_000_000, "type": "VEC3"}],
-    }  # fmt: skip
+    }
     with pytest.raises(MeshError, match="beyond"):
         read_mesh("m.glb", pack_glb(document, b"\0" * 64))
 
@@ -180,7 +190,9 @@ def quantised(normalized: bool, extensions: dict[str, object] | None = None) -> 
     padded[:, :3] = numbers
     points, index = padded.tobytes(), faces.astype("<u2").tobytes()
     document: dict[str, object] = {
-        "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, "scale": [scale] * 3}],
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "scale": [scale] * 3}],
         "extensionsRequired": ["KHR_mesh_quantization"],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
         "accessors": [
@@ -191,8 +203,9 @@ def quantised(normalized: bool, extensions: dict[str, object] | None = None) -> 
             {"buffer": 0, "byteLength": len(points), "byteStride": 8},
             {"buffer": 0, "byteOffset": len(points), "byteLength": len(index)},
         ],
-        "buffers": [{"byteLength": len(points) + len(index)}], **(extensions or {}),
-    }  # fmt: skip
+        "buffers": [{"byteLength": len(points) + len(index)}],
+        **(extensions or {}),
+    }
     return pack_glb(document, points + index)
 
 
@@ -256,14 +269,24 @@ def test_strips_and_fans_of_a_glb_are_wound_as_trimesh_winds_them(mode: int) -> 
     order = np.array([0, 1, 2, 3, 5, 4], "<u2")
     points = np.random.default_rng(0).normal(size=(6, 3)).astype("<f4")
     document = {
-        "asset": {"version": "2.0"}, "nodes": [{"mesh": 0}], "scenes": [{"nodes": [0]}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": kind} | ({"indices": 1} if kind else {})
-                                   for kind in (0, mode)]}],
-        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 6, "type": "VEC3"},
-                      {"bufferView": 1, "componentType": 5123, "count": 6, "type": "SCALAR"}],
+        "asset": {"version": "2.0"},
+        "nodes": [{"mesh": 0}],
+        "scenes": [{"nodes": [0]}],
+        "meshes": [
+            {
+                "primitives": [
+                    {"attributes": {"POSITION": 0}, "mode": kind} | ({"indices": 1} if kind else {})
+                    for kind in (0, mode)
+                ]
+            }
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 6, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5123, "count": 6, "type": "SCALAR"},
+        ],
         "bufferViews": [{"buffer": 0, "byteLength": 72}, {"buffer": 0, "byteOffset": 72, "byteLength": 12}],
         "buffers": [{"byteLength": 84}],
-    }  # fmt: skip
+    }
     faces = read_mesh("m.glb", pack_glb(document, points.tobytes() + order.tobytes())).faces
     expected = (
         trimesh.util.triangle_strips_to_faces([order]) if mode == 5 else [[0, 1, 2], [0, 2, 3], [0, 3, 5], [0, 5, 4]]

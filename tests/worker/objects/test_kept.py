@@ -14,7 +14,7 @@ import pytest
 from service import user_cache
 from service.model.errors import MeshError
 from tests.worker.objects.shapes import box, join, sphere, stl
-from worker.objects import kept, prepare
+from worker.objects import prepare
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object
 
@@ -64,18 +64,18 @@ def test_whatever_it_follows_from_makes_another_entry(made: list[float], monkeyp
     load(stl(box()), error=1e-3)
     load(stl(box()), scale_to=0.08)
     load(stl(sphere(segments=24)))
-    monkeypatch.setattr(kept, "revision", lambda: "another")
+    monkeypatch.setattr(prepare, "revision", lambda: "another")
     load(stl(box()))
     assert len(made) == 5
 
 
 def test_the_revision_follows_the_code_and_the_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = kept.revision.__wrapped__()
-    monkeypatch.setattr(kept, "version_of", lambda name: f"0 of {name}")
-    libraries = kept.revision.__wrapped__()
+    plain = prepare.revision.__wrapped__()
+    monkeypatch.setattr(prepare, "version_of", lambda name: f"0 of {name}")
+    libraries = prepare.revision.__wrapped__()
     read = Path.read_bytes
     monkeypatch.setattr(Path, "read_bytes", lambda file: read(file) + b"#" * (file.name == "repair.py"))
-    assert len({plain, libraries, kept.revision.__wrapped__()}) == 3
+    assert len({plain, libraries, prepare.revision.__wrapped__()}) == 3
 
 
 @pytest.mark.parametrize("harm", ["damaged", "another format"])

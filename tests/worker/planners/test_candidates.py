@@ -41,9 +41,11 @@ def plain(hand, obj, state: HandState, losses: np.ndarray, placed: Placed, *, de
 
 
 def taken(
-    scores: list[list[float]], monkeypatch: pytest.MonkeyPatch, merit: list[list[float]] | None = None,
+    scores: list[list[float]],
+    monkeypatch: pytest.MonkeyPatch,
+    merit: list[list[float]] | None = None,
     unsound: tuple[int, ...] = (),
-) -> tuple[list[int], list[int], list[int]]:  # fmt: skip
+) -> tuple[list[int], list[int], list[int]]:
     """Hands that are taken where hand k of grasp n scores `scores[n][k]` and is the k-th most promising; those that
     were tried, and those that were seated. Some are unsound."""
     monkeypatch.setattr(candidates, "with_postures", plain)

@@ -26,9 +26,15 @@ QUICK = DRAFT.model_copy(update={"coarse_iterations": 20, "fine_iterations": 6, 
 
 
 def grasps(
-    count: int, *, hand: str = "allegro", obj: str = "mug", fidelity: Fidelity = QUICK, threads: int = 1, seed: int = 0,
+    count: int,
+    *,
+    hand: str = "allegro",
+    obj: str = "mug",
+    fidelity: Fidelity = QUICK,
+    threads: int = 1,
+    seed: int = 0,
     batch: int = 0,
-) -> GraspSet:  # fmt: skip
+) -> GraspSet:
     wanted = Wanted(count, fidelity, seed, batch)
     return synthesize(hand_from_path(hand), object_from_path(obj), wanted, Run(threads=threads))
 

@@ -25,9 +25,15 @@ from worker.run import Run
 
 #: Knobs that make a call short; the mesh, which is what the fidelities here differ in, stays theirs.
 SHORT: dict[str, Any] = {
-    "starts": 1, "finalists": 1, "coarse_points": 64, "fine_points": 64, "object_points": 64, "coarse_iterations": 3,
-    "fine_iterations": 2, "polish_iterations": 1,
-}  # fmt: skip
+    "starts": 1,
+    "finalists": 1,
+    "coarse_points": 64,
+    "fine_points": 64,
+    "object_points": 64,
+    "coarse_iterations": 3,
+    "fine_iterations": 2,
+    "polish_iterations": 1,
+}
 METHODS = sorted(name for name in PLANNERS if method(name).free)
 PAIR = ("draft", "fine")
 

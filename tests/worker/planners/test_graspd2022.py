@@ -12,8 +12,17 @@ import warp as wp
 
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.planners.graspd2022 import kernels
-from worker.planners.graspd2022.grid import distance_grid
-from worker.planners.graspd2022.search import FRICTION, LEAK, MISMATCH, STIFFNESS, VISCOUS, Search, _Batch, physics_of
+from worker.planners.graspd2022.search import (
+    FRICTION,
+    LEAK,
+    MISMATCH,
+    STIFFNESS,
+    VISCOUS,
+    Search,
+    _Batch,
+    distance_grid,
+    physics_of,
+)
 from worker.planners.peers import ground_of
 from worker.simulation.state import HandState
 
@@ -39,9 +48,12 @@ def probed(
     found: list[Any] = [wp.zeros(n, dtype=kind, device="cpu") for kind in (wp.float32, wp.vec3, wp.vec3)]
     given = wp.array(points, dtype=wp.vec3, device="cpu")
     wp.launch(
-        kernels.probe, n, inputs=[physics_of(SPHERE.gyration_radius), grid, given, wp.vec3(*velocity)], outputs=found,
+        kernels.probe,
+        n,
+        inputs=[physics_of(SPHERE.gyration_radius), grid, given, wp.vec3(*velocity)],
+        outputs=found,
         device="cpu",
-    )  # fmt: skip
+    )
     return tuple(f.numpy() for f in found)
 
 

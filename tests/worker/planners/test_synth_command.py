@@ -29,9 +29,22 @@ def run(*words: str | Path) -> Any:
 
 def synth(out: Path, *more: str | Path, obj: str | Path = "block") -> dict[str, Any]:
     done = run(
-        "synth", "--hand", "allegro", "--object", obj, "-n", 3, "--fidelity", "draft", "--device", "cpu", "-o", out,
-        "--json", *more,
-    )  # fmt: skip
+        "synth",
+        "--hand",
+        "allegro",
+        "--object",
+        obj,
+        "-n",
+        3,
+        "--fidelity",
+        "draft",
+        "--device",
+        "cpu",
+        "-o",
+        out,
+        "--json",
+        *more,
+    )
     assert done.exit_code == 0, done.output
     found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found
@@ -120,9 +133,22 @@ def test_export_and_pictures_take_grasps_that_nobody_judged_only_when_told(
 
 def test_the_line_for_people_says_that_nobody_judged(tmp_path: Path) -> None:
     done = run(
-        "synth", "--hand", "allegro", "--object", "block", "-n", 1, "--fidelity", "draft", "--device", "cpu",
-        "--referee", "none", "-o", tmp_path / "g.h5",
-    )  # fmt: skip
+        "synth",
+        "--hand",
+        "allegro",
+        "--object",
+        "block",
+        "-n",
+        1,
+        "--fidelity",
+        "draft",
+        "--device",
+        "cpu",
+        "--referee",
+        "none",
+        "-o",
+        tmp_path / "g.h5",
+    )
     assert "1 sound of" in done.stdout and "nobody judged" in done.stdout
     assert "valid" not in done.stdout
 
@@ -184,9 +210,19 @@ def test_every_command_finds_hand_and_object_of_a_file_by_itself(of_own_mesh: Pa
     scene = run("scene", of_own_mesh, "--scenes", 1, "-o", tmp_path / "s.h5")
     assert scene.exit_code == 0, scene.output
     views = run(
-        "render", tmp_path / "s.h5", "--views", 1, "--width", 32, "--height", 24, "--device", "cpu", "-o",
+        "render",
+        tmp_path / "s.h5",
+        "--views",
+        1,
+        "--width",
+        32,
+        "--height",
+        24,
+        "--device",
+        "cpu",
+        "-o",
         tmp_path / "v.h5",
-    )  # fmt: skip
+    )
     assert views.exit_code == 0, views.output
 
 

@@ -51,9 +51,16 @@ def test_the_object_is_carried_with_the_hand_from_where_it_rests():
     poses = {name: rest + np.array([0, 0, height, 0, 0, 0, 0]) for name, height in heights.items()}
     closing = dict(zip(POSTURES, (0.0, 0.0, 0.5, 1.0, 1.2, 1.2), strict=True))
     found = Executions(
-        None, None, ToolFrame("palm", rest[0]), "scene", np.zeros(1, np.intp), rest,
-        {name: Posture(poses[name], np.full((1, 1), closing[name])) for name in POSTURES}, None, {},
-    )  # fmt: skip
+        None,
+        None,
+        ToolFrame("palm", rest[0]),
+        "scene",
+        np.zeros(1, np.intp),
+        rest,
+        {name: Posture(poses[name], np.full((1, 1), closing[name])) for name in POSTURES},
+        None,
+        {},
+    )
     way = timed(straight_paths(found, 0), ["joint"], np.ones(1), speed=1.0)
     points = waypoints(found, way)
     assert len(points) == len(way.time)

@@ -21,8 +21,9 @@ DEPTH_M = 1e-4
 
 def test_points_of_a_rendered_object_lie_on_its_mesh_and_their_normals_are_its_faces(tmp_path: Path) -> None:
     mesh = trimesh.creation.capsule(height=0.05, radius=0.03, count=[24, 24])
-    views = render(object_from_mesh(mesh, "box"), box_scenes.POSES, views=2, stereo=False, width=96, height=72,
-                   seed=1, samples=2)  # fmt: skip
+    views = render(
+        object_from_mesh(mesh, "box"), box_scenes.POSES, views=2, stereo=False, width=96, height=72, seed=1, samples=2
+    )
     folder = box_scenes.write(tmp_path / "set")
     said = {"hand": "claw", "object": "box", "batch": 0, "shard_id": "c" * 32, "base_shard": "b" * 32}
     (folder / "views.h5").write_bytes(write_shard("views", views, said))

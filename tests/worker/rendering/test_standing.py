@@ -63,9 +63,16 @@ def test_every_camera_sees_the_object_past_walls_and_boards(block, kind):
 
 def test_all_supports_are_labelled_as_the_table(block):
     views = render(
-        block, POSE, views=2, stereo=False, width=48, height=36, seed=3, samples=2,
+        block,
+        POSE,
+        views=2,
+        stereo=False,
+        width=48,
+        height=36,
+        seed=3,
+        samples=2,
         extras=Extras(supports=SPECS["bin"], channels=("occlusion",)),
-    )  # fmt: skip
+    )
     assert set(np.unique(views["image/segmentation"])) <= {0, 1, 2}
     assert (np.asarray(views["image/segmentation"]) == 1).mean() > 0.2
     assert np.isfinite(views["box/occlusion_ratio"]).all()

@@ -89,9 +89,12 @@ def traced(solids: list[Solid | Box], poses: np.ndarray, what: Shot) -> Any:
 
 @wp.kernel(enable_backward=False)
 def _in_the_way(
-    placed_in: wp.array2d[rays.Placed], world_in: wp.array[wp.int32], point_in: wp.array[wp.vec3f],
-    toward: wp.vec3f, shadowed_out: wp.array[wp.int32],
-):  # fmt: skip
+    placed_in: wp.array2d[rays.Placed],
+    world_in: wp.array[wp.int32],
+    point_in: wp.array[wp.vec3f],
+    toward: wp.vec3f,
+    shadowed_out: wp.array[wp.int32],
+):
     i = wp.tid()
     shadowed_out[i] = wp.int32(rays.in_the_way(placed_in, world_in[i], point_in[i], toward))
 
@@ -131,12 +134,17 @@ def by_newton(poses: np.ndarray, what: Shot) -> dict[str, np.ndarray]:
     shape = sensor.allocate_image_shape_index(count, WIDTH, HEIGHT)
     normal = sensor.allocate_image_normal(count, WIDTH, HEIGHT)
     sensor.update(
-        state, wp.array(cameras, dtype=wp.transformf, device="cpu"), wp.array(bundle, dtype=wp.vec3f, device="cpu"),
-        hdr_color_image=light, forward_depth_image=depth, shape_index_image=shape, normal_image=normal,
+        state,
+        wp.array(cameras, dtype=wp.transformf, device="cpu"),
+        wp.array(bundle, dtype=wp.vec3f, device="cpu"),
+        hdr_color_image=light,
+        forward_depth_image=depth,
+        shape_index_image=shape,
+        normal_image=normal,
         world_indices=wp.array(what.world, dtype=wp.int32, device="cpu"),
         clear_data=SensorCamera.ClearData(clear_depth=float("inf"), clear_shape_index=0xFFFFFFFF),
         render_config=SensorCamera.RenderConfig(enable_shadows=True, enable_ambient_lighting=False),
-    )  # fmt: skip
+    )
     index = shape.numpy().astype(np.int64)
     cosine = normal.numpy() @ TOWARD_LAMP
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -144,9 +152,12 @@ def by_newton(poses: np.ndarray, what: Shot) -> dict[str, np.ndarray]:
         lit = light.numpy()[..., 0] / cosine > 0.65
     nothing = index == 0xFFFFFFFF
     return {
-        "shape": np.where(nothing, -1, index % len(SOLIDS)), "depth": depth.numpy(), "normal": normal.numpy(),
-        "lit": lit, "facing": ~nothing & (cosine > 0.05),
-    }  # fmt: skip
+        "shape": np.where(nothing, -1, index % len(SOLIDS)),
+        "depth": depth.numpy(),
+        "normal": normal.numpy(),
+        "lit": lit,
+        "facing": ~nothing & (cosine > 0.05),
+    }
 
 
 @pytest.fixture(scope="module")
@@ -179,12 +190,17 @@ def test_shadows_lie_where_newtons_lie(poses: np.ndarray, theirs: dict[str, np.n
     points += 1e-4 * theirs["normal"][view, row, column]
     shadowed = wp.zeros(len(points), dtype=wp.int32, device="cpu")
     wp.launch(
-        _in_the_way, dim=len(points), device="cpu", outputs=[shadowed],
+        _in_the_way,
+        dim=len(points),
+        device="cpu",
+        outputs=[shadowed],
         inputs=[
-            tracer._placed, wp.array(what.world[view], dtype=wp.int32, device="cpu"),
-            wp.array(points.astype(np.float32), dtype=wp.vec3f, device="cpu"), wp.vec3f(*TOWARD_LAMP),
+            tracer._placed,
+            wp.array(what.world[view], dtype=wp.int32, device="cpu"),
+            wp.array(points.astype(np.float32), dtype=wp.vec3f, device="cpu"),
+            wp.vec3f(*TOWARD_LAMP),
         ],
-    )  # fmt: skip
+    )
     lit = theirs["lit"][view, row, column]
     assert 0.05 < np.mean(~lit) < 0.5
     assert np.mean((shadowed.numpy() == 0) == lit) >= 1 - OUTLINE

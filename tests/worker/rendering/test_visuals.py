@@ -58,9 +58,11 @@ def test_looks_change_nothing_that_is_computed(hand: HandModel) -> None:
 def test_a_model_for_viewers_has_the_colours(hand: HandModel) -> None:
     scene = trimesh.load(trimesh.util.wrap_as_stream(hand_glb(hand)), file_type="glb")
     colours = {
-        tuple(colour) for mesh in scene.geometry.values() if len(getattr(mesh, "faces", ()))
+        tuple(colour)
+        for mesh in scene.geometry.values()
+        if len(getattr(mesh, "faces", ()))
         for colour in np.unique(mesh.visual.vertex_colors[:, :3], axis=0).tolist()
-    }  # fmt: skip
+    }
     assert {(255, 0, 0), (0, 0, 255)} <= colours
 
 

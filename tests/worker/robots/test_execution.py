@@ -31,9 +31,14 @@ def of_shard(file: Path) -> Executions:
     case = load_case(file)
     count = len(case.grasps)
     return executions(
-        case.hand, case.obj, case.grasps, rows=np.arange(count), placed=case.placed, tool=TOOL,
+        case.hand,
+        case.obj,
+        case.grasps,
+        rows=np.arange(count),
+        placed=case.placed,
+        tool=TOOL,
         quality={"valid": read_shard(file, kind="base")["quality/valid"]},
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")

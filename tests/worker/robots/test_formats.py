@@ -25,8 +25,18 @@ from worker.hands.urdf import read_urdf
 
 BLOCK = next(Path(service.__file__).parent.glob("builtin/objects/block/*.stl"))
 #: Fields of the messages, from docs.ros.org (moveit_msgs, trajectory_msgs).
-GRASP = {"id", "pre_grasp_posture", "grasp_posture", "grasp_pose", "grasp_quality", "pre_grasp_approach",
-         "post_grasp_retreat", "post_place_retreat", "max_contact_force", "allowed_touch_objects"}  # fmt: skip
+GRASP = {
+    "id",
+    "pre_grasp_posture",
+    "grasp_posture",
+    "grasp_pose",
+    "grasp_quality",
+    "pre_grasp_approach",
+    "post_grasp_retreat",
+    "post_place_retreat",
+    "max_contact_force",
+    "allowed_touch_objects",
+}
 POINT = {"positions", "velocities", "accelerations", "effort", "time_from_start"}
 
 
@@ -129,8 +139,9 @@ def test_an_isaac_file_has_the_fields_of_its_documentation(free_shard: Path, tmp
     for name, grasp in found["grasps"].items():
         row = int(name.removeprefix("grasp_"))
         pose = case.grasps.grasp.hand_pose[row]
-        np.testing.assert_allclose([*grasp["position"], grasp["orientation"]["w"], *grasp["orientation"]["xyz"]], pose,
-                                   atol=1e-8)  # fmt: skip
+        np.testing.assert_allclose(
+            [*grasp["position"], grasp["orientation"]["w"], *grasp["orientation"]["xyz"]], pose, atol=1e-8
+        )
         assert grasp["confidence"] == float(valid[row])
         assert set(grasp["cspace_position"]) == set(grasp["pregrasp_cspace_position"])
         joints = dict(zip(case.hand.joint_names, case.grasps.grasp.joint_positions[row], strict=True))

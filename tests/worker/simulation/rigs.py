@@ -32,9 +32,16 @@ def still(dilation: float = 0.0, weight: float = 0.0) -> Schedule:
 
 
 def rig(
-    hand: HandModel, obj: ObjectModel, *, capacity: int, points: int = 300, options: LossOptions | None = None,
-    cell: float = 0.0, alpha: float = 0.5, schedule: Schedule | None = None,
-) -> tuple[Model, Data]:  # fmt: skip
+    hand: HandModel,
+    obj: ObjectModel,
+    *,
+    capacity: int,
+    points: int = 300,
+    options: LossOptions | None = None,
+    cell: float = 0.0,
+    alpha: float = 0.5,
+    schedule: Schedule | None = None,
+) -> tuple[Model, Data]:
     kernels.load("cpu")
     device_hand = DeviceHand.create(hand, "cpu")
     device_object = DeviceObject.create(obj, "cpu", samples=object_samples(obj, 1000), phong_alpha=alpha, cell=cell)

@@ -31,12 +31,15 @@ class Graphs:
         self.captured, self.replayed = 0, 0
         names = {name: getattr(wp, name) for name in ("launch",)}
         monkeypatch.setattr(
-            launches, "wp",
+            launches,
+            "wp",
             SimpleNamespace(
-                **names, get_device=lambda _: SimpleNamespace(is_cuda=True), ScopedCapture=self.capture,
+                **names,
+                get_device=lambda _: SimpleNamespace(is_cuda=True),
+                ScopedCapture=self.capture,
                 capture_launch=self.replay,
             ),
-        )  # fmt: skip
+        )
 
     def capture(self, device: str) -> Any:
         self.captured += 1

@@ -62,12 +62,16 @@ def run(
         gradient = wp.zeros((1, n), dtype=wp.float32)
         constants = physics(world, leak=leak, one_sided=one_sided, near_gap=near_gap)
         given = [
-            wp.ones(1, dtype=wp.int32), wp.zeros(1, dtype=wp.int32), wp.array([world.dilation], dtype=wp.float32),
+            wp.ones(1, dtype=wp.int32),
+            wp.zeros(1, dtype=wp.int32),
+            wp.array([world.dilation], dtype=wp.float32),
             wp.ones(1, dtype=wp.float32),
             wp.array([n], dtype=wp.int32),
-            wp.array(contacts.points[None], dtype=wp.vec3), wp.array(contacts.normals[None], dtype=wp.vec3),
-            wp.array(contacts.distances[None], dtype=wp.float32), wp.array(contacts.weights[None], dtype=wp.float32),
-        ]  # fmt: skip
+            wp.array(contacts.points[None], dtype=wp.vec3),
+            wp.array(contacts.normals[None], dtype=wp.vec3),
+            wp.array(contacts.distances[None], dtype=wp.float32),
+            wp.array(contacts.weights[None], dtype=wp.float32),
+        ]
         inputs = [constants, wp.array(motions, dtype=contact.vec6), passes, *given]
         if kernel is contact.direct:
             listed = np.flatnonzero(contacts.distances - world.dilation <= near_gap)
@@ -76,9 +80,11 @@ def run(
             inputs += [wp.array([len(listed)], dtype=wp.int32), wp.array(near[None], dtype=wp.int32)]
             wp.launch(kernel, dim=(1, m), inputs=inputs, outputs=[loss, end, adjoint])
             wp.launch(
-                contact.direct_gradient, dim=(1, -(-n // lane)), inputs=[constants, lane, *given, end, adjoint],
+                contact.direct_gradient,
+                dim=(1, -(-n // lane)),
+                inputs=[constants, lane, *given, end, adjoint],
                 outputs=[gradient],
-            )  # fmt: skip
+            )
         else:
             states = wp.zeros((1, m, max(n, passes)), dtype=contact.vec6)
             wp.launch(kernel, dim=(1, m), inputs=inputs, outputs=[states, loss, end, gradient])

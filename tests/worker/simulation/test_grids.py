@@ -111,9 +111,7 @@ def test_an_entry_that_would_lead_kernels_astray_is_made_again(
     assert same(grid(), first) and len(computed) == 2, "the entry is whole again"
 
 
-def test_where_nothing_can_be_kept_the_grid_is_the_same(
-    computed: list[Any], monkeypatch: pytest.MonkeyPatch
-) -> None:  # fmt: skip
+def test_where_nothing_can_be_kept_the_grid_is_the_same(computed: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
     first = grid()
     monkeypatch.setattr(user_cache, "load", lambda file: None)
     monkeypatch.setattr(user_cache, "write_whole", refused)

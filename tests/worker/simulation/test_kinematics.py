@@ -135,10 +135,11 @@ def test_the_transpose_is_the_derivative_of_the_map_it_belongs_to(name: str) -> 
     wrench = np.concatenate([force, np.cross(points, force)], axis=1)
     data.wrench.assign(np.round(wrench[None] / wrenches.UNIT).astype(np.int64))
     wp.launch(
-        kinematics.backward, 1,
+        kinematics.backward,
+        1,
         inputs=[model.hand.tree, data.active, data.pivot, data.body_p, data.axis],
         outputs=[data.wrench, data.gradient],
         device="cpu",
-    )  # fmt: skip
+    )
     # Sums of up to 23 float32 products of size 1.
     np.testing.assert_allclose(data.gradient.numpy()[0], expected, atol=2e-5)

@@ -17,9 +17,7 @@ from worker.simulation.kernels import pieces
 
 
 @wp.kernel
-def ask(
-    pieces_in: pieces.Pieces, piece_in: int, point_in: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.vec4)
-):  # fmt: skip
+def ask(pieces_in: pieces.Pieces, piece_in: int, point_in: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.vec4)):
     i = wp.tid()
     local = wp.quat_rotate_inv(pieces_in.pose_q[piece_in], point_in[i] - pieces_in.pose_p[piece_in])
     out[i] = pieces.piece_distance(pieces_in, piece_in, local)

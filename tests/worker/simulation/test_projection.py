@@ -122,10 +122,12 @@ def test_the_order_of_residuals_moves_no_bit() -> None:
         sums.zero_()
     d, m = found.data, found.model
     wp.launch(
-        kernels.normal_equations, (HANDS, found._lanes),
+        kernels.normal_equations,
+        (HANDS, found._lanes),
         inputs=[m.hand.tree, found._lane, d.active, d.pivot, d.body_p, d.axis, r],
-        outputs=[found._row, found.matrix, found.vector], device="cpu",
-    )  # fmt: skip
+        outputs=[found._row, found.matrix, found.vector],
+        device="cpu",
+    )
     np.testing.assert_array_equal(found.matrix.numpy(), before[0])
     np.testing.assert_array_equal(found.vector.numpy(), before[1])
 

@@ -71,10 +71,12 @@ def test_marked_points_get_the_slots_of_a_counter(count: int) -> None:
     body, near = (wp.full((4, count), -1, dtype=wp.int32) for _ in range(2))
     totals = [wp.full(4, -1, dtype=wp.int32) for _ in range(2)]
     wp.launch(
-        packing.pack, (4, count),
+        packing.pack,
+        (4, count),
         inputs=[active, marked, *counts, index, point, point, real, real],
-        outputs=[totals[0], body, point, point, real, real, real, totals[1], near], device="cpu",
-    )  # fmt: skip
+        outputs=[totals[0], body, point, point, real, real, real, totals[1], near],
+        device="cpu",
+    )
     for b in (0, 1, 3):
         kept, close = np.flatnonzero(mark[b]), np.flatnonzero(mark[b] == packing.NEAR)
         assert totals[0].numpy()[b] == len(kept)

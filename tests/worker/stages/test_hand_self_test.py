@@ -41,9 +41,11 @@ def held(count: int) -> Certified:
     """`count` grasps that hold, equally well."""
     ones = np.ones(count)
     columns = {
-        "quality/success": ones, "quality/epsilon": ones[:, None], "quality/verdict_margin": ones,
+        "quality/success": ones,
+        "quality/epsilon": ones[:, None],
+        "quality/verdict_margin": ones,
         "quality/verdict_outcome": ones[:, None],
-    }  # fmt: skip
+    }
     grasps = SimpleNamespace(grasp=SimpleNamespace(take=lambda rows: None))
     return cast(Certified, SimpleNamespace(columns=columns, grasps=grasps))
 

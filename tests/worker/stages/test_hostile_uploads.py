@@ -187,9 +187,11 @@ def test_an_archive_that_attacks_is_refused_at_the_door_and_reaches_no_worker(
     data, start = archive(), computed()
     with pytest.raises(InputError, match=says):
         publish_asset(
-            open_store("memory://"), AssetKind.OBJECT, "upload",
+            open_store("memory://"),
+            AssetKind.OBJECT,
+            "upload",
             files_of_upload(AssetKind.OBJECT, "archive.zip", data, limit_bytes=UPLOAD_BYTES),
-        )  # fmt: skip
+        )
     assert computed() - start < BOUND_S
 
 

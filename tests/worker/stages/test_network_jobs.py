@@ -64,9 +64,13 @@ def job_of(store: Store, **options: Any) -> JobRecord:
     obj = publish_asset(store, AssetKind.OBJECT, "block", builtin_files(AssetKind.OBJECT, "block"))
     wanted = JobRequest(hand="barrett", object="block", **LEARNED, options=options)
     return JobRecord(
-        id=job_id(wanted, hand.digest, obj.digest), request=wanted, hand_digest=hand.digest, object_digest=obj.digest,
-        lane=Lane.BULK, created=timestamp(),
-    )  # fmt: skip
+        id=job_id(wanted, hand.digest, obj.digest),
+        request=wanted,
+        hand_digest=hand.digest,
+        object_digest=obj.digest,
+        lane=Lane.BULK,
+        created=timestamp(),
+    )
 
 
 def end_of(store: Store, job: JobRecord) -> tuple[EventKind, str]:
@@ -138,14 +142,16 @@ def test_a_network_whose_finding_was_lost_is_checked_by_a_worker(
 @pytest.mark.parametrize(
     "scene",
     [
-        "table", "bin", "shelf",
+        "table",
+        "bin",
+        "shelf",
         {"supports": [{"kind": "half_space", "normal": [0, 0, 5], "offset": 0.3}]},
         {"supports": [{"kind": "half_space", "normal": [0, 0, -1]}]},
         {"supports": [{"kind": "half_space", "normal": [0.001, 0, 1]}]},
         {"supports": [{"kind": "half_space", "normal": [0.01, 0, 1]}]},
         {"supports": [{"kind": "box", "size": [1, 1, 0.1]}]},
     ],
-)  # fmt: skip
+)
 def test_a_scene_is_refused_at_the_door_where_the_planner_finds_no_table(scene: Any) -> None:
     place = JobOptions(scene=scene).place
     assert place == scene_of(JobOptions(scene=scene).scene, faces="drawn", touch=0.0, beside=())

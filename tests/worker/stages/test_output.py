@@ -14,9 +14,17 @@ from worker.stages.output import batch_seed
 
 def message(**changes: Any) -> TaskMessage:
     fields = {
-        "schema_": 1, "task_id": "t", "job_id": "j", "stage": Stage.RENDER, "batch": 0, "count": 32,
-        "request": request(), "hand_digest": "a" * 32, "object_digest": "b" * 32, "output": "c" * 32,
-    }  # fmt: skip
+        "schema_": 1,
+        "task_id": "t",
+        "job_id": "j",
+        "stage": Stage.RENDER,
+        "batch": 0,
+        "count": 32,
+        "request": request(),
+        "hand_digest": "a" * 32,
+        "object_digest": "b" * 32,
+        "output": "c" * 32,
+    }
     return TaskMessage(**fields | changes)
 
 

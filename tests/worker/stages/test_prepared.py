@@ -15,8 +15,8 @@ from tests.worker.objects.shapes import box, join, sphere, stl
 from worker.objects.model import ObjectModel
 from worker.objects.packed import from_bytes, to_bytes
 from worker.objects.prepare import load_object
-from worker.stages import prepared
-from worker.stages.prepared import prepared_object
+from worker.stages import assets
+from worker.stages.assets import prepared_object
 
 #: Two balls in one another: a repair to remember.
 FILES = {"asset.json": b'{"file": "m.stl"}', **stl(join(sphere(segments=32), sphere(segments=32, at=(0.02, 0.0, 0.0))))}
@@ -43,7 +43,7 @@ def same(one: ObjectModel, two: ObjectModel) -> None:
 def test_the_second_worker_finds_what_the_first_has_made(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     fresh = load_object(FILES, name="balls", digest=DIGEST, face_error_m=3e-4)
     same(prepared_object(store, DIGEST, name="balls", face_error_m=3e-4), fresh)
-    monkeypatch.delattr(prepared, "load_object")
+    monkeypatch.delattr(assets, "load_object")
     same(prepared_object(store, DIGEST, name="balls", face_error_m=3e-4), fresh)
     assert fresh.repairs
 

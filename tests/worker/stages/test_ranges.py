@@ -46,9 +46,14 @@ def made(store: Store, span: int, **request: Any) -> tuple[JobRecord, list[tuple
     obj = publish_asset(store, AssetKind.OBJECT, "block", builtin_files(AssetKind.OBJECT, "block"))
     wanted = JobRequest(hand="barrett", object="block", fidelity="draft", seed=3, **request)
     job = JobRecord(
-        id=job_id(wanted, hand.digest, obj.digest), request=wanted, hand_digest=hand.digest, object_digest=obj.digest,
-        lane=Lane.BULK, span=span, created=timestamp(),
-    )  # fmt: skip
+        id=job_id(wanted, hand.digest, obj.digest),
+        request=wanted,
+        hand_digest=hand.digest,
+        object_digest=obj.digest,
+        lane=Lane.BULK,
+        span=span,
+        created=timestamp(),
+    )
     put_record(store, names.job_record(job.id), job)
     runner = Runner(STAGES, worker="w", publish=lambda event: None)  # type: ignore[arg-type]
     found = []

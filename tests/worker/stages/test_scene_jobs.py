@@ -39,9 +39,16 @@ from worker.stages.context import TaskContext
 from worker.stages.output import batch_seed
 
 TABLE = {
-    "grasps": 6, "fidelity": "draft", "seed": 3, "audits": 0, "scene": "table", "scenes": 2, "views": 1, "width": 48,
+    "grasps": 6,
+    "fidelity": "draft",
+    "seed": 3,
+    "audits": 0,
+    "scene": "table",
+    "scenes": 2,
+    "views": 1,
+    "width": 48,
     "height": 36,
-}  # fmt: skip
+}
 STAGES = {Stage.SCENE: scene.run, Stage.SYNTHESIZE: synthesize.run, Stage.RENDER: render.run}
 
 
@@ -61,9 +68,13 @@ class Bench:
             one["digest"] = publish_asset(self.store, AssetKind.OBJECT, one["object"], files).digest
         wanted = JobRequest(hand="barrett", object="block", **request)
         self.job = JobRecord(
-            id=job_id(wanted, hand.digest, obj.digest), request=wanted, hand_digest=hand.digest,
-            object_digest=obj.digest, lane=Lane.BULK, created=timestamp(),
-        )  # fmt: skip
+            id=job_id(wanted, hand.digest, obj.digest),
+            request=wanted,
+            hand_digest=hand.digest,
+            object_digest=obj.digest,
+            lane=Lane.BULK,
+            created=timestamp(),
+        )
         put_record(self.store, names.job_record(self.job.id), self.job)
         runner = Runner(STAGES, worker="w", publish=lambda event: None)  # type: ignore[arg-type]
         for task in plan(self.job):
@@ -153,10 +164,15 @@ def render_alone(bench: Bench, base: Shard) -> dict[str, Any]:
     message = message_of(bench.job, list(plan(bench.job))[-1], attempt=1, max_attempt=3)
     request = bench.job.request
     return pictures(
-        object_of(bench.store, message), np.asarray(base["scene/object_pose"]), views=1, stereo=False,
-        width=request.width, height=request.height, seed=batch_seed(message),
+        object_of(bench.store, message),
+        np.asarray(base["scene/object_pose"]),
+        views=1,
+        stereo=False,
+        width=request.width,
+        height=request.height,
+        seed=batch_seed(message),
         extras=Extras(supports=supports_in(request.place)),
-    )  # fmt: skip
+    )
 
 
 def test_neighbours_that_overlap_fail_the_job_in_a_line(table: Bench) -> None:

@@ -20,9 +20,16 @@ from worker.run import Run
 from worker.studies.timing import host_ms, kernel_shares
 
 RUN_KEYS = {
-    "fidelity", "batch", "processes", "hand_points", "faces", "iterations", "ms_per_iteration", "grasps_per_second",
+    "fidelity",
+    "batch",
+    "processes",
+    "hand_points",
+    "faces",
+    "iterations",
+    "ms_per_iteration",
+    "grasps_per_second",
     "peak_memory_mb",
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")
@@ -39,9 +46,7 @@ def test_every_run_has_the_keys_of_the_contract(result: tuple[dict[str, object],
     found, _ = result
     assert found["device"]
     runs = found["runs"]
-    assert isinstance(runs, list) and [(run["batch"], run["join"]) for run in runs] == [
-        (1, 1), (1, 2), (4, 1), (4, 2),
-    ]  # fmt: skip
+    assert isinstance(runs, list) and [(run["batch"], run["join"]) for run in runs] == [(1, 1), (1, 2), (4, 1), (4, 2)]
     assert all(set(run) >= RUN_KEYS for run in runs)
 
 
@@ -61,7 +66,7 @@ def test_the_host_takes_some_of_the_time_of_a_grasp_and_not_all(result: tuple[di
 
 def test_kernels_on_the_processor_are_no_time_of_the_host() -> None:
     hand, obj, fidelity, count = hand_from_path("barrett"), object_from_path("block"), FIDELITIES["draft"], 16
-    host = host_ms(hand, obj, fidelity, count, "cpu")
+    host = host_ms(hand, obj, fidelity, count)
     began = time.thread_time()
     plan(hand, obj, Wanted(count, fidelity, seed=0), Run("cpu", threads=1))
     assert host < 0.5 * 1e3 * (time.thread_time() - began) / count

@@ -21,13 +21,23 @@ from worker.run import Run
 from worker.studies.chart.report import markdown
 from worker.studies.chart.settings import settings_of
 from worker.studies.chart.statistics import first_valid, pareto, summed
-from worker.studies.chart.sweeps import Turn, _make, turns
-from worker.studies.chart.variants import asking_each
+from worker.studies.chart.sweeps import Turn, _make, asking_each, turns
 
 RUN_KEYS = {
-    "method", "fidelity", "hand", "object", "valid_per_second", "seconds_to_first_valid", "gsr", "epsilon", "pd_mm",
-    "end_to_end_per_second", "letter", "hard", "robust",
-}  # fmt: skip
+    "method",
+    "fidelity",
+    "hand",
+    "object",
+    "valid_per_second",
+    "seconds_to_first_valid",
+    "gsr",
+    "epsilon",
+    "pd_mm",
+    "end_to_end_per_second",
+    "letter",
+    "hard",
+    "robust",
+}
 
 
 @pytest.fixture(scope="module")
@@ -92,11 +102,16 @@ def test_a_published_chart_is_the_latest_in_the_store(made: tuple[dict[str, Any]
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["--methods", "magic"], ["--fidelities", "superb"], ["--batch", "many"], ["--hands", ","],
-        ["--option", "steps=3"], ["--methods", "graspit", "--option", "graspit:steps=1"], ["--objects", "nowhere.stl"],
+        ["--methods", "magic"],
+        ["--fidelities", "superb"],
+        ["--batch", "many"],
+        ["--hands", ","],
+        ["--option", "steps=3"],
+        ["--methods", "graspit", "--option", "graspit:steps=1"],
+        ["--objects", "nowhere.stl"],
         ["--sweep", "--knob", "volume"],
     ],
-)  # fmt: skip
+)
 def test_a_wrong_option_is_the_callers_mistake(arguments: list[str]) -> None:
     done = CliRunner().invoke(app, ["--quick", *arguments])
     assert done.exit_code == 2
@@ -104,9 +119,14 @@ def test_a_wrong_option_is_the_callers_mistake(arguments: list[str]) -> None:
 
 def test_a_method_can_be_charted_with_options_and_a_batch_of_its_own() -> None:
     plain, kept = settings_of(
-        ["graspit", "graspit:keep=5@10"], ["draft"], batches=[32], peer_batch=4, options=["graspit:steps=40000"],
-        quick=False, run=Run(threads=1),
-    )  # fmt: skip
+        ["graspit", "graspit:keep=5@10"],
+        ["draft"],
+        batches=[32],
+        peer_batch=4,
+        options=["graspit:steps=40000"],
+        quick=False,
+        run=Run(threads=1),
+    )
     assert (plain.fidelity, plain.batch, plain.options) == ("as published", 4, {"steps": "40000"})
     assert (kept.fidelity, kept.batch, kept.options) == ("keep=5", 10, {"steps": "40000", "keep": "5"})
 
@@ -160,10 +180,20 @@ def test_a_ratio_to_a_method_without_a_valid_grasp_is_a_bound() -> None:
     """5 valid/s against 0 of 10 at 50 grasps/s: at most 3 of 10 hold, so at least a third of a time more."""
     rows = summed([run_of("fast_graspd", 10, 1.0, 0.5), run_of("graspit", 0, 0.1, 0.0)])
     assert "> × 0.333 (0 of 10 valid)" in markdown(
-        {"summary": rows, "runs": [], "by_hand": {}, "models": 8,
-         "created": "", "device": "", "threads": 2, "versions": {"graspd": "", "warp": ""},
-         "referee": {"level": ""}, "friction": 1.0, "threshold_m": 0.005}
-    )  # fmt: skip
+        {
+            "summary": rows,
+            "runs": [],
+            "by_hand": {},
+            "models": 8,
+            "created": "",
+            "device": "",
+            "threads": 2,
+            "versions": {"graspd": "", "warp": ""},
+            "referee": {"level": ""},
+            "friction": 1.0,
+            "threshold_m": 0.005,
+        }
+    )
 
 
 def test_each_knob_has_the_default_among_its_values_once() -> None:
@@ -174,8 +204,9 @@ def test_each_knob_has_the_default_among_its_values_once() -> None:
 
 def test_one_knob_can_be_turned_alone() -> None:
     assert [(turn.knob, turn.value) for turn in turns(knobs=["queries"])] == [
-        ("queries", "shared"), ("queries", "one per velocity"),
-    ]  # fmt: skip
+        ("queries", "shared"),
+        ("queries", "one per velocity"),
+    ]
 
 
 def test_asking_for_distances_anew_changes_no_grasp() -> None:

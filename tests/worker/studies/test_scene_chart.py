@@ -153,9 +153,16 @@ def test_seconds_are_those_of_the_clock_of_the_settings_device(monkeypatch: pyte
 
 
 def run_of(way: str, pair: str, lifted: int, seconds: float, grasps: int = 10) -> dict[str, Any]:
-    counts = {"grasps": grasps, "seconds": seconds, "end_seconds": 2 * seconds, "clear_count": lifted,
-              "lift_count": lifted, "lift_letter_count": lifted, "lift_hard_count": 0,
-              "robust_sum": 0.5 * lifted}  # fmt: skip
+    counts = {
+        "grasps": grasps,
+        "seconds": seconds,
+        "end_seconds": 2 * seconds,
+        "clear_count": lifted,
+        "lift_count": lifted,
+        "lift_letter_count": lifted,
+        "lift_hard_count": 0,
+        "robust_sum": 0.5 * lifted,
+    }
     said = {"way": way, "method": "m", "fidelity": "f", "batch": grasps, "hand": "h", "object": pair, "note": ""}
     return {**said, **counts, **figures([counts]), "scenes": 1, "seconds_to_first": seconds if lifted else None}
 
@@ -176,7 +183,14 @@ def test_a_pair_that_is_refused_counts_as_tries_without_a_lift() -> None:
     (row,) = summed([refused, run_of(IN_SCENE, "b", 5, 1.0)])
     assert row["lift"] == 0.25 and row["grasps_per_second"] == pytest.approx(10.0)
     assert row["valid_per_second"] == pytest.approx(5.0)
-    chart = {"runs": [refused], "summary": [row], "device": "d", "created": "c", "versions": {"graspd": "0"},
-             "models": 2, "by_hand": {}}  # fmt: skip
+    chart = {
+        "runs": [refused],
+        "summary": [row],
+        "device": "d",
+        "created": "c",
+        "versions": {"graspd": "0"},
+        "models": 2,
+        "by_hand": {},
+    }
     said = markdown(chart | {"scene": {"kind": "table", "faces": "all"}})
     assert "## Refused" in said and "nothing can reach it" in said

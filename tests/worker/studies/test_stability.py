@@ -120,8 +120,12 @@ def test_a_quick_run_takes_less_than_the_minute_that_it_promises() -> None:
 
 def test_what_is_no_number_is_broken() -> None:
     assert [graded(value, 1.0, 2.0) for value in (0.5, 1.5, 2.5, math.nan, math.inf)] == [
-        "good", "weak", "broken", "broken", "broken",
-    ]  # fmt: skip
+        "good",
+        "weak",
+        "broken",
+        "broken",
+        "broken",
+    ]
 
 
 def a_map(**changes: object) -> StabilityMap:

@@ -45,9 +45,28 @@ def test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so(tmp_path: Path) -> 
     plate = tmp_path / "plate.stl"
     trimesh.creation.box((0.15, 0.15, 0.003)).export(plate)
     words = [
-        "synth", "--hand", "barrett", "--object", str(plate), "--units", "m", "--scene", "table", "--faces", "all",
-        "--scenes", "1", "-n", "2", "--budget", "2", "--fidelity", "draft", "-o", str(tmp_path / "g.h5"),
-    ]  # fmt: skip
+        "synth",
+        "--hand",
+        "barrett",
+        "--object",
+        str(plate),
+        "--units",
+        "m",
+        "--scene",
+        "table",
+        "--faces",
+        "all",
+        "--scenes",
+        "1",
+        "-n",
+        "2",
+        "--budget",
+        "2",
+        "--fidelity",
+        "draft",
+        "-o",
+        str(tmp_path / "g.h5"),
+    ]
     result = CliRunner().invoke(build(), words)
     assert result.exit_code == 3, result.output
     assert "the budget of 2 tries for each ended first" in result.output

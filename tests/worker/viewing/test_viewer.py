@@ -164,10 +164,17 @@ def test_without_viser_one_line_says_how_to_install_it(tmp_path, monkeypatch):
 def test_the_command_tells_its_address_and_ends_with_ctrl_c(tmp_path):
     hand, block = hand_from_path("barrett"), object_from_path("block")
     said = {
-        "hand": "barrett", "hand_digest": hand.digest, "object": "block", "object_digest": block.digest,
-        "method": "none", "fidelity": json_attribute({"face_error_m": 3e-4}), "seed": 0, "batch": 0,
-        "joint_names": list(hand.joint_names), "scene": SCENE,
-    }  # fmt: skip
+        "hand": "barrett",
+        "hand_digest": hand.digest,
+        "object": "block",
+        "object_digest": block.digest,
+        "method": "none",
+        "fidelity": json_attribute({"face_error_m": 3e-4}),
+        "seed": 0,
+        "batch": 0,
+        "joint_names": list(hand.joint_names),
+        "scene": SCENE,
+    }
     file = tmp_path / "grasps.h5"
     file.write_bytes(write_shard("base", arrays(len(hand.joint_names)), said))
     command = [sys.executable, "-m", "graspd", "view", str(file), "--port", "0"]

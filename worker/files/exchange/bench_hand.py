@@ -72,10 +72,15 @@ def _configuration(hand: HandModel, model: Path) -> str:
     names = body_names(hand)
     fingers = [f"{_finger(hand, int(b))}_" for b in np.flatnonzero(hand.parent == 0)]
     values: dict[str, Any] = {
-        "xml_path": model.as_posix(), "mocap": True, "exclude_table_contact": None, "tendon": None,
-        "color": list(_COLOUR), "finger_prefix": fingers, "valid_body_name": list(names),
+        "xml_path": model.as_posix(),
+        "mocap": True,
+        "exclude_table_contact": None,
+        "tendon": None,
+        "color": list(_COLOUR),
+        "finger_prefix": fingers,
+        "valid_body_name": list(names),
         "tip_body_name": [names[b] for b in hand.fingertips],
-    }  # fmt: skip
+    }
     return "".join(f"{key}: {json.dumps(value)}\n" for key, value in values.items())
 
 
@@ -109,10 +114,14 @@ def _add_joint(body: Element, hand: HandModel, b: int) -> None:
     d, m, shift = int(hand.dof[b]), float(hand.multiplier[b]), float(hand.offset[b])
     ends = sorted((m * float(hand.lower[d]) + shift, m * float(hand.upper[d]) + shift))
     SubElement(
-        body, "joint", name=_joint_of(hand, b), axis=_text(hand.axis[b]), range=_text(ends),
+        body,
+        "joint",
+        name=_joint_of(hand, b),
+        axis=_text(hand.axis[b]),
+        range=_text(ends),
         type="hinge" if hand.joint_type[b] == JointType.REVOLUTE else "slide",
         damping=_text([_DAMPING_TIME * float(hand.stiffness[d])]),
-    )  # fmt: skip
+    )
 
 
 def _add_solids(body: Element, assets: Element, hand: HandModel, b: int) -> None:
@@ -157,17 +166,25 @@ def _add_drives(equality: Element, actuators: Element, hand: HandModel) -> None:
             if d == min(tendon.dofs):
                 limit = tendon.limit(hand.effort)
                 SubElement(
-                    actuators, "position", name=name, tendon=tendon.name, kp=_text([tendon.gain(hand.stiffness)]),
+                    actuators,
+                    "position",
+                    name=name,
+                    tendon=tendon.name,
+                    kp=_text([tendon.gain(hand.stiffness)]),
                     forcerange=_text([-limit, limit]),
-                )  # fmt: skip
+                )
             continue
         lead, *others = [int(b) for b in hand.joint_body if hand.dof[b] == d]
         m = float(hand.multiplier[lead])
         limit = float(hand.effort[d]) / abs(m)
         SubElement(
-            actuators, "position", name=name, joint=_joint_of(hand, lead),
-            kp=_text([float(hand.stiffness[d]) / m**2]), forcerange=_text([-limit, limit]),
-        )  # fmt: skip
+            actuators,
+            "position",
+            name=name,
+            joint=_joint_of(hand, lead),
+            kp=_text([float(hand.stiffness[d]) / m**2]),
+            forcerange=_text([-limit, limit]),
+        )
         for b in others:
             ratio = float(hand.multiplier[b]) / m
             start = float(hand.offset[b]) - ratio * float(hand.offset[lead])

@@ -56,9 +56,12 @@ def _facts(obj: ObjectModel, solid: float) -> dict[str, Any]:
     """What the evaluator sets the density by: at density 1 the pieces, which it weighs, have this mass."""
     _, extents = trimesh.bounds.oriented_bounds(obj.hull_vertices)
     return {
-        "gravity_center": obj.centre_of_mass.tolist(), "obb": np.asarray(extents, float).tolist(),
-        "scale": 1.0, "density": 1.0, "mass": solid,
-    }  # fmt: skip
+        "gravity_center": obj.centre_of_mass.tolist(),
+        "obb": np.asarray(extents, float).tolist(),
+        "scale": 1.0,
+        "density": 1.0,
+        "mass": solid,
+    }
 
 
 def write_table(name: str, pose: Floats, number: int, root: Path) -> Path:
@@ -84,14 +87,14 @@ def _save(file: Path, record: dict[str, Any]) -> None:
 def _scene(name: str, place: str, pose: Floats) -> dict[str, Any]:
     folder = f"../../../processed_data/{name}"
     thing = {
-        "type": "rigid_object", "scale": np.ones(3), "pose": np.array(pose, float),
-        "file_path": f"{folder}/mesh/simplified.obj", "info_path": f"{folder}/info/simplified.json",
+        "type": "rigid_object",
+        "scale": np.ones(3),
+        "pose": np.array(pose, float),
+        "file_path": f"{folder}/mesh/simplified.obj",
+        "info_path": f"{folder}/info/simplified.json",
         "urdf_path": f"{folder}/urdf/coacd.urdf",
-    }  # fmt: skip
-    return {
-        "scene_id": f"{name}/{place}", "scene": {name: thing},
-        "task": {"type": "force_closure", "obj_name": name},
-    }  # fmt: skip
+    }
+    return {"scene_id": f"{name}/{place}", "scene": {name: thing}, "task": {"type": "force_closure", "obj_name": name}}
 
 
 def _urdf(name: str, pieces: int) -> str:

@@ -70,7 +70,9 @@ def _names(hand: HandModel) -> list[str]:
 def _signs(hand: HandModel) -> np.ndarray:
     """Where the hand's joint closes towards negative angles, the file's sign is turned."""
     high, low = hand.expand(hand.upper[None])[0], hand.expand(hand.lower[None])[0]
-    return np.array([
-        1.0 if max(high[k], low[k]) > -min(high[k], low[k]) else -1.0
-        for k in (hand.joint_names.index(name) for name in _names(hand))
-    ])  # fmt: skip
+    return np.array(
+        [
+            1.0 if max(high[k], low[k]) > -min(high[k], low[k]) else -1.0
+            for k in (hand.joint_names.index(name) for name in _names(hand))
+        ]
+    )

@@ -80,9 +80,8 @@ def read(path: Path, *, hand: str, obj: str) -> list[Imported]:
 
 
 def write(
-    hand: HandModel, obj: ObjectModel, grasps: GraspSet, rows: Sequence[int], folder: Path,
-    placed: Placed | None = None,
-) -> list[Path]:  # fmt: skip
+    hand: HandModel, obj: ObjectModel, grasps: GraspSet, rows: Sequence[int], folder: Path, placed: Placed | None = None
+) -> list[Path]:
     """Write grasps with all that DexGraspBench's evaluator reads: laid over its checkout, the folder is complete.
 
     The object has scale 1. It stands in the origin, or, where the grasps are `placed`, on its table, as the tabletop
@@ -115,9 +114,11 @@ def write(
         for row, file in zip(rows, written, strict=True):
             pose, path = scenes[number[row]]
             record: Row = {
-                "obj_path": obj_path.as_posix(), "obj_scale": 1.0, "obj_pose": pose.copy(),
+                "obj_path": obj_path.as_posix(),
+                "obj_scale": 1.0,
+                "obj_pose": pose.copy(),
                 "scene_path": path.as_posix(),
-            }  # fmt: skip
+            }
             record |= postures(mapping, hand, grasps, row, None if placed is None else pose)
             if placed is not None:
                 record |= tabletop_fields(mapping, hand, grasps, row, pose)
@@ -134,9 +135,14 @@ def models_of(hand: HandModel, folder: Path) -> list[HandMapping]:
     model = write_hand(hand, config, folder)
     order = joint_order(folder / model)
     ours = HandMapping(
-        hand.name, hand.root_link, config, model.as_posix(), tuple(IDENTITY_POSE), tuple((j, j) for j in order),
+        hand.name,
+        hand.root_link,
+        config,
+        model.as_posix(),
+        tuple(IDENTITY_POSE),
+        tuple((j, j) for j in order),
         link_names(hand),
-    )  # fmt: skip
+    )
     return [ours, *filter(None, [of_the_benchmark(hand)])]
 
 
@@ -193,9 +199,15 @@ def _scale(row: Row) -> float:
 
 
 def _set(
-    path: Path, hand: HandModel, obj: ObjectModel, rows: list[Row], scale: float, mapping: HandMapping | None, *,
+    path: Path,
+    hand: HandModel,
+    obj: ObjectModel,
+    rows: list[Row],
+    scale: float,
+    mapping: HandMapping | None,
+    *,
     on_table: bool,
-) -> Imported:  # fmt: skip
+) -> Imported:
     pose = np.array([np.ravel(row.get("obj_pose", IDENTITY_POSE)) for row in rows], float)
     parts = {name: _posture(path, hand, name, rows, pose, mapping) for name in POSTURES}
     grasps = GraspSet(parts["grasp"], parts["pregrasp"], parts["squeeze"], np.full(len(rows), np.nan))

@@ -20,6 +20,8 @@ Its loader takes pixel (u, v) for the place u, v; ours has pixel centres at +0.5
 from __future__ import annotations
 
 import shutil
+import zipfile
+import zlib
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -30,10 +32,10 @@ import scipy.io
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
+from service.model.refusals import why
 from service.model.transforms import apply, compose, invert, pose_from_matrix, pose_to_matrix
 from service.readers import DepthNoise, Pictures
 from service.readers.cloud_views import CloudView
-from worker.files.exchange.archives import load_npz
 from worker.files.exchange.dexgraspnet2_graspness import SceneGraspness, surface_samples
 from worker.files.exchange.imported import Imported, completed, joints_by_name, verdicts
 from worker.files.exchange.lots import Look, Lot, by_scene, looks
@@ -47,7 +49,6 @@ from worker.rendering.annotate import OBJECT
 from worker.rendering.export import export_png
 
 Floats = NDArray[np.float64]
-
 CAMERA: Final = "realsense"
 #: Views of a scene, among which its loader draws.
 VIEWS: Final = 256
@@ -63,6 +64,10 @@ _OURS: Final = ("pregrasp_qpos", "squeeze_qpos", "success", "row")
 _NUMPYS: Final = ("file", "args", "kwds", "allow_pickle")
 #: A `meta` file takes two kilobytes; unpacked it is at most a thousand times as large [bytes].
 _LARGEST_META: Final = 64 * 2**10
+#: Most that the members of a file may unpack to [bytes]; no file of grasps of one object comes near.
+LARGEST: Final = 2**30
+#: Most members.
+_MEMBERS: Final = 1024
 
 
 def write(
@@ -145,9 +150,11 @@ def _write_scene(
         intrinsics = np.asarray(sample["camera/intrinsics"], float) - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
         pose = np.asarray(sample["object/pose"])
         meta = {
-            "intrinsic_matrix": intrinsics, "factor_depth": np.array([[FACTOR]]), "cls_indexes": np.array([[1]]),
+            "intrinsic_matrix": intrinsics,
+            "factor_depth": np.array([[FACTOR]]),
+            "cls_indexes": np.array([[1]]),
             "poses": pose_to_matrix(pose)[:3, :, None],
-        }  # fmt: skip
+        }
         scipy.io.savemat(path / "meta" / f"{view:04}.mat", meta)
         if labels.any():  # its loader passes over a view of nothing, which has no workspace
             found = graspness.of_view(steps / FACTOR, labels, intrinsics, first @ poses[view], pose)
@@ -226,10 +233,13 @@ def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[Imported]:
     set_ = _with_ours(path, model, found, grasp, away)
     return [
         Imported(
-            model, thing, completed(model, thing, grasp) if set_ is None else set_, path.stem,
+            model,
+            thing,
+            completed(model, thing, grasp) if set_ is None else set_,
+            path.stem,
             published=None if published is None or len(np.ravel(published)) != count else verdicts(published),
         )
-    ]  # fmt: skip
+    ]
 
 
 def _with_ours(
@@ -267,3 +277,21 @@ def _object_pose(path: Path, number: int) -> Floats:
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise InputError(f"{file} does not say where object {number} stands")
     return pose_from_matrix(pose)
+
+
+def load_npz(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of a `.npz` file.
+
+    Raises:
+        InputError: no such file, objects in it, or it unpacks to more than `LARGEST`.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+        # A member is never unpacked further than it says here.
+        if len(members) > _MEMBERS or sum(member.file_size for member in members) > LARGEST:
+            raise InputError(f"{path} unpacks to more than {LARGEST >> 20} MiB or to more than {_MEMBERS} arrays")
+        with np.load(path, allow_pickle=False) as found:
+            return {name: found[name] for name in found.files}
+    except (OSError, ValueError, EOFError, KeyError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path} is no .npz file that can be read safely: {why(error)}") from None

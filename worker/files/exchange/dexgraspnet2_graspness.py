@@ -16,7 +16,7 @@ the mean of its other fingertips, and the palm's surface. Where no point is seen
 nearest to the palm. Of the nearest point theirs says 15 mm and holds 0.015 against a squared distance, which is what
 pytorch3d's `knn_points` returns: 122 mm is what it does, and what is taken here.
 
-`service.readers.graspness` tells something else: the share of grasps whose hand touches a point.
+`service.readers.clouds.graspness` tells something else: the share of grasps whose hand touches a point.
 """
 
 from __future__ import annotations

@@ -213,12 +213,21 @@ def _save(file: Path, record: dict[str, Any]) -> None:
 def _configure(folder: Path, name: str, lot: Lot, types: list[str]) -> None:
     """DexLearn's configuration of the data."""
     values: dict[str, Any] = {
-        "num_workers": 8, "num_points": POINTS, "traj_length": len(POSTURES), "joint_num": len(lot.hand.joint_names),
-        "grasp_type_lst": types, "grasp_type_cond": len(types) > 1, "pc_centering": False,
-        "grasp_path": f"${{data_folder}}/grasp/{name}/{COLLECTED}", "object_path": "${data_folder}/object/graspd",
-        "split_path": "valid_split", "pc_path": VISION.relative_to(SET).as_posix(), "test_split": "test",
-        "test_scene_cfg": f"{'floating' if lot.placed is None else TABLETOP}/**.npy", "mini_test": False,
-    }  # fmt: skip
+        "num_workers": 8,
+        "num_points": POINTS,
+        "traj_length": len(POSTURES),
+        "joint_num": len(lot.hand.joint_names),
+        "grasp_type_lst": types,
+        "grasp_type_cond": len(types) > 1,
+        "pc_centering": False,
+        "grasp_path": f"${{data_folder}}/grasp/{name}/{COLLECTED}",
+        "object_path": "${data_folder}/object/graspd",
+        "split_path": "valid_split",
+        "pc_path": VISION.relative_to(SET).as_posix(),
+        "test_split": "test",
+        "test_scene_cfg": f"{'floating' if lot.placed is None else TABLETOP}/**.npy",
+        "mini_test": False,
+    }
     file = folder / "dexlearn" / "config" / "data" / f"{name}.yaml"
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text("".join(f"{key}: {json.dumps(value)}\n" for key, value in values.items()))

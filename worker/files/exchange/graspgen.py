@@ -25,9 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import pose_from_matrix, pose_to_matrix, quat_from_matrix
+from service.model.transforms import apply, pose_from_matrix, pose_to_matrix, quat_from_matrix
 from service.store import standing
-from worker.files.exchange.closing import closed_at
 from worker.files.exchange.imported import Imported, completed, joints_by_name
 from worker.files.exchange.lots import Lot
 from worker.files.exchange.names import plain_name
@@ -38,9 +37,14 @@ from worker.hands.jaws import jaws_of
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.planners.autograsp import kernels
+from worker.planners.autograsp.closing import Closer
+from worker.planners.fast_graspd.selection import posture_of
+from worker.planners.peers import ground_of
+from worker.simulation.state import HandState
 
 Floats = NDArray[np.float64]
-
 MEMBER: Final = "grasps.json"
 INDEX: Final = "uuid_index.json"
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
@@ -52,6 +56,8 @@ LARGEST: Final = 256 * 2**20
 FEWEST: Final = 5
 #: How far a published matrix may be from a rotation: they are printed with six digits and more.
 _ROTATION: Final = 1e-3
+#: Hands that are closed at once.
+_AT_ONCE: Final = 256
 
 
 def write(lots: Sequence[Lot], folder: Path, out: frozenset[str]) -> Written:
@@ -168,9 +174,10 @@ def convention(hand: HandModel) -> dict[str, Any]:
     x = x / np.linalg.norm(x)
     w, *xyz = quat_from_matrix(np.stack([x, np.cross(z, x), z], axis=1)).tolist()
     return {
-        "width": width, "depth": depth,
+        "width": width,
+        "depth": depth,
         "transform_offset_from_asset_to_graspgen_convention": [[0.0, 0.0, 0.0], [*xyz, w]],
-    }  # fmt: skip
+    }
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Imported]:
@@ -265,3 +272,16 @@ def _parsed(what: str, data: bytes) -> dict[str, Any]:
 
 def _json(path: Path, value: Any) -> None:
     path.write_text(json.dumps(value, indent=1) + "\n")
+
+
+def closed_at(hand: HandModel, obj: ObjectModel, hand_pose: NDArray[np.float64]) -> Posture:
+    """The hand at poses (N, 7) in the object frame, its fingers closed from its preshape until they touch or end."""
+    pair = ground_of(hand, obj, "cpu", kernels)
+    joints = np.zeros((len(hand_pose), len(hand.joint_names)))
+    for first in range(0, len(hand_pose), _AT_ONCE):
+        pose = hand_pose[first : first + _AT_ONCE]
+        palm = apply(pose, hand.palm.centre) - obj.centre_of_mass
+        state = HandState(palm, pose[:, 3:], np.tile(hand.preshape, (len(pose), 1)))
+        closed = Closer(pair, len(pose)).close(state).state
+        joints[first : first + len(pose)] = posture_of(hand, obj, closed).joint_positions
+    return Posture(hand_pose, joints)

@@ -43,18 +43,40 @@ FREE: Final = "free"
 TABLE: Final = "table"
 #: Columns of grasps, by the words of `parquet.type_of`.
 GRASPS: Final = {
-    "hand": "text", "object": "text", "shard": "text", "row": "int64", "root_link": "text", "joint_names": "text[]",
+    "hand": "text",
+    "object": "text",
+    "shard": "text",
+    "row": "int64",
+    "root_link": "text",
+    "joint_names": "text[]",
     **{f"{name}_{what}": word for name in POSTURES for what, word in (("pose", "float64[7]"), ("joints", "float64[]"))},
-    "verdict": "int8", "verdict_level": "text", "epsilon": "float64", "penetration_depth_mm": "float64",
-    "grasp_type": "int32", "scene_kind": "text", "scene": "int32", "object_pose": "float64[7]",
-}  # fmt: skip
+    "verdict": "int8",
+    "verdict_level": "text",
+    "epsilon": "float64",
+    "penetration_depth_mm": "float64",
+    "grasp_type": "int32",
+    "scene_kind": "text",
+    "scene": "int32",
+    "object_pose": "float64[7]",
+}
 #: And of pictures.
 PICTURES: Final = {
-    "hand": "text", "object": "text", "shard": "text", "row": "int64", "scene": "int32", "rgb": parquet.IMAGE,
-    "depth": parquet.IMAGE, "segmentation": parquet.IMAGE, "intrinsics": "float64[3][3]",
-    "extrinsics": "float64[4][4]", "object_pose": "float64[7]", "grasp_shard": "text", "grasp_rows": "int64[]",
-    "hand_poses": "float64[7][]", "joint_positions": "float64[][]",
-}  # fmt: skip
+    "hand": "text",
+    "object": "text",
+    "shard": "text",
+    "row": "int64",
+    "scene": "int32",
+    "rgb": parquet.IMAGE,
+    "depth": parquet.IMAGE,
+    "segmentation": parquet.IMAGE,
+    "intrinsics": "float64[3][3]",
+    "extrinsics": "float64[4][4]",
+    "object_pose": "float64[7]",
+    "grasp_shard": "text",
+    "grasp_rows": "int64[]",
+    "hand_poses": "float64[7][]",
+    "joint_positions": "float64[][]",
+}
 #: Pictures in a row group.
 _PICTURES_AT_ONCE: Final = 50
 
@@ -108,13 +130,21 @@ def _grasps(lot: Lot) -> list[dict[str, Any]]:
     rows = []
     for row in lot.rows.tolist():
         one: dict[str, Any] = {
-            "hand": lot.hand.name, "object": lot.name, "shard": lot.id, "row": row, "root_link": lot.hand.root_link,
-            "joint_names": list(lot.hand.joint_names), "verdict": int(lot.verdict[row]),
+            "hand": lot.hand.name,
+            "object": lot.name,
+            "shard": lot.id,
+            "row": row,
+            "root_link": lot.hand.root_link,
+            "joint_names": list(lot.hand.joint_names),
+            "verdict": int(lot.verdict[row]),
             "verdict_level": str(said.get("verdict_level", "none")),
             "epsilon": float(np.asarray(arrays["quality/epsilon"], float)[row, at]),
             "penetration_depth_mm": float(arrays["quality/penetration_depth_mm"][row]),
-            "grasp_type": int(types[row]), "scene_kind": kind, "scene": -1, "object_pose": IDENTITY_POSE.tolist(),
-        }  # fmt: skip
+            "grasp_type": int(types[row]),
+            "scene_kind": kind,
+            "scene": -1,
+            "object_pose": IDENTITY_POSE.tolist(),
+        }
         if lot.placed is not None:
             scene = int(lot.placed.index[row])
             one |= {"scene": scene, "object_pose": np.asarray(lot.placed.object_pose[scene], float).tolist()}
@@ -143,16 +173,22 @@ def _groups(pictures: Pictures, names: Mapping[str, str], noise: DepthNoise | No
 def _picture(sample: Mapping[str, Any], name: str, depth: Floats) -> dict[str, Any]:
     steps = np.where(depth / PNG_STEP_M < np.iinfo(np.uint16).max + 0.5, np.rint(depth / PNG_STEP_M), 0)
     return {
-        "hand": sample["hand"], "object": name, "shard": sample["shard_id"], "row": int(sample["row"]),
-        "scene": int(sample["scene"]), "rgb": png(sample["image/rgb"]), "depth": png(steps.astype(np.uint16)),
+        "hand": sample["hand"],
+        "object": name,
+        "shard": sample["shard_id"],
+        "row": int(sample["row"]),
+        "scene": int(sample["scene"]),
+        "rgb": png(sample["image/rgb"]),
+        "depth": png(steps.astype(np.uint16)),
         "segmentation": png(sample["image/segmentation"]),
         "intrinsics": np.asarray(sample["camera/intrinsics"], float).tolist(),
         "extrinsics": np.asarray(sample["camera/extrinsics"], float).tolist(),
-        "object_pose": np.asarray(sample["object/pose"], float).tolist(), "grasp_shard": sample["base_id"],
+        "object_pose": np.asarray(sample["object/pose"], float).tolist(),
+        "grasp_shard": sample["base_id"],
         "grasp_rows": np.asarray(sample["grasp/base_row"]).tolist(),
         "hand_poses": np.asarray(sample["grasp/hand_pose"], float).tolist(),
         "joint_positions": np.asarray(sample["grasp/joint_positions"], float).tolist(),
-    }  # fmt: skip
+    }
 
 
 def png(pixels: NDArray[Any]) -> dict[str, Any]:
@@ -166,11 +202,12 @@ def _card(splits: list[str], *, seen: bool) -> str:
     """The head of the data set's card: JSON is YAML."""
     tables = [
         {
-            "config_name": table, "default": table == "grasps",
+            "config_name": table,
+            "default": table == "grasps",
             "data_files": [{"split": split, "path": f"{table}/{split}-*.parquet"} for split in splits],
         }
         for table in (["grasps", "pictures"] if seen else ["grasps"])
-    ]  # fmt: skip
+    ]
     head = f"---\nconfigs: {json.dumps(tables)}\n---\n\n"
     return head + "# Grasps made with graspd\n\nColumns, units and frames: docs/exchange/huggingface.md of graspd.\n"
 

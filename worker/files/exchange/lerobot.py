@@ -44,20 +44,26 @@ EPISODE: Final = "episode_index"
 VERDICT: Final = "graspd/verdict"
 #: Columns that each frame has, whatever the features.
 NUMBERS: Final = {
-    "timestamp": "float32", "frame_index": "int64", EPISODE: "int64", "index": "int64", "task_index": "int64",
-}  # fmt: skip
+    "timestamp": "float32",
+    "frame_index": "int64",
+    EPISODE: "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
 #: Episodes in a file, and files in a folder.
 _EPISODES: Final = 100
 _FILES: Final = 1000
 _QUANTILES: Final = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 #: Tells pandas that the words of the tasks are the index of their table.
 _INDEXED: Final = {
-    "index_columns": ["task"], "column_indexes": [], "pandas_version": "2.0.0",
+    "index_columns": ["task"],
+    "column_indexes": [],
+    "pandas_version": "2.0.0",
     "columns": [
         {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
         for name, kind, numpy in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
     ],
-}  # fmt: skip
+}
 ROOT: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
@@ -150,25 +156,39 @@ class _Writer:
         picture, number, count = png(colour), len(self.episodes), len(way) - 1
         rest = look.object_pose.astype(np.float32)
         numbers: dict[str, NDArray[Any]] = {
-            "timestamp": (np.arange(count) / FPS).astype(np.float32), "frame_index": np.arange(count),
-            EPISODE: np.full(count, number), "index": self.frames + np.arange(count),
+            "timestamp": (np.arange(count) / FPS).astype(np.float32),
+            "frame_index": np.arange(count),
+            EPISODE: np.full(count, number),
+            "index": self.frames + np.arange(count),
             "task_index": np.full(count, self.tasks[lot.name]),
-        }  # fmt: skip
+        }
         self._keep({STATE: way[:-1], ACTION: way[1:], OBJECT: np.tile(rest, (count, 1)), **numbers}, colour)
-        self.episodes.append({
-            EPISODE: number, "tasks": [task_of(lot.name)], "length": count, **place,
-            "dataset_from_index": self.frames, "dataset_to_index": self.frames + count,
-            "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0,
-            "graspd/shard": lot.id, "graspd/row": row, VERDICT: int(lot.verdict[row]),
-        })  # fmt: skip
+        self.episodes.append(
+            {
+                EPISODE: number,
+                "tasks": [task_of(lot.name)],
+                "length": count,
+                **place,
+                "dataset_from_index": self.frames,
+                "dataset_to_index": self.frames + count,
+                "meta/episodes/chunk_index": 0,
+                "meta/episodes/file_index": 0,
+                "graspd/shard": lot.id,
+                "graspd/row": row,
+                VERDICT: int(lot.verdict[row]),
+            }
+        )
         self.frames += count
         return [
             {
-                STATE: way[k].tolist(), ACTION: way[k + 1].tolist(), OBJECT: rest.tolist(), PICTURE: picture,
+                STATE: way[k].tolist(),
+                ACTION: way[k + 1].tolist(),
+                OBJECT: rest.tolist(),
+                PICTURE: picture,
                 **{name: values[k].item() for name, values in numbers.items()},
             }
             for k in range(count)
-        ]  # fmt: skip
+        ]
 
     def _keep(self, values: Mapping[str, NDArray[Any]], colour: NDArray[Any]) -> None:
         for name, some in values.items():
@@ -182,11 +202,20 @@ class _Writer:
         meta.mkdir(parents=True)
         splits = {"train": f"0:{train}"} | ({"test": f"{train}:{total}"} if train < total else {})
         info = {
-            "codebase_version": VERSION, "robot_type": self.hand.name, "total_episodes": total,
-            "total_frames": self.frames, "total_tasks": len(self.tasks), "chunks_size": _FILES, "fps": FPS,
-            "data_files_size_in_mb": 100, "video_files_size_in_mb": 500, "splits": splits, "video_path": None,
-            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet", "features": self._features(),
-        }  # fmt: skip
+            "codebase_version": VERSION,
+            "robot_type": self.hand.name,
+            "total_episodes": total,
+            "total_frames": self.frames,
+            "total_tasks": len(self.tasks),
+            "chunks_size": _FILES,
+            "fps": FPS,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 500,
+            "splits": splits,
+            "video_path": None,
+            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+            "features": self._features(),
+        }
         (meta / "info.json").write_text(json.dumps(info, indent=4) + "\n")
         stats = {
             name: _statistics(np.concatenate(some), picture=name == PICTURE) for name, some in self._values.items()
@@ -204,10 +233,12 @@ class _Writer:
         names = [*ROOT, *self.hand.joint_names]
         moving = {"dtype": "float32", "shape": [len(names)], "names": names}
         return {
-            STATE: moving, ACTION: moving, OBJECT: {"dtype": "float32", "shape": [7], "names": list(ROOT)},
+            STATE: moving,
+            ACTION: moving,
+            OBJECT: {"dtype": "float32", "shape": [7], "names": list(ROOT)},
             PICTURE: {"dtype": "image", "shape": list(self._size), "names": ["height", "width", "channels"]},
             **{name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in NUMBERS.items()},
-        }  # fmt: skip
+        }
 
 
 def task_of(name: str) -> str:

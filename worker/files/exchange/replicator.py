@@ -23,13 +23,28 @@ from worker.rendering.export import export_images
 Floats = NDArray[np.float64]
 
 _BOX_2D: Final = np.dtype(
-    [("semanticId", "<u4"), ("x_min", "<i4"), ("y_min", "<i4"), ("x_max", "<i4"), ("y_max", "<i4"),
-     ("occlusionRatio", "<f4")]
-)  # fmt: skip
+    [
+        ("semanticId", "<u4"),
+        ("x_min", "<i4"),
+        ("y_min", "<i4"),
+        ("x_max", "<i4"),
+        ("y_max", "<i4"),
+        ("occlusionRatio", "<f4"),
+    ]
+)
 _BOX_3D: Final = np.dtype(
-    [("semanticId", "<u4"), ("x_min", "<f4"), ("y_min", "<f4"), ("z_min", "<f4"), ("x_max", "<f4"), ("y_max", "<f4"),
-     ("z_max", "<f4"), ("transform", "<f4", (4, 4)), ("occlusionRatio", "<f4")]
-)  # fmt: skip
+    [
+        ("semanticId", "<u4"),
+        ("x_min", "<f4"),
+        ("y_min", "<f4"),
+        ("z_min", "<f4"),
+        ("x_max", "<f4"),
+        ("y_max", "<f4"),
+        ("z_max", "<f4"),
+        ("transform", "<f4", (4, 4)),
+        ("occlusionRatio", "<f4"),
+    ]
+)
 #: Width of the sensor that the focal length is stated for, USD's default [mm].
 APERTURE_MM: Final = 20.955
 NEAR_FAR_M: Final = (0.01, 100.0)
@@ -77,12 +92,14 @@ def camera_params(views: Shard, view: int) -> dict[str, Any]:
     height, width = views["image/rgb"].shape[1:3]
     k, extrinsics = (np.asarray(views[f"camera/{name}"][view], float) for name in ("intrinsics", "extrinsics"))
     near, far = NEAR_FAR_M
-    projection = np.array([
-        [2 * k[0, 0] / width, 0, 1 - 2 * k[0, 2] / width, 0],
-        [0, 2 * k[1, 1] / height, 2 * k[1, 2] / height - 1, 0],
-        [0, 0, -(far + near) / (far - near), -2 * far * near / (far - near)],
-        [0, 0, -1, 0],
-    ])  # fmt: skip
+    projection = np.array(
+        [
+            [2 * k[0, 0] / width, 0, 1 - 2 * k[0, 2] / width, 0],
+            [0, 2 * k[1, 1] / height, 2 * k[1, 2] / height - 1, 0],
+            [0, 0, -(far + near) / (far - near), -2 * far * near / (far - near)],
+            [0, 0, -1, 0],
+        ]
+    )
     return {
         "cameraModel": "pinhole",
         "cameraViewTransform": (_FLIP @ extrinsics).T.ravel().tolist(),

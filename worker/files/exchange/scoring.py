@@ -52,9 +52,14 @@ def write_scored(
         raise InputError(f"{path} exists already; give another folder as --output")
     try:
         request = JobRequest(
-            hand=plain_name(found.hand.name), object=name, grasps=max(1, len(found.grasps)), want="raw",
-            referee=referee, friction=friction, audits=0,
-        )  # fmt: skip
+            hand=plain_name(found.hand.name),
+            object=name,
+            grasps=max(1, len(found.grasps)),
+            want="raw",
+            referee=referee,
+            friction=friction,
+            audits=0,
+        )
     except ValueError:
         raise InputError(f"unknown level {referee!r}; choose letter, certificate, screen or none") from None
     scenes = None if found.placed is None else found.placed.everywhere
@@ -63,13 +68,18 @@ def write_scored(
     folder.mkdir(parents=True, exist_ok=True)
     mesh = mesh_file(found.obj, folder / f"{name}-{found.scale:g}.obj")
     attributes: dict[str, Attribute] = {
-        "hand": found.hand.name, "hand_digest": found.hand.digest,
-        "object": name, "object_digest": _digest(mesh), "object_scale": found.scale,
-        "method": f"imported:{origin.format}", "source": origin.source, "licence": origin.licence,
+        "hand": found.hand.name,
+        "hand_digest": found.hand.digest,
+        "object": name,
+        "object_digest": _digest(mesh),
+        "object_scale": found.scale,
+        "method": f"imported:{origin.format}",
+        "source": origin.source,
+        "licence": origin.licence,
         "fidelity": json_attribute({"face_error_m": 0.0}),
         "shard_id": digest_json([origin.source, found.hand.digest, _digest(mesh), ordinal, len(found.grasps)]),
         "batch": ordinal,
-    }  # fmt: skip
+    }
     attributes |= base_attributes(found.hand, obj, request, tried=made.tried, verdict_key=made.verdict_key)
     arrays = {**made.grasps.to_columns(), **made.columns}
     if found.published is not None and (found.published >= 0).any():

@@ -118,10 +118,12 @@ class Closer:
         for _ in range(ADVANCES):
             self._measure()
             wp.launch(
-                kernels.advance, self.capacity,
-                inputs=[near, along, standoff, SHARE], outputs=[active, self.data.pivot],
+                kernels.advance,
+                self.capacity,
+                inputs=[near, along, standoff, SHARE],
+                outputs=[active, self.data.pivot],
                 device=self.model.device,
-            )  # fmt: skip
+            )
             if not active.numpy().any():
                 break
         return self.data.state(n)
@@ -135,11 +137,12 @@ class Closer:
         for _ in range(STEPS):
             self._measure(fingers=True)
             wp.launch(
-                kernels.close, self.capacity,
+                kernels.close,
+                self.capacity,
                 inputs=[self.closing, self.near, self.pairs, TOUCH_M, SHARE, LARGEST],
                 outputs=[data.active, self.stopped, data.q],
                 device=data.device,
-            )  # fmt: skip
+            )
             if not data.active.numpy().any():
                 break
         return Closed(data.state(n), self.stopped.numpy()[:n].astype(np.int32))
@@ -156,19 +159,25 @@ class Closer:
         pose = [d.body_p, d.body_q]
         wp.launch(kernels.clear, self.near.shape, inputs=[REACH_M], outputs=[self.near, self.pairs], device=device)
         wp.launch(
-            kernels.points_to_object, (self.capacity, m.count),
+            kernels.points_to_object,
+            (self.capacity, m.count),
             inputs=[m.obj.surface, REACH_M, m.options.exact_below, m.point_body, m.point_position, d.active, *pose],
-            outputs=[self.near], device=device,
-        )  # fmt: skip
+            outputs=[self.near],
+            device=device,
+        )
         shape = (self.capacity, m.pieces)
         wp.launch(
-            kernels.object_to_pieces, shape,
+            kernels.object_to_pieces,
+            shape,
             inputs=[m.hand.pieces, m.obj.bvh.id, m.obj.samples, d.active, *pose, MARGIN_M],
-            outputs=[self.near], device=device,
-        )  # fmt: skip
+            outputs=[self.near],
+            device=device,
+        )
         if fingers:
             wp.launch(
-                kernels.bodies_to_pieces, shape,
-                inputs=[m.hand.pieces, m.body_points, d.active, *pose, MARGIN_M], outputs=[self.pairs],
+                kernels.bodies_to_pieces,
+                shape,
+                inputs=[m.hand.pieces, m.body_points, d.active, *pose, MARGIN_M],
+                outputs=[self.pairs],
                 device=device,
-            )  # fmt: skip
+            )

@@ -137,9 +137,13 @@ def bodies_to_pieces(
 
 @wp.func
 def nearest_of(
-    closing: Closing, b: wp.int32, d: wp.int32, body: wp.int32, near: wp.array2d(dtype=wp.float32),
+    closing: Closing,
+    b: wp.int32,
+    d: wp.int32,
+    body: wp.int32,
+    near: wp.array2d(dtype=wp.float32),
     pair: wp.array3d(dtype=wp.float32),
-):  # fmt: skip
+):
     """Distance of a body from what it may hit when dof d moves it; of two fingers each may take half the gap."""
     least = near[b, body]
     for other in range(near.shape[1]):

@@ -244,9 +244,12 @@ def limits(
 @wp.func
 def total_energy(terms: wp.array2d(dtype=wp.float32), b: wp.int32):
     return (
-        terms[b, 0] + W_DISTANCE * terms[b, 1] + W_PENETRATION * terms[b, 2] + W_SELF * terms[b, 3]
+        terms[b, 0]
+        + W_DISTANCE * terms[b, 1]
+        + W_PENETRATION * terms[b, 2]
+        + W_SELF * terms[b, 3]
         + W_JOINTS * terms[b, 4]
-    )  # fmt: skip
+    )
 
 
 @wp.func

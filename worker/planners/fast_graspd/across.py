@@ -237,9 +237,16 @@ def across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats
 
 
 def promising(
-    hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, ways: Floats, scene: Surroundings, *,
-    room: float, keep: int,
-) -> tuple[NDArray[np.intp], Floats]:  # fmt: skip
+    hand: HandModel,
+    obj: ObjectModel,
+    opening: Openings,
+    uniform: Floats,
+    ways: Floats,
+    scene: Surroundings,
+    *,
+    room: float,
+    keep: int,
+) -> tuple[NDArray[np.intp], Floats]:
     """Of C draws of each of n hands those that need to rise least to be clear of obstacles, (n, keep), and how far the
     pair is then from between their pads (n, keep) [m]. Those that are near enough keep their order.
 

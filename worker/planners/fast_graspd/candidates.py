@@ -36,7 +36,7 @@ HOPELESS: Final = 1e9
 
 def with_postures(
     hand: HandModel, obj: ObjectModel, state: HandState, losses: Floats, placed: Placed | None, *, device: str = "cpu"
-) -> GraspSet:  # fmt: skip
+) -> GraspSet:
     """Hands (n) as grasps with the postures around them, found on a device."""
     grasp = posture_of(hand, obj, state)
     before = pregrasp(hand, obj, grasp, placed, device=device)
@@ -83,9 +83,16 @@ class Taken:
 
 
 def tried(
-    hand: HandModel, obj: ObjectModel, order: NDArray[np.intp], seat: Seat, placed: Placed | None, trial: TrialOf, *,
-    together: int = TOGETHER, device: str = "cpu",
-) -> Taken:  # fmt: skip
+    hand: HandModel,
+    obj: ObjectModel,
+    order: NDArray[np.intp],
+    seat: Seat,
+    placed: Placed | None,
+    trial: TrialOf,
+    *,
+    together: int = TOGETHER,
+    device: str = "cpu",
+) -> Taken:
     """Of the hands of each grasp the first that the trial finds good enough, or else the one with the least score.
 
     `together` of each grasp are seated and tried in the order of their merit, then, of grasps that have none yet, as
@@ -115,7 +122,7 @@ def tried(
             where = placed.take(which) if placed is not None else None
             found = with_postures(
                 hand, obj, seated.state[rows[open_]], seated.losses[rows[open_]], where, device=device
-            )  # fmt: skip
+            )
             score = _scores(found, seated.unsound[rows[open_]], which, taken.score[which], trial)
             _gentler(hand, obj, found, score, which, trial, device)
             _take(found, seated, rows[open_], which, score, taken)
@@ -134,18 +141,21 @@ def _scores(
 
 
 def _gentler(
-    hand: HandModel, obj: ObjectModel, found: GraspSet, score: Floats, which: NDArray[np.intp], trial: TrialOf,
+    hand: HandModel,
+    obj: ObjectModel,
+    found: GraspSet,
+    score: Floats,
+    which: NDArray[np.intp],
+    trial: TrialOf,
     device: str,
-) -> None:  # fmt: skip
+) -> None:
     """Gives hands (k,) that nearly lift a gentler squeeze where they lift better with it: fingers are springs, and the
     harder soft ones press, the more they turn the object out of the hand."""
     poor = np.flatnonzero((score >= 1.0) & (score < NEARLY))
     if not len(poor):
         return
     gentle = found.take(poor)
-    gentle.squeeze = squeeze(
-        hand, obj, gentle.grasp, total_normal_force=GENTLER * normal_force(obj), device=device
-    )  # fmt: skip
+    gentle.squeeze = squeeze(hand, obj, gentle.grasp, total_normal_force=GENTLER * normal_force(obj), device=device)
     again = _scores(gentle, np.zeros(len(poor), bool), which[poor], score[poor], trial)
     better = again < score[poor]
     found.squeeze.joint_positions[poor[better]] = gentle.squeeze.joint_positions[better]

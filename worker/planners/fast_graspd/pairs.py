@@ -69,9 +69,7 @@ _pairs: LRUCache[tuple[str, str, str, int, str], Pair] = LRUCache(KEPT)
 _lock = threading.Lock()
 
 
-def pair_of(
-    hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str, *, in_scenes: bool = False
-) -> Pair:  # fmt: skip
+def pair_of(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str, *, in_scenes: bool = False) -> Pair:
     """The pair, from memory where it was used lately. Where nothing projects hands out of a free object, it has the
     samples of the fidelity, too."""
     count = fidelity.object_points

@@ -112,9 +112,7 @@ class Part:
         return Part(rows, state, loss, merit, curve, joined(both) if both else None, attempts)
 
 
-def plan(
-    hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run, *, warm: WarmStart | None = None
-) -> GraspSet:  # fmt: skip
+def plan(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run, *, warm: WarmStart | None = None) -> GraspSet:
     """See `worker.planners.Planner`; `warm` as `Batches` has it."""
     (found,) = plan_joined(hand, obj, [Asked(wanted, run)], warm=warm)
     if isinstance(found, Exception):
@@ -124,7 +122,7 @@ def plan(
 
 def plan_joined(
     hand: HandModel, obj: ObjectModel, asked: Sequence[Asked], *, warm: WarmStart | None = None
-) -> list[GraspSet | Exception]:  # fmt: skip
+) -> list[GraspSet | Exception]:
     """See `worker.planners.Joined`; `warm` as `Batches` has it."""
     began = time.perf_counter()
     batches = Batches(asked, obj, warm)
@@ -448,9 +446,14 @@ def _joined_states(states: Sequence[HandState]) -> HandState:
 
 
 def grasps_of(
-    hand: HandModel, obj: ObjectModel, parts: list[Part], seconds: float, placed: Placed | None = None, *,
+    hand: HandModel,
+    obj: ObjectModel,
+    parts: list[Part],
+    seconds: float,
+    placed: Placed | None = None,
+    *,
     device: str = "cpu",
-) -> GraspSet:  # fmt: skip
+) -> GraspSet:
     """The parts of a batch as grasps with the postures around them."""
     curve = [np.concatenate(chunk).mean() for chunk in zip(*(part.curve for part in parts), strict=True)]
     known = [part.grasps for part in parts if part.grasps is not None]

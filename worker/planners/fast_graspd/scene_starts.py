@@ -249,9 +249,15 @@ class _Around:
         for s in np.unique(scene[reaching]):
             rows = np.flatnonzero(reaching & (scene == s))
             order[rows], least[rows] = promising(
-                self.hand, self.obj, self.openings[s], uniform[rows, :CANDIDATES, :6], self.ways[s], placed.scenes[s],
-                room=ROOM, keep=REACHES,
-            )  # fmt: skip
+                self.hand,
+                self.obj,
+                self.openings[s],
+                uniform[rows, :CANDIDATES, :6],
+                self.ways[s],
+                placed.scenes[s],
+                room=ROOM,
+                keep=REACHES,
+            )
         return order, least
 
     def draws(self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]) -> _Drawn:

@@ -39,9 +39,15 @@ def posture_of(hand: HandModel, obj: ObjectModel, state: HandState) -> Posture:
 
 
 def merits(
-    hand: HandModel, obj: ObjectModel, state: HandState, losses: Floats, depths: Floats | None = None, *,
-    friction: float = FRICTION, device: str = "cpu",
-) -> Floats:  # fmt: skip
+    hand: HandModel,
+    obj: ObjectModel,
+    state: HandState,
+    losses: Floats,
+    depths: Floats | None = None,
+    *,
+    friction: float = FRICTION,
+    device: str = "cpu",
+) -> Floats:
     """(n,) the smaller the better: residual of contact forces balanced with a coefficient of `friction`, a little of
     L_stable (n,), and what the penetration `depths` (n,) [m] have above the tolerated."""
     holds = hold_forces(hand, obj, posture_of(hand, obj, state), friction=friction, device=device)

@@ -256,9 +256,13 @@ def open_further(
 
 
 def _draw_until_clear(
-    drawn: Callable[[NDArray[np.intp]], HandState], probe: Probe, draws: int, rows: NDArray[np.intp], best: HandState,
+    drawn: Callable[[NDArray[np.intp]], HandState],
+    probe: Probe,
+    draws: int,
+    rows: NDArray[np.intp],
+    best: HandState,
     deepest: Floats,
-) -> None:  # fmt: skip
+) -> None:
     """Put into `best` and `deepest` the nearest clear start of each of `rows`, or else the least deep. `drawn` gives a
     draw of some rows at each distance of retreat."""
     for _ in range(draws):
@@ -278,9 +282,13 @@ def _draw_until_clear(
 
 
 def _reach(
-    reaching: Reaching, generators: list[np.random.Generator], rows: NDArray[np.intp], probe: Probe, best: HandState,
+    reaching: Reaching,
+    generators: list[np.random.Generator],
+    rows: NDArray[np.intp],
+    probe: Probe,
+    best: HandState,
     deepest: Floats,
-) -> None:  # fmt: skip
+) -> None:
     """Put into `best` and `deepest` those of the starts `rows` that reach across the object and are clear."""
     seeds = np.array([generators[i].integers(2**31) for i in rows], np.int32)
     first = np.zeros(len(rows), np.int32)

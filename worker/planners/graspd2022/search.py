@@ -1,27 +1,33 @@
-"""The optimisation of a batch of hands: kinematics, forces, gradient, Adam, as a fixed list of launches."""
+"""The optimisation of a batch of hands: kinematics, forces, gradient, Adam, as a fixed list of launches.
+
+The object is a grid of signed distances, read by trilinear interpolation: an error of second order in the cell.
+"""
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from service.model.cores import available_cores
 from service.model.transforms import quat_rotate
 from worker.hands.surface import sample_surface
 from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.graspd2022 import kernels
-from worker.planners.graspd2022.grid import distance_grid
 from worker.planners.threads import Steps
 from worker.simulation.data import Data
+from worker.simulation.device import DeviceObject
+from worker.simulation.kernels import surface
 from worker.simulation.launches import Launches
 from worker.simulation.model import MAX_DILATION, Model
 from worker.simulation.record import add_poses, add_root_gradient, add_self_penalty, add_step
 from worker.simulation.state import HandState, Schedule
 
 Floats = NDArray[np.float64]
-
 #: Hand points: the source's hand has 778 vertices.
 POINTS: Final = 778
 #: The source's constants, SI units: stiffness, viscous friction, friction, time step, speed, mass.
@@ -44,6 +50,8 @@ WARMUP: Final = 200
 APART_M: Final = 0.01
 BACKOFF_M: Final = 0.05
 CHUNK: Final = 25
+#: How far the grid reaches beyond the object's box [m].
+PAD_M: Final = 0.10
 
 
 def schedule(steps: int) -> Schedule:
@@ -123,24 +131,41 @@ class _Batch:
         with wp.ScopedDevice(self.device):
             least = wp.full(self.n, 1e3, dtype=wp.float32)
             wp.launch(
-                kernels.nearest, (self.n, POINTS),
-                inputs=[self.grid, m.point_body, m.point_position, d.body_p, d.body_q], outputs=[least],
-            )  # fmt: skip
+                kernels.nearest,
+                (self.n, POINTS),
+                inputs=[self.grid, m.point_body, m.point_position, d.body_p, d.body_q],
+                outputs=[least],
+            )
             return np.clip((least.numpy() - APART_M) / MAX_DILATION, 0.0, 1.0).astype(np.float32)
 
     def _record(self) -> Launches:
         m, d, n, out = self.model, self.data, self.n, Launches(self.device)
         add_poses(out, m, d)
         out.add(
-            kernels.multipliers, (n, 3),
-            inputs=[self.physics, self.task, d.active], outputs=[self.total, self.multiplier, self.pull, self.gap],
-        )  # fmt: skip
+            kernels.multipliers,
+            (n, 3),
+            inputs=[self.physics, self.task, d.active],
+            outputs=[self.total, self.multiplier, self.pull, self.gap],
+        )
         out.add(
-            kernels.relax, (n, POINTS),
-            inputs=[self.physics, self.grid, self.velocity, m.point_body, m.point_position, d.active, d.iteration,
-                    d.schedule.dilation, d.dilation_scale, d.body_p, d.body_q, self.pull],
+            kernels.relax,
+            (n, POINTS),
+            inputs=[
+                self.physics,
+                self.grid,
+                self.velocity,
+                m.point_body,
+                m.point_position,
+                d.active,
+                d.iteration,
+                d.schedule.dilation,
+                d.dilation_scale,
+                d.body_p,
+                d.body_q,
+                self.pull,
+            ],
             outputs=[self.force, self.first, self.largest, self.total, d.wrench],
-        )  # fmt: skip
+        )
         add_self_penalty(out, m, d, 0.0)
         add_root_gradient(out, m, d)
         add_step(out, m, d, "adam", betas=BETAS)
@@ -153,3 +178,44 @@ class _Batch:
     def residual(self) -> Floats:
         """(n,) largest residual of the moving tasks, 1: as if nothing touched."""
         return self.gap.numpy()[:, 1:].max(axis=1).astype(float) / float(np.linalg.norm(self.wanted[1]))
+
+
+def distance_grid(obj: DeviceObject, cells: int) -> Any:
+    """A `Surface` whose field has `cells` cells along the longest side of the padded box, sampled from the mesh.
+
+    Distances are exact at the corners; the array lies on the object's device.
+    """
+    model = obj.model
+    low = model.vertices.min(axis=0) - model.centre_of_mass - PAD_M
+    high = model.vertices.max(axis=0) - model.centre_of_mass + PAD_M
+    cell = float((high - low).max()) / cells
+    shape = [int(n) for n in np.ceil((high - low) / cell).astype(int) + 1]
+    reach = float(np.linalg.norm(high - low))
+    flat = surface.Surface()
+    flat.mesh, flat.corner_normals, flat.alpha = obj.surface.mesh, obj.surface.corner_normals, 0.0
+    flat.cells = obj.surface.cells
+    device = obj.device
+    with wp.ScopedDevice(device):
+        field = wp.empty(tuple(shape), dtype=wp.float32)
+        flat.field = wp.zeros((0, 0, 0), dtype=wp.float32)
+
+    def slab(first: int, last: int) -> None:
+        corner = low + np.array([first * cell, 0.0, 0.0])
+        with wp.ScopedDevice(device):
+            wp.launch(
+                surface.sample_field,
+                dim=(last - first, shape[1], shape[2]),
+                inputs=[flat, wp.vec3(*corner), cell, reach],
+                outputs=[field[first:last]],
+                device=device,
+            )
+
+    threads = 1 if wp.get_device(device).is_cuda else available_cores()
+    bounds = np.linspace(0, shape[0], 4 * threads + 1).astype(int)
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(lambda ends: slab(*ends), pairwise(bounds.tolist())))
+    out = surface.Surface()
+    out.mesh, out.corner_normals, out.alpha, out.cells = flat.mesh, flat.corner_normals, 0.0, flat.cells
+    out.field, out.field_origin, out.field_cell = field, wp.vec3(*low), cell
+    out.field_error = 0.5 * cell
+    return out

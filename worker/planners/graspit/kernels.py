@@ -86,9 +86,7 @@ def joint_value(problem: Problem, x: vec8, d: wp.int32):
 
 
 @wp.func
-def place(
-    problem: Problem, b: wp.int32, x: vec8, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)
-):  # fmt: skip
+def place(problem: Problem, b: wp.int32, x: vec8, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)):
     """Poses of all bodies."""
     rotation = rotation_of(problem, x)
     body_q[b, 0] = rotation
@@ -133,9 +131,7 @@ def inside(problem: Problem, point: wp.vec3):
 
 
 @wp.func
-def points_collide(
-    problem: Problem, b: wp.int32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)
-):  # fmt: skip
+def points_collide(problem: Problem, b: wp.int32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)):
     """1 if a hand point is inside the object."""
     for body in range(body_p.shape[1]):
         first = problem.points.first[body]
@@ -154,7 +150,7 @@ def points_collide(
 @wp.func
 def samples_collide(
     problem: Problem, b: wp.int32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)
-):  # fmt: skip
+):
     """1 if a sample of the object is inside a piece of the hand."""
     for piece in range(problem.pieces.body.shape[0]):
         q = piece_rotation(problem.pieces, piece, b, body_q)
@@ -178,9 +174,7 @@ def virtual_contact_energy(gap: wp.float32, cosine: wp.float32):
 
 
 @wp.func
-def contact_energy(
-    problem: Problem, b: wp.int32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)
-):  # fmt: skip
+def contact_energy(problem: Problem, b: wp.int32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)):
     """Mean over the virtual contacts of their energy [mm]."""
     total = float(0.0)
     for i in range(problem.contact_body.shape[0]):
@@ -208,9 +202,7 @@ def contact_energy(
 
 
 @wp.func
-def legal(
-    problem: Problem, b: wp.int32, x: vec8, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)
-):  # fmt: skip
+def legal(problem: Problem, b: wp.int32, x: vec8, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)):
     """1 if the hand of a state hits neither itself nor the object; leaves the poses of its bodies."""
     if clashes(problem, x) == 1:
         return 0
@@ -289,9 +281,14 @@ def unlikeness(problem: Problem, x: vec8, y: vec8):
 
 @wp.func
 def remember(
-    problem: Problem, b: wp.int32, x: vec8, e: wp.float32, alike: wp.float32, best: wp.array2d(dtype=vec8),
+    problem: Problem,
+    b: wp.int32,
+    x: vec8,
+    e: wp.float32,
+    alike: wp.float32,
+    best: wp.array2d(dtype=vec8),
     best_energy: wp.array2d(dtype=wp.float32),
-):  # fmt: skip
+):
     """Put a state into the list of the best, in the place of one like it or else of the worst, if it is better."""
     row = wp.int32(0)
     for k in range(best_energy.shape[1]):

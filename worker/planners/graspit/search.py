@@ -1,4 +1,8 @@
-"""The annealing of a batch of chains on a device."""
+"""The annealing of a batch of chains on a device, and the contacts that it wants on the object.
+
+Virtual contacts are few places of a hand: two on each link's inside, and on the palm. GraspIt! ships them as files for
+its own hands; here they are found for any hand.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +14,12 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError
 from service.model.transforms import quat_from_matrix
-from worker.hands.model import HandModel
+from worker.hands.model import HandModel, SurfacePoints
 from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.graspit import kernels
-from worker.planners.graspit.contacts import virtual_contacts
 from worker.planners.graspit.eigengrasps import Eigengrasps, eigengrasps
 from worker.planners.graspit.schedule import FIRST_STEP
+from worker.planners.inner_surface import inside_points
 from worker.planners.threads import Steps
 from worker.simulation.data import Data
 from worker.simulation.device import to_wxyz, to_xyzw
@@ -24,7 +28,6 @@ from worker.simulation.record import record_placement
 from worker.simulation.state import HandState
 
 Floats = NDArray[np.float64]
-
 #: Bounds of the palm's place about the object's centre of mass [m] and its largest jump (GraspIt!'s, in mm there).
 PLACE: Final = ((-0.25, 0.25), (-0.25, 0.25), (-0.25, 0.35))
 PLACE_JUMP: Final = 0.15
@@ -43,6 +46,9 @@ PATIENCE: Final = 3
 #: Two states of the list are alike below this (GraspIt!).
 ALIKE: Final = 0.2
 NOT_YET: Final = 1e9
+#: Contacts on each link that closes, and on the palm.
+EACH: Final = 2
+ON_PALM: Final = 3
 
 
 def clash_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
@@ -127,10 +133,11 @@ class Search:
             begun, done = state.numpy(), 0
             for _ in range(0, max(0, PATIENCE * (steps - FIRST_STEP)), ROUNDS):
                 wp.launch(
-                    kernels.anneal, chains,
+                    kernels.anneal,
+                    chains,
                     inputs=[self.problem, ROUNDS, steps, ALIKE],
                     outputs=[counter, rng, state, energy, best, best_energy, *scratch],
-                )  # fmt: skip
+                )
                 now = int((counter.numpy() - FIRST_STEP).sum())
                 tell(now - done, "annealing")
                 done = now
@@ -155,3 +162,8 @@ def _sorted(best: Floats, energy: Floats, begun: Floats) -> Floats:
         rows = [states[k] for k in found] or [begun[c]]
         out[c] = [rows[min(k, len(rows) - 1)] for k in range(len(states))]
     return out.reshape(-1, best.shape[-1])
+
+
+def virtual_contacts(hand: HandModel) -> SurfacePoints:
+    """Points with normals; none on links that neither close nor carry the palm."""
+    return inside_points(hand, each=EACH, on_palm=ON_PALM)

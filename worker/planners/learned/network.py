@@ -198,12 +198,16 @@ def encode(proposals: Proposals, anchor: ArrayLike) -> Floats:
     rotation = quat_to_matrix(proposals.hand_pose[:, 3:])
     return np.concatenate(
         [
-            proposals.hand_pose[:, :3] - np.asarray(anchor, float), rotation[:, :, 0], rotation[:, :, 1],
-            proposals.approach, proposals.joints, proposals.pregrasp - proposals.joints,
+            proposals.hand_pose[:, :3] - np.asarray(anchor, float),
+            rotation[:, :, 0],
+            rotation[:, :, 1],
+            proposals.approach,
+            proposals.joints,
+            proposals.pregrasp - proposals.joints,
             proposals.squeeze - proposals.joints,
         ],
         axis=1,
-    )  # fmt: skip
+    )
 
 
 def decode(rows: ArrayLike, anchor: ArrayLike) -> Proposals:

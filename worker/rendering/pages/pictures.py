@@ -40,9 +40,12 @@ FLOOR_SIZE: Final = (6.0, 6.0, 0.02)
 FLOOR: Final = Look((1.0, 1.0, 1.0), pattern=CATCHER)
 OBJECT_LOOK: Final = Look(hexadecimal("#dd7432"), roughness=0.5)
 STUDIO: Final = Lamp(
-    key=(1.85, 1.8, 1.7), sky=(0.76, 0.79, 0.84), ground=(0.3, 0.29, 0.28),
-    backdrop_low=(1.15, 1.17, 1.19), backdrop_high=(1.4, 1.42, 1.44),
-)  # fmt: skip
+    key=(1.85, 1.8, 1.7),
+    sky=(0.76, 0.79, 0.84),
+    ground=(0.3, 0.29, 0.28),
+    backdrop_low=(1.15, 1.17, 1.19),
+    backdrop_high=(1.4, 1.42, 1.44),
+)
 
 
 def grasp_pictures(
@@ -118,10 +121,15 @@ def _shoot(
         shot = Shot(
             world=np.arange(worlds, dtype=np.int32),
             extrinsics=np.stack([_camera(obj, points[w], angles[w], k, size) for w in range(worlds)]),
-            intrinsics=k, width=width, height=height, samples=samples, toward_lamp=TOWARD_LAMP,
+            intrinsics=k,
+            width=width,
+            height=height,
+            samples=samples,
+            toward_lamp=TOWARD_LAMP,
             # The lamp goes round with the camera, so no side lies in the dark.
-            turn=-angles, lamps=[STUDIO] * worlds,
-        )  # fmt: skip
+            turn=-angles,
+            lamps=[STUDIO] * worlds,
+        )
         sides.append(stage.shoot(shot, run.quiet()).rgb)
     return np.stack(sides, axis=1)
 

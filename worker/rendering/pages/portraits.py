@@ -168,9 +168,14 @@ def _shoot(
     shot = Shot(
         world=np.arange(worlds, dtype=np.int32),
         extrinsics=np.stack([fit_camera(points, angle, k, SIZE) for angle in azimuths]),
-        intrinsics=k, width=width, height=height, samples=_SAMPLES, toward_lamp=TOWARD_LAMP,
-        turn=-np.asarray(azimuths), lamps=[STUDIO] * worlds,
-    )  # fmt: skip
+        intrinsics=k,
+        width=width,
+        height=height,
+        samples=_SAMPLES,
+        toward_lamp=TOWARD_LAMP,
+        turn=-np.asarray(azimuths),
+        lamps=[STUDIO] * worlds,
+    )
     return stage.shoot(shot).rgb
 
 

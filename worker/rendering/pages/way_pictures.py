@@ -181,11 +181,17 @@ class _Stage:
         self, world: NDArray[np.intp], cameras: Floats, k: Floats, size: tuple[int, int], angle: float, samples: int
     ) -> Shot:
         return Shot(
-            world=world.astype(np.int32), extrinsics=cameras, intrinsics=k, width=size[0], height=size[1],
-            samples=samples, toward_lamp=self.lamp,
+            world=world.astype(np.int32),
+            extrinsics=cameras,
+            intrinsics=k,
+            width=size[0],
+            height=size[1],
+            samples=samples,
+            toward_lamp=self.lamp,
             # The lamp goes round with the camera, so no side lies in the dark.
-            turn=np.full(self.frames, -angle), lamps=[STUDIO] * self.frames,
-        )  # fmt: skip
+            turn=np.full(self.frames, -angle),
+            lamps=[STUDIO] * self.frames,
+        )
 
     def _best_sides(self, world: int, near: Floats, first: float, count: int) -> list[tuple[float, float]]:
         """Azimuth and height [rad] of the sides that show most, apart from one another.

@@ -64,7 +64,7 @@ class Obstacles:
 @wp.func
 def posed(
     features: Features, i: wp.int32, b: wp.int32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)
-):  # fmt: skip
+):
     """Feature i of hand b."""
     out = Feature()
     out.body = features.body[i]
@@ -123,9 +123,16 @@ def kept(features: Features, obstacles: Obstacles, i: wp.int32, k: wp.int32, roo
 
 @wp.func
 def may_meet(
-    features: Features, obstacles: Obstacles, piece: wp.int32, scene: wp.int32, b: wp.int32, more: wp.float32,
-    room: wp.float32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat),
-):  # fmt: skip
+    features: Features,
+    obstacles: Obstacles,
+    piece: wp.int32,
+    scene: wp.int32,
+    b: wp.int32,
+    more: wp.float32,
+    room: wp.float32,
+    body_p: wp.array2d(dtype=wp.vec3),
+    body_q: wp.array2d(dtype=wp.quat),
+):
     """Whether a piece's ball is nearer to a half-space of its scene than what it keeps and `more`."""
     if features.first[piece] == features.first[piece + 1]:
         return False

@@ -45,8 +45,9 @@ class Sweep:
 
 
 @wp.func
-def opened(fingers: Fingers, hands: Hands, direction: wp.array2d(dtype=wp.float64), b: wp.int32, d: wp.int32,
-           steps: wp.int32):  # fmt: skip
+def opened(
+    fingers: Fingers, hands: Hands, direction: wp.array2d(dtype=wp.float64), b: wp.int32, d: wp.int32, steps: wp.int32
+):
     """A dof so many steps along its way. A grasp may stand a hair outside its limits: that is no reason to jump."""
     q = hands.q[b, d]
     value = q + wp.float64(steps) * fingers.step[d] * direction[b, d]

@@ -16,9 +16,14 @@ def turn(rotation: wp.quat, w: wp.vec3):
 
 @wp.func
 def move(
-    b: wp.int32, column: wp.int32, step: wp.float32, lower: wp.array(dtype=wp.float32),
-    upper: wp.array(dtype=wp.float32), clamp: wp.int32, q: wp.array2d(dtype=wp.float32),
-):  # fmt: skip
+    b: wp.int32,
+    column: wp.int32,
+    step: wp.float32,
+    lower: wp.array(dtype=wp.float32),
+    upper: wp.array(dtype=wp.float32),
+    clamp: wp.int32,
+    q: wp.array2d(dtype=wp.float32),
+):
     """Add a step to a dof, inside its limits where `clamp` is 1."""
     d = column - 6
     value = q[b, d] + step

@@ -41,8 +41,9 @@ def count_marks(
 
 
 @wp.func
-def before(counts: wp.array2d(dtype=wp.int32), mark: wp.array2d(dtype=wp.int32), least: wp.int32, b: wp.int32,
-           i: wp.int32):  # fmt: skip
+def before(
+    counts: wp.array2d(dtype=wp.int32), mark: wp.array2d(dtype=wp.int32), least: wp.int32, b: wp.int32, i: wp.int32
+):
     """Points before the i-th whose mark is at least so much."""
     chunk = i // CHUNK
     total = wp.int32(0)

@@ -103,7 +103,7 @@ def piece_rotation(pieces: Pieces, piece: wp.int32, b: wp.int32, body_q: wp.arra
 @wp.func
 def piece_centre(
     pieces: Pieces, piece: wp.int32, b: wp.int32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)
-):  # fmt: skip
+):
     """Origin of a piece's frame in the object's."""
     body = pieces.body[piece]
     return body_p[b, body] + wp.quat_rotate(body_q[b, body], pieces.pose_p[piece])
@@ -265,9 +265,16 @@ class BodyPoints:
 
 @wp.func
 def may_touch(
-    pieces: Pieces, points: BodyPoints, other: wp.int32, centre: wp.vec3, reach: wp.float32, own: wp.int32, b: wp.int32,
-    body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat),
-):  # fmt: skip
+    pieces: Pieces,
+    points: BodyPoints,
+    other: wp.int32,
+    centre: wp.vec3,
+    reach: wp.float32,
+    own: wp.int32,
+    b: wp.int32,
+    body_p: wp.array2d(dtype=wp.vec3),
+    body_q: wp.array2d(dtype=wp.quat),
+):
     """Whether the points of body `own` count against a piece of body `other` and come within `reach` of its centre."""
     if pieces.apart[own, other] == 0 or points.first[own] == points.first[own + 1]:
         return False

@@ -43,9 +43,15 @@ class Residuals:
 
 @wp.func
 def emit(
-    out: Residuals, b: wp.int32, body: wp.int32, other: wp.int32, point: wp.vec3, direction: wp.vec3,
-    value: wp.float32, weight: wp.float32,
-):  # fmt: skip
+    out: Residuals,
+    b: wp.int32,
+    body: wp.int32,
+    other: wp.int32,
+    point: wp.vec3,
+    direction: wp.vec3,
+    value: wp.float32,
+    weight: wp.float32,
+):
     k = wp.atomic_add(out.count, b, 1)
     if k < out.body.shape[1]:
         out.body[b, k] = body
@@ -172,9 +178,17 @@ def self_residuals(
 
 @wp.func
 def add_chain(
-    tree: Tree, b: wp.int32, own: wp.int32, body: wp.int32, point: wp.vec3, direction: wp.vec3, sign: wp.float32,
-    body_p: wp.array2d(dtype=wp.vec3), axis: wp.array2d(dtype=wp.vec3), row: wp.array2d(dtype=wp.float32),
-):  # fmt: skip
+    tree: Tree,
+    b: wp.int32,
+    own: wp.int32,
+    body: wp.int32,
+    point: wp.vec3,
+    direction: wp.vec3,
+    sign: wp.float32,
+    body_p: wp.array2d(dtype=wp.vec3),
+    axis: wp.array2d(dtype=wp.vec3),
+    row: wp.array2d(dtype=wp.float32),
+):
     """Add the joints' part of a row: motion along `direction` of a point of `body`."""
     k = body
     while k > 0:

@@ -71,9 +71,13 @@ def clear_of(surface: Surface, grips: Grips, posture: wp.int32, pivot: wp.vec3, 
 
 @wp.func
 def drawn(
-    surface: Surface, grips: Grips, alike: wp.vec2, room: wp.vec2, retreats: wp.array(dtype=wp.float32),
+    surface: Surface,
+    grips: Grips,
+    alike: wp.vec2,
+    room: wp.vec2,
+    retreats: wp.array(dtype=wp.float32),
     state: wp.uint32,
-):  # fmt: skip
+):
     """A hand around a pair of places, at the nearest distance at which it is clear."""
     out = Draw()
     pair = wp.min(first_above(grips.sums, wp.randf(state)), grips.sums.shape[0] - 1)

@@ -177,9 +177,16 @@ def over_face(obstacles: Obstacles, k: wp.int32, x: wp.vec3):
 
 @wp.func
 def apart(
-    features: Features, pieces: Pieces, obstacles: Obstacles, piece: wp.int32, k: wp.int32, b: wp.int32,
-    reach: wp.float32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat),
-):  # fmt: skip
+    features: Features,
+    pieces: Pieces,
+    obstacles: Obstacles,
+    piece: wp.int32,
+    k: wp.int32,
+    b: wp.int32,
+    reach: wp.float32,
+    body_p: wp.array2d(dtype=wp.vec3),
+    body_q: wp.array2d(dtype=wp.quat),
+):
     """Whether the bounding spheres of a piece and an obstacle are farther than `reach` from each other."""
     offset = piece_centre(pieces, piece, b, body_p, body_q) - obstacles.centre[k]
     r = obstacles.radius[k] + wp.length(pieces.half[piece]) + wp.max(reach, 0.0)
@@ -188,9 +195,16 @@ def apart(
 
 @wp.func
 def nearest_edge(
-    features: Features, pieces: Pieces, obstacles: Obstacles, piece: wp.int32, k: wp.int32, b: wp.int32,
-    limit: wp.float32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat),
-):  # fmt: skip
+    features: Features,
+    pieces: Pieces,
+    obstacles: Obstacles,
+    piece: wp.int32,
+    k: wp.int32,
+    b: wp.int32,
+    limit: wp.float32,
+    body_p: wp.array2d(dtype=wp.vec3),
+    body_q: wp.array2d(dtype=wp.quat),
+):
     """Where an edge of obstacle k is nearest to a piece, or an edge of the piece deepest in the obstacle."""
     out = Near()
     out.distance = limit

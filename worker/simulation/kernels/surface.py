@@ -37,8 +37,9 @@ class Sample:
 
 
 @wp.func
-def smoothed(surface: Surface, point: wp.vec3, closest: wp.vec3, face: wp.int32, u: wp.float32, v: wp.float32,
-             sign: wp.float32):  # fmt: skip
+def smoothed(
+    surface: Surface, point: wp.vec3, closest: wp.vec3, face: wp.int32, u: wp.float32, v: wp.float32, sign: wp.float32
+):
     """Distance and normal at a point whose closest point on the mesh has weights u, v, 1 - u - v of a face."""
     out = Sample()
     w = 1.0 - u - v

@@ -33,9 +33,15 @@ class Thing:
 
 
 def chart(
-    hands: Sequence[HandModel], things: Sequence[Thing], settings: Sequence[Setting], *, repeats: int, models: int,
-    say: Say = lambda line: None, keep: Callable[[dict[str, Any]], None] = lambda result: None,
-) -> dict[str, Any]:  # fmt: skip
+    hands: Sequence[HandModel],
+    things: Sequence[Thing],
+    settings: Sequence[Setting],
+    *,
+    repeats: int,
+    models: int,
+    say: Say = lambda line: None,
+    keep: Callable[[dict[str, Any]], None] = lambda result: None,
+) -> dict[str, Any]:
     """Run everything.
 
     Args:

@@ -20,9 +20,11 @@ PANELS: Final = (
     ("Penetration, mm (median; less is better)", "pd_mm"),
 )
 IN_SCENES: Final = (
-    ("Lifted, share of all tries", "lift"), ("Lifted by the letter", "lift_letter"),
-    ("Lifted at half the friction", "lift_hard"), ("Robust share of those lifted", "robust"),
-)  # fmt: skip
+    ("Lifted, share of all tries", "lift"),
+    ("Lifted by the letter", "lift_letter"),
+    ("Lifted at half the friction", "lift_hard"),
+    ("Robust share of those lifted", "robust"),
+)
 SPEED: Final = "end_to_end_per_second"
 #: Shares.
 OF_ONE: Final = frozenset({"letter", "hard", "robust", "lift", "lift_letter", "lift_hard"})
@@ -51,9 +53,14 @@ def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
 
 
 def draw_hands(
-    by_hand: Mapping[str, Sequence[Row]], files: Sequence[Path], *, key: str, speed: str, words: tuple[str, str],
+    by_hand: Mapping[str, Sequence[Row]],
+    files: Sequence[Path],
+    *,
+    key: str,
+    speed: str,
+    words: tuple[str, str],
     label: Callable[[Row, Sequence[Row]], str] | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """A panel for each hand: one accuracy over speed, both in words; `label` gives a point's word."""
     from matplotlib.figure import Figure
 
@@ -79,9 +86,15 @@ def _save(figure: Any, labels: Sequence[Label], files: Sequence[Path]) -> None:
 
 
 def _over_speed(
-    axes: Any, rows: Sequence[Row], styles: Mapping[str, tuple[str, str]], key: str, title: str, words: str, speed: str,
+    axes: Any,
+    rows: Sequence[Row],
+    styles: Mapping[str, tuple[str, str]],
+    key: str,
+    title: str,
+    words: str,
+    speed: str,
     label: Callable[[Row, Sequence[Row]], str] | None = None,
-) -> list[Label]:  # fmt: skip
+) -> list[Label]:
     """One accuracy over a speed, with the front; the words that belong to it."""
     known = [row for row in rows if row[key] is not None]
     labels = _panel(axes, known, styles, x=speed, y=key, label=label)
@@ -126,9 +139,14 @@ def _styles(rows: Sequence[Row]) -> dict[str, tuple[str, str]]:
 
 
 def _panel(
-    axes: Any, rows: Sequence[Row], styles: Mapping[str, tuple[str, str]], *, x: str, y: str,
+    axes: Any,
+    rows: Sequence[Row],
+    styles: Mapping[str, tuple[str, str]],
+    *,
+    x: str,
+    y: str,
     label: Callable[[Row, Sequence[Row]], str] | None = None,
-) -> list[Label]:  # fmt: skip
+) -> list[Label]:
     """The points; the words that belong to them."""
     shown: set[str] = set()
     labels = []
@@ -143,10 +161,20 @@ def _panel(
         if none:
             bars |= {"xerr": [[0.55 * at], [0.0]], "xuplims": True}
         axes.errorbar(
-            at, row[y], **bars, fmt=marker, color=colour, ecolor=colour, elinewidth=1, capsize=2, markersize=7,
-            markeredgecolor=colour if none else "white", markerfacecolor="white" if none else colour,
-            label=None if row["method"] in shown else row["method"], zorder=3,
-        )  # fmt: skip
+            at,
+            row[y],
+            **bars,
+            fmt=marker,
+            color=colour,
+            ecolor=colour,
+            elinewidth=1,
+            capsize=2,
+            markersize=7,
+            markeredgecolor=colour if none else "white",
+            markerfacecolor="white" if none else colour,
+            label=None if row["method"] in shown else row["method"],
+            zorder=3,
+        )
         shown.add(row["method"])
         text = (label or _label)(row, rows)
         words = ", ".join(filter(None, (text, f"0 of {row['grasps']}" * none)))
@@ -199,9 +227,16 @@ def one_of_several(row: Row, rows: Sequence[Row]) -> str:
 def _front(axes: Any, rows: Sequence[Row], key: str, speed: str) -> None:
     front = sorted((r for r in rows if key in r["front"] and r[speed]), key=lambda r: r[speed])
     axes.step(
-        [r[speed] for r in front], [r[key] for r in front], where="pre", color=INK, linewidth=1,
-        linestyle="--", alpha=0.6, zorder=1, label="Pareto front",
-    )  # fmt: skip
+        [r[speed] for r in front],
+        [r[key] for r in front],
+        where="pre",
+        color=INK,
+        linewidth=1,
+        linestyle="--",
+        alpha=0.6,
+        zorder=1,
+        label="Pareto front",
+    )
 
 
 def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
@@ -219,9 +254,16 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
         axes.plot([r["speedup"] for r in own], [r["gsr"] for r in own], color=COLOURS[0], alpha=0.4)
         for row in own:
             axes.errorbar(
-                row["speedup"], row["gsr"], yerr=_error(row, "gsr"), fmt="o", color=COLOURS[0], capsize=2,
-                elinewidth=1, markerfacecolor=COLOURS[0] if row["default"] else "white", markersize=6,
-            )  # fmt: skip
+                row["speedup"],
+                row["gsr"],
+                yerr=_error(row, "gsr"),
+                fmt="o",
+                color=COLOURS[0],
+                capsize=2,
+                elinewidth=1,
+                markerfacecolor=COLOURS[0] if row["default"] else "white",
+                markersize=6,
+            )
             labels.append(Label(axes, row["speedup"], row["gsr"], str(row["value"]), INK, y_bar=_ends(row, "gsr")))
         axes.set_title(knob, loc="left", fontsize=10)
         axes.set_ylim(0, 1.05)

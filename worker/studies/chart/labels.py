@@ -113,10 +113,19 @@ def _write(axes: Any, label: Label, point: Boxes, box: Boxes, pixels: float, *, 
     offset = (box[:2] - point) / pixels
     line = {"arrowstyle": "-", "color": label.colour, "linewidth": 0.6, "alpha": 0.7, "shrinkA": 0, "shrinkB": 4}
     note = axes.annotate(
-        label.text, (label.x, label.y), xytext=offset, textcoords="offset points", fontsize=SIZE_PT, color=label.colour,
-        ha="left", va="bottom", zorder=4, arrowprops=line if led else None, annotation_clip=False,
+        label.text,
+        (label.x, label.y),
+        xytext=offset,
+        textcoords="offset points",
+        fontsize=SIZE_PT,
+        color=label.colour,
+        ha="left",
+        va="bottom",
+        zorder=4,
+        arrowprops=line if led else None,
+        annotation_clip=False,
         path_effects=[withStroke(linewidth=2, foreground="white")],
-    )  # fmt: skip
+    )
     # The layout was made without it: a word must not move the panels under the others.
     note.set_in_layout(False)
     return note

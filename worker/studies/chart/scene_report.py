@@ -16,12 +16,42 @@ from worker.studies.chart.scenes import ACCURACIES
 Row = Mapping[str, Any]
 
 COLUMNS: Final = (
-    "way", "method", "fidelity", "hand", "object", "scenes", "grasps", "seconds", "end_seconds", "clear_count",
-    "lift_count", "lift_letter_count", "lift_hard_count", "clear", "lift", "lift_low", "lift_high", "lift_letter",
-    "lift_letter_low", "lift_letter_high", "lift_hard", "lift_hard_low", "lift_hard_high", "robust", "robust_low",
-    "robust_high", "grasps_per_second", "valid_per_second", "valid_per_second_low", "valid_per_second_high",
-    "end_to_end_per_second", "end_to_end_per_second_low", "end_to_end_per_second_high", "seconds_to_first", "note",
-)  # fmt: skip
+    "way",
+    "method",
+    "fidelity",
+    "hand",
+    "object",
+    "scenes",
+    "grasps",
+    "seconds",
+    "end_seconds",
+    "clear_count",
+    "lift_count",
+    "lift_letter_count",
+    "lift_hard_count",
+    "clear",
+    "lift",
+    "lift_low",
+    "lift_high",
+    "lift_letter",
+    "lift_letter_low",
+    "lift_letter_high",
+    "lift_hard",
+    "lift_hard_low",
+    "lift_hard_high",
+    "robust",
+    "robust_low",
+    "robust_high",
+    "grasps_per_second",
+    "valid_per_second",
+    "valid_per_second_low",
+    "valid_per_second_high",
+    "end_to_end_per_second",
+    "end_to_end_per_second_low",
+    "end_to_end_per_second_high",
+    "seconds_to_first",
+    "note",
+)
 
 
 def write(chart: Row, folder: Path) -> list[Path]:

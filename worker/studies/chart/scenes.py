@@ -84,9 +84,16 @@ class Place:
 
 
 def scene_chart(
-    hands: Sequence[HandModel], things: Sequence[Thing], settings: Sequence[Setting], spec: SceneSpec, *, models: int,
-    work: Path | None = None, say: Say = lambda line: None, keep: Callable[[Row], None] = lambda result: None,
-) -> Row:  # fmt: skip
+    hands: Sequence[HandModel],
+    things: Sequence[Thing],
+    settings: Sequence[Setting],
+    spec: SceneSpec,
+    *,
+    models: int,
+    work: Path | None = None,
+    say: Say = lambda line: None,
+    keep: Callable[[Row], None] = lambda result: None,
+) -> Row:
     """Run everything.
 
     Args:
@@ -125,9 +132,14 @@ def _ways(settings: Sequence[Setting]) -> list[tuple[Setting, str]]:
 def _kept(setting: Setting, way: str, hand: HandModel, place: Place, models: int, work: Path | None) -> Row:
     """What the setting finds on the pair, from its file where it was found before."""
     said = {
-        "way": way, "method": setting.method, "fidelity": setting.fidelity, "hand": hand.name,
-        "object": place.thing.name, "batch": setting.batch, "options": dict(setting.options),
-    }  # fmt: skip
+        "way": way,
+        "method": setting.method,
+        "fidelity": setting.fidelity,
+        "hand": hand.name,
+        "object": place.thing.name,
+        "batch": setting.batch,
+        "options": dict(setting.options),
+    }
     if work is None:
         return said | _tried(setting, way, hand, place, models)
     told = place.spec.model_dump(mode="json")
@@ -208,9 +220,13 @@ class Judged:
         if not len(rows):
             return rows
         success = judge_lifts(
-            self.hand, self.place.true, self.grasps.take(rows), self.placed.take(rows), pieces=self.place.pieces,
+            self.hand,
+            self.place.true,
+            self.grasps.take(rows),
+            self.placed.take(rows),
+            pieces=self.place.pieces,
             **options,
-        ).success  # fmt: skip
+        ).success
         return rows[success == 1]
 
     def counts(self, models: int) -> Row:
@@ -218,15 +234,21 @@ class Judged:
         lifted the sum of the shares of models in which they are."""
         lifted = self.lifted
         shares = robust(
-            self.hand, self.place.true, self.grasps.take(lifted), placed=self.placed.take(lifted), models=models,
-            seed=MODELS_SEED, pieces=self.place.pieces,
-        ).share  # fmt: skip
+            self.hand,
+            self.place.true,
+            self.grasps.take(lifted),
+            placed=self.placed.take(lifted),
+            models=models,
+            seed=MODELS_SEED,
+            pieces=self.place.pieces,
+        ).share
         return {
-            "clear_count": len(self.clear), "lift_count": len(lifted),
+            "clear_count": len(self.clear),
+            "lift_count": len(lifted),
             "lift_letter_count": len(self._lifting(self.clear, level="letter")),
             "lift_hard_count": len(self._lifting(lifted, hard=True)),
             "robust_sum": float(shares.sum()),
-        }  # fmt: skip
+        }
 
 
 def figures(rows: Sequence[Mapping[str, Any]]) -> Row:

@@ -19,9 +19,15 @@ _VARIANT: Final = re.compile(r"([^:@]+)(?::([\w.]+=[\w.]+(?:\+[\w.]+=[\w.]+)*))?
 
 
 def settings_of(
-    methods: Sequence[str], fidelities: Sequence[str], *, batches: Sequence[int], peer_batch: int,
-    options: Sequence[str], quick: bool, run: Run,
-) -> list[Setting]:  # fmt: skip
+    methods: Sequence[str],
+    fidelities: Sequence[str],
+    *,
+    batches: Sequence[int],
+    peer_batch: int,
+    options: Sequence[str],
+    quick: bool,
+    run: Run,
+) -> list[Setting]:
     """A setting for every method, fidelity and batch; methods without fidelities have one each.
 
     Those with a budget of steps take seconds a grasp and get `peer_batch` grasps per call, the others the first batch.

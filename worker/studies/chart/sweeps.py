@@ -24,16 +24,17 @@ from worker.planners.fast_graspd.planner import grasps_of, optimise_pair
 from worker.planners.port import Wanted
 from worker.quality.referee.decomposition import decompose
 from worker.run import Run
-from worker.simulation.model import LossOptions
+from worker.simulation import record
+from worker.simulation.data import Data
+from worker.simulation.launches import Launches
+from worker.simulation.model import LossOptions, Model
 from worker.studies.chart import kernels
 from worker.studies.chart.chart import TRUE_ERROR_M, Thing
 from worker.studies.chart.statistics import figures, plain
 from worker.studies.chart.trials import Setting, Trial
-from worker.studies.chart.variants import asking_each
 
 Say = Callable[[str], None]
 Change = Callable[[Pair], Pair]
-
 DEFAULT: Final = FIDELITIES["standard"]
 
 
@@ -105,9 +106,16 @@ def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[Turn]:
 
 
 def sweep(
-    hand: HandModel, thing: Thing, *, batch: int, repeats: int, quick: bool, run: Run,
-    knobs: Sequence[str] = (), say: Say = lambda line: None,
-) -> list[dict[str, Any]]:  # fmt: skip
+    hand: HandModel,
+    thing: Thing,
+    *,
+    batch: int,
+    repeats: int,
+    quick: bool,
+    run: Run,
+    knobs: Sequence[str] = (),
+    say: Say = lambda line: None,
+) -> list[dict[str, Any]]:
     """One row per knob and value: `knob`, `value`, `default`, `speedup` and the figures of a run.
 
     Values are run in turn, repeat by repeat. `speedup` is what the default costs over what the value costs: in
@@ -151,3 +159,26 @@ def _make(hand: HandModel, obj: ObjectModel, count: int, seed: int, *, turn: Tur
     pair = (turn.change or _same)(pair_of(hand, obj, turn.fidelity, run.device))
     parts = optimise_pair(pair, Wanted(count, turn.fidelity, seed), run)
     return grasps_of(hand, obj, parts, time.perf_counter() - began)
+
+
+class AskingEach(Pair):
+    """Every simulated velocity asks for the distances anew; the answers are the same."""
+
+    def iteration(self, model: Model, data: Data, optimizer: str, patience: int) -> Launches:
+        out = Launches(model.device)
+        record.add_poses(out, model, data)
+        record.add_distances(out, model, data)
+        for _ in range(model.options.velocities - 1):
+            counts = [data.contacts.count, data.contacts.near_count]
+            out.add(kernels.forget, data.capacity, inputs=[data.active], outputs=counts)
+            record.add_distances(out, model, data)
+        record.add_contact(out, model, data)
+        record.add_penalties(out, model, data)
+        record.add_gradient(out, model, data)
+        record.add_step(out, model, data, optimizer, patience=patience)
+        return out
+
+
+def asking_each(pair: Pair) -> Pair:
+    """The pair with a query for each velocity."""
+    return AskingEach(pair.coarse, pair.fine, pair.options, pair.hand)

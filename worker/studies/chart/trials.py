@@ -71,9 +71,15 @@ class Setting:
     """Another way to make them than by method and fidelity: for sweeps of what no fidelity names."""
 
     def grasps(
-        self, hand: HandModel, obj: ObjectModel, count: int, seed: int, *, trial: Tried | None = None,
+        self,
+        hand: HandModel,
+        obj: ObjectModel,
+        count: int,
+        seed: int,
+        *,
+        trial: Tried | None = None,
         warm: bool = False,
-    ) -> GraspSet:  # fmt: skip
+    ) -> GraspSet:
         """Make grasps; methods that try candidates do so by `trial`."""
         if self.make is not None:
             return self.make(hand, obj, count, seed)
@@ -159,7 +165,7 @@ class Trial:
     def _measured(self, found: GraspSet) -> dict[str, Floats]:
         table = measure(
             self.hand, self.true, found, friction=FRICTION, thresholds_m=[THRESHOLD_M], run=self.setting.run
-        )  # fmt: skip
+        )
         columns = {key: _flat(table[f"quality/{name}"]) for key, name in COLUMNS.items()}
         return columns | {"sound": np.asarray(passes(table), float)}
 

@@ -54,9 +54,15 @@ class Descent:
 
 
 def descend(
-    pair: Pair, state: HandState, fidelity: Fidelity, *, rates: float = 1.0, weights: float = 1.0,
-    iterations: int | None = None, optimizer: str = "adam",
-) -> Descent:  # fmt: skip
+    pair: Pair,
+    state: HandState,
+    fidelity: Fidelity,
+    *,
+    rates: float = 1.0,
+    weights: float = 1.0,
+    iterations: int | None = None,
+    optimizer: str = "adam",
+) -> Descent:
     """Coarse and fine phase and projection from given hands.
 
     Args:
@@ -97,21 +103,30 @@ def start_map(hand: HandModel, obj: ObjectModel, *, count: int = 8, say: Say = l
         cells += _cells(pair, descend(pair, moved, fidelity), f"{hand.name} on {obj.name}", move, "standard")
         say(f"start moved by {move * 1e3:.0f} mm: {cells[-1].outcome}")
     return StabilityMap(
-        "starts", f"{count} starts moved along the approach", "way towards the object [m]", "fidelity",
-        _MEASURE, _BOUNDS,
+        "starts",
+        f"{count} starts moved along the approach",
+        "way towards the object [m]",
+        "fidelity",
+        _MEASURE,
+        _BOUNDS,
         reachable(cells, lambda cell: cell.x == 0.0),
         "a hand that stays away has no contacts; one that begins inside stays tangled",
         "the planner's own starts are drawn back until nothing touches; the merit drops hands that hold nothing, the "
         "gate those that sink in",
         "tests/worker/studies/test_stability.py::test_a_start_that_is_too_far_is_flagged",
         reach="0 m: the planner draws its starts itself",
-    )  # fmt: skip
+    )
 
 
 def rate_map(
-    hand: HandModel, obj: ObjectModel, *, rates: Sequence[float] = RATES, weights: Sequence[float] = WEIGHTS,
-    count: int = 8, say: Say = lambda line: None,
-) -> StabilityMap:  # fmt: skip
+    hand: HandModel,
+    obj: ObjectModel,
+    *,
+    rates: Sequence[float] = RATES,
+    weights: Sequence[float] = WEIGHTS,
+    count: int = 8,
+    say: Say = lambda line: None,
+) -> StabilityMap:
     """Learning rate x weight of penetration, for Adam and for plain descent."""
     fidelity = FIDELITIES["draft"]
     pair = pair_of(hand, obj, fidelity, "cpu")
@@ -124,14 +139,18 @@ def rate_map(
                 cells += _cells(pair, found, _OPTIMIZERS[optimizer], rate, weight)
             say(f"{optimizer} rate x {rate:g}: {[cell.outcome for cell in cells[-len(weights) :]]}")
     return StabilityMap(
-        "rates", f"Rates and weights of the descent, draft, {hand.name} on {obj.name}", "factor on the rates",
-        "factor on the weights of penetration", _MEASURE, _BOUNDS,
+        "rates",
+        f"Rates and weights of the descent, draft, {hand.name} on {obj.name}",
+        "factor on the rates",
+        "factor on the weights of penetration",
+        _MEASURE,
+        _BOUNDS,
         reachable(cells, lambda cell: (cell.panel, cell.x, cell.y) == (_OPTIMIZERS["adam"], 1.0, 1.0)),
         "hands jump past the object or sink into it",
         "rates and weights are fixed by the schedule; hands that are no numbers are dropped, others judged",
         "tests/worker/test_certified.py::test_hands_that_are_no_numbers_are_dropped_and_counted",
         reach="Adam at 1 and 1: rates and weights are no options of a job; `optimizer: gd` brings the paper's own",
-    )  # fmt: skip
+    )
 
 
 def length_map(
@@ -148,14 +167,18 @@ def length_map(
         cells += [cell, MapCell("draft", length, "quaternion drift", found.drift, graded(found.drift, 1e-5, 1e-3))]
         say(f"{length} iterations: {cell.outcome}, quaternions off by {found.drift:.1e}")
     return StabilityMap(
-        "length", f"Long runs of the fine phase, {hand.name} on {obj.name}", "iterations", "measure",
+        "length",
+        f"Long runs of the fine phase, {hand.name} on {obj.name}",
+        "iterations",
+        "measure",
         _MEASURE + "; the largest departure of a quaternion's length from 1",
-        _BOUNDS + "; drift: 1e-5, 1e-3", reachable(cells, lambda cell: True),
+        _BOUNDS + "; drift: 1e-5, 1e-3",
+        reachable(cells, lambda cell: True),
         "poses that are no rotations any more, hands that creep away",
         "quaternions are normalised in each step; a grasp that does not improve is frozen after `patience` iterations",
         "tests/worker/studies/test_stability.py::test_a_long_run_does_not_drift",
         reach="all: a fidelity of one's own may ask for 100,000 iterations",
-    )  # fmt: skip
+    )
 
 
 _ORDER: Final = ("good", "weak", "broken")
@@ -190,9 +213,11 @@ def _cells(pair: Pair, found: Descent, panel: str, x: float | str, y: float | st
 
 def _scaled(schedule: Schedule, rates: float, weights: float) -> Schedule:
     return replace(
-        schedule, rates=rates * schedule.rates, penetration=weights * schedule.penetration,
+        schedule,
+        rates=rates * schedule.rates,
+        penetration=weights * schedule.penetration,
         object_penetration=weights * schedule.object_penetration,
-    )  # fmt: skip
+    )
 
 
 def _lengthened(schedule: Schedule, iterations: int | None) -> Schedule:
@@ -205,6 +230,9 @@ def _lengthened(schedule: Schedule, iterations: int | None) -> Schedule:
         return np.concatenate([values, np.repeat(values[-1:], more, axis=0)])
 
     return Schedule(
-        longer(schedule.dilation), longer(schedule.penetration), longer(schedule.object_penetration),
-        longer(schedule.self_penetration), longer(schedule.rates),
-    )  # fmt: skip
+        longer(schedule.dilation),
+        longer(schedule.penetration),
+        longer(schedule.object_penetration),
+        longer(schedule.self_penetration),
+        longer(schedule.rates),
+    )

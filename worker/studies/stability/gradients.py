@@ -46,11 +46,16 @@ def kernel_gradient(name: str, contacts: Contacts, world: World) -> Floats:
         gradient = wp.zeros((1, n), dtype=wp.float32)
         physics = _physics(world)
         given = [
-            wp.ones(1, dtype=wp.int32), wp.zeros(1, dtype=wp.int32), wp.array([world.dilation], dtype=wp.float32),
-            wp.ones(1, dtype=wp.float32), wp.array([n], dtype=wp.int32), wp.array(contacts.points[None], dtype=wp.vec3),
+            wp.ones(1, dtype=wp.int32),
+            wp.zeros(1, dtype=wp.int32),
+            wp.array([world.dilation], dtype=wp.float32),
+            wp.ones(1, dtype=wp.float32),
+            wp.array([n], dtype=wp.int32),
+            wp.array(contacts.points[None], dtype=wp.vec3),
             wp.array(contacts.normals[None], dtype=wp.vec3),
-            wp.array(contacts.distances[None], dtype=wp.float32), wp.array(contacts.weights[None], dtype=wp.float32),
-        ]  # fmt: skip
+            wp.array(contacts.distances[None], dtype=wp.float32),
+            wp.array(contacts.weights[None], dtype=wp.float32),
+        ]
         inputs = [physics, wp.array(motions, dtype=contact.vec6), PASSES, *given]
         if name == "direct":
             near = [wp.array([n], dtype=wp.int32), wp.array(np.arange(n)[None], dtype=wp.int32)]
@@ -58,7 +63,7 @@ def kernel_gradient(name: str, contacts: Contacts, world: World) -> Floats:
             wp.launch(contact.direct, dim=(1, m), inputs=[*inputs, *near], outputs=[loss, end, adjoint])
             wp.launch(
                 contact.direct_gradient, dim=(1, 1), inputs=[physics, n, *given, end, adjoint], outputs=[gradient]
-            )  # fmt: skip
+            )
         else:
             states = wp.zeros((1, m, max(n, PASSES)), dtype=contact.vec6)
             wp.launch(_KERNELS[name], dim=(1, m), inputs=inputs, outputs=[states, loss, end, gradient])
@@ -90,15 +95,19 @@ def gradient_map(
                 worst = float(np.median(angles))
                 cells.append(MapCell(name, size, gap, worst, graded(worst, *ANGLE)))
     return StabilityMap(
-        "gradient", "Gradient of the float32 kernels against float64 differences", "radius of the object [m]",
-        "spread of the gaps over the step", "sine of the angle between the gradients, median of some contact sets",
-        f"weak: {ANGLE[0]:g}; broken: {ANGLE[1]:g}", reachable(cells, lambda cell: True),
+        "gradient",
+        "Gradient of the float32 kernels against float64 differences",
+        "radius of the object [m]",
+        "spread of the gaps over the step",
+        "sine of the angle between the gradients, median of some contact sets",
+        f"weak: {ANGLE[0]:g}; broken: {ANGLE[1]:g}",
+        reachable(cells, lambda cell: True),
         "the descent wanders: losses stay where they were however many iterations are run",
         "a descent that does not improve stops after `patience` iterations; of several starts the best is kept, judged "
         "by the balance of forces and not by the loss",
         "tests/worker/studies/test_stability.py::test_gradients_agree_at_the_sizes_of_hands_and_their_objects",
         reach="all: `contact_solver` offers each, and objects have every size",
-    )  # fmt: skip
+    )
 
 
 def _physics(world: World) -> Any:

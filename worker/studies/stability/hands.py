@@ -103,10 +103,16 @@ def _solid(kind: str, height: float, radius: float, length: float) -> str:
 
 
 def hand_map(
-    *, fingers: Sequence[int] = FINGERS, sizes: Sequence[float] = SIZES, ratios: Sequence[float] = RATIOS,
-    couplings: Sequence[Coupling] = COUPLINGS, fidelity: str = "standard", count: int = 8, run: Run = ALONE,
+    *,
+    fingers: Sequence[int] = FINGERS,
+    sizes: Sequence[float] = SIZES,
+    ratios: Sequence[float] = RATIOS,
+    couplings: Sequence[Coupling] = COUPLINGS,
+    fidelity: str = "standard",
+    count: int = 8,
+    run: Run = ALONE,
     say: Callable[[str], None] = lambda line: None,
-) -> StabilityMap:  # fmt: skip
+) -> StabilityMap:
     """Valid grasps of a cube in each hand, or why the hand is refused."""
     makes: list[tuple[str, float, str, Callable[[], HandModel]]] = []
     for way in couplings:
@@ -117,8 +123,10 @@ def hand_map(
         makes += [("distal over middle joint", r, f"{n} fingers", partial(following, ratio=r)) for r in ratios]
     cells = [_cell(panel, x, y, make, fidelity, count, run, say) for panel, x, y, make in makes]
     return StabilityMap(
-        "hands", f"{count} grasps of a cube of {CUBE_MM:g} mm in hands that are hard, {fidelity}",
-        "the hand's parameter", "what a drive moves",
+        "hands",
+        f"{count} grasps of a cube of {CUBE_MM:g} mm in hands that are hard, {fidelity}",
+        "the hand's parameter",
+        "what a drive moves",
         MEASURE,
         BOUNDS,
         reachable(cells, lambda cell: True),
@@ -127,13 +135,19 @@ def hand_map(
         "holds plain objects; a job that finds too few says so",
         "tests/worker/studies/test_stability_hands.py::test_a_palm_without_fingers_is_refused_and_three_of_them_hold",
         reach="all: users bring such hands",
-    )  # fmt: skip
+    )
 
 
 def _cell(
-    panel: str, x: float, y: str, make: Callable[[], HandModel], fidelity: str, count: int, run: Run,
+    panel: str,
+    x: float,
+    y: str,
+    make: Callable[[], HandModel],
+    fidelity: str,
+    count: int,
+    run: Run,
     say: Callable[[str], None],
-) -> MapCell:  # fmt: skip
+) -> MapCell:
     try:
         hand = make()
     except GraspdError as error:

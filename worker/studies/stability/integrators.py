@@ -186,7 +186,10 @@ def time_step_map(time_steps: Sequence[float] = TIME_STEPS, speeds: Sequence[flo
     # The grid comes no nearer to the planner's step than a tenth of it.
     cells = reachable(cells, lambda c: c.panel in _OFFERED and abs(float(c.x) * float(c.y) / step - 1) < 0.15)
     return StabilityMap(
-        "time_step", "A ball of 1 kg in a cage of 24 points, 60 steps", "time step [s]", "speed [m/s]",
+        "time_step",
+        "A ball of 1 kg in a cage of 24 points, 60 steps",
+        "time step [s]",
+        "speed [m/s]",
         _BALL_MEASURE,
         f"weak: energy × {ENERGY[0]:g} or {SINK_M[0] * 1e3:g} mm deep; broken: energy × {ENERGY[1]:g} or "
         f"{SINK_M[1] * 1e3:g} mm deep",
@@ -196,7 +199,7 @@ def time_step_map(time_steps: Sequence[float] = TIME_STEPS, speeds: Sequence[flo
         "MuJoCo's implicit solver",
         "tests/worker/studies/test_stability.py::test_the_planners_own_step_lies_where_its_integrators_are_good",
         reach=f"the offered solvers at a step of {1e3 * step:g} mm; the step is no option of a job",
-    )  # fmt: skip
+    )
 
 
 def _ball_cell(name: str, dt: float, speed: float, found: tuple[float, float]) -> MapCell:
@@ -231,8 +234,11 @@ def stiffness_map(
         for dt in time_steps
     ]
     return StabilityMap(
-        "stiffness", "Penalty stiffness against the position-based step, 0.3 m/s", "contact stiffness [N/m]",
-        "time step [s]", _BALL_MEASURE,
+        "stiffness",
+        "Penalty stiffness against the position-based step, 0.3 m/s",
+        "contact stiffness [N/m]",
+        "time step [s]",
+        _BALL_MEASURE,
         "as in time_step; the line is dt = 2 sqrt(m / k), above which one contact alone is unstable",
         cells,
         "soft contacts let the hand sink in, stiff ones throw the object; the band between them narrows with dt",
@@ -240,7 +246,7 @@ def stiffness_map(
         "tests/worker/studies/test_stability.py::test_a_penalty_force_blows_up_above_the_bound_of_theory",
         lines,
         reach="none: no planner integrates penalty forces over time, and the planner's own stiffness is fixed",
-    )  # fmt: skip
+    )
 
 
 def contact_count_map(counts: Sequence[int] = COUNTS) -> StabilityMap:
@@ -253,14 +259,18 @@ def contact_count_map(counts: Sequence[int] = COUNTS) -> StabilityMap:
     ]
     cells = reachable(cells, lambda cell: cell.panel in _OFFERED)
     return StabilityMap(
-        "contact_count", "A step of 1 mm into a wall of contact points", "contact points", "initial depth [m]",
-        "motion left into or out of the wall, over the step", "weak: 0.25 of the step; broken: 1, more than came in",
+        "contact_count",
+        "A step of 1 mm into a wall of contact points",
+        "contact points",
+        "initial depth [m]",
+        "motion left into or out of the wall, over the step",
+        "weak: 0.25 of the step; broken: 1, more than came in",
         cells,
         "more points on the same finger push harder; losses and gradients grow with the sampling",
         "summed Jacobi is not offered; the direct solver weighs points by the area they stand for",
         "tests/worker/studies/test_stability.py::test_summed_jacobi_overshoots_with_the_number_of_contacts",
         reach="the offered solvers, with any number of contacts: it is the number of hand points that touch",
-    )  # fmt: skip
+    )
 
 
 def _wall_cell(name: str, solver: Solver, count: int, depth: float, step: float) -> MapCell:

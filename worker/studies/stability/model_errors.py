@@ -74,12 +74,8 @@ ERRORS: Final[dict[str, _Error]] = {
     "friction over the model's": _Error(
         (0.25, 0.5, 0.67, 0.8, 1.33, 2), FRICTIONS, lambda h, x, d: Variant(friction=x)
     ),
-    "mass over the model's": _Error(
-        (0.25, 0.5, 2, 4, 8), (1 / FACTOR, FACTOR), lambda h, x, d: Variant(mass=x)
-    ),
-    "gains over the model's": _Error(
-        (0.12, 0.25, 0.5, 2, 4, 8), (1 / FACTOR, FACTOR), lambda h, x, d: Variant(gain=x)
-    ),
+    "mass over the model's": _Error((0.25, 0.5, 2, 4, 8), (1 / FACTOR, FACTOR), lambda h, x, d: Variant(mass=x)),
+    "gains over the model's": _Error((0.12, 0.25, 0.5, 2, 4, 8), (1 / FACTOR, FACTOR), lambda h, x, d: Variant(gain=x)),
     "armature [1e-4 kg m²]": _Error(
         (1, 2, 4, 16, 64), (0.0, 1e4 * ARMATURE * FACTOR), lambda h, x, d: Variant(armature=1e-4 * x)
     ),
@@ -90,7 +86,8 @@ ERRORS: Final[dict[str, _Error]] = {
         (1, 2, 4, 8, 16), (0.0, SHIFT_M / _MM), lambda h, x, d: Variant(object_shift_m=_along(d, x * _MM))
     ),
     "object is turned by [°]": _Error(
-        (1, 2, 5, 10, 20), (0.0, float(np.degrees(TURN))),
+        (1, 2, 5, 10, 20),
+        (0.0, float(np.degrees(TURN))),
         lambda h, x, d: Variant(object_turn=_along(d, float(np.radians(x)))),
     ),
     "hand stands off by [mm]": _Error(
@@ -102,31 +99,48 @@ ERRORS: Final[dict[str, _Error]] = {
     "last finger begins later by [share of closing]": _Error(
         (0.1, 0.25, 0.5, 0.75), (0.0, LATEST), lambda h, x, d: Variant(lags=_lags(h, x))
     ),
-}  # fmt: skip
+}
 
 
 def model_error_map(
-    hands: Sequence[HandModel], obj: ObjectModel, *, errors: Sequence[str] = tuple(ERRORS), every: int = 1,
-    fidelity: str = "standard", count: int = 16, run: Run = ALONE, say: Callable[[str], None] = lambda line: None,
-) -> StabilityMap:  # fmt: skip
+    hands: Sequence[HandModel],
+    obj: ObjectModel,
+    *,
+    errors: Sequence[str] = tuple(ERRORS),
+    every: int = 1,
+    fidelity: str = "standard",
+    count: int = 16,
+    run: Run = ALONE,
+    say: Callable[[str], None] = lambda line: None,
+) -> StabilityMap:
     """Share of valid grasps that still hold where one thing is off; of each amount's every so many-th."""
     cells = [cell for hand in hands for cell in _cells(hand, obj, errors, every, fidelity, count, run, say)]
     return StabilityMap(
-        "model_errors", f"{count} valid grasps of {obj.name}, judged in models that are wrong", "by how much", "hand",
-        "share of the grasps that hold there, too", f"weak: under {WEAK:g}; broken: under {BROKEN:g}",
+        "model_errors",
+        f"{count} valid grasps of {obj.name}, judged in models that are wrong",
+        "by how much",
+        "hand",
+        "share of the grasps that hold there, too",
+        f"weak: under {WEAK:g}; broken: under {BROKEN:g}",
         cells,
         "a grasp that is valid here fails on a robot that is another one",
         "`--robust` keeps what holds in the wanted share of models that are off by so much; `robust_share` and "
         "`robust_weakest` are stored. What is farther off is another hand: `graspd evaluate --judge-hand` judges in it",
         "tests/worker/studies/test_stability_model_errors.py::test_amounts_within_reach_are_those_that_robust_draws",
         reach="amounts that `--robust` draws: a job that asks for it is judged there",
-    )  # fmt: skip
+    )
 
 
 def _cells(
-    hand: HandModel, obj: ObjectModel, errors: Sequence[str], every: int, fidelity: str, count: int, run: Run,
+    hand: HandModel,
+    obj: ObjectModel,
+    errors: Sequence[str],
+    every: int,
+    fidelity: str,
+    count: int,
+    run: Run,
     say: Callable[[str], None],
-) -> list[MapCell]:  # fmt: skip
+) -> list[MapCell]:
     request = JobRequest(hand="hand", object="object", grasps=count, fidelity=fidelity, audits=0)
     grasps = certified_grasps(hand, obj, request, count=count, run=run).grasps
     models = Models(hand, obj, decompose(obj), MujocoOptions())

@@ -23,9 +23,14 @@ SHAPES: Final[dict[str, tuple[float, ...]]] = {
 
 
 def peer_map(
-    hand: HandModel, *, methods: Sequence[str] = METHODS, shapes: dict[str, tuple[float, ...]] = SHAPES, count: int = 8,
-    run: Run = ALONE, say: Callable[[str], None] = lambda line: None,
-) -> StabilityMap:  # fmt: skip
+    hand: HandModel,
+    *,
+    methods: Sequence[str] = METHODS,
+    shapes: dict[str, tuple[float, ...]] = SHAPES,
+    count: int = 8,
+    run: Run = ALONE,
+    say: Callable[[str], None] = lambda line: None,
+) -> StabilityMap:
     """Valid grasps of each method on each shape, at the settings that it was published with."""
     cells = []
     for family, values in shapes.items():
@@ -37,7 +42,9 @@ def peer_map(
                 say(f"{family} {value:g} {method}: {cell.outcome} {cell.value:.2f} {cell.note}")
                 cells.append(cell)
     return StabilityMap(
-        "peers", f"{count} grasps of {hand.name} by each method on shapes that are hard", "the shape's parameter",
+        "peers",
+        f"{count} grasps of {hand.name} by each method on shapes that are hard",
+        "the shape's parameter",
         "method",
         MEASURE,
         BOUNDS,
@@ -46,4 +53,4 @@ def peer_map(
         "what a method leaves in the object or the referee drops is never valid; a job that finds too few says so",
         "tests/worker/studies/test_stability.py::test_a_job_whose_every_grasp_is_bad_ends_with_none",
         reach="all: any job may name another method",
-    )  # fmt: skip
+    )

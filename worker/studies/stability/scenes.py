@@ -65,9 +65,15 @@ _TEST: Final = "tests/worker/studies/test_stability_scenes.py::"
 
 
 def height_map(
-    hands: Sequence[HandModel], *, heights: Sequence[float] = HEIGHTS_MM, sides: Sequence[float] = SIDES_MM,
-    fidelity: str = "draft", count: int = 8, run: Run = ALONE, say: Say = lambda line: None,
-) -> StabilityMap:  # fmt: skip
+    hands: Sequence[HandModel],
+    *,
+    heights: Sequence[float] = HEIGHTS_MM,
+    sides: Sequence[float] = SIDES_MM,
+    fidelity: str = "draft",
+    count: int = 8,
+    run: Run = ALONE,
+    say: Say = lambda line: None,
+) -> StabilityMap:
     """Boxes from a plate to a tower on a table."""
     cells = [
         _cell(hand, hand.name, height, side, _standing((side, side, height), ()), fidelity, count, run, say)
@@ -76,16 +82,30 @@ def height_map(
         for height in heights
     ]
     return StabilityMap(
-        "scene_height", f"{count} grasps of boxes on a table, {fidelity}", "height [mm]", "side of the footprint [mm]",
-        _MEASURE, _BOUNDS, reachable(cells, lambda cell: True), _SHOWS, _FEWER,
-        _TEST + "test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so", reach="all: users bring such things",
-    )  # fmt: skip
+        "scene_height",
+        f"{count} grasps of boxes on a table, {fidelity}",
+        "height [mm]",
+        "side of the footprint [mm]",
+        _MEASURE,
+        _BOUNDS,
+        reachable(cells, lambda cell: True),
+        _SHOWS,
+        _FEWER,
+        _TEST + "test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so",
+        reach="all: users bring such things",
+    )
 
 
 def wall_map(
-    hands: Sequence[HandModel], *, gaps: Sequence[float] = GAPS_MM, walls: Sequence[str] = tuple(WALLS),
-    fidelity: str = "draft", count: int = 8, run: Run = ALONE, say: Say = lambda line: None,
-) -> StabilityMap:  # fmt: skip
+    hands: Sequence[HandModel],
+    *,
+    gaps: Sequence[float] = GAPS_MM,
+    walls: Sequence[str] = tuple(WALLS),
+    fidelity: str = "draft",
+    count: int = 8,
+    run: Run = ALONE,
+    say: Say = lambda line: None,
+) -> StabilityMap:
     """A box with walls at a distance from its sides."""
     cells = [
         _cell(hand, hand.name, gap, name, _standing(TARGET_MM, _walls(WALLS[name], gap)), fidelity, count, run, say)
@@ -94,38 +114,72 @@ def wall_map(
         for gap in gaps
     ]
     return StabilityMap(
-        "scene_wall", f"{count} grasps of a box of {_size(TARGET_MM)} mm beside walls, {fidelity}",
-        "distance from the walls [mm]", "walls", _MEASURE, _BOUNDS, reachable(cells, lambda cell: True), _SHOWS, _FEWER,
+        "scene_wall",
+        f"{count} grasps of a box of {_size(TARGET_MM)} mm beside walls, {fidelity}",
+        "distance from the walls [mm]",
+        "walls",
+        _MEASURE,
+        _BOUNDS,
+        reachable(cells, lambda cell: True),
+        _SHOWS,
+        _FEWER,
         _TEST + "test_an_object_in_a_narrow_well_is_refused_or_comes_out_valid",
         reach="all: bins, shelves and files bring such walls",
-    )  # fmt: skip
+    )
 
 
 def neighbour_map(
-    hands: Sequence[HandModel], *, gaps: Sequence[float] = GAPS_MM, around: Sequence[str] = tuple(NEIGHBOURS),
-    fidelity: str = "draft", count: int = 8, run: Run = ALONE, say: Say = lambda line: None,
-) -> StabilityMap:  # fmt: skip
+    hands: Sequence[HandModel],
+    *,
+    gaps: Sequence[float] = GAPS_MM,
+    around: Sequence[str] = tuple(NEIGHBOURS),
+    fidelity: str = "draft",
+    count: int = 8,
+    run: Run = ALONE,
+    say: Say = lambda line: None,
+) -> StabilityMap:
     """A box among boxes as large as itself."""
     cells = [
         _cell(
-            hand, hand.name, gap, name, _standing(TARGET_MM, _neighbours(NEIGHBOURS[name], gap)), fidelity, count, run,
+            hand,
+            hand.name,
+            gap,
+            name,
+            _standing(TARGET_MM, _neighbours(NEIGHBOURS[name], gap)),
+            fidelity,
+            count,
+            run,
             say,
         )
         for hand in hands
         for name in around
         for gap in gaps
-    ]  # fmt: skip
+    ]
     return StabilityMap(
-        "scene_neighbours", f"{count} grasps of a box of {_size(TARGET_MM)} mm among its like, {fidelity}",
-        "gap between them [mm]", "fixed boxes around it", _MEASURE, _BOUNDS, reachable(cells, lambda cell: True),
-        _SHOWS, _FEWER, _TEST + "test_a_box_among_boxes_is_lifted_out_or_not_valid", reach="all: clutter is like that",
-    )  # fmt: skip
+        "scene_neighbours",
+        f"{count} grasps of a box of {_size(TARGET_MM)} mm among its like, {fidelity}",
+        "gap between them [mm]",
+        "fixed boxes around it",
+        _MEASURE,
+        _BOUNDS,
+        reachable(cells, lambda cell: True),
+        _SHOWS,
+        _FEWER,
+        _TEST + "test_a_box_among_boxes_is_lifted_out_or_not_valid",
+        reach="all: clutter is like that",
+    )
 
 
 def size_map(
-    hands: Sequence[HandModel], *, ratios: Sequence[float] = RATIOS, kinds: Sequence[str] = KINDS,
-    fidelity: str = "draft", count: int = 8, run: Run = ALONE, say: Say = lambda line: None,
-) -> StabilityMap:  # fmt: skip
+    hands: Sequence[HandModel],
+    *,
+    ratios: Sequence[float] = RATIOS,
+    kinds: Sequence[str] = KINDS,
+    fidelity: str = "draft",
+    count: int = 8,
+    run: Run = ALONE,
+    say: Say = lambda line: None,
+) -> StabilityMap:
     """Cubes from a crumb to as large as the hand, afloat and in scenes."""
     cells = []
     for hand in hands:
@@ -137,13 +191,18 @@ def size_map(
                 cells.append(_cell(hand, hand.name, ratio, kind, scene, fidelity, count, run, say))
     spans = ", ".join(f"{hand.name} {1e3 * span_of(hand):.0f} mm" for hand in hands)
     return StabilityMap(
-        "scene_size", f"{count} grasps of cubes as large as a part of the hand's span, {fidelity}",
-        "side of the cube over the hand's span", "scene",
-        f"{_MEASURE}; free: that hold six pushes; span, between fingertips before the grasp: {spans}", _BOUNDS,
-        reachable(cells, lambda cell: True), _SHOWS,
+        "scene_size",
+        f"{count} grasps of cubes as large as a part of the hand's span, {fidelity}",
+        "side of the cube over the hand's span",
+        "scene",
+        f"{_MEASURE}; free: that hold six pushes; span, between fingertips before the grasp: {spans}",
+        _BOUNDS,
+        reachable(cells, lambda cell: True),
+        _SHOWS,
         _FEWER + "; an object larger than the bin or the shelf is refused in a line",
-        _TEST + "test_a_cube_that_does_not_fit_its_bin_is_refused", reach="all: users bring such things",
-    )  # fmt: skip
+        _TEST + "test_a_cube_that_does_not_fit_its_bin_is_refused",
+        reach="all: users bring such things",
+    )
 
 
 def span_of(hand: HandModel) -> float:
@@ -190,9 +249,16 @@ def _size(sides_mm: Sequence[float]) -> str:
 
 
 def _cell(
-    hand: HandModel, panel: str, x: float | str, y: float | str, placement: Placement, fidelity: str, count: int,
-    run: Run, say: Say,
-) -> MapCell:  # fmt: skip
+    hand: HandModel,
+    panel: str,
+    x: float | str,
+    y: float | str,
+    placement: Placement,
+    fidelity: str,
+    count: int,
+    run: Run,
+    say: Say,
+) -> MapCell:
     sides, spec = placement
     try:
         found = planned(hand, sides, spec, fidelity, count, run)

@@ -93,10 +93,15 @@ CLOSED: Final = tuple(name for name, (_, options) in DEFECTS.items() if not opti
 
 
 def shape_map(
-    hand: HandModel, *, fidelities: Sequence[str] = ("draft", "standard", "fine"), count: int = 8, run: Run = ALONE,
-    families: Sequence[str] = tuple(FAMILIES), defects: Sequence[str] = tuple(DEFECTS),
+    hand: HandModel,
+    *,
+    fidelities: Sequence[str] = ("draft", "standard", "fine"),
+    count: int = 8,
+    run: Run = ALONE,
+    families: Sequence[str] = tuple(FAMILIES),
+    defects: Sequence[str] = tuple(DEFECTS),
     say: Callable[[str], None] = lambda line: None,
-) -> StabilityMap:  # fmt: skip
+) -> StabilityMap:
     """Valid grasps on each shape at each fidelity, or the reason why it was refused."""
     jobs: list[tuple[str, float | str, Any, dict[str, Any]]] = [
         (f"{family}: {FAMILIES[family][0]}", value, FAMILIES[family][1](value), {"units": "m"})
@@ -111,7 +116,10 @@ def shape_map(
             say(f"{panel} {value} {fidelity}: {cell.outcome} {cell.value:.2f} {cell.note}")
             cells.append(cell)
     return StabilityMap(
-        "shapes", f"{count} grasps of {hand.name} on shapes that are hard", "the shape's parameter", "fidelity",
+        "shapes",
+        f"{count} grasps of {hand.name} on shapes that are hard",
+        "the shape's parameter",
+        "fidelity",
         MEASURE,
         BOUNDS,
         reachable(cells, lambda cell: True),
@@ -120,7 +128,7 @@ def shape_map(
         "sink in; a job that finds too few says so",
         "tests/worker/studies/test_stability.py::test_a_shape_is_refused_or_its_grasps_are_sound",
         reach="all: users bring such shapes",
-    )  # fmt: skip
+    )
 
 
 def prepared(mesh: Any, options: dict[str, Any], face_error_m: float) -> ObjectModel:
@@ -131,9 +139,14 @@ def prepared(mesh: Any, options: dict[str, Any], face_error_m: float) -> ObjectM
 
 
 def shape_cell(
-    hand: HandModel, place: tuple[str, float | str, float | str], mesh: Any, options: dict[str, Any],
-    asked: dict[str, Any], count: int, run: Run,
-) -> MapCell:  # fmt: skip
+    hand: HandModel,
+    place: tuple[str, float | str, float | str],
+    mesh: Any,
+    options: dict[str, Any],
+    asked: dict[str, Any],
+    count: int,
+    run: Run,
+) -> MapCell:
     """Raw grasps of a hand on a mesh, planned and judged as a job does.
 
     Args:

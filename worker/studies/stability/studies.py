@@ -46,10 +46,14 @@ def run(
             few(gradients.SIZES_M), few(gradients.GAPS), repeats=1 if quick else 3
         ),
         "shapes": lambda: shapes.shape_map(
-            model, fidelities=("draft",) if quick else ("draft", "standard", "fine"), count=4 if quick else 8,
+            model,
+            fidelities=("draft",) if quick else ("draft", "standard", "fine"),
+            count=4 if quick else 8,
             families=("plate", "cube") if quick else tuple(shapes.FAMILIES),
             # Grasps on an open mesh cost more than all else of a quick run.
-            defects=shapes.CLOSED if quick else tuple(shapes.DEFECTS), run=work, say=say,
+            defects=shapes.CLOSED if quick else tuple(shapes.DEFECTS),
+            run=work,
+            say=say,
         ),
         "starts": lambda: descents.start_map(model, thing, count=4 if quick else 8, say=say),
         "rates": lambda: descents.rate_map(
@@ -57,17 +61,31 @@ def run(
         ),
         "length": lambda: descents.length_map(model, thing, lengths=lengths, say=say),
         "hands": lambda: hands.hand_map(
-            fingers=(1, 3) if quick else hands.FINGERS, sizes=() if quick else hands.SIZES,
-            ratios=() if quick else hands.RATIOS, couplings=("each joint",) if quick else hands.COUPLINGS,
-            fidelity="draft" if quick else "standard", count=4 if quick else 8, run=work, say=say,
+            fingers=(1, 3) if quick else hands.FINGERS,
+            sizes=() if quick else hands.SIZES,
+            ratios=() if quick else hands.RATIOS,
+            couplings=("each joint",) if quick else hands.COUPLINGS,
+            fidelity="draft" if quick else "standard",
+            count=4 if quick else 8,
+            run=work,
+            say=say,
         ),
         "model_errors": lambda: model_errors.model_error_map(
-            beside(ALL_HANDS), thing, every=3 if quick else 1, fidelity="draft" if quick else "standard",
-            count=2 if quick else 16, run=work, say=say,
+            beside(ALL_HANDS),
+            thing,
+            every=3 if quick else 1,
+            fidelity="draft" if quick else "standard",
+            count=2 if quick else 16,
+            run=work,
+            say=say,
         ),
         "peers": lambda: peers.peer_map(
-            model, methods=peers.METHODS[:2] if quick else peers.METHODS,
-            shapes={"cube": (60,)} if quick else peers.SHAPES, count=4 if quick else 8, run=work, say=say,
+            model,
+            methods=peers.METHODS[:2] if quick else peers.METHODS,
+            shapes={"cube": (60,)} if quick else peers.SHAPES,
+            count=4 if quick else 8,
+            run=work,
+            say=say,
         ),
         "scene_height": lambda: scenes.height_map(
             pair, heights=(10, 80) if quick else scenes.HEIGHTS_MM, sides=(60,) if quick else scenes.SIDES_MM, **place
@@ -81,7 +99,7 @@ def run(
         "scene_size": lambda: scenes.size_map(
             pair, ratios=(0.1, 0.3) if quick else scenes.RATIOS, kinds=("table",) if quick else scenes.KINDS, **place
         ),
-    }  # fmt: skip
+    }
     found = []
     for name in names:
         say(f"study {name}")

@@ -35,9 +35,7 @@ class Loaded:
         """Actuators' targets: their moments times the hand's joints."""
         dense = np.zeros((self.model.nu, self.model.nv))
         data = self.data
-        mujoco.mju_sparse2dense(
-            dense, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
-        )  # fmt: skip
+        mujoco.mju_sparse2dense(dense, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
         return dense[:, 6:-6] @ qpos[7:]
 
 
@@ -84,9 +82,13 @@ def _add_hand(spec: Any, root: Path, file: str) -> None:
     hold = np.zeros(mujoco.mjNEQDATA)
     hold[10] = 1
     spec.add_equality(
-        type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1="mocap_body", name2=f"{PREFIX}world",
-        data=hold, solimp=[0.9, 0.95, 0.001, 0.5, 2],
-    )  # fmt: skip
+        type=mujoco.mjtEq.mjEQ_WELD,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        name1="mocap_body",
+        name2=f"{PREFIX}world",
+        data=hold,
+        solimp=[0.9, 0.95, 0.001, 0.5, 2],
+    )
 
 
 def _add_object(spec: Any, pieces: Path, scale: float, density: float) -> None:

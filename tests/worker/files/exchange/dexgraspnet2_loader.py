@@ -78,11 +78,16 @@ def sample(root: Path, scene: str, view: int, robot: str, joint_names: list[str]
         # It draws points by number and takes the same numbers here: another length is another cloud.
         assert len(graspness) == len(cloud)
     return Sample(
-        cloud, seg, np.einsum("ji,njk->nik", turn, grasps["rotation"]), (grasps["translation"] - place) @ turn,
+        cloud,
+        seg,
+        np.einsum("ji,njk->nik", turn, grasps["rotation"]),
+        (grasps["translation"] - place) @ turn,
         np.stack([grasps[name] for name in joint_names], axis=-1),
-        point, np.linalg.norm(cloud[None] - point[:, None], axis=2).min(axis=1) <= MAX_POINT_DIS,
-        graspness, values.exists(),
-    )  # fmt: skip
+        point,
+        np.linalg.norm(cloud[None] - point[:, None], axis=2).min(axis=1) <= MAX_POINT_DIS,
+        graspness,
+        values.exists(),
+    )
 
 
 def _points(depth: np.ndarray, intrinsics: np.ndarray, factor: np.ndarray) -> np.ndarray:

@@ -154,11 +154,18 @@ _SHADOW_THUMB = [
         ("shadow/shadow_hand_right.urdf", "shadow", [0, 0, 0.034, 1, 0, 0, 0], _SHADOW_INDEX, 0, "FFJ1"),
         ("shadow/shadow_hand_right.urdf", "shadow", [0, 0, 0.034, 1, 0, 0, 0], _SHADOW_THUMB, 17, "THJ1"),
     ],
-)  # fmt: skip
+)
 def test_a_hand_that_the_benchmark_has_is_mapped_onto_its_own_model(
-    shared_data: Path, block: ObjectModel, tmp_path: Path, file: str, config: str, root: list[float],
-    chain: list[Any], first: int, tip: str,
-) -> None:  # fmt: skip
+    shared_data: Path,
+    block: ObjectModel,
+    tmp_path: Path,
+    file: str,
+    config: str,
+    root: list[float],
+    chain: list[Any],
+    first: int,
+    tip: str,
+) -> None:
     hand = hand_from_path(shared_data / "hands" / file)
     grasps = random_postures(hand)
     dexgraspbench.write(hand, block, grasps, [0], tmp_path)

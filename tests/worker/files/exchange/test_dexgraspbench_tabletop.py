@@ -44,9 +44,24 @@ def shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Raw grasps in two scenes: most lift, the first `LIMP` do not, for they squeeze no more than the open hand."""
     out = tmp_path_factory.mktemp("scenes") / "g.h5"
     graspd(
-        "synth", "--hand", "barrett", "--object", "block", "--scene", "table", "--scenes", 2, "-n", COUNT,
-        "--want", "raw", "--fidelity", "draft", "-o", out,
-    )  # fmt: skip
+        "synth",
+        "--hand",
+        "barrett",
+        "--object",
+        "block",
+        "--scene",
+        "table",
+        "--scenes",
+        2,
+        "-n",
+        COUNT,
+        "--want",
+        "raw",
+        "--fidelity",
+        "draft",
+        "-o",
+        out,
+    )
     made = read_shard(out, kind="base")
     squeeze, held = np.array(made["squeeze/joint_positions"]), np.array(made["quality/success"])
     squeeze[:LIMP], held[:LIMP] = made["pregrasp/joint_positions"][:LIMP], 0
@@ -177,9 +192,21 @@ def test_an_import_is_judged_by_its_lift(bench: Path, stored: Shard, tmp_path: P
     folder = bench / "output" / f"{EXPERIMENT}_{CONFIG}"
     out = tmp_path / "imported"
     graspd(
-        "import", folder, "--format", "dexgraspbench", "--hand", "barrett", "--object", "block", "--source", "a test",
-        "--licence", "CC0-1.0", "-o", out,
-    )  # fmt: skip
+        "import",
+        folder,
+        "--format",
+        "dexgraspbench",
+        "--hand",
+        "barrett",
+        "--object",
+        "block",
+        "--source",
+        "a test",
+        "--licence",
+        "CC0-1.0",
+        "-o",
+        out,
+    )
     (file,) = out.glob("*.h5")
     found = read_shard(file, kind="base")
     assert json.loads(str(found.attributes["scene"]))["kind"] == "table"

@@ -18,8 +18,8 @@ from service.readers import Pictures, open_shards
 from service.store.shards import Shard, read_shard, write_shard
 from tests.worker.files.exchange.conftest import run
 from tests.worker.files.exchange.dexgraspnet2_loader import graspness_at, pointed, sample, some_views
-from worker.files.exchange import archives, dexgraspnet2
-from worker.files.exchange.archives import load_npz
+from worker.files.exchange import dexgraspnet2
+from worker.files.exchange.dexgraspnet2 import load_npz
 from worker.files.exchange.dexgraspnet2_graspness import surface_samples
 from worker.files.exchange.lots import Look
 from worker.hands.kinematics import body_poses
@@ -248,7 +248,7 @@ def test_objects_in_an_archive_are_not_unpickled(tmp_path: Path) -> None:
 
 
 def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(archives, "LARGEST", 2**20)
+    monkeypatch.setattr(dexgraspnet2, "LARGEST", 2**20)
     np.savez_compressed(tmp_path / "x.npz", point=np.zeros(2**20))
     with pytest.raises(InputError, match="unpacks to more"):
         load_npz(tmp_path / "x.npz")

@@ -45,15 +45,19 @@ def views() -> Shard:
     world = local @ pose[:3, :3].T + pose[:3, 3]
     corners = world @ camera()[:3, :3].T + camera()[:3, 3]
     arrays = {
-        "camera/intrinsics": K[None], "camera/extrinsics": camera()[None], "camera/scene_index": np.zeros(1, np.int32),
-        "camera/eye": np.zeros(1, np.uint8), "camera/stereo_baseline_m": np.zeros(1),
-        "image/rgb": np.zeros((1, H, W, 3), np.uint8), "image/depth": np.ones((1, H, W), np.float32),
+        "camera/intrinsics": K[None],
+        "camera/extrinsics": camera()[None],
+        "camera/scene_index": np.zeros(1, np.int32),
+        "camera/eye": np.zeros(1, np.uint8),
+        "camera/stereo_baseline_m": np.zeros(1),
+        "image/rgb": np.zeros((1, H, W, 3), np.uint8),
+        "image/depth": np.ones((1, H, W), np.float32),
         "image/segmentation": np.full((1, H, W), 2, np.uint8),
         "box/bounding_box_2d_tight": np.array([[3, 4, 20, 15]], np.float32),
         "box/bounding_box_2d_loose": np.array([[2.6, 4, 21, 15]], np.float32),
         "box/bounding_box_3d": corners[None].astype(np.float32),
         "box/occlusion_ratio": np.array([0.25], np.float32),
-    }  # fmt: skip
+    }
     return Shard("views", {"object": "mug"}, arrays)
 
 

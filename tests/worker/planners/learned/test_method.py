@@ -103,8 +103,9 @@ def test_joined_batches_are_those_of_separate_launches(hand, block, network) -> 
 def proposing(network: ProposalNetwork, found: Proposals, anchor: np.ndarray) -> ProposalNetwork:
     """A network that proposes one grasp, whatever it sees; its noise is a tenth of a millimetre or milliradian."""
     rows = encode(found, anchor)[0].astype(np.float32)
-    weights = {name: np.zeros_like(array) if name.startswith("flow.out") else array
-               for name, array in network.weights.items()}  # fmt: skip
+    weights = {
+        name: np.zeros_like(array) if name.startswith("flow.out") else array for name, array in network.weights.items()
+    }
     return replace(network, weights=weights, mean=rows, std=np.full_like(rows, 1e-4))
 
 

@@ -28,9 +28,12 @@ def write(bundle: Bundle, folder: Path) -> list[Path]:
     tool = f"{hand}/{prim_name(found.tool.name)}"
     document = {
         **FORMAT,
-        "object_frame_link": thing, "gripper_frame_link": tool, "object_frame": thing, "gripper_frame": tool,
+        "object_frame_link": thing,
+        "gripper_frame_link": tool,
+        "object_frame": thing,
+        "gripper_frame": tool,
         "grasps": {bundle.name(row): _grasp(bundle, row) for row in range(len(found))},
-    }  # fmt: skip
+    }
     file = folder / f"{plain_name(found.hand.name)}_{plain_name(found.obj.name)}.yaml"
     return [dump_yaml(file, document)]
 

@@ -152,8 +152,15 @@ def _object(bundle: Bundle, folder: Path) -> list[Path]:
     obj, name = bundle.found.obj, plain_name(bundle.found.obj.name)
     folder.mkdir(parents=True, exist_ok=True)
     mesh = f'<geometry><mesh filename="{name}.obj"/></geometry>'
-    lines = [f'<robot name="{name}">', f'  <link name="{name}">', f"    <visual>{mesh}</visual>",
-             f"    <collision>{mesh}</collision>", "  </link>", "</robot>", ""]  # fmt: skip
+    lines = [
+        f'<robot name="{name}">',
+        f'  <link name="{name}">',
+        f"    <visual>{mesh}</visual>",
+        f"    <collision>{mesh}</collision>",
+        "  </link>",
+        "</robot>",
+        "",
+    ]
     urdf = folder / f"{name}.urdf"
     urdf.write_text("\n".join(lines))
     return [mesh_file(obj, folder / f"{name}.obj"), urdf]

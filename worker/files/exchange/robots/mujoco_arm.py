@@ -46,9 +46,13 @@ def _add_keys(tree: Element, bundle: Bundle, carrier: Carrier) -> None:
             qpos = np.zeros(world.model.nq)
             qpos[world.arm_qpos], qpos[world.hand_qpos] = joints[:arms], joints[arms:]
             SubElement(
-                keys, "key", name=f"{bundle.name(row)}/{posture}", qpos=element_text(qpos),
-                mpos=element_text(thing[:3]), mquat=element_text(thing[3:]),
-            )  # fmt: skip
+                keys,
+                "key",
+                name=f"{bundle.name(row)}/{posture}",
+                qpos=element_text(qpos),
+                mpos=element_text(thing[:3]),
+                mquat=element_text(thing[3:]),
+            )
 
 
 def _names(bundle: Bundle, carrier: Carrier) -> dict[str, str]:

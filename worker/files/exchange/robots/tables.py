@@ -23,11 +23,24 @@ def write(bundle: Bundle, folder: Path) -> list[Path]:
     joints = bundle.found.hand.joint_names
     of_trajectory = bundle.trajectories[0].joint_names
     return [
-        _table(folder / "grasps.csv", ("grasp", "row", "frame", "tool_frame", "scene", "valid", "success", "epsilon",
-                                       *(f"object_{part}" for part in POSE)), _grasps(bundle)),
+        _table(
+            folder / "grasps.csv",
+            (
+                "grasp",
+                "row",
+                "frame",
+                "tool_frame",
+                "scene",
+                "valid",
+                "success",
+                "epsilon",
+                *(f"object_{part}" for part in POSE),
+            ),
+            _grasps(bundle),
+        ),
         _table(folder / "postures.csv", ("grasp", "posture", *POSE, *joints), _postures(bundle)),
         _table(folder / "trajectories.csv", ("grasp", "phase", "time_s", *POSE, *of_trajectory), _trajectories(bundle)),
-    ]  # fmt: skip
+    ]
 
 
 def _grasps(bundle: Bundle) -> Iterable[list[Any]]:
@@ -36,9 +49,15 @@ def _grasps(bundle: Bundle) -> Iterable[list[Any]]:
         scene = "" if found.placed is None else int(found.placed.index[row])
         judged = [int(found.quality["valid"][row]), int(found.quality["success"][row])]
         yield [
-            bundle.name(row), int(found.rows[row]), bundle.frame, found.tool.name, scene, *judged,
-            *numbers(found.quality["epsilon"][row]), *numbers(bundle.seen(found.object_pose[row])),
-        ]  # fmt: skip
+            bundle.name(row),
+            int(found.rows[row]),
+            bundle.frame,
+            found.tool.name,
+            scene,
+            *judged,
+            *numbers(found.quality["epsilon"][row]),
+            *numbers(bundle.seen(found.object_pose[row])),
+        ]
 
 
 def _postures(bundle: Bundle) -> Iterable[list[Any]]:
