@@ -14,7 +14,9 @@ from typing import Any, Final
 
 from redis import Redis
 from redis.exceptions import LockError, RedisError, ResponseError
+from rq import Queue
 from rq.exceptions import DuplicateJobError
+from rq.job import Job
 from rq.serializers import JSONSerializer
 
 from service.model.ability import need_of
@@ -23,7 +25,7 @@ from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
 from service.queue import entries, rq_keys
 from service.queue.address import redis_url
-from service.queue.allowed import FAILURE_TTL_S, TASK_FUNCTION, AllowedJob, AllowedQueue
+from service.queue.allowed import TASK_FUNCTION, new_job
 from service.queue.at_scrape import QueueNow, read_queue
 from service.queue.connection import connect
 from service.queue.lists import known_lists, place_of, queue_name, without_takers
@@ -48,7 +50,7 @@ class RqQueue:
 
     def __init__(self, connection: Redis) -> None:
         self.connection: Any = connection
-        self._queues: dict[str, AllowedQueue] = {}
+        self._queues: dict[str, Queue] = {}
         self._reader = EventReader(connection)
         self._leases: dict[str, Any] = {}
         """Locks of those who lead, or want to, through this connection."""
@@ -70,7 +72,7 @@ class RqQueue:
             for message in messages:
                 name = queue_name(lane, message.stage, need_of(message) if apart else None)
                 if name not in self._queues:
-                    self._queues[name] = AllowedQueue.open(name, self.connection)
+                    self._queues[name] = Queue(name, self.connection, serializer=JSONSerializer)
                 with suppress(DuplicateJobError):
                     self._queues[name].enqueue_job(self._job(message), unique=True)
                     added += 1
@@ -270,19 +272,14 @@ class RqQueue:
     def close(self) -> None:
         self.connection.close()
 
-    def _job(self, message: Message) -> AllowedJob:
-        made: AllowedJob = AllowedJob.create(
+    def _job(self, message: Message) -> Job:
+        return new_job(
             TASK_FUNCTION,
-            args=(message.model_dump(mode="json", by_alias=True),),
+            message.model_dump(mode="json", by_alias=True),
             id=rq_id(message.task_id, message.attempt),
             connection=self.connection,
-            timeout=-1,  # the worker's own clock ends a task that takes too long: see `worker.process.main`
-            result_ttl=0,
-            failure_ttl=FAILURE_TTL_S,
             description=f"{message.stage} {message.task_id}",
-            serializer=JSONSerializer,
         )
-        return made
 
     def _list_keys(self) -> list[str]:
         return [list_key(name) for name in known_lists(self.connection)]

@@ -10,36 +10,34 @@ import logging
 import math
 import os
 import secrets
-import signal
 import socket
 import time
 from collections.abc import Collection, Mapping
+from datetime import UTC, datetime
 from typing import Any, Final
 
 from redis.exceptions import ResponseError
 from rq import SimpleWorker
-from rq.exceptions import InvalidJobOperation
+from rq.job import JobStatus
 from rq.serializers import JSONSerializer
-from rq.timeouts import BaseDeathPenalty
 
 from service.model.ability import own_ability
 from service.model.clock import timestamp
-from service.model.errors import QueueUnavailable
+from service.model.errors import QueueUnavailable, TaskRefused
 from service.model.states import Stage
 from service.model.version import PACKAGE_VERSION
 from service.model.worker_beat import WorkerBeat
 from service.pipeline.identity import check_queue
+from service.queue import allowed
 from service.queue.address import redis_url
-from service.queue.allowed import AllowedJob, AllowedQueue
 from service.queue.lists import queue_names
 from service.queue.port import Event
-from service.queue.rq_queue import RqQueue, open_queue, worker_key
+from service.queue.rq_queue import RqQueue, open_queue
 from service.settings import Settings
 from service.store.store import open_store
 from worker.engines.devices import Device
 from worker.process.fitness import Check, Fitness
 from worker.process.heartbeat import Heartbeat, Hold
-from worker.process.pulse import LEASE_KEPT_S
 from worker.process.runner import Runner
 from worker.process.selfcheck import check_engine
 from worker.process.surroundings import Surroundings
@@ -52,25 +50,15 @@ log = logging.getLogger(__name__)
 _PATIENCE: Final = 60
 #: RQ waits this long for a task before it looks after itself [s]: its `worker_ttl` less 15.
 _WORKER_TTL_S: Final = 20
+#: RQ's maintenance is off: see docs/adr/0003-silence-is-judged-by-one-clock.md.
+_NEVER_S: Final = 10**9
 _REFUSED_PAUSE_S: Final = 0.5
 #: Longest wait between two attempts to reach Redis [s].
 _LONGEST_RETRY_S: Final = 2.0
 
 
-class _NoAlarm(BaseDeathPenalty):  # type: ignore[misc]
-    """RQ's alarm signal comes only when a launch returns, and may come inside RQ's own bookkeeping."""
-
-    def setup_death_penalty(self) -> None:
-        """The heartbeat watches the time instead."""
-
-    def cancel_death_penalty(self) -> None:
-        """Nothing was set up."""
-
-
 class GraspWorker(SimpleWorker):  # type: ignore[misc]
-    """RQ's in-process worker without RQ's maintenance, command channel, alarm and retries: the keeper does all that."""
-
-    death_penalty_class = _NoAlarm
+    """RQ's in-process worker. What of RQ it does without, and why, is in docs/adr."""
 
     def __init__(
         self,
@@ -89,10 +77,10 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             connection=queue.connection,
             serializer=JSONSerializer,
             worker_ttl=_WORKER_TTL_S,
-            queue_class=AllowedQueue,
-            job_class=AllowedJob,
+            maintenance_interval=_NEVER_S,
             log_job_description=False,
         )
+        self.last_cleaned_at = datetime.now(UTC)
         self.max_connection_wait_time = _LONGEST_RETRY_S
         self._queue = queue
         self._runner = runner
@@ -109,18 +97,13 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         """Whether it ended so that its supervisor starts a fresh one."""
         self._context: TaskContext | None = None
         self._outcome: Event | None = None
-        self._was_late = False
-        AllowedJob.function = self._run_task
-
-    def get_heartbeat_ttl(self, job: Any) -> int:
-        return LEASE_KEPT_S
+        allowed.task_function = self._run_task
 
     def execute_job(self, job: Any, queue: Any) -> None:
         """One task under a lease. Its outcome is told after RQ has closed its books on it."""
         self._outcome = None
         self.prepare_execution(job)
-        raw = _raw(job)
-        self._context = self._surroundings.context(raw, self._queue)
+        self._job, self._context = job, self._surroundings.context(job.args[0], self._queue)
         if self._stop_requested:
             self._context.stop(StopReason.SHUTDOWN)
         limit_s = self._surroundings.settings.task_timeout_s
@@ -152,21 +135,6 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             self.makes_room = True
             self._stop_requested = True
 
-    def handle_exception(self, job: Any, *exc_info: Any) -> None:
-        """An error that the runner did not sort. Where RQ finds no books to close, the keeper has closed them."""
-        self._was_late = isinstance(exc_info[1], InvalidJobOperation)
-        if self._was_late:
-            log.info("task %s was taken from this worker meanwhile: it was slow", job.id.rpartition("-")[0])
-        else:
-            super().handle_exception(job, *exc_info)
-
-    def handle_job_failure(self, job: Any, *args: Any, **options: Any) -> None:
-        """Forget what ending a task that was taken away wrote about it again."""
-        if self._was_late:
-            self.connection.delete(job.key)
-        else:
-            super().handle_job_failure(job, *args, **options)
-
     def _tell_outcome(self) -> None:
         """Of a task whose books are closed."""
         self._surroundings.tasks_done += 1
@@ -179,37 +147,49 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
     def _run_task(self, message: dict[str, Any]) -> None:
         assert self._context is not None
         self._outcome = self._runner.run(message, self._context)
-        self._wait_for_writes()
+        self._prepare_end()
 
-    def _wait_for_writes(self) -> None:
-        """Until Redis takes writes: on a full disk it refuses them, RQ could not close its books, and would end."""
+    def _prepare_end(self) -> None:
+        """See to it that RQ can close its books: Redis refuses writes on a full disk, and a task that was taken away
+        has no books any more."""
+        if not self.job_class.exists(self._job.id, self.connection):
+            log.info("task %s was taken from this worker meanwhile: it was slow", self._job.id.rpartition("-")[0])
         told = False
-        while not self._stop_requested:
+        while True:
             try:
-                self.connection.expire(worker_key(self.name), max(2, round(self._surroundings.settings.lease_s)))
+                with self.connection.pipeline() as pipe:
+                    self._job.set_status(JobStatus.STARTED, pipe)
+                    pipe.expire(self._job.key, allowed.FAILURE_TTL_S)
+                    pipe.execute()
                 return
             except ResponseError as error:
                 if not told:
                     log.warning("Redis takes no writes, and the end of a task waits for it: %s", error)
                 told = True
+                if self._stop_requested:
+                    return
                 time.sleep(_REFUSED_PAUSE_S)
 
     def dequeue_job_and_maintain_ttl(self, *args: Any, **options: Any) -> Any:
-        """The next task, or None where none waits."""
-        found = super().dequeue_job_and_maintain_ttl(*args, **options)
-        self.found_none = found is None
-        return found
+        """The next task, or None where none waits. An entry of the queue that is no task is passed over."""
+        while True:
+            try:
+                found = super().dequeue_job_and_maintain_ttl(*args, **options)
+                self.found_none = found is None
+                return found and (allowed.allowed_job(*found), found[1])
+            except TaskRefused as error:
+                log.warning("%s", error)
+                self.connection.delete(found[0].key)
+            except Exception as error:
+                if not allowed.is_of_an_entry(error):
+                    raise
+                log.warning("an entry of the queue cannot be read: %s", error)
 
     def reorder_queues(self, reference_queue: Any) -> None:
         """RQ calls this after each task it took: which lane comes first for the next one."""
         self._taken += 1
         queues = {queue.name: queue for queue in self.queues}
         self._ordered_queues = [queues[name] for name in queue_names(self._stages, self._taken, ability=own_ability())]
-
-    def kill_horse(self, sig: signal.Signals = signal.SIGTERM) -> None:
-        """RQ's way to stop a task: there is no child to kill, so the task is asked."""
-        if self._context is not None:
-            self._context.stop(StopReason.CANCELLED)
 
     def handle_warm_shutdown_request(self) -> None:
         """SIGTERM: the task in hand stops at its next launch and goes back to the queue."""
@@ -218,27 +198,12 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             self._context.stop(StopReason.SHUTDOWN)
 
     @property
-    def should_run_maintenance_tasks(self) -> bool:
-        """Never: the keeper reaps, and RQ's own maintenance would fail tasks that the keeper queues again."""
-        return False
-
-    @property
     def was_told_to_stop(self) -> bool:
         """Whether a signal ended the loop."""
         return self._shutdown_requested_date is not None
 
     def subscribe(self) -> None:
         """No command channel: it is deaf after a reconnect, and lets anybody in Redis stop workers."""
-
-    def unsubscribe(self) -> None:
-        """There is no channel."""
-
-
-def _raw(job: Any) -> Mapping[str, Any]:
-    try:
-        return job.args[0] if isinstance(job.args[0], dict) else {}
-    except Exception:  # forged data may fail anywhere; running the job then says what is wrong with it
-        return {}
 
 
 def run_worker(
@@ -296,7 +261,7 @@ def run_worker(
             logging_level="WARNING",
         )
     finally:
-        AllowedJob.function = None
+        allowed.task_function = None
         surroundings.close()
         heart.stop()
         queue.close()

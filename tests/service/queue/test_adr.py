@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Iterator
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -12,8 +14,10 @@ from rq import Queue
 from rq.command import send_stop_job_command
 from rq.executions import Execution
 from rq.job import Job
-from rq.registry import StartedJobRegistry
+from rq.registry import BaseRegistry, StartedJobRegistry
 from rq.serializers import JSONSerializer
+from rq.timeouts import BaseDeathPenalty
+from rq.worker import BaseWorker
 
 from service.model.states import Lane, Stage
 from service.pipeline import job_actions
@@ -84,6 +88,51 @@ def test_a_command_that_is_published_while_nobody_listens_is_lost_and_a_key_is_n
     parts.queue.discard([task])
     assert connection.exists(cancel_key(task)), "its next beat finds this"
     listener.close()
+
+
+#: What of RQ's worker is its own here, each a hook of RQ's: the order of the lists, what happens around a task, what is
+#: passed over, what a signal stops, and that nobody commands.
+OVERRIDDEN = {
+    "dequeue_job_and_maintain_ttl",
+    "execute_job",
+    "handle_warm_shutdown_request",
+    "reorder_queues",
+    "subscribe",
+}
+
+
+def test_rq_is_used_as_rq() -> None:
+    """Members of RQ's classes that classes of the product redefine; names with two underscores do not count."""
+    for module in _modules_with_rq():
+        import_module(module)
+    ours = {
+        found
+        for base in (BaseWorker, Job, Queue, BaseRegistry, Execution, BaseDeathPenalty)
+        for found in _subclasses(base)
+        if found.__module__.partition(".")[0] in ROOMS
+    }
+    assert {
+        name
+        for found in ours
+        for name in vars(found)
+        if not name.startswith("__") and any(name in vars(base) for base in found.__mro__ if base not in ours)
+    } == OVERRIDDEN
+
+
+ROOMS = ("service", "worker", "api", "graspd")
+
+
+def _modules_with_rq() -> list[str]:
+    files = [file for room in ROOMS for file in sorted((REPOSITORY / room).rglob("*.py"))]
+    found = [file for file in files if re.search(r"^(from|import) rq\b", file.read_text(), re.MULTILINE)]
+    assert found
+    return [".".join(file.relative_to(REPOSITORY).with_suffix("").parts) for file in found]
+
+
+def _subclasses(base: type) -> Iterator[type]:
+    for found in base.__subclasses__():
+        yield found
+        yield from _subclasses(found)
 
 
 def test_every_decision_names_a_test_that_is_there() -> None:

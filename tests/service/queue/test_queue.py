@@ -7,14 +7,14 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import pytest
-from rq import SimpleWorker
+from rq import Queue, SimpleWorker
 from rq.executions import prepare_execution
+from rq.serializers import JSONSerializer
 
 from service.model.clock import timestamp
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
-from service.queue.allowed import AllowedJob, AllowedQueue
 from service.queue.lists import queue_names
 from service.queue.port import BULK_EVERY, Counters, Event, EventKind, Holder, TaskQueue
 from service.queue.rq_queue import LEAD, RqQueue, worker_key
@@ -91,10 +91,9 @@ class RqSide:
         self.state = state
 
     def take(self) -> TaskMessage | None:
-        queues = [AllowedQueue.open(name, self.connection) for name in queue_names(tuple(Stage), self.taken)]
-        found = AllowedQueue.dequeue_any(
-            queues, None, connection=self.connection, job_class=AllowedJob, serializer=queues[0].serializer
-        )
+        names = queue_names(tuple(Stage), self.taken)
+        queues = [Queue(name, self.connection, serializer=JSONSerializer) for name in names]
+        found = Queue.dequeue_any(queues, None, connection=self.connection, serializer=JSONSerializer)
         if found is None:
             return None
         self.taken += 1
@@ -388,11 +387,7 @@ def test_redis_keeps_nothing_of_a_finished_task(rq_queue: RqQueue) -> None:
 
 def test_a_killed_worker_leaves_nothing_in_redis(rq_queue: RqQueue) -> None:
     worker = SimpleWorker(
-        [AllowedQueue.open(name, rq_queue.connection) for name in queue_names(tuple(Stage))],
-        connection=rq_queue.connection,
-        name="dead",
-        queue_class=AllowedQueue,
-        job_class=AllowedJob,
+        queue_names(tuple(Stage)), connection=rq_queue.connection, name="dead", serializer=JSONSerializer
     )
     worker.register_birth()
     one_beat(rq_queue.connection, "dead")
