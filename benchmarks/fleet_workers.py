@@ -23,6 +23,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Final
 
+from rq.defaults import DEFAULT_WORKER_TTL as LEASE_KEPT_S
+
 from service.model import names
 from service.model.ability import own_ability
 from service.model.clock import timestamp
@@ -39,7 +41,6 @@ from service.queue.streams import put_event
 from service.settings import Settings
 from service.store.store import Store, open_store
 from tests.fakes import make_shard
-from worker.process.pulse import LEASE_KEPT_S
 
 _TICK_S: Final = 0.02
 _QUEUES: Final = tuple(queue_name(lane, Stage.SYNTHESIZE) for lane in Lane)

@@ -6,16 +6,19 @@ result storage are not used: each of them loses or repeats work in ways the keep
 
 from __future__ import annotations
 
+import json
 import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from typing import Any, Final
 
 from redis import Redis
 from redis.exceptions import LockError, RedisError, ResponseError
 from rq import Queue
 from rq.exceptions import DuplicateJobError
+from rq.executions import Execution
 from rq.job import Job
 from rq.serializers import JSONSerializer
 
@@ -26,10 +29,10 @@ from service.model.worker_beat import WorkerBeat
 from service.queue import entries, rq_keys
 from service.queue.address import redis_url
 from service.queue.allowed import TASK_FUNCTION, new_job
-from service.queue.at_scrape import QueueNow, read_queue
+from service.queue.at_scrape import read_queue
 from service.queue.connection import connect
 from service.queue.lists import known_lists, place_of, queue_name, without_takers
-from service.queue.port import Event, Holder, Lease, Message, Report
+from service.queue.port import Event, Holder, Lease, Message, QueueNow, Report
 from service.queue.reports import REPORTS, drop_reports, put_report, read_reports
 from service.queue.rq_keys import LISTS, execution_keys, held_key, job_key, list_key
 from service.queue.streams import EVENTS, EventReader, put_event, readable
@@ -298,6 +301,49 @@ def rq_id(task_id: str, attempt: int) -> str:
 def cancel_key(task_id: str) -> str:
     """Key that tells a worker to stop a task."""
     return f"graspd:cancel:{task_id}"
+
+
+@dataclass(frozen=True)
+class LeaseState:
+    """What its worker must know of a task in hand."""
+
+    is_held: bool
+    """Whether the lease is still its own."""
+    is_cancelled: bool
+
+
+def lease_state(connection: Any, job: Job, execution: Execution) -> LeaseState:
+    """In one round trip, and reading changes nothing."""
+    with connection.pipeline(transaction=False) as pipe:
+        pipe.zscore(job.started_job_registry.key, execution.composite_key)
+        pipe.exists(cancel_key(entries.task_of(job.id)[0]))
+        score, cancelled = pipe.execute()
+    return LeaseState(score is not None, bool(cancelled))
+
+
+def renew_lease(pipe: Any, job: Job, execution: Execution, ttl: int) -> None:
+    """A sign of life for a task in hand. RQ notes whole seconds, and a lease may be as short."""
+    registry = job.started_job_registry
+    execution.heartbeat(registry, ttl, pipe)
+    pipe.zadd(registry.key, {execution.composite_key: time.time() + ttl}, xx=True)
+
+
+def list_worker(connection: Any, beat: Mapping[str, Any], lease_s: float) -> int:
+    """Register a worker for the length of a lease [s]; returns how many are listed."""
+    with connection.pipeline() as pipe:
+        pipe.set(worker_key(beat["name"]), json.dumps(beat), ex=max(2, round(lease_s)))
+        pipe.sadd(WORKERS, beat["name"])
+        pipe.scard(WORKERS)
+        return int(pipe.execute()[2])
+
+
+def unlist_worker(connection: Any, left: Event) -> None:
+    """End a worker's registration with the event that says so."""
+    with connection.pipeline() as pipe:
+        pipe.delete(worker_key(left.worker))
+        pipe.srem(WORKERS, left.worker)
+        put_event(pipe, left)
+        pipe.execute()
 
 
 def _lease(key: str, entry: bytes, score: float) -> Lease:

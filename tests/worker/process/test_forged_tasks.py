@@ -14,7 +14,7 @@ from service.model.states import Lane, Stage
 from service.queue.port import EventKind
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings
-from tests.fakes import fake_synthesize, message_for
+from tests.fakes import engine_of, fake_synthesize, message_for
 from worker.process.main import run_worker
 from worker.stages import scene
 
@@ -46,7 +46,7 @@ def test_it_is_refused_and_the_worker_goes_on(
 ) -> None:
     rq_queue.enqueue([Forged(nonsense)], Lane.BULK)  # type: ignore[list-item]
     settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
-    assert run_worker(settings, table={Stage.SCENE: scene.run}, burst=True), "the worker is none the worse"
+    assert run_worker(settings, start=engine_of({Stage.SCENE: scene.run}), burst=True), "the worker is none the worse"
     assert rq_queue.leases() == [] and sum(rq_queue.depths().values()) == 0
     assert not list(tmp_path.rglob("*.h5")) and not list(tmp_path.rglob("attempts/*"))
 
@@ -80,7 +80,9 @@ def test_what_is_no_task_is_passed_over(rq_queue: RqQueue, redis_server: str, tm
     FORGERIES[what](rq_queue.connection, witness)
     rq_queue.enqueue([message_for()], Lane.BULK)
     settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
-    assert run_worker(settings, table={Stage.SYNTHESIZE: fake_synthesize}, burst=True), "the worker is none the worse"
+    assert run_worker(settings, start=engine_of({Stage.SYNTHESIZE: fake_synthesize}), burst=True), (
+        "the worker is none the worse"
+    )
     kinds = [event.kind for _, event in rq_queue.tail("0", limit=10, wait_s=0)]
     assert kinds[:2] == [EventKind.STARTED, EventKind.FINISHED], "the task behind it is done"
     assert not witness.exists() and rq_queue.leases() == []
