@@ -11,7 +11,6 @@ import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from typing import Any, Final
 
 from redis import Redis
@@ -303,22 +302,13 @@ def cancel_key(task_id: str) -> str:
     return f"graspd:cancel:{task_id}"
 
 
-@dataclass(frozen=True)
-class LeaseState:
-    """What its worker must know of a task in hand."""
-
-    is_held: bool
-    """Whether the lease is still its own."""
-    is_cancelled: bool
-
-
-def lease_state(connection: Any, job: Job, execution: Execution) -> LeaseState:
-    """In one round trip, and reading changes nothing."""
+def lease_state(connection: Any, job: Job, execution: Execution) -> tuple[bool, bool]:
+    """Whether a task in hand is still its worker's, and whether it is cancelled. Reading changes nothing."""
     with connection.pipeline(transaction=False) as pipe:
         pipe.zscore(job.started_job_registry.key, execution.composite_key)
         pipe.exists(cancel_key(entries.task_of(job.id)[0]))
         score, cancelled = pipe.execute()
-    return LeaseState(score is not None, bool(cancelled))
+    return score is not None, bool(cancelled)
 
 
 def renew_lease(pipe: Any, job: Job, execution: Execution, ttl: int) -> None:

@@ -7,15 +7,18 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Final, Literal
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from service.model.states import Stage
-from service.settings import Settings
 from worker.stages.context import StopReason
+
+if TYPE_CHECKING:
+    from service.settings import Settings
 
 #: What an engine may take to end by itself [s].
 _END_S: Final = 3.0
@@ -104,7 +107,9 @@ def start_engine(setup: Setup, program: Sequence[str] = (sys.executable, "-m", "
             start_new_session=True,  # Ctrl-C in the terminal is for the worker alone
         )
     link = Link(ours, process)
-    ours.send(setup)
+    # The values alone: the library that reads settings takes 8 MiB of a process.
+    values: Any = SimpleNamespace(**dict(setup.settings), resolved_store_url=setup.settings.resolved_store_url)
+    ours.send(replace(setup, settings=values))
     return link
 
 

@@ -179,8 +179,8 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         if self._engine.is_stopped:
             return
         try:
-            state = lease_state(self.connection, self._job, self.execution)
-            if state.is_held:
+            is_held, is_cancelled = lease_state(self.connection, self._job, self.execution)
+            if is_held:
                 with self.connection.pipeline() as pipe:
                     self.heartbeat(pipeline=pipe)
                     renew_lease(pipe, self._job, self.execution, self.get_heartbeat_ttl(self._job))
@@ -188,8 +188,8 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         except RedisError as error:
             log.warning("the lease of a task could not be renewed: %s", error)
             return
-        if state.is_cancelled or not state.is_held:
-            self._engine.say("stop", StopReason.CANCELLED if state.is_cancelled else StopReason.LEASE_LOST)
+        if is_cancelled or not is_held:
+            self._engine.say("stop", StopReason.CANCELLED if is_cancelled else StopReason.LEASE_LOST)
 
     def _prepare_end(self) -> None:
         """See to it that RQ can close its books: Redis refuses writes on a full disk, and a task that was taken away
@@ -267,8 +267,6 @@ def run_worker(
     """
     does_all = not burst and max_tasks is None
     name = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
-    # First, as it takes longest; it begins while the rest is seen to.
-    engine = start(Setup(settings, tuple(stages), name, patient=does_all))
     queue = open_queue(settings, patience=_PATIENCE)
     heart = Heartbeat(
         redis_url(settings),
@@ -277,6 +275,7 @@ def run_worker(
         alive=settings.heartbeat_file,
         is_stopped=lambda: engine.is_stopped,
     )
+    engine = start(Setup(settings, tuple(stages), name, patient=does_all))
     try:
         queue.ping()
         worker = GraspWorker(queue, engine, heart, stages=stages, name=name, limit_s=settings.task_timeout_s)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from service.model.states import Stage
 from service.queue.port import Report
-from service.settings import Settings
 from service.store.store import Store
 from worker.engines.devices import Device
 from worker.engines.joins import batches_at_once, parse_join
@@ -16,6 +15,9 @@ from worker.pool.pool import Pool
 from worker.pool.size import processes_at_once
 from worker.process.memory import limit_mb, resident_mb
 from worker.stages.context import TaskContext
+
+if TYPE_CHECKING:
+    from service.settings import Settings
 
 
 class Surroundings:

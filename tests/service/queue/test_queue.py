@@ -104,12 +104,12 @@ class RqSide:
 
     def beat(self) -> StopReason | None:
         one_beat(self.connection, self.name)
-        state = lease_state(self.connection, self.job, self.execution)
-        if state.is_held:
+        is_held, is_cancelled = lease_state(self.connection, self.job, self.execution)
+        if is_held:
             with self.connection.pipeline() as pipe:
                 renew_lease(pipe, self.job, self.execution, 60)
                 pipe.execute()
-        return StopReason.CANCELLED if state.is_cancelled else None if state.is_held else StopReason.LEASE_LOST
+        return StopReason.CANCELLED if is_cancelled else None if is_held else StopReason.LEASE_LOST
 
     def finish(self) -> None:
         with self.connection.pipeline() as pipe:
