@@ -12,7 +12,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from service.index.at_scrape import IndexNow
 from service.pipeline.series import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S
 from service.pipeline.tally import parse_field
-from service.queue.at_scrape import QueueNow
+from service.queue.port import QueueNow
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 

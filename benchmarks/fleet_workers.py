@@ -23,6 +23,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Final
 
+from rq.defaults import DEFAULT_WORKER_TTL as LEASE_KEPT_S
+
 from service.model import names
 from service.model.ability import own_ability
 from service.model.clock import timestamp
@@ -34,12 +36,12 @@ from service.queue.port import Event, EventKind, Report
 from service.queue.rates import beat_every_s, report_every_s
 from service.queue.reports import REPORTS
 from service.queue.rq_keys import execution_keys, held_key, job_key, list_key
+from service.queue.rq_keys import worker_key as rq_worker_key
 from service.queue.rq_queue import WORKERS, RqQueue, cancel_key, open_queue, worker_key
 from service.queue.streams import put_event
 from service.settings import Settings
 from service.store.store import Store, open_store
 from tests.fakes import make_shard
-from worker.process.pulse import LEASE_KEPT_S
 
 _TICK_S: Final = 0.02
 _QUEUES: Final = tuple(queue_name(lane, Stage.SYNTHESIZE) for lane in Lane)
@@ -139,11 +141,18 @@ class Fleet:
             pipe.sadd(WORKERS, name)
             pipe.scard(WORKERS)
             if held is not None:
-                pipe.zadd(held_key(held.queue), {held.entry: time.time() + LEASE_KEPT_S}, xx=True)
-                for key in execution_keys(held.entry):
-                    pipe.expire(key, LEASE_KEPT_S)
+                execution, executions = execution_keys(held.entry)
+                kept_until = {held.entry: time.time() + LEASE_KEPT_S}
                 pipe.zscore(held_key(held.queue), held.entry)
                 pipe.exists(cancel_key(held.message["task_id"]))
+                pipe.hset(rq_worker_key(name), "last_heartbeat", timestamp())
+                pipe.expire(rq_worker_key(name), LEASE_KEPT_S)
+                pipe.hset(execution, "last_heartbeat", time.time())
+                pipe.expire(execution, LEASE_KEPT_S)
+                pipe.zadd(executions, kept_until)
+                pipe.expire(executions, LEASE_KEPT_S)
+                for _ in range(2):
+                    pipe.zadd(held_key(held.queue), kept_until, xx=True)
 
     def _tell_due(self, pipe: Any, now: float) -> None:
         while self._news and self._news[0][0] <= now:

@@ -21,6 +21,7 @@ from typing import Any, Final
 
 import httpx
 
+import worker.process.engine
 import worker.process.main
 from api.access.keys import KeyFile, Scope
 from service.index.index import Index
@@ -34,7 +35,7 @@ from service.run.supervisor import Supervisor
 from service.settings import Settings
 from service.store.records import read_record
 from service.store.store import open_store
-from tests.fakes import add_assets, fake_stages, make_shard, request
+from tests.fakes import add_assets, engine_of, fake_stages, make_shard, request
 from tests.memory_queue import MemoryQueue
 
 #: A batch of 32 grasps takes at least this long on two cores (docs/performance.md) [s].
@@ -94,7 +95,7 @@ def queue() -> None:
     """What a task costs beyond its work: the queue alone, then with its shard, manifest and place in the index."""
     spent: list[float] = []
 
-    class Timed(worker.process.main.Runner):
+    class Timed(worker.process.engine.Runner):
         def run(self, *args: Any) -> Any:
             start = time.perf_counter()
             try:
@@ -104,9 +105,9 @@ def queue() -> None:
 
     with service(workers=0) as parts:
         job_actions.submit(parts, request(grasps=32 * 500), lane=Lane.BULK)
-        worker.process.main.Runner = Timed  # type: ignore[misc]
+        worker.process.engine.Runner = Timed  # type: ignore[misc]
         start = time.perf_counter()
-        worker.process.main.run_worker(parts.settings, table=fake_stages(), max_tasks=400)
+        worker.process.main.run_worker(parts.settings, start=engine_of(fake_stages()), max_tasks=400)
         whole = (time.perf_counter() - start) / len(spent)
     alone = whole - statistics.fmean(spent)
     say("| what | measured | beside |\n| --- | --: | --: |")

@@ -15,10 +15,12 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import UTC, datetime
 from types import MappingProxyType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from service.model.redaction import without_secrets
-from service.settings import Settings
+
+if TYPE_CHECKING:
+    from service.settings import Settings
 
 #: What a line can be about, in the order in which it is shown.
 SUBJECTS: Final = ("request", "key", "job", "task", "attempt", "worker")

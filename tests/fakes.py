@@ -7,8 +7,11 @@ import ctypes
 import os
 import sys
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from functools import partial
+from multiprocessing import Pipe
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -25,9 +28,12 @@ from service.store.library import publish_asset
 from service.store.manifests import ShardManifest, load_shard, publish_shard
 from service.store.seals import put_document
 from service.store.store import Store
+from worker.process.engine import Engine
+from worker.process.fitness import Check
+from worker.process.link import Link, Setup, StartEngine, start_engine
 from worker.process.selfcheck import EngineError
 from worker.stages.context import TaskContext
-from worker.stages.output import Output, shard_of
+from worker.stages.output import Output, StageFunction, shard_of
 from worker.stages.ranges import base_rows, batches_of, joined
 
 HAND_FILES = {"asset.json": b'{"file": "hand.urdf"}', "hand.urdf": b"<robot name='fake'/>"}
@@ -162,6 +168,17 @@ def _die_untold(once: Path) -> None:
     runner.publish_shard = publish  # type: ignore[attr-defined]
 
 
+def engine_of(table: Mapping[Stage, StageFunction], check: Check | None = None) -> StartEngine:
+    """Starts engines in threads of this process."""
+
+    def start(setup: Setup) -> Link:
+        ours, theirs = Pipe()
+        Thread(target=Engine(theirs, setup, table, check).serve, name="engine", daemon=True).start()
+        return Link(ours)
+
+    return start
+
+
 def main() -> None:
     """A worker process with these stages: `python -m tests.fakes`.
 
@@ -172,10 +189,9 @@ def main() -> None:
     """
     from service.cli import log_to_stderr
     from service.settings import Settings
+    from worker.process import engine
     from worker.process.main import run_worker
 
-    settings = Settings()
-    log_to_stderr(settings, "worker")
     table = fake_stages()
     poison = os.environ.get("FAKE_POISON")
     leaked: list[bytes] = []
@@ -197,12 +213,17 @@ def main() -> None:
 
     if once := os.environ.get("FAKE_DIE_UNTOLD"):
         _die_untold(Path(once))
+    table |= {Stage.SYNTHESIZE: synthesize}
+    if "--engine" in sys.argv:
+        engine.main(table, check)
+    settings = Settings()
+    log_to_stderr(settings, "worker")
     options = argparse.ArgumentParser()
     options.add_argument("--burst", action="store_true")
     options.add_argument("--idle", type=int, default=0)
     wanted, _ = options.parse_known_args()
-    table |= {Stage.SYNTHESIZE: synthesize}
-    ended_well = run_worker(settings, table=table, check=check, burst=wanted.burst, idle_s=wanted.idle)
+    start = partial(start_engine, program=(sys.executable, "-m", "tests.fakes", "--engine"))
+    ended_well = run_worker(settings, burst=wanted.burst, idle_s=wanted.idle, start=start)
     sys.exit(0 if ended_well else 1)
 
 

@@ -11,13 +11,14 @@ from dataclasses import dataclass, field
 
 from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
-from service.queue.at_scrape import QueueNow, WorkerPulse
 from service.queue.port import (
     Event,
     Holder,
     Lease,
     Message,
+    QueueNow,
     Report,
+    WorkerPulse,
     lane_order,
 )
 

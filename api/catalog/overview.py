@@ -23,7 +23,7 @@ from service.model.projects import Reach
 from service.model.states import Lane, Stage
 from service.pipeline.backends import Parts
 from service.pipeline.leading import PART
-from service.queue.at_scrape import QueueNow
+from service.queue.port import QueueNow
 
 _DAMAGE_SHOWN: Final = 5
 _JOBS_WATCHED: Final = 20

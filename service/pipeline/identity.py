@@ -145,7 +145,11 @@ def check_queue(store: Store, queue: Presence) -> bool:
     Raises:
         BusyError: it belongs to another one.
     """
-    redis = queue.service()
+    return check_service(store, queue.service())
+
+
+def check_service(store: Store, redis: str | None) -> bool:
+    """The same of what Redis says."""
     if redis is None:
         return False
     chain = services(store)

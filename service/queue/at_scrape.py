@@ -3,34 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 from service.model.clock import age_of
-from service.model.states import Lane, Stage
+from service.queue.port import Place, QueueNow, WorkerPulse
 from service.queue.rq_keys import held_key, job_key, list_key
-
-Place = tuple[Lane, Stage]
-
-
-@dataclass(frozen=True)
-class WorkerPulse:
-    """A living worker."""
-
-    device: str
-    state: str
-    lease_age_s: float
-    """Time since its last beat, by Redis's clock."""
-
-
-@dataclass(frozen=True)
-class QueueNow:
-    """Waiting and running tasks, and the workers. Places without a task may be left out."""
-
-    depth: Mapping[Place, int] = field(default_factory=dict)
-    oldest_s: Mapping[Place, float] = field(default_factory=dict)
-    running: Mapping[Place, int] = field(default_factory=dict)
-    workers: Mapping[str, WorkerPulse] = field(default_factory=dict)
 
 
 def read_queue(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Annotated, Final, Protocol
 
@@ -14,7 +14,6 @@ from service.model.domain import Word
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Lane, Stage
 from service.model.worker_beat import Count, HostWord, WorkerBeat
-from service.queue.at_scrape import QueueNow
 
 Message = TaskMessage | IngestMessage
 
@@ -109,6 +108,29 @@ class Holder:
     worker: str
     message: Message | None
     """None if Redis no longer knows."""
+
+
+Place = tuple[Lane, Stage]
+
+
+@dataclass(frozen=True)
+class WorkerPulse:
+    """A living worker."""
+
+    device: str
+    state: str
+    lease_age_s: float
+    """Time since its last beat, by Redis's clock."""
+
+
+@dataclass(frozen=True)
+class QueueNow:
+    """Waiting and running tasks, and the workers. Places without a task may be left out."""
+
+    depth: Mapping[Place, int] = field(default_factory=dict)
+    oldest_s: Mapping[Place, float] = field(default_factory=dict)
+    running: Mapping[Place, int] = field(default_factory=dict)
+    workers: Mapping[str, WorkerPulse] = field(default_factory=dict)
 
 
 class Tasks(Protocol):

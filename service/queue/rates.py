@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-#: Signs of life of all workers together [1/s]; each is a round trip of nine commands.
+#: Signs of life of all workers together [1/s]; each is three round trips, of thirteen commands.
 _BEATS_PER_S: Final = 2500.0
 #: A cancelled task must stop within two seconds, so where there is room the key that says so is read twice in them.
 _LEAST_BEAT_S: Final = 0.8

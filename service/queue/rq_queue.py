@@ -6,6 +6,7 @@ result storage are not used: each of them loses or repeats work in ways the keep
 
 from __future__ import annotations
 
+import json
 import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -14,7 +15,10 @@ from typing import Any, Final
 
 from redis import Redis
 from redis.exceptions import LockError, RedisError, ResponseError
+from rq import Queue
 from rq.exceptions import DuplicateJobError
+from rq.executions import Execution
+from rq.job import Job
 from rq.serializers import JSONSerializer
 
 from service.model.ability import need_of
@@ -23,11 +27,11 @@ from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
 from service.queue import entries, rq_keys
 from service.queue.address import redis_url
-from service.queue.allowed import FAILURE_TTL_S, TASK_FUNCTION, AllowedJob, AllowedQueue
-from service.queue.at_scrape import QueueNow, read_queue
+from service.queue.allowed import TASK_FUNCTION, new_job
+from service.queue.at_scrape import read_queue
 from service.queue.connection import connect
 from service.queue.lists import known_lists, place_of, queue_name, without_takers
-from service.queue.port import Event, Holder, Lease, Message, Report
+from service.queue.port import Event, Holder, Lease, Message, QueueNow, Report
 from service.queue.reports import REPORTS, drop_reports, put_report, read_reports
 from service.queue.rq_keys import LISTS, execution_keys, held_key, job_key, list_key
 from service.queue.streams import EVENTS, EventReader, put_event, readable
@@ -48,7 +52,7 @@ class RqQueue:
 
     def __init__(self, connection: Redis) -> None:
         self.connection: Any = connection
-        self._queues: dict[str, AllowedQueue] = {}
+        self._queues: dict[str, Queue] = {}
         self._reader = EventReader(connection)
         self._leases: dict[str, Any] = {}
         """Locks of those who lead, or want to, through this connection."""
@@ -70,7 +74,7 @@ class RqQueue:
             for message in messages:
                 name = queue_name(lane, message.stage, need_of(message) if apart else None)
                 if name not in self._queues:
-                    self._queues[name] = AllowedQueue.open(name, self.connection)
+                    self._queues[name] = Queue(name, self.connection, serializer=JSONSerializer)
                 with suppress(DuplicateJobError):
                     self._queues[name].enqueue_job(self._job(message), unique=True)
                     added += 1
@@ -270,19 +274,14 @@ class RqQueue:
     def close(self) -> None:
         self.connection.close()
 
-    def _job(self, message: Message) -> AllowedJob:
-        made: AllowedJob = AllowedJob.create(
+    def _job(self, message: Message) -> Job:
+        return new_job(
             TASK_FUNCTION,
-            args=(message.model_dump(mode="json", by_alias=True),),
+            message.model_dump(mode="json", by_alias=True),
             id=rq_id(message.task_id, message.attempt),
             connection=self.connection,
-            timeout=-1,  # the worker's own clock ends a task that takes too long: see `worker.process.main`
-            result_ttl=0,
-            failure_ttl=FAILURE_TTL_S,
             description=f"{message.stage} {message.task_id}",
-            serializer=JSONSerializer,
         )
-        return made
 
     def _list_keys(self) -> list[str]:
         return [list_key(name) for name in known_lists(self.connection)]
@@ -301,6 +300,40 @@ def rq_id(task_id: str, attempt: int) -> str:
 def cancel_key(task_id: str) -> str:
     """Key that tells a worker to stop a task."""
     return f"graspd:cancel:{task_id}"
+
+
+def lease_state(connection: Any, job: Job, execution: Execution) -> tuple[bool, bool]:
+    """Whether a task in hand is still its worker's, and whether it is cancelled. Reading changes nothing."""
+    with connection.pipeline(transaction=False) as pipe:
+        pipe.zscore(job.started_job_registry.key, execution.composite_key)
+        pipe.exists(cancel_key(entries.task_of(job.id)[0]))
+        score, cancelled = pipe.execute()
+    return score is not None, bool(cancelled)
+
+
+def renew_lease(pipe: Any, job: Job, execution: Execution, ttl: int) -> None:
+    """A sign of life for a task in hand. RQ notes whole seconds, and a lease may be as short."""
+    registry = job.started_job_registry
+    execution.heartbeat(registry, ttl, pipe)
+    pipe.zadd(registry.key, {execution.composite_key: time.time() + ttl}, xx=True)
+
+
+def list_worker(connection: Any, beat: Mapping[str, Any], lease_s: float) -> int:
+    """Register a worker for the length of a lease [s]; returns how many are listed."""
+    with connection.pipeline() as pipe:
+        pipe.set(worker_key(beat["name"]), json.dumps(beat), ex=max(2, round(lease_s)))
+        pipe.sadd(WORKERS, beat["name"])
+        pipe.scard(WORKERS)
+        return int(pipe.execute()[2])
+
+
+def unlist_worker(connection: Any, left: Event) -> None:
+    """End a worker's registration with the event that says so."""
+    with connection.pipeline() as pipe:
+        pipe.delete(worker_key(left.worker))
+        pipe.srem(WORKERS, left.worker)
+        put_event(pipe, left)
+        pipe.execute()
 
 
 def _lease(key: str, entry: bytes, score: float) -> Lease:

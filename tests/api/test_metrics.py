@@ -6,7 +6,7 @@ import pytest
 
 from api.metrics import Metrics, Snapshot
 from service.pipeline.series import SERIES
-from service.queue.at_scrape import QueueNow, WorkerPulse
+from service.queue.port import QueueNow, WorkerPulse
 
 STATES = ("checking", "idle", "busy", "stopping", "quarantined")
 

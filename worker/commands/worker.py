@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import atexit
-import os
 import socket
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from service import tracing
 from service.cli import keep_private, load_settings, log_to_stderr, reporting_errors
 from service.model.errors import InputError, UnavailableError
 from service.model.imports import imports
@@ -59,7 +55,6 @@ def worker(
     with imports():
         from worker.process.main import run_worker
 
-    tracing.set_up("worker")
     ended_well = run_worker(
         settings,
         stages=_parse_stages(stages),
@@ -67,7 +62,7 @@ def worker(
         idle_s=idle,
         max_tasks=1 if once else max_tasks,
     )
-    _end(0 if ended_well else 1)
+    raise typer.Exit(0 if ended_well else 1)
 
 
 def _run_several(count: int, settings: Settings, stages: str | None) -> None:
@@ -79,14 +74,6 @@ def _run_several(count: int, settings: Settings, stages: str | None) -> None:
     arguments += ["--join", settings.join, "--processes", str(settings.processes)]
     arguments += ["--data-dir", str(settings.data_dir), *(("--stages", stages) if stages else ())]
     run_workers(count, arguments, settings, stop_on_signals())
-
-
-def _end(code: int) -> None:
-    """End at once: taking Warp and its kernels apart takes the interpreter seconds, and nothing is left to be saved."""
-    atexit._run_exitfuncs()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)
 
 
 def check_worker(settings: Settings) -> None:

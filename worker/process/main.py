@@ -1,7 +1,8 @@
-"""The worker process: RQ's loop with graspd's leases, stop reasons and outcomes.
+"""The worker process: RQ's worker, which holds a task and keeps its lease while an engine beside it does it.
 
-Everything runs in this one process: a CUDA context does not survive a fork, and a new process for each task would load
-kernels and meshes anew each time.
+The engine (`worker.process.engine`) is a process of its own and lives as long as the worker: a CUDA context does not
+survive a fork, and a new process for each task would load kernels and meshes anew each time. This one shares no
+interpreter lock with it, so no kernel that compiles and no busy machine can starve the lease.
 """
 
 from __future__ import annotations
@@ -12,193 +13,219 @@ import os
 import secrets
 import signal
 import socket
+import sys
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection
+from contextlib import suppress
+from datetime import UTC, datetime
 from typing import Any, Final
 
-from redis.exceptions import ResponseError
+from redis.exceptions import RedisError, ResponseError
 from rq import SimpleWorker
-from rq.exceptions import InvalidJobOperation
+from rq.exceptions import StopRequested
+from rq.job import JobStatus
 from rq.serializers import JSONSerializer
-from rq.timeouts import BaseDeathPenalty
+from rq.worker import WorkerStatus
 
 from service.model.ability import own_ability
 from service.model.clock import timestamp
-from service.model.errors import QueueUnavailable
+from service.model.errors import QueueUnavailable, TaskRefused
 from service.model.states import Stage
 from service.model.version import PACKAGE_VERSION
 from service.model.worker_beat import WorkerBeat
-from service.pipeline.identity import check_queue
+from service.queue import allowed
 from service.queue.address import redis_url
-from service.queue.allowed import AllowedJob, AllowedQueue
 from service.queue.lists import queue_names
 from service.queue.port import Event
-from service.queue.rq_queue import RqQueue, open_queue, worker_key
+from service.queue.rq_queue import RqQueue, lease_state, open_queue, renew_lease
 from service.settings import Settings
-from service.store.store import open_store
-from worker.engines.devices import Device
-from worker.process.fitness import Check, Fitness
-from worker.process.heartbeat import Heartbeat, Hold
-from worker.process.pulse import LEASE_KEPT_S
-from worker.process.runner import Runner
-from worker.process.selfcheck import check_engine
-from worker.process.surroundings import Surroundings
-from worker.stages import stage_table
-from worker.stages.context import StopReason, TaskContext
-from worker.stages.output import StageFunction
+from worker.process.heartbeat import Heartbeat
+from worker.process.link import Condition, EngineLost, Link, Setup, StartEngine, start_engine
+from worker.stages.context import StopReason
 
 log = logging.getLogger(__name__)
 #: Reconnection attempts of a worker, about a minute's worth: longer than a Redis takes to come back.
 _PATIENCE: Final = 60
 #: RQ waits this long for a task before it looks after itself [s]: its `worker_ttl` less 15.
 _WORKER_TTL_S: Final = 20
+#: RQ's maintenance is off: see docs/adr/0003-silence-is-judged-by-one-clock.md.
+_NEVER_S: Final = 10**9
 _REFUSED_PAUSE_S: Final = 0.5
 #: Longest wait between two attempts to reach Redis [s].
 _LONGEST_RETRY_S: Final = 2.0
-
-
-class _NoAlarm(BaseDeathPenalty):  # type: ignore[misc]
-    """RQ's alarm signal comes only when a launch returns, and may come inside RQ's own bookkeeping."""
-
-    def setup_death_penalty(self) -> None:
-        """The heartbeat watches the time instead."""
-
-    def cancel_death_penalty(self) -> None:
-        """Nothing was set up."""
+#: How long it may take until a worker that is told to stop hears it [s].
+_LOOK_S: Final = 0.1
+#: Time an engine has to notice that it must stop before it is ended [s].
+STUCK_AFTER_S: Final = 60.0
 
 
 class GraspWorker(SimpleWorker):  # type: ignore[misc]
-    """RQ's in-process worker without RQ's maintenance, command channel, alarm and retries: the keeper does all that."""
-
-    death_penalty_class = _NoAlarm
+    """RQ's in-process worker, whose tasks an engine does. What of RQ it does without, and why, is in docs/adr."""
 
     def __init__(
-        self,
-        queue: RqQueue,
-        runner: Runner,
-        heart: Heartbeat,
-        surroundings: Surroundings,
-        fitness: Fitness,
-        *,
-        stages: Collection[Stage],
-        name: str,
+        self, queue: RqQueue, engine: Link, heart: Heartbeat, *, stages: Collection[Stage], name: str, limit_s: float
     ) -> None:
+        """`limit_s` is how long a task may take [s]."""
         super().__init__(
             queues=queue_names(stages, ability=own_ability()),
             name=name,
             connection=queue.connection,
             serializer=JSONSerializer,
             worker_ttl=_WORKER_TTL_S,
-            queue_class=AllowedQueue,
-            job_class=AllowedJob,
+            maintenance_interval=_NEVER_S,
             log_job_description=False,
         )
+        self.last_cleaned_at = datetime.now(UTC)
         self.max_connection_wait_time = _LONGEST_RETRY_S
-        self._queue = queue
-        self._runner = runner
-        self._heart = heart
-        self._surroundings = surroundings
-        self._fitness = fitness
-        self._stages, self._taken = stages, 0
-        self.gave_up = False
-        """Whether it ended because it is unfit for tasks."""
-        self._stop_requested: bool = False
+        self._queue, self._engine, self._heart = queue, engine, heart
+        self._stages, self._taken, self._limit_s = stages, 0, limit_s
+        self.tasks_done = 0
+        self.told_to_stop = False
+        """Whether a signal said so."""
         self.found_none = False
         """Whether it ended because no task waits."""
-        self.makes_room = False
-        """Whether it ended so that its supervisor starts a fresh one."""
-        self._context: TaskContext | None = None
+        self.engine_is: Condition = "fit"
+        """How the engine was after the last task."""
+        self._job: Any = None
         self._outcome: Event | None = None
-        self._was_late = False
-        AllowedJob.function = self._run_task
+        self._asked = False
+        allowed.task_function = self._run_task
 
-    def get_heartbeat_ttl(self, job: Any) -> int:
-        return LEASE_KEPT_S
+    def check_service(self) -> None:
+        """Raises BusyError if Redis belongs to another service than the store, and InputError if there is no such
+        device."""
+        self._engine.say("service", self._queue.service())
+        self._await("service")
+
+    def admit(self) -> bool:
+        """Whether the engine passes its check before the first task, now or later. Raises EngineLost."""
+        self._engine.say("check")
+        return bool(self._await("ready"))
 
     def execute_job(self, job: Any, queue: Any) -> None:
         """One task under a lease. Its outcome is told after RQ has closed its books on it."""
-        self._outcome = None
+        self._job = job
         self.prepare_execution(job)
-        raw = _raw(job)
-        self._context = self._surroundings.context(raw, self._queue)
-        if self._stop_requested:
-            self._context.stop(StopReason.SHUTDOWN)
-        limit_s = self._surroundings.settings.task_timeout_s
-        task_id = job.id.rpartition("-")[0]
-        hold = Hold.of(task_id, self._context, self.execution, job.started_job_registry, limit_s)
-        self._heart.hold(hold, state="stopping" if self._stop_requested else "busy")
-        try:
-            self.perform_job(job, queue)
-        finally:
-            self._heart.hold(None, state="stopping" if self._stop_requested else "idle")
-            self._context = None
-        self._tell_outcome()
-        self._look_after_itself()
-        self.set_state("idle")
-
-    def _look_after_itself(self) -> None:
-        """What a worker sees to between two tasks: is it fit, and is it time to end?"""
-        if self._runner.device_lost:
-            log.error("this worker ends: %s", self._runner.device_lost)
-            self._heart.stopping()
-            self.gave_up = self._stop_requested = True
-        if self._fitness.reason and not self._stop_requested:
-            fit = self._fitness.sit_out(self._stages, self._heart, lambda: self._stop_requested)
-            self.gave_up = not fit and not self._stop_requested
-            self._stop_requested = self._stop_requested or self.gave_up
-        if why := self._surroundings.outgrown():
-            log.info("this worker ends for a fresh one to start: %s", why)
-            self._heart.stopping()
-            self.makes_room = True
-            self._stop_requested = True
-
-    def handle_exception(self, job: Any, *exc_info: Any) -> None:
-        """An error that the runner did not sort. Where RQ finds no books to close, the keeper has closed them."""
-        self._was_late = isinstance(exc_info[1], InvalidJobOperation)
-        if self._was_late:
-            log.info("task %s was taken from this worker meanwhile: it was slow", job.id.rpartition("-")[0])
-        else:
-            super().handle_exception(job, *exc_info)
-
-    def handle_job_failure(self, job: Any, *args: Any, **options: Any) -> None:
-        """Forget what ending a task that was taken away wrote about it again."""
-        if self._was_late:
-            self.connection.delete(job.key)
-        else:
-            super().handle_job_failure(job, *args, **options)
-
-    def _tell_outcome(self) -> None:
-        """Of a task whose books are closed."""
-        self._surroundings.tasks_done += 1
-        if self._outcome is not None:
-            try:
-                self._queue.publish(self._outcome)
-            except QueueUnavailable as error:
-                log.warning("the end of task %s is for the keeper to find: %s", self._outcome.task_id, error)
+        self._heart.update(task_id=job.id.rpartition("-")[0], state="busy")
+        self.perform_job(job, queue)
+        self._heart.update(task_id="", state="stopping" if self.told_to_stop else "idle")
+        self.tasks_done += 1
+        outcome, self._outcome = self._outcome, None
+        if outcome is not None:
+            self._publish(outcome)
+        asked, self._asked = self._asked, False
+        if asked:
+            self.engine_is = self._await("idle")
+        if self.engine_is != "fit":
+            self._heart.update(state="stopping")
+            raise StopRequested
+        self.set_state(WorkerStatus.IDLE)
 
     def _run_task(self, message: dict[str, Any]) -> None:
-        assert self._context is not None
-        self._outcome = self._runner.run(message, self._context)
-        self._wait_for_writes()
+        self._engine.say("task", message)
+        self._asked = True
+        try:
+            self._outcome = self._await("done", self._keep_lease)
+        except EngineLost as error:
+            # As if this process had been killed: the lease stays, and the keeper finds that nobody keeps it.
+            log.error("this worker ends: %s", error)
+            os._exit(1)
+        self._prepare_end()
 
-    def _wait_for_writes(self) -> None:
-        """Until Redis takes writes: on a full disk it refuses them, RQ could not close its books, and would end."""
+    def _await(self, word: str, beat: Callable[[], None] = lambda: None) -> Any:
+        """What the engine answers, within the time that a task may take. What else it says is passed on meanwhile."""
+        began = time.monotonic()
+        due = began + self._heart.interval_s
+        told: StopReason | None = None
+        while True:
+            if (news := self._engine.hear(_LOOK_S)) is not None:
+                if news[0] == word:
+                    return news[1]
+                self._pass_on(*news)
+            elapsed = time.monotonic() - began
+            reason = (
+                StopReason.TIMEOUT if elapsed > self._limit_s else StopReason.SHUTDOWN if self.told_to_stop else None
+            )
+            if reason is not told:
+                self._engine.say("stop", reason)
+                told = reason
+            if elapsed > self._limit_s + STUCK_AFTER_S:
+                log.error("the engine does not stop, and is ended")
+                self._engine.kill()
+            if time.monotonic() >= due:
+                beat()
+                due = time.monotonic() + self._heart.interval_s
+
+    def _pass_on(self, word: str, about: Any) -> None:
+        """News of the engine."""
+        if word == "refused":
+            raise about
+        if word == "facts":
+            self._heart.update(**about)
+        elif word == "event":
+            self._publish(about)
+        else:
+            with suppress(QueueUnavailable):
+                self._engine.say("report every", self._queue.report(*about))
+
+    def _publish(self, event: Event) -> None:
+        try:
+            self._queue.publish(event)
+        except QueueUnavailable as error:
+            log.warning("what became of task %s is for the keeper to find: %s", event.task_id, error)
+
+    def _keep_lease(self) -> None:
+        """A sign of life for the task in hand, which hears if it is not wanted any more."""
+        if self._engine.is_stopped:
+            return
+        try:
+            is_held, is_cancelled = lease_state(self.connection, self._job, self.execution)
+            if is_held:
+                with self.connection.pipeline() as pipe:
+                    self.heartbeat(pipeline=pipe)
+                    renew_lease(pipe, self._job, self.execution, self.get_heartbeat_ttl(self._job))
+                    pipe.execute()
+        except RedisError as error:
+            log.warning("the lease of a task could not be renewed: %s", error)
+            return
+        if is_cancelled or not is_held:
+            self._engine.say("stop", StopReason.CANCELLED if is_cancelled else StopReason.LEASE_LOST)
+
+    def _prepare_end(self) -> None:
+        """See to it that RQ can close its books: Redis refuses writes on a full disk, and a task that was taken away
+        has no books any more."""
+        if not self.job_class.exists(self._job.id, self.connection):
+            log.info("task %s was taken from this worker meanwhile: it was slow", self._job.id.rpartition("-")[0])
         told = False
-        while not self._stop_requested:
+        while True:
             try:
-                self.connection.expire(worker_key(self.name), max(2, round(self._surroundings.settings.lease_s)))
+                with self.connection.pipeline() as pipe:
+                    self._job.set_status(JobStatus.STARTED, pipe)
+                    pipe.expire(self._job.key, allowed.FAILURE_TTL_S)
+                    pipe.execute()
                 return
             except ResponseError as error:
                 if not told:
                     log.warning("Redis takes no writes, and the end of a task waits for it: %s", error)
                 told = True
+                if self.told_to_stop:
+                    return
                 time.sleep(_REFUSED_PAUSE_S)
 
     def dequeue_job_and_maintain_ttl(self, *args: Any, **options: Any) -> Any:
-        """The next task, or None where none waits."""
-        found = super().dequeue_job_and_maintain_ttl(*args, **options)
-        self.found_none = found is None
-        return found
+        """The next task, or None where none waits. An entry of the queue that is no task is passed over."""
+        while True:
+            try:
+                found = super().dequeue_job_and_maintain_ttl(*args, **options)
+                self.found_none = found is None
+                return found and (allowed.allowed_job(*found), found[1])
+            except TaskRefused as error:
+                log.warning("%s", error)
+                self.connection.delete(found[0].key)
+            except Exception as error:
+                if not allowed.is_of_an_entry(error):
+                    raise
+                log.warning("an entry of the queue cannot be read: %s", error)
 
     def reorder_queues(self, reference_queue: Any) -> None:
         """RQ calls this after each task it took: which lane comes first for the next one."""
@@ -206,57 +233,29 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         queues = {queue.name: queue for queue in self.queues}
         self._ordered_queues = [queues[name] for name in queue_names(self._stages, self._taken, ability=own_ability())]
 
-    def kill_horse(self, sig: signal.Signals = signal.SIGTERM) -> None:
-        """RQ's way to stop a task: there is no child to kill, so the task is asked."""
-        if self._context is not None:
-            self._context.stop(StopReason.CANCELLED)
-
     def handle_warm_shutdown_request(self) -> None:
         """SIGTERM: the task in hand stops at its next launch and goes back to the queue."""
-        self._heart.stopping()
-        if self._context is not None:
-            self._context.stop(StopReason.SHUTDOWN)
-
-    @property
-    def should_run_maintenance_tasks(self) -> bool:
-        """Never: the keeper reaps, and RQ's own maintenance would fail tasks that the keeper queues again."""
-        return False
-
-    @property
-    def was_told_to_stop(self) -> bool:
-        """Whether a signal ended the loop."""
-        return self._shutdown_requested_date is not None
+        self.told_to_stop = True
+        self._heart.update(state="stopping")
 
     def subscribe(self) -> None:
         """No command channel: it is deaf after a reconnect, and lets anybody in Redis stop workers."""
-
-    def unsubscribe(self) -> None:
-        """There is no channel."""
-
-
-def _raw(job: Any) -> Mapping[str, Any]:
-    try:
-        return job.args[0] if isinstance(job.args[0], dict) else {}
-    except Exception:  # forged data may fail anywhere; running the job then says what is wrong with it
-        return {}
 
 
 def run_worker(
     settings: Settings,
     *,
     stages: Collection[Stage] = tuple(Stage),
-    table: Mapping[Stage, StageFunction] | None = None,
-    check: Check | None = None,
     burst: bool = False,
     idle_s: int = 0,
     max_tasks: int | None = None,
+    start: StartEngine = start_engine,
 ) -> bool:
     """Do tasks until told to stop; with `burst` until none waits, with `max_tasks` that many.
 
     Args:
-        table: what each stage does; the real ones by default.
         idle_s: with `burst`: how long it waits for a task before none waits [s].
-        check: of what they run on, before the first task and in doubt; that of the real engine if the stages are.
+        start: starts the engine.
 
     Returns:
         False if the worker ended because something broke.
@@ -266,28 +265,27 @@ def run_worker(
         BusyError: Redis belongs to another service than the store.
         QueueUnavailable, StoreUnavailable: at the start.
     """
-    queue = open_queue(settings, patience=_PATIENCE)
-    name = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
-    device = Device(settings.device, number=settings.worker_number)
-    store = open_store(settings.resolved_store_url)
-    queue.ping()
-    check_queue(store, queue)
-    heart = Heartbeat(
-        redis_url(settings), _first_beat(name, device, stages), lease_s=settings.lease_s, alive=settings.heartbeat_file
-    )
-    if table is None:
-        table, check = stage_table(), lambda some: check_engine(device.resolve, some, threads=settings.threads)
-    fitness = Fitness(store, check)
-    runner = Runner(table, worker=name, publish=queue.publish, fitness=fitness)
-    surroundings = Surroundings(settings, store, device)
-    worker = GraspWorker(queue, runner, heart, surroundings, fitness, stages=stages, name=name)
     does_all = not burst and max_tasks is None
-    heart.start()
+    name = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
+    queue = open_queue(settings, patience=_PATIENCE)
+    heart = Heartbeat(
+        redis_url(settings),
+        _first_beat(name, settings.device, stages),
+        lease_s=settings.lease_s,
+        alive=settings.heartbeat_file,
+        is_stopped=lambda: engine.is_stopped,
+    )
+    engine = start(Setup(settings, tuple(stages), name, patient=does_all))
     try:
-        device.find_out(lambda: heart.update(device=device.resolve(), device_name=device.name))
-        if not _admitted(fitness, heart, stages, limit_s=settings.task_timeout_s, patient=does_all):
+        queue.ping()
+        worker = GraspWorker(queue, engine, heart, stages=stages, name=name, limit_s=settings.task_timeout_s)
+        worker.check_service()
+        heart.start()
+        # It holds no task yet: a signal ends it at once, in good order. RQ sets a handler of its own later.
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+        if not worker.admit():
             return False
-        check_queue(store, queue)  # an empty Redis may have become somebody's meanwhile
+        worker.check_service()  # an empty Redis may have become somebody's meanwhile
         patient = burst and idle_s > 0
         worker.work(
             burst=burst and not patient,
@@ -295,40 +293,27 @@ def run_worker(
             max_idle_time=idle_s if patient else None,
             logging_level="WARNING",
         )
+    except EngineLost as error:
+        log.error("this worker ends: %s", error)
+        return False
     finally:
-        AllowedJob.function = None
-        surroundings.close()
+        allowed.task_function = None
+        engine.close()
         heart.stop()
         queue.close()
     # RQ's loop ends in the same way where an error that nobody foresaw broke it off.
-    is_done = not does_all and (worker.found_none or surroundings.tasks_done >= (max_tasks or math.inf))
-    return not worker.gave_up and (is_done or worker.was_told_to_stop or worker.makes_room)
+    is_done = not does_all and (worker.found_none or worker.tasks_done >= (max_tasks or math.inf))
+    return worker.engine_is == "outgrown" or (worker.engine_is == "fit" and (is_done or worker.told_to_stop))
 
 
-def _admitted(fitness: Fitness, heart: Heartbeat, stages: Collection[Stage], *, limit_s: float, patient: bool) -> bool:
-    """Check the engine before the first task; a worker that is patient waits in quarantine until it passes.
-
-    A signal to stop ends the process at once here: it holds no task.
-    """
-    heart.update(state="checking")
-    heart.limit("the check of the engine", limit_s)
-    # The dearest part of the engine; what the other stages add is loaded by their first task, and checked in doubt.
-    first = (Stage.SYNTHESIZE,) if Stage.SYNTHESIZE in stages else tuple(stages)
-    fit = fitness.try_engine(first) or (patient and fitness.sit_out(first, heart, lambda: False))
-    heart.limit("", 0.0)
-    if fit:
-        heart.update(state="idle")
-    return fit
-
-
-def _first_beat(name: str, device: Device, stages: Collection[Stage]) -> WorkerBeat:
+def _first_beat(name: str, device: str, stages: Collection[Stage]) -> WorkerBeat:
     now = timestamp()
     return WorkerBeat(
         name=name,
         host=socket.gethostname(),
         pid=os.getpid(),
-        device=device.wanted,
-        device_name=device.name,
+        device=device,
+        device_name="",
         stages=tuple(stages),
         version=PACKAGE_VERSION,
         state="checking",

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
-from service.model.errors import QueueUnavailable
 from service.model.states import Stage
-from service.queue.port import Events, Report
-from service.settings import Settings
+from service.queue.port import Report
 from service.store.store import Store
 from worker.engines.devices import Device
 from worker.engines.joins import batches_at_once, parse_join
@@ -19,7 +16,8 @@ from worker.pool.size import processes_at_once
 from worker.process.memory import limit_mb, resident_mb
 from worker.stages.context import TaskContext
 
-log = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    from service.settings import Settings
 
 
 class Surroundings:
@@ -73,16 +71,12 @@ class Surroundings:
         if self._pool is not None:
             self._pool.close()
 
-    def context(self, raw: Mapping[str, Any], events: Events) -> TaskContext:
-        """The context of a task, which reports how far it is."""
+    def context(self, raw: Mapping[str, Any], report: Callable[[str, Report], float | None]) -> TaskContext:
+        """The context of a task, whose progress goes to `report`; that says when more is welcome [s]."""
 
         def tell(done: float, total: float, message: str) -> float | None:
-            try:
-                report = Report(attempt=raw["attempt"], done=done, total=total, message=message[:200])
-                return events.report(raw["task_id"], report)
-            except QueueUnavailable:
-                log.debug("nobody could be told about the progress of %s", raw["task_id"])
-                return None
+            how_far = Report(attempt=raw["attempt"], done=done, total=total, message=message[:200])
+            return report(raw["task_id"], how_far)
 
         device = "cpu" if raw.get("stage") == Stage.INGEST else self._device.resolve()
         chosen = self.settings

@@ -6,12 +6,14 @@ import threading
 import time
 from collections.abc import Callable
 from enum import StrEnum
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from service.model.errors import TaskCancelled
-from service.store.store import Store
 from worker.pool.pool import Pool
 from worker.run import FirstJudge, Run
+
+if TYPE_CHECKING:
+    from service.store.store import Store
 
 #: Pause between two reports where nobody asks for another [s]: enough for a smooth bar.
 _REPORT_EVERY_S: Final = 0.25

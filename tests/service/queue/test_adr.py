@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import os
 import re
 import time
+from collections.abc import Iterator
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
-from rq import Queue
+from rq import Queue, Retry, SimpleWorker, Worker
 from rq.command import send_stop_job_command
 from rq.executions import Execution
 from rq.job import Job
-from rq.registry import StartedJobRegistry
+from rq.registry import BaseRegistry, ScheduledJobRegistry, StartedJobRegistry
 from rq.serializers import JSONSerializer
+from rq.timeouts import BaseDeathPenalty
+from rq.worker import BaseWorker
 
-from service.model.states import Lane, Stage
+from service.model.states import Lane, Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.indexer import Indexer
@@ -84,6 +90,97 @@ def test_a_command_that_is_published_while_nobody_listens_is_lost_and_a_key_is_n
     parts.queue.discard([task])
     assert connection.exists(cancel_key(task)), "its next beat finds this"
     listener.close()
+
+
+def _fail() -> None:
+    raise RuntimeError("as a task does")
+
+
+def test_retries_that_redis_counts_are_lost_with_it_and_those_of_the_store_are_not(held: tuple[Parts, Job]) -> None:
+    parts, job = held
+    connection = parts.queue.connection  # type: ignore[attr-defined]
+    plain = Queue("plain", connection=connection, serializer=JSONSerializer)
+    failed = plain.enqueue(_fail, retry=Retry(max=1, interval=1))
+    SimpleWorker([plain], connection=connection, serializer=JSONSerializer).work(burst=True, logging_level="CRITICAL")
+    waits = ScheduledJobRegistry(queue=plain)
+    assert (failed.get_status(), waits.get_job_ids()) == ("scheduled", [failed.id])
+    now = [0.0]
+    reaper = Reaper(parts, Indexer(parts), clock=lambda: now[0])
+    while not reaper.reap(parts.queue.leases()):  # a worker that is silent
+        now[0] += 1.0
+    connection.flushdb()
+    assert waits.get_job_ids() == [], "nobody knows of it"
+    task = parts.index.jobs.task(job.id.rpartition("-")[0])
+    assert (task.attempt, task.state) == (2, State.QUEUED), "the second attempt is due"
+
+
+LOADED: list[int] = []
+
+
+def _load() -> int:
+    """As a stage loads its engine: once for all tasks of a process."""
+    LOADED.append(os.getpid())
+    return len(LOADED)
+
+
+def test_a_work_horse_loads_everything_anew_for_each_job(rq_queue: RqQueue) -> None:
+    plain = Queue("plain", connection=rq_queue.connection, serializer=JSONSerializer)
+
+    def loaded(worker: type[BaseWorker]) -> list[Any]:
+        LOADED.clear()
+        jobs = [plain.enqueue(_load) for _ in range(2)]
+        worker([plain], connection=rq_queue.connection, serializer=JSONSerializer).work(
+            burst=True, logging_level="CRITICAL"
+        )
+        return [job.return_value() for job in jobs]
+
+    assert loaded(Worker) == [1, 1]
+    assert loaded(SimpleWorker) == [1, 2]
+
+
+#: What of RQ's worker is its own here, each a hook of RQ's: the order of the lists, what happens around a task, what is
+#: passed over, what a signal stops, and that nobody commands.
+OVERRIDDEN = {
+    "dequeue_job_and_maintain_ttl",
+    "execute_job",
+    "handle_warm_shutdown_request",
+    "reorder_queues",
+    "subscribe",
+}
+
+
+def test_rq_is_used_as_rq() -> None:
+    """Members of RQ's classes that classes of the product redefine; names with two underscores do not count."""
+    for module in _modules_with_rq():
+        import_module(module)
+    ours = {
+        found
+        for base in (BaseWorker, Job, Queue, BaseRegistry, Execution, BaseDeathPenalty)
+        for found in _subclasses(base)
+        if found.__module__.partition(".")[0] in ROOMS
+    }
+    assert {
+        name
+        for found in ours
+        for name in vars(found)
+        if not name.startswith("__") and any(name in vars(base) for base in found.__mro__ if base not in ours)
+    } == OVERRIDDEN
+
+
+ROOMS = ("service", "worker", "api", "graspd")
+
+
+def _modules_with_rq() -> list[str]:
+    files = [file for room in ROOMS for file in sorted((REPOSITORY / room).rglob("*.py"))]
+    found = [file for file in files if re.search(r"^(from|import) rq\b", file.read_text(), re.MULTILINE)]
+    assert found
+    return [".".join(file.relative_to(REPOSITORY).with_suffix("").parts) for file in found]
+
+
+def _subclasses(base: type) -> Iterator[type]:
+    for found in base.__subclasses__():
+        yield found
+        yield from _subclasses(found)
 
 
 def test_every_decision_names_a_test_that_is_there() -> None:

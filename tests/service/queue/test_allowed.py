@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rq import Callback, Queue
-from rq.exceptions import NoSuchJobError
+from rq import Callback, Queue, Retry
+from rq.job import Job
 from rq.serializers import DefaultSerializer, JSONSerializer
 
 from service.model.errors import TaskRefused
-from service.queue.allowed import TASK_FUNCTION, AllowedJob
+from service.queue.allowed import TASK_FUNCTION, allowed_job
 from service.queue.rq_queue import RqQueue
 
 
@@ -24,8 +24,10 @@ def forge(queue: RqQueue, function: str, *args: Any, serializer: Any = JSONSeria
     return job
 
 
-def fetch(queue: RqQueue, job: str) -> AllowedJob:
-    return AllowedJob.fetch(job, connection=queue.connection, serializer=JSONSerializer)
+def fetch(queue: RqQueue, job: str) -> Job:
+    """What a worker would run of it."""
+    bulk = Queue("bulk-synthesize", connection=queue.connection, serializer=JSONSerializer)
+    return allowed_job(Job.fetch(job, connection=queue.connection, serializer=JSONSerializer), bulk)
 
 
 @pytest.mark.parametrize(
@@ -33,17 +35,23 @@ def fetch(queue: RqQueue, job: str) -> AllowedJob:
 )
 def test_a_forged_function_name_is_refused(rq_queue: RqQueue, function: str, tmp_path: Path) -> None:
     witness = tmp_path / "witness"
-    job = fetch(rq_queue, forge(rq_queue, function, f"touch {witness}"))
     with pytest.raises(TaskRefused, match="no task of graspd"):
-        job.perform()
+        fetch(rq_queue, forge(rq_queue, function, f"touch {witness}")).perform()
     assert not witness.exists()
 
 
 def test_a_method_of_a_forged_object_is_refused(rq_queue: RqQueue) -> None:
-    job = fetch(rq_queue, forge(rq_queue, TASK_FUNCTION))
-    job.data = json.dumps([TASK_FUNCTION, {"an": "object"}, [], {}]).encode()
+    job = forge(rq_queue, TASK_FUNCTION)
+    data = json.dumps([TASK_FUNCTION, {"an": "object"}, [{}], {}]).encode()
+    rq_queue.connection.hset(f"rq:job:{job}", "data", data)
     with pytest.raises(TaskRefused):
-        job.perform()
+        fetch(rq_queue, job)
+
+
+@pytest.mark.parametrize("arguments", [(), (["no", "message"],), ("text",)])
+def test_a_task_without_a_message_is_refused(rq_queue: RqQueue, arguments: tuple[Any, ...]) -> None:
+    with pytest.raises(TaskRefused):
+        fetch(rq_queue, forge(rq_queue, TASK_FUNCTION, *arguments))
 
 
 def test_a_process_that_is_no_worker_runs_nothing(rq_queue: RqQueue) -> None:
@@ -53,7 +61,7 @@ def test_a_process_that_is_no_worker_runs_nothing(rq_queue: RqQueue) -> None:
 
 def test_callbacks_and_webhooks_from_redis_are_dropped(rq_queue: RqQueue) -> None:
     hooks = {"on_success": Callback(os.getcwd), "on_failure": Callback(os.getcwd), "on_stopped": Callback(os.getcwd)}
-    name = forge(rq_queue, "os.getcwd", **hooks)
+    name = forge(rq_queue, TASK_FUNCTION, {}, **hooks)
     rq_queue.connection.hset(f"rq:job:{name}", "webhooks", json.dumps([{"url": "http://127.0.0.1:9/"}]))
     job = fetch(rq_queue, name)
     assert not any((job.success_callback, job.failure_callback, job.stopped_callback, job.webhooks))
@@ -61,9 +69,8 @@ def test_callbacks_and_webhooks_from_redis_are_dropped(rq_queue: RqQueue) -> Non
 
 def test_pickled_data_is_never_unpickled(rq_queue: RqQueue, tmp_path: Path) -> None:
     witness = tmp_path / "witness"
-    job = fetch(rq_queue, forge(rq_queue, "os.system", _Bomb(str(witness)), serializer=DefaultSerializer))
-    with pytest.raises(Exception):  # noqa: B017 - RQ wraps whatever the JSON parser says
-        _ = job.func_name
+    with pytest.raises(TaskRefused):
+        fetch(rq_queue, forge(rq_queue, "os.system", _Bomb(str(witness)), serializer=DefaultSerializer))
     assert not witness.exists()
 
 
@@ -76,13 +83,13 @@ class _Bomb:
 
 
 def test_a_forged_job_cannot_stay_for_a_year(rq_queue: RqQueue) -> None:
-    job = fetch(rq_queue, forge(rq_queue, "os.getcwd", failure_ttl=365 * 86400, result_ttl=-1))
+    job = fetch(rq_queue, forge(rq_queue, TASK_FUNCTION, {}, failure_ttl=365 * 86400, result_ttl=-1))
     assert job.failure_ttl <= 3600
     assert job.result_ttl == 0
 
 
-def test_an_entry_that_cannot_be_read_counts_as_gone(rq_queue: RqQueue) -> None:
-    name = forge(rq_queue, "os.getcwd")
-    rq_queue.connection.hset(f"rq:job:{name}", "created_at", "the day before yesterday")
-    with pytest.raises(NoSuchJobError):
-        fetch(rq_queue, name)
+def test_a_forged_job_has_neither_a_limit_nor_retries_nor_a_list_of_its_own(rq_queue: RqQueue) -> None:
+    name = forge(rq_queue, TASK_FUNCTION, {}, timeout=1, retry=Retry(max=1000))
+    rq_queue.connection.hset(f"rq:job:{name}", mapping={"origin": "elsewhere", "repeats_left": 1000})
+    job = fetch(rq_queue, name)
+    assert (job.timeout, job.retries_left, job.repeats_left, job.origin) == (-1, None, None, "bulk-synthesize")

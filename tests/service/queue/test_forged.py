@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rq.serializers import JSONSerializer
 
 from api.metrics import Metrics, Snapshot
 from service.model.clock import timestamp
@@ -19,7 +18,6 @@ from service.model.states import Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.keeper import Keeper
-from service.queue.allowed import AllowedJob, AllowedQueue
 from service.queue.port import Event, EventKind
 from service.queue.rq_queue import METRICS, WORKERS, RqQueue, worker_key
 from service.queue.streams import EVENTS
@@ -116,13 +114,3 @@ def test_a_forged_entry_stops_neither_feeding_nor_reaping_nor_pages(parts: Parts
     page.add_sums(queue.counted())
     assert b"graspd_workers" in Metrics().render(page)
     assert [beat.name for beat in queue.workers()] == []
-
-
-@pytest.mark.parametrize("entry", [b"\xff", b"X", b"a-" + b"9" * 5000])
-def test_a_worker_passes_over_a_forged_task(rq_queue: RqQueue, entry: bytes) -> None:
-    rq_queue.connection.set("rq:job:X", "x")
-    rq_queue.connection.rpush("rq:queue:bulk-scene", entry)
-    queues = [AllowedQueue.open(name, rq_queue.connection) for name in ("bulk-scene", "bulk-render")]
-    for some in (queues, queues[:1]):
-        rq_queue.connection.rpush("rq:queue:bulk-scene", entry)
-        assert AllowedQueue.dequeue_any(some, None, rq_queue.connection, AllowedJob, JSONSerializer) is None

@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import pytest
-from rq import SimpleWorker
+from rq import Queue, SimpleWorker
 from rq.executions import prepare_execution
+from rq.serializers import JSONSerializer
 
 from service.model.clock import timestamp
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
-from service.queue.allowed import AllowedJob, AllowedQueue
 from service.queue.lists import queue_names
 from service.queue.port import BULK_EVERY, Counters, Event, EventKind, Holder, TaskQueue
-from service.queue.rq_queue import LEAD, RqQueue, worker_key
+from service.queue.rq_queue import LEAD, RqQueue, lease_state, list_worker, renew_lease, worker_key
 from tests.fakes import request
 from tests.memory_queue import MemoryQueue
-from tests.waiting import PATIENCE_S, until
-from worker.process.heartbeat import Heartbeat, Hold, place_of
-from worker.process.pulse import Pulse
-from worker.stages.context import StopReason, TaskContext
+from tests.waiting import until
+from worker.process.heartbeat import Heartbeat
+from worker.stages.context import StopReason
 
 DIGEST = "0" * 32
 
@@ -78,7 +77,6 @@ class RqSide:
     job: Any = None
     state: str = ""
     taken: int = 0
-    context: TaskContext = field(default_factory=lambda: TaskContext(None))  # type: ignore[arg-type]
 
     @property
     def connection(self) -> Any:
@@ -91,10 +89,9 @@ class RqSide:
         self.state = state
 
     def take(self) -> TaskMessage | None:
-        queues = [AllowedQueue.open(name, self.connection) for name in queue_names(tuple(Stage), self.taken)]
-        found = AllowedQueue.dequeue_any(
-            queues, None, connection=self.connection, job_class=AllowedJob, serializer=queues[0].serializer
-        )
+        names = queue_names(tuple(Stage), self.taken)
+        queues = [Queue(name, self.connection, serializer=JSONSerializer) for name in names]
+        found = Queue.dequeue_any(queues, None, connection=self.connection, serializer=JSONSerializer)
         if found is None:
             return None
         self.taken += 1
@@ -103,15 +100,16 @@ class RqSide:
         with self.connection.pipeline() as pipe:
             self.job.prepare_for_execution(self.name, pipeline=pipe)
             pipe.execute()
-        self.context = TaskContext(None)  # type: ignore[arg-type]
         return TaskMessage.model_validate(self.job.args[0])
 
     def beat(self) -> StopReason | None:
-        task_id = self.job.id.rpartition("-")[0]
-        hold = Hold.of(task_id, self.context, self.execution, self.job.started_job_registry, timeout_s=60)
-        for word in one_beat(self.connection, self.name, hold):
-            self.context.stop(StopReason(word))
-        return self.context.stop_reason
+        one_beat(self.connection, self.name)
+        is_held, is_cancelled = lease_state(self.connection, self.job, self.execution)
+        if is_held:
+            with self.connection.pipeline() as pipe:
+                renew_lease(pipe, self.job, self.execution, 60)
+                pipe.execute()
+        return StopReason.CANCELLED if is_cancelled else None if is_held else StopReason.LEASE_LOST
 
     def finish(self) -> None:
         with self.connection.pipeline() as pipe:
@@ -120,13 +118,9 @@ class RqSide:
             pipe.execute()
 
 
-def one_beat(connection: Any, name: str, hold: Hold | None = None) -> list[str]:
-    """Of a worker; returns why its task must stop."""
-    said: list[str] = []
-    pulse = Pulse(connection, place_of(name, 6), tell=lambda word, entry: said.append(word), end_worker=said.append)
-    pulse.take({"beat": asdict(beat_of(name)), "hold": hold.told() if hold else None})
-    pulse.tick()
-    return said
+def one_beat(connection: Any, name: str) -> None:
+    """Of a worker."""
+    list_worker(connection, asdict(beat_of(name)), 6)
 
 
 def beat_of(name: str) -> WorkerBeat:
@@ -353,10 +347,7 @@ def test_what_waits_is_told_by_lane_and_stage(sides: tuple[TaskQueue, Worker]) -
     assert not any(shown.running.values())
 
 
-def test_a_worker_is_listed_while_it_gives_signs_of_life(
-    rq_queue: RqQueue, redis_server: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("worker.process.heartbeat._LEAVE_S", PATIENCE_S)
+def test_a_worker_is_listed_while_it_gives_signs_of_life(rq_queue: RqQueue, redis_server: str) -> None:
     heart = Heartbeat(redis_server, beat_of("alive"), lease_s=6)
     heart.start()
     try:
@@ -388,11 +379,7 @@ def test_redis_keeps_nothing_of_a_finished_task(rq_queue: RqQueue) -> None:
 
 def test_a_killed_worker_leaves_nothing_in_redis(rq_queue: RqQueue) -> None:
     worker = SimpleWorker(
-        [AllowedQueue.open(name, rq_queue.connection) for name in queue_names(tuple(Stage))],
-        connection=rq_queue.connection,
-        name="dead",
-        queue_class=AllowedQueue,
-        job_class=AllowedJob,
+        queue_names(tuple(Stage)), connection=rq_queue.connection, name="dead", serializer=JSONSerializer
     )
     worker.register_birth()
     one_beat(rq_queue.connection, "dead")

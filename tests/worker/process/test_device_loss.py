@@ -17,10 +17,10 @@ from service.settings import Settings
 from service.store.manifests import shard_exists
 from service.store.records import task_attempts
 from service.store.store import Store, open_store
-from tests.fakes import fake_synthesize, message_for
+from tests.fakes import engine_of, fake_synthesize, message_for
 from worker.engines.cuda_errors import DeviceLost
 from worker.pool.pool import ProcessLost
-from worker.process import main
+from worker.process import engine, main
 from worker.process.runner import Runner
 from worker.stages.context import TaskContext
 
@@ -84,11 +84,13 @@ def test_the_worker_ends_and_leaves_the_other_tasks(
     rq_queue: RqQueue, redis_server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(main, "Runner", partial(Runner, check_device=broken))
+    monkeypatch.setattr(engine, "Runner", partial(Runner, check_device=broken))
     rq_queue.enqueue([message_for(), message_for(seed=1)], Lane.BULK)
     settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
     with caplog.at_level(logging.ERROR):
-        assert not main.run_worker(settings, table={Stage.SYNTHESIZE: fake_synthesize}), "its supervisor should know"
+        assert not main.run_worker(settings, start=engine_of({Stage.SYNTHESIZE: fake_synthesize})), (
+            "its supervisor should know"
+        )
     kinds = [event.kind for _, event in rq_queue.tail("0", limit=10, wait_s=0)]
     assert kinds[:2] == [EventKind.STARTED, EventKind.RETURNED] and kinds.count(EventKind.STARTED) == 1
     assert rq_queue.leases() == []

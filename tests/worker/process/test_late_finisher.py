@@ -14,9 +14,9 @@ from service.model.states import Lane, Stage
 from service.queue.port import EventKind
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings
-from tests.fakes import fake_synthesize, message_for
-from worker.process.main import run_worker
-from worker.process.surroundings import Surroundings
+from tests.fakes import engine_of, fake_synthesize, message_for
+from tests.waiting import until
+from worker.process.main import GraspWorker, run_worker
 from worker.stages.context import TaskContext
 
 
@@ -31,7 +31,7 @@ def test_a_task_that_was_taken_away_ends_in_a_line_and_no_traceback(
     rq_queue.enqueue([message_for()], Lane.BULK)
     settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
     with caplog.at_level(logging.INFO):
-        assert run_worker(settings, table={Stage.SYNTHESIZE: slow}, burst=True)
+        assert run_worker(settings, start=engine_of({Stage.SYNTHESIZE: slow}), burst=True)
     assert [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING] == []
     assert [record for record in caplog.records if "was taken from this worker" in record.getMessage()]
     assert not rq_queue.connection.keys("rq:job:*"), "nothing is left of it"
@@ -43,18 +43,18 @@ def test_a_worker_that_an_error_broke_off_does_not_say_that_none_waits(
     """Batch scripts start it again then; where none waits any more, they end."""
     settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
     table = {Stage.SYNTHESIZE: fake_synthesize}
-    assert run_worker(settings, table=table, burst=True), "none waits"
+    assert run_worker(settings, start=engine_of(table), burst=True), "none waits"
 
     def broken(*_: object) -> None:
         raise AttributeError("of another version")
 
     rq_queue.enqueue([message_for()], Lane.BULK)
     with monkeypatch.context() as patch:
-        patch.setattr(Surroundings, "context", broken)
-        assert not run_worker(settings, table=table, burst=True)
+        patch.setattr(GraspWorker, "prepare_execution", broken)
+        assert not run_worker(settings, start=engine_of(table), burst=True)
     rq_queue.connection.flushdb()
     rq_queue.enqueue([message_for()], Lane.BULK)
-    assert run_worker(settings, table=table, max_tasks=1), "as many as were wanted"
+    assert run_worker(settings, start=engine_of(table), max_tasks=1), "as many as were wanted"
 
 
 def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue: RqQueue, redis_server: str, tmp_path: Path) -> None:
@@ -64,6 +64,7 @@ def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue: RqQueue, red
         rq_queue.connection.config_set("min-replicas-to-write", replicas)
 
     def stage(message: TaskMessage, context: TaskContext) -> Any:
+        until(lambda: rq_queue.tail("0", limit=1, wait_s=0), "it was told that the task began")
         refuse(1)
         threading.Timer(1.0, refuse, [0]).start()
         return fake_synthesize(message, context)
@@ -71,7 +72,7 @@ def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue: RqQueue, red
     rq_queue.enqueue([message_for()], Lane.BULK)
     settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
     try:
-        assert run_worker(settings, table={Stage.SYNTHESIZE: stage}, burst=True)
+        assert run_worker(settings, start=engine_of({Stage.SYNTHESIZE: stage}), burst=True)
     finally:
         refuse(0)
     assert rq_queue.leases() == []

@@ -1,0 +1,207 @@
+"""A worker and the engine beside it, as processes: what each does when the other stops, hangs or ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.model.states import Lane
+from service.queue.port import EventKind
+from service.queue.rq_queue import RqQueue
+from tests.fakes import message_for
+from tests.waiting import until
+from worker.process import main
+from worker.process.heartbeat import Heartbeat
+from worker.process.link import EngineLost, Link, is_stopped
+from worker.process.main import GraspWorker
+from worker.stages.context import StopReason, TaskContext
+
+LEASE_S = 2.0
+TASK = message_for()
+
+
+@dataclass
+class Worker:
+    """A worker's process and what Redis shows of it."""
+
+    process: subprocess.Popen[bytes]
+    queue: RqQueue
+
+    @property
+    def engine(self) -> int:
+        """Process of its engine."""
+        pid = self.process.pid
+        (child,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        return int(child)
+
+    def events(self) -> list[EventKind]:
+        return [event.kind for _, event in self.queue.tail("0", limit=100, wait_s=0)]
+
+    def states(self) -> list[str]:
+        return [beat.state for beat in self.queue.workers()]
+
+    def begin(self) -> None:
+        """Have it begin a task."""
+        self.queue.enqueue([TASK], Lane.BULK)
+        until(lambda: EventKind.STARTED in self.events(), "the task began")
+
+
+Start = Callable[..., Worker]
+
+
+@pytest.fixture
+def start(rq_queue: RqQueue, redis_server: str, tmp_path: Path) -> Iterator[Start]:
+    """Starts a worker; by itself it goes on with its task until there is no file `hold`."""
+    started: list[subprocess.Popen[bytes]] = []
+    (tmp_path / "hold").touch()
+
+    def start(environment: Mapping[str, str] | None = None, *, state: str = "idle") -> Worker:
+        settings = {"REDIS_URL": redis_server, "DATA_DIR": str(tmp_path), "DEVICE": "cpu", "LEASE_S": str(LEASE_S)}
+        own = {f"GRASPD_{name}": value for name, value in settings.items()}
+        fake = {"FAKE_HOLD": str(tmp_path / "hold"), **(environment or {})}
+        started.append(subprocess.Popen([sys.executable, "-m", "tests.fakes"], env={**os.environ, **own, **fake}))
+        worker = Worker(started[-1], rq_queue)
+        until(lambda: worker.states() == [state], f"it is {state}")
+        return worker
+
+    yield start
+    for process in started:
+        process.kill()
+        process.wait()
+
+
+def test_a_cancelled_task_stops(start: Start) -> None:
+    worker = start()
+    worker.begin()
+    worker.queue.discard([TASK.task_id])
+    until(lambda: worker.events()[-1:] == [EventKind.CANCELLED], "it stops")
+    assert worker.queue.leases() == []
+    until(lambda: worker.states() == ["idle"], "its worker takes the next one")
+
+
+def test_a_lease_that_was_taken_is_not_made_again(start: Start) -> None:
+    worker = start()
+    worker.begin()
+    (lease,) = worker.queue.leases()
+    worker.queue.release(lease)
+    until(lambda: worker.states() == ["idle"], "the task stops")
+    assert worker.queue.leases() == [] and worker.events()[-1] is EventKind.STARTED, "it is another's now"
+    left = [key for key in worker.queue.connection.keys("*") if TASK.task_id.encode() in key]
+    assert left == []
+
+
+def test_a_lease_is_kept_while_the_engine_lets_nothing_else_run(start: Start) -> None:
+    worker = start({"FAKE_LOCK_S": str(4 * LEASE_S)})
+    worker.begin()
+    (first,) = worker.queue.leases()
+    seen = {first.beat}
+
+    def beats() -> bool:
+        seen.update(lease.beat for lease in worker.queue.leases())
+        return len(seen) > 3
+
+    until(beats, "its lease is renewed")
+    assert worker.states() == ["busy"]
+
+
+def test_a_worker_that_was_stopped_by_a_signal_falls_silent(start: Start) -> None:
+    worker = start()
+    worker.process.send_signal(signal.SIGSTOP)
+    until(lambda: worker.states() == [], "its registration ends")
+    worker.process.send_signal(signal.SIGCONT)
+    until(worker.states, "it gives signs of life again")
+
+
+def test_a_worker_whose_engine_was_stopped_keeps_no_lease(start: Start) -> None:
+    worker = start()
+    worker.begin()
+    os.kill(worker.engine, signal.SIGSTOP)
+    until(lambda: worker.states() == [], "its registration ends")
+    (lease,) = worker.queue.leases()
+    worker.queue.release(lease)
+    os.kill(worker.engine, signal.SIGCONT)
+    until(lambda: worker.states() == ["idle"], "it hears that the task is another's")
+
+
+def test_no_engine_outlives_its_worker(start: Start) -> None:
+    worker = start()
+    worker.begin()
+    engine = worker.engine
+    worker.process.kill()
+    worker.process.wait()
+    until(lambda: is_stopped(engine), "the engine ended")
+    assert worker.queue.leases(), "the keeper finds the lease"
+
+
+def test_a_worker_ends_with_its_engine_and_leaves_the_lease_to_the_keeper(start: Start) -> None:
+    worker = start()
+    worker.begin()
+    os.kill(worker.engine, signal.SIGKILL)
+    assert worker.process.wait(60) == 1
+    assert worker.queue.leases() and worker.events() == [EventKind.STARTED]
+
+
+def test_a_worker_without_a_task_that_loses_its_engine_leaves(start: Start, tmp_path: Path) -> None:
+    broken = tmp_path / "broken"
+    broken.touch()
+    worker = start({"FAKE_BROKEN": str(broken)}, state="quarantined")
+    os.kill(worker.engine, signal.SIGKILL)
+    assert worker.process.wait(60) == 1
+    assert worker.events() == [EventKind.LEFT] and worker.states() == []
+
+
+def test_a_worker_that_is_told_to_stop_while_it_checks_its_engine_leaves(start: Start, tmp_path: Path) -> None:
+    broken = tmp_path / "broken"
+    broken.touch()
+    worker = start({"FAKE_BROKEN": str(broken)}, state="quarantined")
+    engine = worker.engine
+    worker.process.send_signal(signal.SIGTERM)
+    worker.process.wait(60)
+    assert worker.events() == [EventKind.LEFT] and is_stopped(engine)
+
+
+class Deaf(Link):
+    """To an engine that hears and says nothing until it is killed."""
+
+    def __init__(self) -> None:
+        self.told: list[Any] = []
+        self.killed = False
+
+    def say(self, word: str, about: Any = None) -> None:
+        self.told.append(about)
+
+    def hear(self, wait_s: float) -> None:
+        if self.killed:
+            raise EngineLost("killed")
+
+    def kill(self) -> None:
+        self.killed = True
+
+
+def test_an_engine_is_stopped_when_the_time_of_a_task_is_over_and_then_ended(
+    rq_queue: RqQueue, redis_server: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from tests.worker.process.test_heartbeat import beat_of
+
+    monkeypatch.setattr(main, "STUCK_AFTER_S", 0.2)
+    engine = Deaf()
+    heart = Heartbeat(redis_server, beat_of(), lease_s=LEASE_S)
+    worker = GraspWorker(rq_queue, engine, heart, stages=[TASK.stage], name="w", limit_s=0.2)
+    with pytest.raises(EngineLost):
+        worker.admit()
+    assert engine.told == [None, StopReason.TIMEOUT] and engine.killed
+
+
+def test_the_first_reason_to_stop_stands() -> None:
+    context = TaskContext(None)  # type: ignore[arg-type]
+    context.stop(StopReason.SHUTDOWN)
+    context.stop(StopReason.LEASE_LOST)
+    assert context.stop_reason is StopReason.SHUTDOWN

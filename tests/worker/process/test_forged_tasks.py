@@ -1,0 +1,88 @@
+"""Tasks, and what is none, that somebody wrote into Redis: a worker goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rq import Queue
+from rq.serializers import JSONSerializer
+
+from service.model.states import Lane, Stage
+from service.queue.port import EventKind
+from service.queue.rq_queue import RqQueue
+from service.settings import Settings
+from tests.fakes import engine_of, fake_synthesize, message_for
+from worker.process.main import run_worker
+from worker.stages import scene
+
+
+class Forged:
+    """A message that says what it likes."""
+
+    def __init__(self, nonsense: Any) -> None:
+        self._message, self._nonsense = message_for(Stage.SCENE, scene="table"), nonsense
+        self.stage, self.task_id, self.attempt = Stage.SCENE, self._message.task_id, 1
+
+    def model_dump(self, **how: Any) -> dict[str, Any]:
+        said = self._message.model_dump(**how)
+        return said | {"request": said["request"] | {"scene": self._nonsense}}
+
+
+@pytest.mark.parametrize(
+    "nonsense",
+    [
+        "moon",
+        {"supports": [{"kind": "mesh", "file": "/etc/passwd"}]},
+        {"supports": [{"kind": "box", "size": [1e300, 1, 1]}]},
+        {"supports": [{"kind": "half_space"}] * 100_000},
+    ],
+    ids=["kind", "path", "size", "number"],
+)
+def test_it_is_refused_and_the_worker_goes_on(
+    rq_queue: RqQueue, redis_server: str, tmp_path: Path, nonsense: Any
+) -> None:
+    rq_queue.enqueue([Forged(nonsense)], Lane.BULK)  # type: ignore[list-item]
+    settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
+    assert run_worker(settings, start=engine_of({Stage.SCENE: scene.run}), burst=True), "the worker is none the worse"
+    assert rq_queue.leases() == [] and sum(rq_queue.depths().values()) == 0
+    assert not list(tmp_path.rglob("*.h5")) and not list(tmp_path.rglob("attempts/*"))
+
+
+def _waits(redis: Any, entry: str | bytes) -> None:
+    redis.rpush("rq:queue:bulk-synthesize", entry)
+
+
+def _job(redis: Any, function: str, *arguments: Any) -> str:
+    queue = Queue("bulk-synthesize", connection=redis, serializer=JSONSerializer)
+    return str(queue.enqueue_call(function, args=arguments).id)
+
+
+FORGERIES: dict[str, Callable[[Any, Path], object]] = {
+    "a name that is no text": lambda redis, _: _waits(redis, b"\xff"),
+    "a name with blanks": lambda redis, _: _waits(redis, "a b"),
+    "an attempt of 5,000 digits": lambda redis, _: _waits(redis, "a-" + "9" * 5000),
+    "a string in the place of a job": lambda redis, _: (redis.set("rq:job:X", "x"), _waits(redis, "X")),
+    "a job of no time": lambda redis, _: redis.hset(f"rq:job:{_job(redis, 'os.getcwd')}", "created_at", "yesterday"),
+    "a job of no data": lambda redis, _: redis.hset(f"rq:job:{_job(redis, 'os.getcwd')}", "data", b"\xff\xfe"),
+    "a command": lambda redis, witness: _job(redis, "os.system", f"touch {witness}"),
+    "another function of ours": lambda redis, _: _job(redis, "service.queue.allowed.run_task", {}),
+    "a task without a message": lambda redis, _: _job(redis, "graspd.task", "text"),
+    "a message of nothing": lambda redis, _: _job(redis, "graspd.task", {}),
+}
+
+
+@pytest.mark.parametrize("what", FORGERIES)
+def test_what_is_no_task_is_passed_over(rq_queue: RqQueue, redis_server: str, tmp_path: Path, what: str) -> None:
+    witness = tmp_path / "witness"
+    FORGERIES[what](rq_queue.connection, witness)
+    rq_queue.enqueue([message_for()], Lane.BULK)
+    settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
+    assert run_worker(settings, start=engine_of({Stage.SYNTHESIZE: fake_synthesize}), burst=True), (
+        "the worker is none the worse"
+    )
+    kinds = [event.kind for _, event in rq_queue.tail("0", limit=10, wait_s=0)]
+    assert kinds[:2] == [EventKind.STARTED, EventKind.FINISHED], "the task behind it is done"
+    assert not witness.exists() and rq_queue.leases() == []

@@ -1,0 +1,197 @@
+"""A worker's engine: the process that owns the device and does tasks, one after the other.
+
+Its worker (`worker.process.main`) sends pairs of a word and what it is about over a pipe, after the `Setup`. Orders are
+`service` (does the store belong to it?), `check` (answer: `ready`), `task` (`done`, then `idle`), `end`; an error may
+come as `refused` in place of an answer. `stop` with a reason is heard at any time. On its own the engine sends `facts`
+for the list of workers, `event` and `report`. It knows nothing of Redis.
+"""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import os
+import queue
+import signal
+import sys
+import threading
+from collections.abc import Collection, Mapping
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from typing import Any
+
+from service import logs, tracing
+from service.model.errors import BusyError, InputError, TaskRefused, UnavailableError
+from service.model.imports import own_process
+from service.model.states import Stage
+from service.pipeline.identity import check_service
+from service.queue.port import Report
+from service.store.store import open_store
+from worker.engines.devices import Device
+from worker.process.fitness import Check, Fitness
+from worker.process.link import Condition, Setup
+from worker.process.runner import Runner
+from worker.process.selfcheck import check_engine
+from worker.process.surroundings import Surroundings
+from worker.stages import stage_table
+from worker.stages.context import StopReason, TaskContext
+from worker.stages.output import StageFunction
+
+log = logging.getLogger(__name__)
+
+
+class Engine:
+    """Does what its worker tells it."""
+
+    def __init__(
+        self,
+        connection: Connection,
+        setup: Setup,
+        table: Mapping[Stage, StageFunction] | None = None,
+        check: Check | None = None,
+    ) -> None:
+        """`table` is what each stage does, and `check` tries what they run on: the real ones by default."""
+        self._connection, self._setup = connection, setup
+        self._table, self._check = table, check
+        self._speaking = threading.Lock()
+        self._changing = threading.Lock()
+        self._orders: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+        self._reason: StopReason | None = None
+        self._context: TaskContext | None = None
+        self._report_every_s: float | None = None
+
+    def serve(self) -> None:
+        """Until told to end."""
+        with self._connection:
+            threading.Thread(target=self._listen, name="engine-ears", daemon=True).start()
+            try:
+                self._start()
+                word, about = self._orders.get()
+                while word != "end":
+                    self._carry_out(word, about)
+                    word, about = self._orders.get()
+                self._surroundings.close()
+            except (InputError, UnavailableError, BusyError) as error:
+                self._say("refused", error)
+
+    def _carry_out(self, word: str, about: Any) -> None:
+        if word == "service":
+            check_service(self._surroundings.store, about)
+            self._say("service", True)
+        elif word == "check":
+            self._say("ready", self._admitted())
+        else:
+            self._do(about)
+
+    def update(self, **facts: str) -> None:
+        """Facts for the list of workers."""
+        self._say("facts", facts)
+
+    def _start(self) -> None:
+        settings = self._setup.settings
+        device = Device(settings.device, number=settings.worker_number)
+        store = open_store(settings.resolved_store_url)
+        table, check = self._table, self._check
+        if table is None:
+            table, check = stage_table(), lambda some: check_engine(device.resolve, some, threads=settings.threads)
+        self._fitness = Fitness(store, check)
+        self._runner = Runner(
+            table, worker=self._setup.worker, publish=lambda event: self._say("event", event), fitness=self._fitness
+        )
+        self._surroundings = Surroundings(settings, store, device)
+        self.update(device_name=device.name)
+        device.find_out(lambda: self.update(device=device.resolve(), device_name=device.name))
+
+    def _admitted(self) -> bool:
+        """Check what tasks run on before the first of them; one that is patient waits in quarantine until it passes."""
+        # The dearest part of the engine; what the other stages add is loaded by their first task, and checked in doubt.
+        stages = self._setup.stages
+        first = (Stage.SYNTHESIZE,) if Stage.SYNTHESIZE in stages else stages
+        fit = self._fitness.try_engine(first) or (self._setup.patient and self._sit_out(first))
+        if fit:
+            self.update(state="idle")
+        return fit
+
+    def _sit_out(self, stages: Collection[Stage]) -> bool:
+        return self._fitness.sit_out(stages, self, lambda: self._reason is not None)
+
+    def _do(self, raw: dict[str, Any]) -> None:
+        context = self._surroundings.context(raw, self._tell)
+        with self._changing:
+            self._context = context
+            if self._reason is not None:
+                context.stop(self._reason)
+        try:
+            self._say("done", self._runner.run(raw, context))
+        except TaskRefused as error:
+            self._say("refused", error)
+        finally:
+            with self._changing:
+                self._context = None
+        self._surroundings.tasks_done += 1
+        self._say("idle", self._look_after_itself())
+
+    def _look_after_itself(self) -> Condition:
+        """Between two tasks: is it fit, and is it time to end?"""
+        if self._runner.device_lost:
+            log.error("this worker ends: %s", self._runner.device_lost)
+            return "unfit"
+        if self._fitness.reason and self._reason is None and not self._sit_out(self._setup.stages):
+            return "fit" if self._reason is StopReason.SHUTDOWN else "unfit"
+        if why := self._surroundings.outgrown():
+            log.info("this worker ends for a fresh one to start: %s", why)
+            return "outgrown"
+        return "fit"
+
+    def _tell(self, task_id: str, report: Report) -> float | None:
+        """How far a task is; returns when more is welcome [s], as far as that is known."""
+        self._say("report", (task_id, report))
+        return self._report_every_s
+
+    def _listen(self) -> None:
+        while True:
+            try:
+                word, about = self._connection.recv()
+            except (EOFError, OSError):
+                word, about = "end", StopReason.LEASE_LOST  # nobody waits for what is being done
+            with self._changing:
+                if word == "report every":
+                    self._report_every_s = about
+                elif word in ("stop", "end"):
+                    self._reason = about
+                    if self._context is not None:
+                        self._context.stop(about)
+                elif word == "task":
+                    self._reason = None
+            if word not in ("stop", "report every"):
+                self._orders.put((word, about))
+            if word == "end":
+                return
+
+    def _say(self, word: str, about: Any) -> None:
+        with self._speaking, suppress(OSError):  # a worker that is gone
+            self._connection.send((word, about))
+
+
+def main(table: Mapping[Stage, StageFunction] | None = None, check: Check | None = None) -> None:
+    """The process. Signals to end are the worker's: this one ends with it."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    own_process()
+    connection = Connection(int(sys.argv[-1]))
+    setup: Setup = connection.recv()
+    logs.set_up(setup.settings, "worker")
+    tracing.set_up("worker")
+    Engine(connection, setup, table, check).serve()
+    end()
+
+
+def end() -> None:
+    """At once: taking Warp and its kernels apart takes the interpreter seconds, and nothing is left to be saved."""
+    atexit._run_exitfuncs()
+    sys.stderr.flush()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,126 @@
+"""A worker's end of the pipe to its engine (`worker.process.engine`), and what goes through it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from service.model.states import Stage
+from worker.stages.context import StopReason
+
+if TYPE_CHECKING:
+    from service.settings import Settings
+
+#: What an engine may take to end by itself [s].
+_END_S: Final = 3.0
+
+
+class EngineLost(Exception):
+    """The engine of a worker ended by itself."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What an engine needs to know before its first task."""
+
+    settings: Settings
+    stages: tuple[Stage, ...]
+    worker: str
+    """Name of the worker that it belongs to."""
+    patient: bool
+    """Whether to wait in quarantine until the first check passes."""
+
+
+class Link:
+    """The engine as its worker sees it. One thread speaks and listens."""
+
+    def __init__(self, connection: Connection, process: subprocess.Popen[bytes] | None = None) -> None:
+        """`process` is None where the engine is none of its own."""
+        self._connection, self._process = connection, process
+
+    def say(self, word: str, about: Any = None) -> None:
+        """Tell the engine; one that is lost does not hear."""
+        with suppress(OSError):
+            self._connection.send((word, about))
+
+    def hear(self, wait_s: float) -> tuple[str, Any] | None:
+        """What the engine says; None if it says nothing for that long. Raises EngineLost."""
+        try:
+            return self._connection.recv() if self._connection.poll(wait_s) else None
+        except (EOFError, OSError):
+            raise EngineLost(f"the engine ended ({self._code()})") from None
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether a signal stopped the engine, as SIGSTOP does: then nothing goes on, though it is there."""
+        return self._process is not None and is_stopped(self._process.pid)
+
+    def kill(self) -> None:
+        """End the engine at once."""
+        if self._process is not None:
+            self._process.kill()
+
+    def close(self) -> None:
+        """End the engine: in good order if it does so soon."""
+        self.say("end", StopReason.SHUTDOWN)
+        if self._process is not None:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(_END_S)
+            self._process.kill()
+            self._process.wait()
+        self._connection.close()
+
+    def _code(self) -> str:
+        if self._process is None:
+            return "its thread broke off"
+        with suppress(subprocess.TimeoutExpired):
+            code = self._process.wait(_END_S)
+            return f"signal {-code}" if code < 0 else f"exit code {code}"
+        return "it does not say why"
+
+
+StartEngine = Callable[[Setup], Link]
+#: How an engine is after a task: fit for the next one, unfit, or so large that a fresh one should take its place.
+Condition = Literal["fit", "unfit", "outgrown"]
+
+
+def start_engine(setup: Setup, program: Sequence[str] = (sys.executable, "-m", "worker.process.engine")) -> Link:
+    """An engine in a fresh process, which ends with this one: a CUDA context and an engine's threads outlive no fork.
+
+    Call it from the main thread: the kernel ties a child to the thread that starts it.
+    """
+    ours, theirs = Pipe()
+    with theirs:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "service.run.launch", str(os.getpid()), *program, str(theirs.fileno())],
+            stdin=subprocess.DEVNULL,
+            pass_fds=(theirs.fileno(),),
+            start_new_session=True,  # Ctrl-C in the terminal is for the worker alone
+        )
+    link = Link(ours, process)
+    # The values alone: the library that reads settings takes 8 MiB of a process.
+    values: Any = SimpleNamespace(**dict(setup.settings), resolved_store_url=setup.settings.resolved_store_url)
+    ours.send(replace(setup, settings=values))
+    return link
+
+
+def is_stopped(pid: int) -> bool:
+    """Whether a process was stopped by a signal, or ended."""
+    if sys.platform == "linux":
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except (OSError, IndexError):
+            return True
+    else:
+        listing = subprocess.run(["ps", "-o", "state=", "-p", str(pid)], capture_output=True, check=False, text=True)
+        state = listing.stdout.strip()[:1]
+    return state in ("T", "t", "Z", "X", "")
