@@ -55,6 +55,8 @@ OBJECTS = ("025_mug", "005_tomato_soup_can", "011_banana")
 FITTING = 0.1
 #: Not a seed that any setting was chosen with.
 SEED, SCENES = 404, 4
+#: What a row is of, at the end of its key.
+REVISIONS = f"{STAGE_REVISIONS['synthesize']}-{STAGE_REVISIONS['scene']}"
 
 
 def main() -> None:
@@ -72,8 +74,7 @@ def main() -> None:
         if not entry.path or not (asked.sources / entry.path).exists() or (wanted and entry.name not in wanted):
             continue
         hand = hand_from_path(asked.sources / entry.path, entry.options)
-        revisions = "-".join(str(STAGE_REVISIONS[stage]) for stage in ("synthesize", "scene"))
-        key = f"{hand.content[:16]}-{asked.grasps}-{SEED}-{revisions}"
+        key = f"{hand.content[:16]}-{asked.grasps}-{SEED}-{REVISIONS}"
         if done.get(entry.name, {}).get("key") == key:
             continue
         began = time.perf_counter()
@@ -120,13 +121,15 @@ def page(done: dict[str, Any]) -> str:
             f"| {'yes' if agrees else 'no'} | {row['seconds']:.0f} |"
         )
     grasps = next(iter(done.values()))["grasps"]
+    earlier = sum(not row["key"].endswith(f"-{REVISIONS}") for row in done.values())
     return (
         "# Published hands: the self-test's verdict, and what they lift\n\n"
         "`python -m benchmarks.published_hands DIR --data DATA`: for each hand as published its self-test (*free* "
         "and *table*: the shares that hold and that lift), and beside it the share of raw grasps that lift an object "
         f"off a table, {grasps} of each object, standard fidelity, seed {SEED}. *Too wide*: the hand opens to less "
         f"than {FITTING:.0%} of the pairs of opposite places. The verdict agrees where a hand is "
-        f"ready and lifts {TABLE_READY:.0%} or more, or neither: {agreeing} of {len(done)} do.\n\n"
+        f"ready and lifts {TABLE_READY:.0%} or more, or neither: {agreeing} of {len(done)} do. Of earlier "
+        f"revisions than today's: {earlier} rows (their keys are in the JSON).\n\n"
         f"| hand | from | dofs | verdict | free | table | {' | '.join(OBJECTS)} | mean | agrees | self-test [s] |\n"
         f"| --- | --- | --: | --- | --: | --: | {'--: | ' * len(OBJECTS)}--: | --- | --: |\n" + "\n".join(rows) + "\n"
     )
