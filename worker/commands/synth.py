@@ -278,6 +278,6 @@ def _said(found: dict[str, Any]) -> str:
             f"stands there, {found['lift_share']:.0%} lift, {found['lift_hard_share']:.0%} at half the friction"
         )
         lines += [note for note in [rolling_note(found["rolling_scenes"], found["scenes"])] if note]
-    if found["reason"] is not None:
-        lines.append(found["reason"])
+    if (why := found["reason"] or found.get("narrow")) is not None:
+        lines.append(why)
     return "\n".join(lines)

@@ -72,7 +72,7 @@ class Synthesized:
         request = self.request
         if self.interrupted:
             return f"interrupted: {len(self.arrays['quality/valid'])} of {request.grasps} grasps were there"
-        limit, narrow = self.limit, self.batches[0].narrow
+        limit, narrow = self.limit, self.narrow
         reason = shortfall(
             len(self.arrays["quality/valid"]),
             request.grasps,
@@ -85,6 +85,11 @@ class Synthesized:
         if limit is not None and not limit.hopeless:
             reason = f"{reason}; {limit.line}"
         return f"{reason}; {narrow}" if reason and narrow else reason
+
+    @property
+    def narrow(self) -> str | None:
+        """The geometric reason where nothing is valid, raw grasps or none; None: there is none."""
+        return None if self.arrays["quality/valid"].any() else self.batches[0].narrow
 
     @property
     def limit(self) -> Limit | None:
@@ -131,7 +136,7 @@ class Synthesized:
             }
         if self.place.kind != "free":
             told |= {"scene": self.place.kind, "scenes": len(self.arrays["scene/object_pose"])} | self._shares()
-            told["rolling_scenes"] = self.rolling
+            told |= {"rolling_scenes": self.rolling, "narrow": self.narrow}
         return told
 
     def _diversity(self) -> dict[str, Any]:

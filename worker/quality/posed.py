@@ -117,11 +117,20 @@ class Posing:
     def touching_links(self, posture: Posture) -> NDArray[np.int32]:
         """(N,) bodies of posed hands with points nearer to the object than `LINK_CONTACT_M`; the quality table, which
         looks from both sides, finds as many or more."""
-        found, body = np.zeros(len(posture), np.int32), self.points.body.numpy()
+        return contact_links(self._gaps(posture, LINK_CONTACT_M, self.points.body.numpy()))
+
+    def finger_gaps(self, posture: Posture, reach: float) -> Floats:
+        """(N, F) least distance of each finger's points from the object, at most `reach` [m]."""
+        return self._gaps(posture, reach, self.finger.numpy()[self.points.body.numpy()])
+
+    def _gaps(self, posture: Posture, reach: float, part: NDArray[np.int32]) -> Floats:
+        """(N, P) the same of points of each part that `part` (points,) tells; -1: of none."""
+        parts = distinct_values(part[part >= 0])
+        found = np.full((len(posture), len(parts)), reach)
         for rows in self.parts(len(posture)):
-            distance = self.touch(posture.take(rows), LINK_CONTACT_M)[1].distance.numpy()
-            least = [distance[:, body == link].min(axis=1) for link in distinct_values(body)]
-            found[rows] = contact_links(np.stack(least, axis=1))
+            distance = self.touch(posture.take(rows), reach)[1].distance.numpy()
+            for place, one in enumerate(parts):
+                found[rows, place] = distance[:, part == one].min(axis=1)
         return found
 
 

@@ -36,6 +36,8 @@ MAX_PRESSING: Final = 16
 #: A finger that stands off presses with its points within so much [m]: commanded to close, or the others push a free
 #: object past it.
 CLOSING_M: Final = 0.009
+#: A finger between the two stands off: it could touch and does not. One that is farther away is not of the grasp [m].
+STANDS_OFF_M: Final = (0.005, 0.02)
 #: Sum of the contact forces' normal components [N], and the Coulomb coefficient they are balanced with: less than that
 #: of what is held, for forces at the edge of their cones slip as soon as a contact is not quite where it was thought.
 TOTAL_NORMAL_FORCE: Final = 50.0
@@ -135,6 +137,13 @@ def normal_force(obj: ObjectModel) -> float:
 def touching_links(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.int32]:
     """(N,) bodies of the hand in contact, as the geometric gate counts them."""
     return posing_of(hand, obj, points=_POINTS, device=device).touching_links(grasp)
+
+
+def standing_off(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.bool_]:
+    """(N,) whether a finger stands off the object, see `STANDS_OFF_M`."""
+    near, far = STANDS_OFF_M
+    gap = posing_of(hand, obj, points=_POINTS, device=device).finger_gaps(grasp, 2 * far)
+    return np.asarray(((gap > near) & (gap < far)).any(axis=1))
 
 
 def _in_the_way(hand: HandModel, opening: Openings, placed: Placed | None) -> Blocked | None:

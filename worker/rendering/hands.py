@@ -87,8 +87,9 @@ def drawn_poses(hand: HandModel, hand_pose: Floats, joint_positions: Floats, wri
 
 
 def without_visuals(hand: HandModel) -> HandModel:
-    """The same hand, drawn as the engine sees it."""
-    return replace(hand, visuals=NO_VISUALS)
+    """The same hand with its mounting, drawn as the engine sees it."""
+    above = None if hand.mounting is None else without_visuals(hand.mounting)
+    return replace(hand, visuals=NO_VISUALS, mounting=above)
 
 
 def drawn_bodies(hand: HandModel) -> list[int]:

@@ -73,24 +73,26 @@ def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> d
 
 
 def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
-    """One scene for each face that holds the object and that at least `LEAST_PROBABILITY` of drops end on."""
+    """One scene for each face that holds the object and that at least `LEAST_PROBABILITY` of drops end on; of faces on
+    which it rolls only where there is no other."""
     faces = resting_faces(obj)
     stable = faces.stable
     share = reference_share(obj, stable.tolist())
     kept = stable[share >= LEAST_PROBABILITY]
     if not len(kept):
         kept = stable[[int(np.argmax(share))]]
+    chosen = [face for face in kept.tolist() if not faces.rolls(face)] or kept.tolist()
     poses = []
-    for number, face in enumerate(kept):
+    for number, face in enumerate(chosen):
         turn = np.random.default_rng([seed, number]).uniform(0, 2 * np.pi)
-        pose = lay_flat(faces, int(face), np.array([0.0, 0, 0, 1, 0, 0, 0]))
+        pose = lay_flat(faces, face, np.array([0.0, 0, 0, 1, 0, 0, 0]))
         about = np.concatenate([np.zeros(3), quat_from_axis_angle(np.array([0.0, 0, 1]), np.asarray(turn))])
         pose = compose(about, pose)
         pose[:2] -= (pose[:3] + quat_rotate(pose[3:], obj.centre_of_mass))[:2]
         poses.append(pose)
     return {
         "scene/object_pose": np.array(poses),
-        "scene/rest_probability": rest_probability(obj, kept.tolist()),
+        "scene/rest_probability": rest_probability(obj, chosen),
         "scene/drop_seconds": np.zeros(len(poses)),
     }
 

@@ -32,6 +32,7 @@ from worker.scenes.simulate import (
     REST_WINDOW_S,
     TIMESTEP_S,
     rest_probability,
+    steadied,
 )
 
 TIMEOUT_S: Final = 6.0
@@ -149,7 +150,7 @@ class _Heap:
             return None
         self.data.qpos[:] = start.ravel()
         seconds = self._run()
-        return None if seconds is None or void(self.data) else self._at_rest(seconds)
+        return None if seconds is None or void(self.data) else self._at_rest(seconds, rng)
 
     def _sample(self, rng: np.random.Generator) -> Floats | None:
         """(1 + M, 7) release poses whose bounding balls lie apart; None if the neighbours found no room."""
@@ -185,7 +186,7 @@ class _Heap:
                 return (step + 1) * TIMESTEP_S
         return None
 
-    def _at_rest(self, seconds: float) -> tuple[Floats, int, float] | None:
+    def _at_rest(self, seconds: float, rng: np.random.Generator) -> tuple[Floats, int, float] | None:
         """The poses laid flat; None where something leans, lies on another, rolled away or would overlap."""
         flat, first = [], -1
         for k, (obj, pose) in enumerate(zip(self.objects, self.data.qpos.reshape(-1, 7).copy(), strict=True)):
@@ -197,6 +198,7 @@ class _Heap:
             away = np.hypot(*middle[:2]) > (NEIGHBOUR_REACH if k else REACH)
             if away or angle > MAX_SETTLE_ANGLE or lift > MAX_LIFT or self.faces[k].topples(face):
                 return None
+            face, laid = steadied(obj, self.faces[k], face, laid, rng)
             flat.append(laid)
             first = face if k == 0 else first
         self.data.qpos[:] = np.concatenate(flat)

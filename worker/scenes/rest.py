@@ -72,12 +72,16 @@ class RestingFaces:
         """Whether a change of the surface by `CHANGE_M` lets the object fall to a lower face."""
         return self.looseness(face)[1] > CHANGE_M
 
+    def rolls(self, face: int) -> bool:
+        """Whether such a change may turn the object farther than `ROLLS`: it is round there."""
+        return self.looseness(face)[0] > ROLLS
+
 
 def rolling_poses(obj: ObjectModel, poses: Floats) -> int:
     """How many of the rest poses (S, 7) on a table a change of the object's surface by `CHANGE_M` may turn farther than
     `ROLLS`: those of round things."""
     faces = resting_faces(obj.centred)
-    return sum(faces.looseness(settle(faces, pose[3:])[0])[0] > ROLLS for pose in np.asarray(poses, float))
+    return sum(faces.rolls(settle(faces, pose[3:])[0]) for pose in np.asarray(poses, float))
 
 
 def rolling_note(rolling: int, scenes: int) -> str | None:

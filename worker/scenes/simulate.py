@@ -86,7 +86,8 @@ def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     """Let an object fall onto a table until it rests, `count` times.
 
     Drops that time out, roll away or do not stand on a face that holds the centre of mass, were the surface other by
-    a millimetre, too, are redone with a new sample. Scene i depends on the object, the seed and i alone.
+    a millimetre, too, are redone with a new sample. One that rolls is laid on a steady face, see `steadied`. Scene i
+    depends on the object, the seed and i alone.
 
     Args:
         obj: the object.
@@ -104,13 +105,31 @@ def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     if count < 0 or seed < 0:
         raise InputError(f"scenes and seed must not be negative; got {count} scenes, seed {seed}")
     table = _build(obj.centred)
-    rests = [_redo_until_rest(table, obj.name, (seed, scene)) for scene in range(count)]
+    rests = []
+    for scene in range(count):
+        rest, rng = _redo_until_rest(table, obj.name, (seed, scene)), np.random.default_rng([seed, scene, MAX_ATTEMPTS])
+        face, pose = steadied(obj.centred, table.faces, rest.face, rest.pose, rng)
+        rests.append(Rest(pose, face, rest.seconds))
     poses = moved(np.array([rest.pose for rest in rests]).reshape(count, 7), np.zeros(3))
     return {
         "scene/object_pose": to_file(poses, obj.centre),
         "scene/rest_probability": rest_probability(obj, [rest.face for rest in rests]),
         "scene/drop_seconds": np.array([rest.seconds for rest in rests]),
     }
+
+
+def steadied(
+    obj: ObjectModel, faces: RestingFaces, face: int, pose: Floats, rng: np.random.Generator
+) -> tuple[int, Floats]:
+    """The face on which a centred object stays that came to rest on one, and its pose (7,).
+
+    Where it may roll there, this is one of the faces of the reference drops on which it does not, as often as they end
+    on it. What is round on all of them stays as it lies.
+    """
+    if not faces.rolls(face) or not (steady := _steady_faces(_ByContent(obj))):
+        return face, pose
+    chosen = int(rng.choice(steady))
+    return chosen, lay_flat(faces, chosen, pose)
 
 
 def rest_probability(obj: ObjectModel, faces: Sequence[int]) -> Floats:
@@ -157,6 +176,13 @@ def _reference_faces(of: _ByContent) -> tuple[int, ...]:
 
     kept = arrays_kept_or_made("drops", (obj.content, version_of("mujoco")), code, drops, fits=fits)
     return tuple(kept["face"].tolist())
+
+
+@lru_cache(maxsize=64)
+def _steady_faces(of: _ByContent) -> tuple[int, ...]:
+    """Those of the same on which the object does not roll."""
+    faces = resting_faces(of.obj)
+    return tuple(face for face in _reference_faces(of) if not faces.rolls(face))
 
 
 def _build(obj: ObjectModel) -> _Table:

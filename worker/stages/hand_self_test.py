@@ -22,6 +22,7 @@ from worker.grasps import Posture, joined
 from worker.hands.jaws import jaws_of
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
+from worker.hands.oppositions import oppositions_of
 from worker.hands.pads import fingertip_pad
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object
@@ -267,7 +268,9 @@ def fitting_width(hand: HandModel) -> float:
     poses = body_poses(hand, _IDENTITY, hand.expand(hand.preshape))[0]
     tips = np.array([_tip(hand, body, poses[body]) for body in hand.fingertips or (hand.bodies - 1,)])
     reach = float(np.median(np.linalg.norm(tips - hand.palm.centre, axis=1)))
-    return float(np.clip(OF_REACH * reach, *WIDTH_M))
+    # What is thinner than the gap that opposed pads leave at least does not suit a hand.
+    least = float(known.width[0]) if len(known := oppositions_of(hand)) else 0.0
+    return float(np.clip(max(OF_REACH * reach, least), *WIDTH_M))
 
 
 def _tip(hand: HandModel, body: int, pose: Floats) -> Floats:

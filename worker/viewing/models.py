@@ -14,7 +14,7 @@ from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.probe import Probe, probe_of
-from worker.rendering.hands import drawn_bodies, hand_looks, hand_solids, without_visuals
+from worker.rendering.hands import drawn_parts, drawn_poses, without_visuals
 from worker.scenes.neighbours import Neighbours
 
 #: Points of the hand whose distance from the object is shown, where it is less than this [m].
@@ -35,28 +35,27 @@ Supports = Sequence[HalfSpace | Box]
 class Models:
     """Nodes under `/grasp` (the frame of the object at rest) and `/scene`."""
 
-    def __init__(self, scene: Any, hand: HandModel, obj: ObjectModel) -> None:
-        self._scene, self._hand = scene, hand
+    def __init__(self, scene: Any, hand: HandModel, obj: ObjectModel, *, mounted: bool = False) -> None:
+        """Build the nodes; with those of the links above the hand's root if it is `mounted`."""
+        self._scene, self._hand, self._mounted = scene, hand, mounted
         self._probe: Probe = probe_of(hand, obj, hand_points=POINTS, object_points=64)
         scene.set_up_direction("+z")
         self.rest = scene.add_frame("/grasp", show_axes=False)
         self.thing = scene.add_frame("/grasp/object", show_axes=False)
         scene.add_mesh_simple("/grasp/object/mesh", obj.vertices, obj.faces, color=_OBJECT, flat_shading=True)
-        self._drawn = drawn_bodies(hand)
         self.bodies = self._nodes(hand, "hand")
-        bare = without_visuals(hand)
         #: The hand as the engine sees it, where it looks otherwise.
-        self._bare = drawn_bodies(bare) if hand.visuals.meshes else []
-        self.collisions = self._nodes(bare, "collision") if self._bare else []
+        self._bare = without_visuals(hand) if hand.visuals.meshes else None
+        self.collisions = self._nodes(self._bare, "collision") if self._bare else []
         self.show_collision(False)
         self.contacts: Any = None
         self._around: list[Any] = []
 
     def _nodes(self, hand: HandModel, name: str) -> list[Any]:
         nodes = []
-        for number, (solid, look) in enumerate(zip(hand_solids(hand), hand_looks(hand), strict=True)):
-            colour = tuple(round(255 * _srgb(part)) for part in look.base)
-            path = f"/grasp/{name}/{number}"
+        for number, part in enumerate(drawn_parts(hand, mounted=self._mounted)):
+            colour = tuple(round(255 * _srgb(share)) for share in part.look.base)
+            path, solid = f"/grasp/{name}/{number}", part.solid
             nodes.append(
                 self._scene.add_mesh_simple(path, solid.vertices, solid.faces, color=colour, flat_shading=True)
             )
@@ -99,14 +98,17 @@ class Models:
         for node in self._around:
             node.visible = on
 
-    def pose(self, point: Waypoint, *, contacts: bool) -> Floats:
-        """Take a posture; the distances (P,) of the hand's points from the object [m], at most the probe's reach."""
-        (bodies,) = body_poses(self._hand, point.hand_pose[None], point.joint_positions[None])
-        for node, body in zip([*self.bodies, *self.collisions], [*self._drawn, *self._bare], strict=True):
-            _place(node, bodies[body])
+    def pose(self, point: Waypoint, *, wrist: Floats | None = None, contacts: bool) -> Floats:
+        """Take a posture, of a mounted hand at wrist angles (1, U); the distances (P,) of the hand's points from the
+        object [m], at most the probe's reach."""
+        posture = point.hand_pose[None], point.joint_positions[None]
+        for hand, nodes in ((self._hand, self.bodies), (self._bare, self.collisions)):
+            if hand is not None:
+                for node, pose in zip(nodes, drawn_poses(hand, *posture, wrist)[0], strict=True):
+                    _place(node, pose)
         self.thing.position = point.carried
         # The probe's object stays where it rests.
-        points = self._probe.posed_points(bodies[None])[0] - point.carried
+        points = self._probe.posed_points(body_poses(self._hand, *posture))[0] - point.carried
         distance = np.asarray(self._probe.signed_distance(points)[0])
         near = distance < NEAR_M
         if self.contacts is not None:

@@ -16,9 +16,9 @@ from service.model.errors import InputError
 from service.model.scene_kinds import supports_in
 from service.model.scene_spec import SceneSpec
 from service.model.transforms import IDENTITY_POSE, quat_rotate
-from service.readers.ways import point_at, scene_spec_of, stop_places, way_of
+from service.readers.ways import point_at, scene_spec_of, stop_places, way_of, wrists_of
 from service.store.shards import Shard
-from worker.hands.model import HandModel
+from worker.hands.model import Floats, HandModel
 from worker.objects.model import ObjectModel
 from worker.rendering.standing import seen_share
 from worker.scenes.neighbours import Neighbours
@@ -72,11 +72,16 @@ class Viewer:
         spec = scene_spec_of(shown.shard) or SceneSpec()
         self._supports: Supports = supports_in(spec)
         self.server = _served(host, port)
-        self.models = Models(self.server.scene, shown.hand, shown.obj)
+        self.models = Models(self.server.scene, shown.hand, shown.obj, mounted=self._wrist is not None)
         self._way = way_of(shown.shard, self.row)
         self._controls()
         self._load()
         self._aim()
+
+    @property
+    def _wrist(self) -> Floats | None:
+        """(1, U) angles of the wrist at the grasp that is shown; None: the file has none."""
+        return wrists_of(self._shown.shard, np.array([self.row]))
 
     @property
     def url(self) -> str:
@@ -117,7 +122,8 @@ class Viewer:
         """Draw the posture at which the slider stands."""
         with self._lock:
             place = float(self.slider.value)
-            distance = self.models.pose(point_at(self._way, place), contacts=bool(self._contacts.value))
+            point, contacts = point_at(self._way, place), bool(self._contacts.value)
+            distance = self.models.pose(point, wrist=self._wrist, contacts=contacts)
             self.models.show_scene(bool(self._scene.value))
             self.models.show_collision(bool(self._collision.value))
             touching, least = int((distance < 0.001).sum()), 1e3 * float(distance.min())

@@ -18,7 +18,7 @@ from worker.objects.prepare import object_from_path
 from worker.planners import Wanted, synthesize
 from worker.planners.fast_graspd import candidates, planner
 from worker.planners.fast_graspd.candidates import GENTLER, Seated
-from worker.planners.fast_graspd.planner import ATTEMPTS
+from worker.planners.fast_graspd.planner import ATTEMPTS, CLOSER
 from worker.planners.fast_graspd.schedule import PULL
 from worker.quality.postures import normal_force, squeeze
 from worker.quality.referee.decomposition import ConvexPieces
@@ -258,6 +258,35 @@ def test_a_grasp_that_nobody_holds_sets_out_as_often_as_it_may_and_the_least_bad
     # Half of the hands that set out without a trial at each attempt, and of them those that can be valid are tried.
     assert ATTEMPTS // 2 < len(scores) <= (1 + ATTEMPTS) * QUICK.starts // 2
     assert len(found) == 1
+
+
+@pytest.mark.parametrize(("score", "made"), [(0.5, 1 + CLOSER), (1.5, 1 + CLOSER), (2.5, 1 + ATTEMPTS)])
+def test_a_free_grasp_whose_finger_stands_off_sets_out_again_a_few_times(
+    free, attempts: list[int], monkeypatch: pytest.MonkeyPatch, score: float, made: int
+) -> None:
+    hand, obj, wanted, _ = free
+    monkeypatch.setattr(planner, "standing_off", lambda hand, obj, grasp, **_: np.ones(len(grasp), bool))
+    trial = lambda grasps, *_: np.full(len(grasps), score)  # noqa: E731
+    synthesize(hand, obj, replace(wanted, count=1, trial=trial), Run(threads=1))
+    assert attempts == list(range(made))
+
+
+def test_of_free_grasps_that_hold_one_is_chosen_whose_fingers_touch(free, monkeypatch: pytest.MonkeyPatch) -> None:
+    hand, obj, wanted, _ = free
+    seen: list[bool] = []
+
+    def off_at_first(hand, obj, grasp, **_):
+        seen.append(not seen)
+        return np.full(len(grasp), seen[-1])
+
+    trial = lambda grasps, *_: np.full(len(grasps), 0.1 if not seen else 1.5)  # noqa: E731
+    one = replace(wanted, count=1, trial=trial)
+    monkeypatch.setattr(planner, "CLOSER", 0)
+    first = synthesize(hand, obj, one, Run(threads=1))
+    seen.clear()
+    monkeypatch.setattr(planner, "CLOSER", 1)
+    monkeypatch.setattr(planner, "standing_off", off_at_first)
+    assert (synthesize(hand, obj, one, Run(threads=1)).grasp.hand_pose != first.grasp.hand_pose).any()
 
 
 def test_hands_are_drawn_to_a_free_object_when_they_first_set_out_and_not_again(

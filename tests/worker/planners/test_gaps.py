@@ -8,9 +8,12 @@ import trimesh
 
 from service.model.domain import JobOptions
 from service.model.fidelity import FIDELITIES
+from service.model.scene_spec import SceneSpec
 from service.model.transforms import IDENTITY_POSE
 from tests.worker.models import object_from_mesh
 from worker.certified import certified_grasps
+from worker.commands.synth import _said
+from worker.files.synthesis import synthesized
 from worker.hands.load import hand_from_path
 from worker.hands.oppositions import oppositions_of
 from worker.hands.pads import thinnest_fingertip
@@ -89,3 +92,14 @@ def test_a_batch_without_a_valid_grasp_says_the_reason(barrett) -> None:
     assert not len(found.grasps)
     assert found.narrow == why_narrow(barrett, BOX, scenes.placed(np.zeros(1, int)).scenes)
     assert "8 mm" in str(found.narrow)
+
+
+def test_raw_grasps_none_of_which_is_valid_come_with_the_reason(tmp_path) -> None:
+    sheet = tmp_path / "sheet.stl"
+    trimesh.creation.box([0.08, 0.08, 0.004]).export(sheet)
+    place, request = SceneSpec(kind="table"), JobOptions(want="raw", grasps=1, fidelity="draft", scene="table")
+    made = synthesized("allegro", str(sheet), request, place=place, scenes=1)
+    found = made.summary()
+    assert (found["grasps"], found["valid"], found["reason"]) == (1, 0, None)
+    assert "lies 4 mm high" in found["narrow"]
+    assert _said({"file": "g.h5", **found}).endswith(found["narrow"])

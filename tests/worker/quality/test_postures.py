@@ -16,7 +16,7 @@ from worker.hands.jacobian import generalized_forces
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.quality.opening import CLEARANCE_M, JAM_M, PALM_CLEARANCE_M
-from worker.quality.postures import hold_forces, normal_force, pregrasp, squeeze
+from worker.quality.postures import STANDS_OFF_M, hold_forces, normal_force, pregrasp, squeeze, standing_off
 from worker.quality.probe import Probe
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
@@ -174,3 +174,14 @@ def test_a_finger_opens_no_farther_than_its_neighbour_lets_it() -> None:
 def test_what_is_light_is_held_more_gently_and_what_is_heavy_more_firmly() -> None:
     forces = [normal_force(dataclasses.replace(BOX, mass=mass)) for mass in (0.02, 0.1, 0.5, 1.0)]
     assert forces == pytest.approx([10.0, 50.0, 50.0, 100.0])
+
+
+def test_a_finger_stands_off_that_is_near_the_object_and_does_not_touch_it() -> None:
+    # The left plate touches; the right one stands at distances around both limits.
+    near, far = STANDS_OFF_M
+    rights = np.array([0.0, near - 1e-3, near + 1e-3, far - 1e-3, far + 1e-3])
+    grasps = Posture(
+        np.repeat(CLOSED.hand_pose, len(rights), axis=0),
+        np.stack([np.full(len(rights), 0.065), 0.065 - rights], axis=1),
+    )
+    assert standing_off(PLATES, BOX, grasps).tolist() == [False, False, True, True, False]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,8 @@ def test_collision_shapes_are_drawn_on_a_toggle(hand: HandModel) -> None:
     bare = without_visuals(hand)
     assert drawn_bodies(bare) == [0, 1] and drawn_bodies(hand) == [0, 0, 1]
     assert np.ptp(hand_parts(bare)[0].solid.vertices, axis=0) == pytest.approx([0.02, 0.02, 0.04])
+    above = without_visuals(replace(hand, mounting=hand)).mounting
+    assert above is not None and drawn_bodies(above) == [0, 1]
 
 
 def test_looks_change_nothing_that_is_computed(hand: HandModel) -> None:

@@ -152,7 +152,7 @@ def test_synth_with_neighbours_writes_them_and_its_lifts_are_judged_again_alike(
     [
         (["--scene", "table", *["--with", "mug"] * 9], "at most 8"),
         (["--with", "mug"], "neighbours stand in a scene"),
-        (["--scene", "bin", *["--with", "bottle"] * 8], "no room for 8 neighbours beside block"),
+        (["--scene", "bin", *["--with", "mug"] * 8], "no room for 8 neighbours beside block"),
         (["--scene", "table", "--with", "no-such-thing"], "no-such-thing"),
     ],
 )

@@ -50,6 +50,21 @@ def test_a_can_rolls_on_its_side_and_stands_on_its_bottom() -> None:
     assert rolling_note(0, 3) is None
 
 
+def test_a_can_is_put_on_its_ends_and_a_ball_stays_as_it_lies() -> None:
+    # Half as high as wide: about a half of the drops end on its side.
+    stout = object_from_mesh(trimesh.creation.cylinder(radius=0.03, height=0.05, sections=60))
+    free = [
+        drop(stout, count=12, seed=1)["scene/object_pose"],
+        rest_poses(SceneSpec(kind="table", faces="all"), stout, count=1, seed=0)["scene/object_pose"],
+        drop_together(plate(0.05), [stout], count=8, seed=3)["scene/neighbour_pose"][:, 0],
+    ]
+    for pose in np.concatenate(free):
+        assert abs(quat_rotate(quat_conjugate(pose[3:]), UP)[2]) == pytest.approx(1.0, abs=1e-6)
+        assert pose[2] == pytest.approx(0.025, abs=1e-6)
+    ball = object_from_mesh(trimesh.creation.icosphere(2, 0.03))
+    assert rolling_poses(ball, drop(ball, count=3, seed=1)["scene/object_pose"]) == 3
+
+
 def test_drops_and_faces_leave_out_what_topples() -> None:
     thin = plate(0.007)
     poses = [

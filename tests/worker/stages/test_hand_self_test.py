@@ -17,8 +17,9 @@ from tests.worker.hands.grippers import OPENING, gripper
 from tests.worker.hands.urdfs import joint, link, robot
 from worker.certified import Certified
 from worker.hands.jaws import jaws_of
-from worker.hands.load import load_hand
+from worker.hands.load import hand_from_path, load_hand
 from worker.hands.model import HandModel
+from worker.hands.oppositions import oppositions_of
 from worker.objects.model import ObjectModel
 from worker.quality.referee.limit import Limit
 from worker.run import Run
@@ -26,6 +27,7 @@ from worker.stages import hand_self_test
 from worker.stages.hand_self_test import (
     OF_OPENING,
     OF_REACH,
+    WIDTH_M,
     SelfTest,
     fitting_width,
     plain_objects,
@@ -106,6 +108,16 @@ def test_a_finger_of_one_joint_reaches_to_its_pad_and_not_only_to_its_base() -> 
     assert jaws_of(hand) is None
     # Its joints lie 30 mm from the palm's middle, its pads beyond half of the 100 mm of a finger.
     assert OF_REACH * 0.05 < fitting_width(hand) < OF_REACH * 0.11
+
+
+def test_objects_are_no_thinner_than_opposed_pads_come_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    hand = hand_from_path("barrett")
+    known, width = oppositions_of(hand), fitting_width(hand)
+    assert known.width[0] < width
+    thick = replace(known, width=known.width + 0.03)
+    monkeypatch.setattr("worker.stages.hand_self_test.oppositions_of", lambda hand: thick)
+    assert fitting_width(hand) == pytest.approx(thick.width[0])
+    assert width < thick.width[0] < WIDTH_M[1]
 
 
 def test_a_busy_machine_leaves_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:

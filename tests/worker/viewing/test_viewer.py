@@ -9,6 +9,7 @@ import subprocess
 import sys
 import urllib.request
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -61,14 +62,18 @@ SCENE = json_attribute(SceneSpec(kind="bin").model_dump(mode="json"))
 
 
 @pytest.fixture(scope="module")
-def viewer() -> Iterator:
+def viewer(block) -> Iterator:
     from worker.viewing.viewer import Shown, Viewer
 
-    block = object_from_mesh(trimesh.creation.box((0.05, 0.04, 0.06)), "block")
     said = {"hand": "two fingers", "object": "block", "scene": SCENE}
     made = Viewer(Shown(Shard("base", said, arrays(2)), HAND, block), port=0)
     yield made
     made.close()
+
+
+@pytest.fixture(scope="module")
+def block():
+    return object_from_mesh(trimesh.creation.box((0.05, 0.04, 0.06)), "block")
 
 
 @pytest.fixture(autouse=True)
@@ -202,14 +207,39 @@ def test_the_file_that_is_no_shard_is_one_line(tmp_path: Path):
     assert "grasps.h5 is not a readable HDF5 file" in result.output
 
 
-def test_collision_shapes_take_the_place_of_what_the_hand_looks_like() -> None:
+def test_links_above_the_root_are_drawn_at_the_angles_of_the_wrist_of_each_grasp(block) -> None:
+    from worker.viewing.viewer import Shown, Viewer
+
+    # A copy of the hand behind its root serves as a forearm with two wrist joints.
+    forearm, mounted = HAND, replace(HAND, mounting=HAND)
+    angles = np.array([[0.0, 0], [0.3, 0.6], [0.9, 0.1]])
+    said = {"hand": "two fingers", "object": "block", "scene": SCENE}
+    shard = Shard("base", said, arrays(2) | {"grasp/wrist_positions": angles})
+    made = Viewer(Shown(shard, mounted, block), port=0)
+    try:
+        made.choose("all")
+        own = len(drawn_bodies(HAND))
+        assert len(made.models.bodies) == own + len(drawn_bodies(forearm))
+        for row in range(GRASPS):
+            made.slider.value = 2
+            made.show()
+            root = arrays(2)["grasp/hand_pose"][[row]]
+            (poses,) = body_poses(forearm, root, forearm.expand(angles[[row]]))
+            for node, body in zip(made.models.bodies[own:], drawn_bodies(forearm), strict=True):
+                np.testing.assert_allclose(node.position, poses[body, :3], atol=1e-6)
+                assert abs(node.wxyz @ poses[body, 3:]) == pytest.approx(1, abs=1e-6)
+            made.step(1)
+    finally:
+        made.close()
+
+
+def test_collision_shapes_take_the_place_of_what_the_hand_looks_like(block) -> None:
     from worker.viewing.viewer import Shown, Viewer
 
     seen = '<visual><geometry><sphere radius="0.03"/></geometry></visual>'
     hand = load_hand(
         {"h.urdf": robot(link("palm", BOX + seen), link("a"), joint("j", "palm", "a"))}, name="h", digest=""
     )
-    block = object_from_mesh(trimesh.creation.box((0.05, 0.04, 0.06)), "block")
     made = Viewer(
         Shown(Shard("base", {"hand": "h", "object": "block", "scene": SCENE}, arrays(1)), hand, block), port=0
     )

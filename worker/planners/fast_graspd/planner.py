@@ -40,7 +40,7 @@ from worker.planners.fast_graspd.withdrawal import hindrance
 from worker.planners.port import Asked, Wanted
 from worker.planners.threads import cut, run_parts
 from worker.quality.gate import MAX_PENETRATION_MM, MIN_CONTACT_LINKS
-from worker.quality.postures import touching_links
+from worker.quality.postures import standing_off, touching_links
 from worker.run import Run
 from worker.simulation.data import Data
 from worker.simulation.launches import Launches
@@ -64,6 +64,10 @@ FAILED: Final = 2.0
 #: How often grasps whose hands are tried may set out again. One more attempt finds what the first ones found, so valid
 #: grasps a second hardly depend on it, and fewer grasps of a hard pair are left that hold nothing.
 ATTEMPTS: Final = 20
+#: Score of a free grasp that holds while a finger stands off: it sets out again up to `CLOSER` times, then the best
+#: stays.
+STANDS: Final = 1.99
+CLOSER: Final = 2
 #: Scores beyond which grasps in scenes set out again, at each attempt: at the first also those that lift at the whole
 #: friction only. An attempt costs half of another grasp of the batch, and one in ten of these then lifts at half.
 IN_SCENES: Final = (1.0, FAILED, FAILED, FAILED, FAILED)
@@ -317,7 +321,11 @@ def _work(launch: _Launch, begun: _Begun) -> Part:
 
         together = 1 if placed is None else TOGETHER
         taken = tried(hand, obj, order, seats.seated, placed, trial, together=together, device=pair.hand.device)
-        return Part(rows, taken.state, taken.losses, taken.score, curve, taken.joined())
+        found, score = taken.joined(), taken.score
+        if placed is None:
+            off = standing_off(hand, obj, found.grasp, device=pair.hand.device)
+            score = np.where(off & (score < STANDS), STANDS + 1e-3 * score, score)
+        return Part(rows, taken.state, taken.losses, score, curve, found)
     seated = seats.seated(np.sort(order, axis=1), np.arange(n))
     winners = best_of_each(seated.merit, n, 1) if last > 1 else np.arange(n)
     return Part(rows, seated.state[winners], seated.losses[winners], seated.merit[winners], curve)
@@ -329,12 +337,13 @@ def _tried_again(launch: _Launch, part: Part, run: Run) -> Part:
 
     The last few would leave cores idle, and a hand of a small launch costs a third more: they make some attempts ahead.
     Those after a good one are forgotten, so a grasp is as if it had made one after the other."""
-    limits: tuple[float, ...] = (FAILED,) * ATTEMPTS if launch.batches.has_trial else (SET_OUT_AGAIN,)
+    closer = (STANDS,) * CLOSER + (FAILED,) * (ATTEMPTS - CLOSER)
+    limits: tuple[float, ...] = closer if launch.batches.has_trial else (SET_OUT_AGAIN,)
     if launch.batches.placed is not None:
         limits = IN_SCENES
     done = 0
     while done < len(limits) and len(poor := np.flatnonzero(part.merit > limits[done])):
-        ahead = int(np.clip(PART * run.cores // len(poor), 1, min(AHEAD, len(limits) - done)))
+        ahead = int(np.clip(PART * run.cores // len(poor), 1, min(AHEAD, limits[done:].count(limits[done]))))
         attempt = np.repeat(np.arange(done + 1, done + 1 + ahead), len(poor))
         again = _set_out_again(launch, np.tile(part.rows[poor], ahead), attempt, run)
         merit, attempts, chosen = part.merit.copy(), part.attempts.copy(), np.arange(len(part.rows))
