@@ -1,4 +1,4 @@
-"""What trimesh's readers would lose that the readers of meshes keep: docs/adr/0004 has the decision."""
+"""What trimesh's readers would lose that the readers of meshes keep: docs/adr/0006 has the decision."""
 
 from __future__ import annotations
 
