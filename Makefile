@@ -30,11 +30,12 @@ test-slow: $(STAMP) ## the long accuracy and soak runs
 test-containers: $(STAMP) ## images built, compose up, a job through two kills (needs a container engine)
 	$(BIN)/python -m pytest -m containers -rs tests/containers
 
-check: $(STAMP) ## format, lint, types, import contract
+check: $(STAMP) ## format, lint, types, import contracts, spelling
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/codespell
 
 format: $(STAMP) ## rewrite the sources in the house style
 	$(BIN)/ruff format .

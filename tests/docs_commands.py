@@ -35,7 +35,11 @@ from tests.docs_files import files_for
 
 REPOSITORY: Final = Path(__file__).resolve().parent.parent
 DOCS: Final = REPOSITORY / "docs"
-PAGES: Final = (REPOSITORY / "README.md", *sorted(DOCS.glob("*.md")), *sorted((DOCS / "exchange").glob("*.md")))
+PAGES: Final = (
+    *(REPOSITORY / name for name in ("README.md", "CONTRIBUTING.md")),
+    *sorted(DOCS.glob("*.md")),
+    *sorted((DOCS / "exchange").glob("*.md")),
+)
 LIMIT_S: Final = 3600.0
 #: What came, a file for each page, and which pages ended well.
 KEPT: Final = REPOSITORY / "build" / "docs-commands"
@@ -73,7 +77,10 @@ NOT_RUN: Final = (
     (r"python src/|dexlearn\.train|cp -r", "needs the sources of another project"),
     (r"^pip |\bjq\b|benchmarks\.gallery", "needs packages or programs from elsewhere"),
     (r"cuda|--join\b|on_gpu|gpu-check", "needs a GPU, or its tools"),
-    (r"^make |^\. \.venv", "the repository's own verbs and environment, which are tested and used without this"),
+    (
+        r"^make |^\. \.venv|pre-commit",
+        "the repository's own verbs and environment, which are tested and used without this",
+    ),
     (r"graspd (up|api|keeper|worker|view)\b(?!.*--check)", "does not end"),
     (r"graspd (keys|projects|webhooks)\b", "with the first key every other line needs one; tests/api runs them"),
     (r"datasets (cancel|retry|delete)", "the dataset that stands in has ended, and is read below; tests/api runs them"),

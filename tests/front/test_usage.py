@@ -29,7 +29,7 @@ NOBODY = {"GRASPD_API_URL": "http://127.0.0.1:9"}
             "--grasps: must be a whole number; see `graspd submit --help`",
         ),
         (
-            "jobs --state runing",
+            "jobs --state runing",  # codespell:ignore runing
             "--state: must be one of queued, running, succeeded, failed, cancelled; did you mean running?",
         ),
         ("export x.h5 --format mjcf -o out", "there is no export format 'mjcf'"),

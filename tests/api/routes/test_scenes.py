@@ -76,7 +76,7 @@ def test_the_document_offers_scenes_and_keeps_the_defaults(http: TestClient) -> 
 @pytest.mark.parametrize(
     ("wrong", "where", "words"),
     [
-        ({"scene": "tabel"}, "scene", "did you mean table?"),
+        ({"scene": "tabel"}, "scene", "did you mean table?"),  # codespell:ignore tabel
         ({"scene": {"supports": [PLANE, {"kind": "box", "size": [0, 1, 1]}]}}, "scene", "must be more than 0.0001"),
         ({"scene": {"supports": [PLANE], "target": [0, 0, 0, 9, 0, 0, 0]}}, "scene", "must be at most 2"),
         ({"scene": {"supports": [PLANE] * 33}}, "scene", "at most 32"),

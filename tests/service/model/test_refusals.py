@@ -45,7 +45,7 @@ class Kind(BaseModel):
             {"name": "a/b"},
             "name: must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores",
         ),
-        ({"fidelity": "standart"}, "fidelity: must be one of draft, standard, fine; did you mean standard?"),
+        ({"fidelity": "strandard"}, "fidelity: must be one of draft, standard, fine; did you mean standard?"),
         ({"fidelity": 3}, "fidelity: must be one of draft, standard, fine"),
         ({"text": "long"}, "text: must have at most 3 characters"),
         ({"text": "x"}, "text: x is taken"),

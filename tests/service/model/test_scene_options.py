@@ -140,7 +140,7 @@ def test_fingertips_may_touch_unless_the_request_or_its_document_says_otherwise(
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"scene": "tabel"}, "'free', 'table', 'bin' or 'shelf'"),
+        ({"scene": "tabel"}, "'free', 'table', 'bin' or 'shelf'"),  # codespell:ignore tabel
         ({"scene": 5}, "'free', 'table', 'bin' or 'shelf'"),
         ({"scene": {"supports": []}}, "at least 1"),
         ({"scene": {"supports": [PLANE] * 33}}, "at most 32"),

@@ -99,7 +99,7 @@ def test_following_a_dropped_joint_is_refused_with_the_mend() -> None:
         ({"preshape": {"j1": 9.0}}, "limits"),
         ({"fingertips": ["zz"]}, "zz"),
         ({"palm": {"link": "zz"}}, "zz"),
-        ({"stifness": 3.0}, "stifness"),
+        ({"stifness": 3.0}, "stifness"),  # codespell:ignore stifness
         ({"stiffness": -1.0}, "stiffness"),
         ({"effort": 0.0}, "effort"),
         ({"approach": [0, 0, 0]}, "zero"),

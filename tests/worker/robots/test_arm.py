@@ -133,7 +133,7 @@ def test_moveit_is_told_poses_in_the_arms_base_and_joints_of_arm_and_hand(
     ("options", "said"),
     [
         (["--mount", "flange", "--base", "-5 0 0 1 0 0 0"], "carries out none of 1 grasps (1 out of reach)"),
-        (["--mount", "flage"], "no link 'flage'"),
+        (["--mount", "flage"], "no link 'flage'"),  # codespell:ignore flage
         (["--mount", "base"], "no joint of the arm six moves the link 'base'"),
         ([], "--mount LINK"),
         (["--mount", "flange", "--base", "0 0 0"], "--base '0 0 0' is no pose"),

@@ -1,0 +1,94 @@
+"""Files that a public project keeps beside its sources: valid by their schemas, and true of this repository."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import check_jsonschema
+import pytest
+import yaml
+from click.testing import CliRunner
+from packaging.specifiers import SpecifierSet
+
+from service.model.version import PACKAGE_VERSION
+from tests.conftest import REPOSITORY
+from tests.docs_commands import Line
+
+FORGE = REPOSITORY / ".github"
+WORKFLOWS = sorted((FORGE / "workflows").glob("*"))
+#: Name of a schema that check-jsonschema brings, and the files that it describes.
+SCHEMAS = {
+    "citation-file-format": [REPOSITORY / "CITATION.cff"],
+    "dependabot": [FORGE / "dependabot.yml"],
+    "github-issue-forms": sorted((FORGE / "ISSUE_TEMPLATE").glob("*")),
+    "github-workflows": WORKFLOWS,
+}
+PROSE = [
+    *(REPOSITORY / name for name in ("CONTRIBUTING.md", "SECURITY.md", "CODE_OF_CONDUCT.md")),
+    FORGE / "pull_request_template.md",
+]
+
+
+def jobs() -> dict[str, Any]:
+    """All jobs of all workflows by their names."""
+    return {name: job for file in WORKFLOWS for name, job in yaml.safe_load(file.read_text())["jobs"].items()}
+
+
+@pytest.mark.parametrize("schema", SCHEMAS)
+def test_files_are_what_their_readers_take(schema: str) -> None:
+    files = SCHEMAS[schema]
+    assert files
+    done = CliRunner().invoke(check_jsonschema.main, ["--builtin-schema", f"vendor.{schema}", *map(str, files)])
+    assert done.exit_code == 0, done.output
+
+
+def test_workflows_run_commands_that_exist() -> None:
+    lines = [line for job in jobs().values() for step in job["steps"] for line in step.get("run", "").splitlines()]
+    assert {"make check PYTHON=python", "make test PYTHON=python", "make dist PYTHON=python"} <= set(lines)
+    faults = [Line("ci.yml", line).fault() for line in lines]
+    assert not any(faults), faults
+
+
+def test_workflows_test_every_python_that_the_package_allows() -> None:
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    allowed = SpecifierSet(project["requires-python"])
+    tested = jobs()["test"]["strategy"]["matrix"]["python"]
+    assert tested == [f"3.{minor}" for minor in range(30) if f"3.{minor}" in allowed]
+
+
+@pytest.mark.parametrize("page", PROSE, ids=lambda page: page.name)
+def test_code_that_a_page_names_exists(page: Path) -> None:
+    named = re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL))
+    faults = [Line(page.name, one).fault() for one in named]
+    paths = [word for one in named for word in one.split() if "/" in word and not word.startswith(".venv/")]
+    assert not any(faults), faults
+    assert [path for path in paths if not (REPOSITORY / path).exists()] == []
+
+
+def test_contributing_is_short() -> None:
+    assert len((REPOSITORY / "CONTRIBUTING.md").read_text().split()) <= 700
+
+
+def test_a_citation_names_the_last_release() -> None:
+    cited = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
+    assert cited["version"] == PACKAGE_VERSION
+    assert f"\n## {PACKAGE_VERSION}, {cited['date-released']}\n" in (REPOSITORY / "CHANGELOG.md").read_text()
+
+
+def test_decisions_have_numbers_of_their_own_and_are_listed() -> None:
+    folder = REPOSITORY / "docs" / "adr"
+    files = sorted(folder.glob("[0-9]*.md"))
+    assert [int(file.name[:4]) for file in files] == list(range(1, len(files) + 1))
+    listed = re.findall(r"^- \[(.+)\]\((.+)\)$", (folder / "README.md").read_text(), re.MULTILINE)
+    assert listed == [(file.read_text().splitlines()[0].removeprefix("# "), file.name) for file in files]
+
+
+def test_a_commit_is_checked_by_the_tools_of_make_check() -> None:
+    config = yaml.safe_load((REPOSITORY / ".pre-commit-config.yaml").read_text())
+    recipe = (REPOSITORY / "Makefile").read_text().partition("\ncheck:")[2].partition("\n\n")[0]
+    checked = set(re.findall(r"\$\(BIN\)/([\w-]+)", recipe))
+    tools = {hook["entry"].split()[0] for repository in config["repos"] for hook in repository["hooks"]}
+    assert tools <= {f".venv/bin/{name}" for name in checked}
