@@ -57,6 +57,8 @@ try:
 except ImportError:  # one module in older revisions
     import graspd
 def walk(command, name):
+    if isinstance(command, getattr(graspd, "Deferred", ())):
+        command = graspd.load(command.module, command.name, root)
     print("==", name)
     print(command.get_help(typer.Context(command, info_name=name)))
     for child, inner in sorted((getattr(command, "commands", None) or {}).items()):

@@ -171,7 +171,7 @@ def main(
     kept.save(data_dir / "run.json")
     after = run.shards()
     found, cells = run.client().dataset(DATASET), list(run.client().cells(DATASET))
-    check = run.graspd("index", "rebuild", "--check", "--data-dir", str(data_dir / "data"))
+    check = run.graspd("admin", "index", "rebuild", "--check", "--data-dir", str(data_dir / "data"))
     run.stop()
     facts = {
         "killed at": f"{100 * kept.killed_at:.0f} % of the tasks, {len(kept.shards)} shards in the store",

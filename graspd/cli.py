@@ -21,69 +21,55 @@ from service.model.version import PACKAGE_VERSION
 
 #: Command, module of its group, panel of the overview, help.
 COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
-    (
-        "demo",
-        "graspd.demo",
-        "Start here",
-        "The main job on built-in data: grasps, scenes, pictures, and a page that shows them.",
-    ),
-    ("up", "service.run.commands", "Start here", "The whole service on this machine, until Ctrl-C."),
-    (
-        "doctor",
-        "graspd.doctor",
-        "Start here",
-        "Check disk, clocks, Redis, store, index, GPU, kernels and ports; say the mend.",
-    ),
-    ("submit", "api.client.commands", "Jobs", "Submit a job: one hand on one object."),
-    ("jobs", "api.client.commands", "Jobs", "List jobs, the newest first."),
-    ("status", "api.client.commands", "Jobs", "Stages, progress and quality of a job."),
-    ("cancel", "api.client.commands", "Jobs", "Stop a job; what is written stays."),
-    ("retry", "api.client.commands", "Jobs", "Run again what failed or was cancelled."),
-    ("delete", "api.client.commands", "Jobs", "Remove an ended job; its grasps go where no other job has them."),
-    ("restore", "api.client.commands", "Jobs", "Bring back a job that was deleted."),
-    ("logs", "api.client.commands", "Jobs", "Failed attempts of a job, with their reasons."),
-    ("hands", "api.client.commands", "Jobs", "Check, add, list and show hands."),
-    ("objects", "api.client.commands", "Jobs", "Check, add, list and show objects."),
-    ("networks", "api.client.commands", "Jobs", "Add, list and show networks that propose grasps of a hand."),
-    (
-        "datasets",
-        "api.client.dataset_commands",
-        "Jobs",
-        "Hands x objects as one dataset: cost, status, snapshots, files.",
-    ),
-    ("api", "api.server_command", "Parts of the service", "The HTTP API and the dashboard."),
-    ("keeper", "service.run.commands", "Parts of the service", "Reaper, delayed retries and indexer."),
-    ("worker", "worker.commands.worker", "Parts of the service", "One worker on one device."),
-    ("kernels", "worker.commands.kernels", "Parts of the service", "Compile all kernels ahead of time."),
-    ("index", "service.run.commands", "Parts of the service", "Rebuild the index from the store."),
-    ("store", "service.run.store_commands", "Parts of the service", "Check the store, and mend it."),
-    ("keys", "api.client.commands", "Parts of the service", "Make, list and revoke API keys."),
-    ("projects", "api.client.commands", "Parts of the service", "List projects of keys, and limit what each may use."),
-    ("webhooks", "api.client.commands", "Jobs", "Addresses that are told when jobs and datasets end."),
-    ("tags", "api.client.commands", "Jobs", "Names for grasps of the service, to find them and take them home."),
-    ("synth", "worker.commands.synth", "Without a server", "Grasps of a hand file on an object file."),
-    ("evaluate", "worker.commands.evaluate", "Without a server", "Quality of grasps, judged by an independent engine."),
-    ("scene", "worker.commands.scene", "Without a server", "The object at rest on a table; grasps that fit there."),
-    ("render", "worker.commands.render", "Without a server", "Pictures of scenes with their labels."),
-    ("chart", "worker.commands.chart", "Studies", "Speed against accuracy of methods and fidelities."),
-    ("bench", "worker.commands.bench", "Studies", "Grasps per second, and where the time goes."),
-    ("view", "worker.commands.view", "Without a server", "Grasps of a file in 3D in the browser, one at a time."),
-    ("pictures", "worker.commands.render", "Without a server", "The best grasps of a file on one sheet."),
-    ("grasps", "worker.commands.curate", "Without a server", "Grasps of files and datasets, chosen by their numbers."),
-    ("clouds", "worker.commands.clouds", "Without a server", "Pictures as point clouds with their grasps, in files."),
-    ("export", "worker.commands.exchange", "Without a server", "Grasps and pictures in the formats of others."),
-    ("import", "worker.commands.exchange", "Without a server", "Grasps of others, judged and measured like ours."),
-    ("stability", "worker.commands.stability", "Studies", "Where integrators and the planner fail."),
-    ("gallery", "worker.commands.gallery", "Studies", "Hands and objects at rest, as a camera sees them."),
-    ("bench-render", "worker.commands.gallery", "Studies", "Images per second, and where the time goes."),
+    ("demo", "graspd.demo", "Make grasps", "Make grasps, scenes and pictures from built-in data, and a page of them."),
+    ("synth", "worker.commands.synth", "Make grasps", "Generate grasps of a hand file on an object file."),
+    ("evaluate", "worker.commands.evaluate", "Make grasps", "Validate grasps in MuJoCo, an independent engine."),
+    ("scene", "worker.commands.scene", "Make grasps", "Drop the object on a table, and keep grasps that fit there."),
+    ("render", "worker.commands.render", "Make grasps", "Render pictures of scenes, with labels."),
+    ("chart", "worker.commands.chart", "Make grasps", "Compare speed and accuracy of methods and fidelities."),
+    ("bench", "worker.commands.bench", "Make grasps", "Measure grasps per second, and where the time goes."),
+    ("stability", "worker.commands.stability", "Make grasps", "Map where integrators and planners fail."),
+    ("pictures", "worker.commands.render", "Use grasps", "Draw the best grasps of a file on one sheet."),
+    ("view", "worker.commands.view", "Use grasps", "Show grasps of a file in 3D in the browser."),
+    ("grasps", "worker.commands.curate", "Use grasps", "Select grasps of files and datasets by their metrics."),
+    ("clouds", "worker.commands.clouds", "Use grasps", "Write pictures as point clouds, with their grasps."),
+    ("export", "worker.commands.exchange", "Use grasps", "Export grasps and pictures to other formats."),
+    ("import", "worker.commands.exchange", "Use grasps", "Import grasps from other formats, and validate them."),
+    ("up", "service.run.commands", "Service", "Run the whole service on this machine, until Ctrl-C."),
+    ("submit", "api.client.commands", "Service", "Submit a job: one hand on one object."),
+    ("jobs", "api.client.commands", "Service", "List jobs, the newest first."),
+    ("status", "api.client.commands", "Service", "Show stages, progress and quality of a job."),
+    ("logs", "api.client.commands", "Service", "Show failed attempts of a job, with their reasons."),
+    ("cancel", "api.client.commands", "Service", "Stop a job; finished grasps stay."),
+    ("retry", "api.client.commands", "Service", "Run failed and cancelled tasks of a job again."),
+    ("delete", "api.client.commands", "Service", "Delete an ended job, and grasps that no other job has."),
+    ("restore", "api.client.commands", "Service", "Restore a deleted job."),
+    ("datasets", "api.client.dataset_commands", "Service", "Make datasets of many hands and objects."),
+    ("hands", "api.client.commands", "Service", "Check, add, list and show hands."),
+    ("objects", "api.client.commands", "Service", "Check, add, list and show objects."),
+    ("networks", "api.client.commands", "Service", "Add, list and show networks that propose grasps."),
+    ("tags", "api.client.commands", "Service", "Tag grasps; list and export tagged ones."),
+    ("webhooks", "api.client.commands", "Service", "Notify URLs when jobs and datasets end."),
+    ("doctor", "graspd.doctor", "Administration", "Check Redis, store, index, GPU and more; suggest fixes."),
+    ("api", "api.server_command", "Administration", "Run the HTTP API and the dashboard."),
+    ("keeper", "service.run.commands", "Administration", "Run the keeper: retries, lost leases, index."),
+    ("worker", "worker.commands.worker", "Administration", "Run workers, each on one device."),
+    ("keys", "api.client.commands", "Administration", "Make, list and revoke API keys."),
+    ("projects", "api.client.commands", "Administration", "List projects of keys, and limit what each may use."),
+    ("admin", "graspd.admin", "Administration", "Rare tasks: kernels, index, store, pictures."),
 )
 
-#: Group of one room, command in it, module of the room that has it, help.
+#: Group, command in it, module that has it, help.
 JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
+    ("admin", "kernels", "worker.commands.kernels", "Compile all kernels ahead of time."),
+    ("admin", "index", "service.run.commands", "Rebuild the index from the store, or export its tables."),
+    ("admin", "store", "service.run.store_commands", "Check the store, and repair it."),
+    ("admin", "bench-render", "worker.commands.gallery", "Measure pictures per second, and where the time goes."),
+    ("admin", "gallery", "worker.commands.gallery", "Draw hands and objects at rest, as a camera sees them."),
     ("hands", "check", "worker.commands.hands", "Say whether a hand can be used, and what was guessed about it."),
     ("objects", "check", "worker.commands.objects", "Say whether a mesh can be used, and what was repaired."),
-    ("datasets", "balance", "worker.commands.curate", "A part in which no kind of grasps is more frequent."),
-    ("datasets", "diff", "worker.commands.curate", "What two datasets do not have in common."),
+    ("datasets", "balance", "worker.commands.curate", "Draw a part in which no kind of grasps is more frequent."),
+    ("datasets", "diff", "worker.commands.curate", "Compare two datasets."),
     ("datasets", "card", "worker.commands.card", "Write a dataset's card: contents, quality, biases, plots."),
 )
 
@@ -116,9 +102,6 @@ class LazyGroup(TyperGroup):
         sys.exit(code)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        # `graspd bench render` is the benchmark of another room.
-        if args[:2] == ["bench", "render"]:
-            args = ["bench-render", *args[2:]]
         name, command, rest = super().resolve_command(ctx, args)
         module = next((module for known, module, _, _ in COMMANDS if known == name), None)
         # Completion says nothing of what is not installed.
@@ -127,7 +110,7 @@ class LazyGroup(TyperGroup):
         # A worker's image has no API, but checks hands and objects.
         room = next((room for parent, child, room, _ in JOINED if [parent, child] == [name, *rest[:1]]), None)
         if room and missing_extra(module):
-            return f"{name} {rest[0]}", load(room, rest[0]), rest[1:]
+            return f"{name} {rest[0]}", load(room, rest[0], ctx), rest[1:]
         return name, load(module, name, ctx), rest
 
 
@@ -139,15 +122,17 @@ class Deferred(TyperCommand):
         self.module = module
 
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
-        return load(self.module, str(self.name)).make_context(info_name, args, parent, **extra)
+        # Completion says nothing of what is not installed.
+        if extra.get("resilient_parsing") and missing_extra(self.module):
+            return super().make_context(info_name, args, parent, **extra)
+        return load(self.module, str(self.name), parent).make_context(info_name, args, parent, **extra)
 
 
 def load(module: str, name: str, ctx: Any = None) -> Any:
     """The command of a room, imported now; one line and exit code 1 where that room is not installed."""
     if missing := missing_extra(module):
-        typer.echo(
-            f"graspd: `graspd {name}` is not part of this install; run pip install 'graspd[{missing}]'", err=True
-        )
+        path = f"{ctx.command_path} {name}" if ctx else f"graspd {name}"
+        typer.echo(f"graspd: `{path}` is not part of this install; run pip install 'graspd[{missing}]'", err=True)
         raise typer.Exit(1)
     with imports():
         group: Any = typer.main.get_command(import_module(module).app)
@@ -207,7 +192,7 @@ def build() -> typer.Typer:
 
     @app.callback(invoke_without_command=True)
     def root(
-        version: bool = typer.Option(False, "--version", help="Say the version and stop.", is_eager=True),
+        version: bool = typer.Option(False, "--version", help="Print the version and exit.", is_eager=True),
     ) -> None:
         if version:
             typer.echo(PACKAGE_VERSION)

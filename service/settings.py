@@ -128,7 +128,7 @@ class Settings(BaseSettings):
     stop_grace_s: float = Field(10.0, gt=0, description="time a process has to stop before it is killed [s]")
     kernels: Path | None = Field(
         None,
-        description="folder of kernels that `graspd kernels` compiled ahead; what Warp's cache lacks is copied from it",
+        description="folder of `graspd admin kernels`: compiled kernels, copied to Warp's cache where it lacks them",
     )
     heartbeat_file: Path | None = Field(
         None, description="file that a keeper or worker touches while it lives, for health checks; unset: none"

@@ -49,8 +49,8 @@ _PRINTED_URL: Final = "http://127.0.0.1:8000"
 _NOBODY: Final = "http://127.0.0.1:9"
 #: What needs a service; one that is not started saves half a minute of a core.
 _ASKS: Final = re.compile(
-    r"graspd (submit|jobs|datasets|grasps|tags|index|store|doctor|keeper|worker|(objects|hands|networks) (?!check))|"
-    r"http://|\$API|graspd-data"
+    r"graspd (submit|jobs|datasets|grasps|tags|admin (index|store)|doctor|keeper|worker)\b|"
+    r"graspd (objects|hands|networks) (?!check)|http://|\$API|graspd-data"
 )
 _FENCED: Final = re.compile(r"^```(\w*)\n(.*?)^```\n?", re.DOTALL | re.MULTILINE)
 _INDENTED: Final = re.compile(r"(?:^\n)((?:^    .*\n)+)", re.MULTILINE)

@@ -73,7 +73,7 @@ class Probes:
             return part.model_copy(update={"ok": False, "detail": _INCOMPLETE})
         if made.left_out:
             some = ", ".join(made.names[:3])
-            detail = f"{made.left_out} damaged records of the store are left out: {some}; `graspd store verify`"
+            detail = f"{made.left_out} damaged records of the store are left out: {some}; `graspd admin store verify`"
             return part.model_copy(update={"detail": detail})
         return part
 

@@ -1,8 +1,8 @@
 """Connection to the index database: SQLite in WAL mode or PostgreSQL, whose tables are made when it is first opened.
 
-There are no migrations: the index follows from the store. `graspd index rebuild` makes one of another revision anew.
-Columns of metrics that the table of grasps lacks are added when it is opened, so a new metric needs no other revision.
-Grasps whose shards lack it hold NULL. A column whose metric is gone stays.
+There are no migrations: the index follows from the store. `graspd admin index rebuild` makes one of another revision
+anew. Columns of metrics that the table of grasps lacks are added when it is opened, so a new metric needs no other
+revision. Grasps whose shards lack it hold NULL. A column whose metric is gone stays.
 """
 
 from __future__ import annotations
@@ -263,7 +263,7 @@ def _of_another_revision(found: str) -> str:
         return (
             f"the index was made by a newer graspd (revision {found}, here {REVISION}); use that, or delete the index"
         )
-    return f"the index is of an older graspd (revision {found}, here {REVISION}); run `graspd index rebuild`"
+    return f"the index is of an older graspd (revision {found}, here {REVISION}); run `graspd admin index rebuild`"
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 The store holds a chain of records, put create-only: the last one is the service that works on it. The index and Redis
 repeat its id. Where one of the two was lost, the other tells that the service is the same; an index and a Redis that
-both know nothing are of a second service, and `graspd index rebuild` says that it takes the first one's place.
+both know nothing are of a second service, and `graspd admin index rebuild` says that it takes the first one's place.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Identity:
         what = "was taken over by" if known else "belongs to"
         return (
             f"the store {store} {what} another graspd service, with another index and Redis; give this one a store of "
-            "its own, or if the other is gone for good, run `graspd index rebuild` here"
+            "its own, or if the other is gone for good, run `graspd admin index rebuild` here"
         )
 
 
@@ -172,7 +172,7 @@ def recorded(folder: Path) -> str | None:
 def _others_index(store: str) -> str:
     return (
         f"the index belongs to another graspd service than the store {store}; name the index of that store, or run "
-        "`graspd index rebuild` to make this one from it"
+        "`graspd admin index rebuild` to make this one from it"
     )
 
 

@@ -137,7 +137,7 @@ def _identify(settings: Settings, stop: threading.Event, alive: HeartbeatFile) -
         parts.close()
 
 
-@index_app.command(epilog="graspd index rebuild --check")
+@index_app.command(epilog="graspd admin index rebuild --check")
 @reporting_errors
 def rebuild(
     check: Annotated[bool, typer.Option("--check", help="Change nothing; print what would change.")] = False,
@@ -187,7 +187,7 @@ def rebuild(
         raise typer.Exit(1)
 
 
-@index_app.command(epilog="graspd index export -o tables")
+@index_app.command(epilog="graspd admin index export -o tables")
 @reporting_errors
 def export(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder that gets a file for each table.")],
@@ -210,7 +210,7 @@ def export(
             typer.echo(f"{output / name}.parquet  {count} rows")
 
 
-@index_app.command(epilog="graspd index path")
+@index_app.command(epilog="graspd admin index path")
 @reporting_errors
 def path(data_dir: DataDir = None) -> None:
     """Print where the index is; a password in the URL is left out."""

@@ -1,4 +1,4 @@
-"""`graspd store`: whether the store still holds what was put into it."""
+"""`graspd admin store`: whether the store still holds what was put into it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def store() -> None:
     """Check the store, and mend it."""
 
 
-@store_app.command(epilog="graspd store verify --repair")
+@store_app.command(epilog="graspd admin store verify --repair")
 @reporting_errors
 def verify(
     repair: Annotated[
@@ -46,7 +46,7 @@ def verify(
     turn = Turn(parts, is_keeper=False)
     try:
         if not turn.is_mine():
-            raise ConflictError("another `graspd store verify` reads this store; wait until it is done")
+            raise ConflictError("another `graspd admin store verify` reads this store; wait until it is done")
         shards, found, unsealed = 0, [], list[str]()
         for key, wrong in scan(parts.store, read=lambda size: turn.keep(), unsealed=unsealed.append):
             turn.keep()
@@ -80,7 +80,7 @@ def verify(
         raise typer.Exit(1)
 
 
-@store_app.command(epilog="graspd store upgrade")
+@store_app.command(epilog="graspd admin store upgrade")
 @reporting_errors
 def upgrade(
     data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Folder of everything graspd keeps.")] = None,

@@ -22,7 +22,7 @@ from service.store.store import STREAM_BYTES, Stamp, Store
 CHECKSUM_LISTS: Final = ("SHA256SUMS", "checksums.sha256")
 _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 _LEVELS: Final = 3
-MEND: Final = "`graspd store verify --repair` makes it again where that is possible"
+MEND: Final = "`graspd admin store verify --repair` makes it again where that is possible"
 #: Bits may rot without a new time of change, so that what was found intact is not believed for ever [s].
 _BELIEVED_S: Final = 3600.0
 _REMEMBERED: Final = 100_000

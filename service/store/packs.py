@@ -27,7 +27,7 @@ from service.store.store import Store
 
 log = logging.getLogger(__name__)
 #: What is told of a store that has some.
-PACKED: Final = "packs of graspd 0.2; take them apart with `graspd store upgrade`"
+PACKED: Final = "packs of graspd 0.2; take them apart with `graspd admin store upgrade`"
 _FOLDER: Final = "packs"
 _MAGIC: Final = b"graspd\x00\x01"
 _HEAD: Final = struct.Struct("<8sQ")
@@ -102,7 +102,7 @@ def _take_apart(store: Store, key: str, dead: list[str]) -> Iterator[ShardManife
     if whole:
         store.delete(key)
     else:
-        log.error("some of the pack %s is damaged, and it is moved aside: `graspd store verify --repair`", key)
+        log.error("some of the pack %s is damaged, and it is moved aside: `graspd admin store verify --repair`", key)
         store.set_aside(key)
 
 

@@ -129,7 +129,7 @@ def is_sealed(key: str, chunks: Iterable[bytes], size: int) -> bool:
 def _damaged(key: str) -> DamagedError:
     return DamagedError(
         f"{key} in the store is damaged: its bytes are not those of its checksum; put a copy in its place, or run "
-        "`graspd store verify --repair`"
+        "`graspd admin store verify --repair`"
     )
 
 

@@ -172,8 +172,8 @@ def test_a_job_over_http_outlives_two_killed_workers(project: Project) -> None:
         assert len({row["shard_id"] for row in rows}) == BATCHES
 
     # Both end with 1 where something differs, is damaged or is missing.
-    project.compose("exec", "-T", "keeper", "graspd", "index", "rebuild", "--check")
-    project.compose("exec", "-T", "keeper", "graspd", "store", "verify")
+    project.compose("exec", "-T", "keeper", "graspd", "admin", "index", "rebuild", "--check")
+    project.compose("exec", "-T", "keeper", "graspd", "admin", "store", "verify")
     for service in ("api", "keeper", "worker-cpu", "redis", "postgres", "s3"):
         for container in project.containers(service):
             found = project.looked_at(container)

@@ -1,10 +1,9 @@
-"""docs/operations.md and docs/install.md as commands: the blocks marked as tried, and every line that calls graspd."""
+"""Blocks of docs/operations.md and docs/install.md that are marked as tried, and how to run them."""
 
 from __future__ import annotations
 
 import os
 import re
-import shlex
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -20,19 +19,6 @@ _TRIED: Final = re.compile(r"<!-- tried: ([\w-]+) -->\n```sh\n(.*?)```", re.DOTA
 def tried() -> dict[str, str]:
     """Shell text of the marked blocks by name."""
     return dict(_TRIED.findall(TEXT))
-
-
-def calls() -> list[list[str]]:
-    """Arguments of every call of graspd on the page, in blocks and in running text."""
-    inline = re.findall(r"`((?:GRASPD_\w+=\S+ )?graspd [^`]+)`", TEXT)
-    blocks = re.findall(r"^(?:    )?((?:GRASPD_\w+=\S+ )?(?:\.venv/bin/)?graspd [^\n]+)$", TEXT, re.MULTILINE)
-    found = []
-    for line in [*inline, *blocks]:
-        words = shlex.split(line.replace("…", "").rstrip(" &"), comments=True)
-        start = next(i for i, word in enumerate(words) if word.endswith("graspd"))
-        found.append(words[start + 1 :])
-    # Options of the program itself are no command.
-    return [words for words in found if words and not words[0].startswith("--")]
 
 
 def run(name: str, folder: Path, environment: Mapping[str, str]) -> subprocess.CompletedProcess[str]:

@@ -137,7 +137,7 @@ def test_workers_bring_kernels_that_are_compiled_already() -> None:
         (copied_from,) = [rest for keyword, rest in stages()[image] if keyword == "COPY"]
         assert copied_from == f"--from={made} {place['GRASPD_KERNELS']} {place['GRASPD_KERNELS']}"
         (command,) = [rest for keyword, rest in stages()[made] if keyword == "RUN"]
-        assert command.startswith(f"graspd kernels {place['GRASPD_KERNELS']} ")
+        assert command.startswith(f"graspd admin kernels {place['GRASPD_KERNELS']} ")
 
 
 def test_no_image_asks_a_hub_for_how_to_build_it() -> None:

@@ -103,6 +103,18 @@ def test_a_command_of_a_room_that_is_not_installed_says_what_to_install(command:
     assert len(done.stderr.splitlines()) == 1
 
 
+def test_a_rare_command_of_a_room_that_is_not_installed_is_named_in_full() -> None:
+    done = without_engine("admin", "gallery")
+    assert (done.returncode, done.stderr.partition(" is not")[0]) == (1, "graspd: `graspd admin gallery`")
+
+
+def test_completion_does_not_mention_what_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = {"_GRASPD_COMPLETE": "complete_bash", "COMP_WORDS": "graspd admin gallery --h", "COMP_CWORD": "3"}
+    for name, value in asked.items():
+        monkeypatch.setenv(name, value)
+    assert without_engine().stderr == ""
+
+
 def test_a_worker_without_an_api_checks_hands() -> None:
     done = without_engine("hands", "check", "barrett", "--no-self-test", absent="fastapi")
     assert (done.returncode, done.stderr) == (0, "")

@@ -5,11 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-import graspd.cli
 from service.index.index import Index
 from service.index.rebuild import differences, rebuild
 from service.model.states import State
@@ -99,19 +97,6 @@ def test_keys_are_made_rotated_limited_and_revoked(tmp_path: Path) -> None:
     first, second = re.findall(r"^(gd_\S+)", done.stdout, re.MULTILINE)
     assert first != second
     assert first not in (tmp_path / "data" / "keys.json").read_text()
-
-
-@pytest.mark.parametrize("call", page.calls(), ids=" ".join)
-def test_every_command_on_the_page_exists_with_its_options(call: list[str]) -> None:
-    module = next((module for name, module, *_ in graspd.cli.COMMANDS if name == call[0]), None)
-    assert module is not None, f"graspd has no command {call[0]}"
-    command: Any = graspd.cli.load(module, call[0])
-    rest = call[1:]
-    while rest and getattr(command, "commands", None):
-        assert rest[0] in command.commands, f"graspd {call[0]} has no command {rest[0]}"
-        command, rest = command.commands[rest[0]], rest[1:]
-    known = {option for parameter in command.params for option in parameter.opts}
-    assert {word.partition("=")[0] for word in rest if word.startswith("--")} <= known
 
 
 def test_every_profile_service_and_variant_on_the_page_exists() -> None:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
 from tests import docs_commands
+from tests.conftest import REPOSITORY
 from tests.docs_commands import NOT_RUN, PAGES, Line, lines_of
 
+#: `graspd jobs`, <pre>graspd jobs</pre>, epilog="graspd jobs".
+_NAMED = re.compile(r'(?:`|>|epilog=")(graspd\s+[a-z](?:(?!\.\.\.)[^"`{}<…,;])*)')
 ALL = [line for page in PAGES for line in lines_of(page)]
 
 
@@ -16,6 +20,17 @@ ALL = [line for page in PAGES for line in lines_of(page)]
 def test_commands_of_a_page_are_those_of_the_command_line(page: Path) -> None:
     faults = {line.text: line.fault() for line in lines_of(page)}
     assert {text: fault for text, fault in faults.items() if fault} == {}
+
+
+def test_commands_in_sentences_messages_and_examples_of_help_exist() -> None:
+    files = [*REPOSITORY.glob("*.md")]
+    for room in ("api", "docker", "docs", "graspd", "service", "worker"):
+        files += [file for file in (REPOSITORY / room).rglob("*") if file.suffix in {".html", ".md", ".py", ".yaml"}]
+    # The changelog names commands of older releases.
+    named = {(f.name, one) for f in files if f.name != "CHANGELOG.md" for one in _NAMED.findall(f.read_text())}
+    assert len(named) > 200
+    faults = {(file, one): Line(file, one).fault() for file, one in named}
+    assert {one: fault for one, fault in faults.items() if fault} == {}
 
 
 def test_most_pages_have_commands_and_many_are_run() -> None:

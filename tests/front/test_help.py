@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -44,3 +45,16 @@ def test_help_loses_no_word(every: dict[str, Any], monkeypatch: pytest.MonkeyPat
                 lost.append(f"{path}: {said}")
     assert len(every) > 60
     assert not lost, "\n".join(lost)
+
+
+#: Of a number that is no count: its unit, or the word of one without.
+UNIT = re.compile(r"\[\w+\]|\b(mm|kg|kg/m3|metres|coefficient|share|tries|tried)\b", re.IGNORECASE)
+
+
+def test_every_option_has_a_help_with_its_unit(every: dict[str, Any]) -> None:
+    options = [(path, one) for path, command in every.items() for one in command.params if one.opts[0][:1] == "-"]
+    numbers = [(path, one) for path, one in options if "float" in str(one.type_descriptor.annotation)]
+    silent = [f"{path} {one.opts[0]}" for path, one in options if not one.help]
+    no_unit = [f"{path} {one.opts[0]}: {one.help}" for path, one in numbers if not UNIT.search(one.help)]
+    assert len(numbers) > 20
+    assert (silent, no_unit) == ([], [])

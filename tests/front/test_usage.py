@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -18,6 +19,8 @@ NOBODY = {"GRASPD_API_URL": "http://127.0.0.1:9"}
 @pytest.mark.parametrize(
     ("command", "line"),
     [
+        ("store verify", "no such command store; did you mean restore?"),
+        ("admin stor", "no such command stor; did you mean store?"),
         ("jbos", "no such command jbos; did you mean jobs?"),
         ("datasets lst", "no such command lst; did you mean list?"),
         ("submit --handd allegro", "there is no option --handd; did you mean --hand?"),
@@ -41,6 +44,14 @@ def test_a_mistake_is_one_line(command: str, line: str) -> None:
     assert done.stderr.startswith(f"graspd: {line}") and done.stderr.count("\n") == 1
 
 
+GROUPS = ["Make grasps", "Use grasps", "Service", "Administration"]
+
+
+def test_the_overview_has_four_groups() -> None:
+    shown = CliRunner().invoke(build(), ["--help"], prog_name="graspd").stdout
+    assert re.findall(r"─ ([A-Z][a-z ]+) ─", shown) == ["Options", *GROUPS]
+
+
 def test_a_group_without_a_command_shows_its_help() -> None:
     done = CliRunner().invoke(build(), ["tags"], prog_name="graspd")
     assert done.exit_code == 2 and not done.stderr
@@ -56,7 +67,14 @@ def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize(
     ("typed", "offered"),
-    [("", "synth"), ("datasets cr", "create"), ("export --for", "--format"), ("datasets card --li", "--licence")],
+    [
+        ("", "synth"),
+        ("admin ker", "kernels"),
+        ("admin index re", "rebuild"),
+        ("datasets cr", "create"),
+        ("export --for", "--format"),
+        ("datasets card --li", "--licence"),
+    ],
 )
 def test_completion_knows_commands_of_rooms_without_the_engine(typed: str, offered: str) -> None:
     code = "try: main()\nfinally: print('warp' in sys.modules, file=sys.stderr)"

@@ -47,11 +47,11 @@ COMMANDS = (
     "objects check FILE.zip",
     "objects check FILE.stl",
     "bench --hand FILE.urdf",
-    "bench-render --object FILE.stl",
+    "admin bench-render --object FILE.stl",
     "chart --from FILE.json",
     "chart --scene FILE.json --quick",
     "stability --from FILE.json",
-    "gallery --hand FILE.urdf -o OUT",
+    "admin gallery --hand FILE.urdf -o OUT",
     "submit --hand allegro --object mug --scene FILE.json",
     *(f"export FILE.h5 --format {name} -o OUT" for name in EXPORTS),
     *(

@@ -1,4 +1,4 @@
-"""Command line: `graspd bench-render` and `graspd gallery`."""
+"""Command line: `graspd admin bench-render` and `graspd admin gallery`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 app = typer.Typer(add_completion=False)
 
 
-@app.command("bench-render", epilog="graspd bench-render --object mug --size 320x240 --size 640x480")
+@app.command("bench-render", epilog="graspd admin bench-render --object mug --size 320x240 --size 640x480")
 @reporting_errors
 def bench_render(
     object: Annotated[str, typer.Option(help="A mesh or a built-in object.")] = "mug",
@@ -44,7 +44,7 @@ def bench_render(
         typer.echo(tables(results))
 
 
-@app.command(epilog="graspd gallery --object mug --object banana.stl -o docs/images/scenes")
+@app.command(epilog="graspd admin gallery --object mug --object banana.stl -o docs/images/scenes")
 @reporting_errors
 def gallery(
     object: Annotated[
@@ -52,7 +52,7 @@ def gallery(
     ] = None,
     hand: Annotated[list[str] | None, typer.Option(help="A URDF or a built-in hand; several times.")] = None,
     device: Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")] = "auto",
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same pictures.")] = 0,
     output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("gallery"),
     json: JsonFlag = False,
 ) -> None:

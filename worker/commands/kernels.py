@@ -1,4 +1,4 @@
-"""Command line: `graspd kernels`."""
+"""Command line: `graspd admin kernels`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from service.cli import JsonFlag, emit, reporting_errors
 app = typer.Typer()
 
 
-@app.command(epilog="graspd kernels ./kernels --arch 90")
+@app.command(epilog="graspd admin kernels ./kernels --arch 90")
 @reporting_errors
 def kernels(
     folder: Annotated[Path, typer.Argument(help="Where they go; name it in GRASPD_KERNELS.")],

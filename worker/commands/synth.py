@@ -83,7 +83,7 @@ def synth(
     ] = None,
     fidelity: Annotated[str, typer.Option(help=f"one of {', '.join(FIDELITIES)}")] = "standard",
     contact_solver: Annotated[str, typer.Option(help="direct, jacobi or gauss_seidel; empty: the fidelity's")] = "",
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same grasps.")] = 0,
     friction: Annotated[
         float, typer.Option(help="Coulomb coefficient of the quality metrics", min=0.01, max=3.0)
     ] = 1.0,

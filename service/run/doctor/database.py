@@ -25,7 +25,9 @@ from service.store.store import open_store
 _NONE_HERE: Final = (
     "no index is here: GRASPD_INDEX_URL is unset and there is no index.sqlite; only api and keeper need one"
 )
-_REBUILD: Final = "graspd index rebuild --check shows all of it; graspd index rebuild mends it while the service runs"
+_REBUILD: Final = (
+    "graspd admin index rebuild --check shows all of it; graspd admin index rebuild mends it while the service runs"
+)
 _CROWDED: Final = 0.8
 #: With more shards than this only a sample is compared.
 _ALL_SHARDS: Final = 2000
@@ -39,7 +41,7 @@ def index(settings: Settings) -> Finding:
     try:
         found = look(settings.resolved_index_url)
     except IndexDamaged as error:
-        return bad(name, str(error), "graspd index rebuild: it is moved aside and made again from the store")
+        return bad(name, str(error), "graspd admin index rebuild: it is moved aside and made again from the store")
     except InputError as error:
         return bad(name, str(error), "see the message, and GRASPD_INDEX_URL")
     except UnavailableError as error:
@@ -67,11 +69,13 @@ def _judge(name: str, settings: Settings, found: IndexCondition) -> Finding:
         return bad(
             name,
             f"{line}: a newer graspd made it; this one knows {found.newest}",
-            "install the newer version here, or graspd index rebuild: it is made again from the store",
+            "install the newer version here, or graspd admin index rebuild: it is made again from the store",
         )
     if found.revision and not found.is_ready:
         return bad(
-            name, f"{line}: this graspd has {found.newest}", "graspd index rebuild: it is made again from the store"
+            name,
+            f"{line}: this graspd has {found.newest}",
+            "graspd admin index rebuild: it is made again from the store",
         )
     if not found.is_ready:
         return warning(name, line, "the next start makes its tables")
@@ -160,7 +164,7 @@ def index_is_store(settings: Settings, *, full: bool = False, settles_s: float =
 
 
 def damage(settings: Settings) -> Finding:
-    """What the keeper's reading through the store found, or `graspd store verify`."""
+    """What the keeper's reading through the store found, or `graspd admin store verify`."""
     name = "damage"
     if why := _openable(settings):
         return skipped(name, why)
@@ -171,18 +175,20 @@ def damage(settings: Settings) -> Finding:
         return bad(
             name,
             f"{count} objects of the store are damaged or missing, {known[0].key}: {known[0].what}",
-            "graspd store verify --repair",
+            "graspd admin store verify --repair",
         )
     if made is not None and made.left_out:
-        mend = "put copies in their place, then graspd index rebuild"
+        mend = "put copies in their place, then graspd admin index rebuild"
         return bad(name, f"{made.left_out} damaged records are left out of the index, {made.names[0]}", mend)
     if not settings.scrub_mb_per_s:
         return warning(
             name,
             "nothing is known, and nobody reads the store through",
-            "GRASPD_SCRUB_MB_PER_S=1, or graspd store verify at times",
+            "GRASPD_SCRUB_MB_PER_S=1, or graspd admin store verify at times",
         )
     when = (
-        f"last read through by {note.ended}" if note.ended else "not read through yet; graspd store verify does at once"
+        f"last read through by {note.ended}"
+        if note.ended
+        else "not read through yet; graspd admin store verify does at once"
     )
     return good(name, f"nothing is known to be damaged; {when}")

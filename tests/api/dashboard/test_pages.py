@@ -34,11 +34,11 @@ def test_an_empty_service_says_what_to_do(http: TestClient) -> None:
 def test_damage_of_the_store_is_shown_with_its_mend_and_only_while_there_is_some(
     http: TestClient, parts: Parts, path: str
 ) -> None:
-    assert "graspd store verify" not in http.get(path).text
+    assert "graspd admin store verify" not in http.get(path).text
     parts.index.damage.mark([Damage(f"shards/base/{n}.h5", "its <file> is gone", f"{n}") for n in range(7)])
     page = http.get(path).text
     assert "7 objects of the store are damaged or missing" in page
-    assert "graspd store verify --repair" in page
+    assert "graspd admin store verify --repair" in page
     if path == "/":
         assert "shards/base/0.h5" in page
         assert "its &lt;file&gt; is gone" in page

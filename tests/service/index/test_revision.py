@@ -1,4 +1,4 @@
-"""Tables of another revision are refused, and `graspd index rebuild` makes them anew, on every database."""
+"""Tables of another revision are refused, and `graspd admin index rebuild` makes them anew, on every database."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_other_tables_have_another_revision() -> None:
 
 def test_an_index_of_an_older_graspd_is_refused_with_the_way_out(url: str, engine: Engine) -> None:
     set_revision(engine, "0007")
-    with pytest.raises(IndexUnavailable, match=r"older graspd \(revision 0007.*`graspd index rebuild`"):
+    with pytest.raises(IndexUnavailable, match=r"older graspd \(revision 0007.*`graspd admin index rebuild`"):
         Index(url)
     assert len(columns(engine)) > 10, "it is left as it was"
 
@@ -123,7 +123,7 @@ def test_the_command_makes_an_older_index_anew(tmp_path: Path) -> None:
     old.dispose()
     refused = CliRunner().invoke(app, ["index", "rebuild", "--check", "--data-dir", str(tmp_path)])
     assert refused.exit_code == 1
-    assert "run `graspd index rebuild`" in refused.output
+    assert "run `graspd admin index rebuild`" in refused.output
     done = CliRunner().invoke(app, ["index", "rebuild", "--data-dir", str(tmp_path)])
     assert done.exit_code == 0, done.output
     assert "was of revision 0007" in done.output

@@ -89,7 +89,7 @@ def test_readers_name_the_command_and_then_read_a_snapshot_of_places_in_packs(pa
     job, tasks = submit(parts, 2)
     pack(parts.store, tasks)
     for source in (parts.store, parts.settings.data_dir / "store"):
-        with pytest.raises(InputError, match="graspd store upgrade"):
+        with pytest.raises(InputError, match="graspd admin store upgrade"):
             open_shards(source, job=job)
     told = CliRunner().invoke(
         store_commands.app, ["store", "upgrade", "--json", "--data-dir", str(parts.settings.data_dir)]

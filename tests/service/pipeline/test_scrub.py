@@ -1,4 +1,4 @@
-"""`graspd store verify`: five kinds of damage are five findings, on files and on S3; what can be made again is."""
+"""`graspd admin store verify`: five kinds of damage are five findings, on files and on S3; most is made again."""
 
 from __future__ import annotations
 

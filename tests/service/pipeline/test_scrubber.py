@@ -158,7 +158,7 @@ def test_a_second_verify_is_refused(
     refused = CliRunner().invoke(app, command)
     other.close()
     assert refused.exit_code == 2
-    assert "another `graspd store verify`" in refused.output
+    assert "another `graspd admin store verify`" in refused.output
 
 
 @pytest.mark.parametrize("rate", [100.0, 0.0])

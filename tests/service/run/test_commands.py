@@ -31,9 +31,9 @@ from tests.service.index.test_index import run_all
 runner = CliRunner()
 
 
-@pytest.mark.parametrize("command", [["up"], ["keeper"], ["index", "rebuild"], ["index", "path"]])
+@pytest.mark.parametrize("command", [["up"], ["keeper"], ["admin", "index", "path"]])
 def test_every_command_shows_an_example(command: list[str]) -> None:
-    shown = runner.invoke(app, [*command, "--help"])
+    shown = runner.invoke(program.build(), [*command, "--help"])
     assert shown.exit_code == 0
     assert f"graspd {' '.join(command)}" in shown.output
 
@@ -108,7 +108,7 @@ def test_a_rebuild_of_a_sound_index_finds_no_difference(parts: Parts) -> None:
 
 @pytest.mark.parametrize("command", [["store", "verify"], ["index", "rebuild", "--check"], ["index", "rebuild"]])
 def test_what_reads_a_store_makes_none_where_there_is_none(tmp_path: Path, command: list[str]) -> None:
-    shown = runner.invoke(program.build(), [*command, "--data-dir", str(tmp_path / "mistyped")])
+    shown = runner.invoke(program.build(), ["admin", *command, "--data-dir", str(tmp_path / "mistyped")])
     assert shown.exit_code == 2
     assert f"there is no store at {tmp_path / 'mistyped' / 'store'}" in " ".join(shown.output.split())
     assert list(tmp_path.iterdir()) == []

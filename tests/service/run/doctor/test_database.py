@@ -100,7 +100,7 @@ def test_known_damage_is_told_with_its_mend(kept: Parts) -> None:
     found = database.damage(kept.settings)
     assert not found.ok
     assert "shards/base/x.h5" in found.message
-    assert found.mend == "graspd store verify --repair"
+    assert found.mend == "graspd admin store verify --repair"
 
 
 def test_where_there_is_no_index_none_is_made(tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_a_damaged_file_is_bad_and_left_where_it_is(kept: Parts) -> None:
     file.write_bytes(b"no database" * 1000)
     found = database.index(kept.settings)
     assert not found.ok
-    assert "graspd index rebuild" in found.mend
+    assert "graspd admin index rebuild" in found.mend
     assert database.index_is_store(kept.settings).condition is Condition.SKIPPED
     assert file.read_bytes() == b"no database" * 1000
 
@@ -130,7 +130,7 @@ def test_tables_of_another_version_are_bad_and_left_as_they_are(kept: Parts, rev
     kept.index.close()
     found = database.index(kept.settings)
     assert not found.ok
-    assert "graspd index rebuild" in found.mend
+    assert "graspd admin index rebuild" in found.mend
     assert database.index_is_store(kept.settings).condition is Condition.SKIPPED
     with sqlite3.connect(kept.settings.data_dir / "index.sqlite") as connection:
         assert connection.execute("SELECT version_num FROM alembic_version").fetchone() == (revision,)
