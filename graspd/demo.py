@@ -65,7 +65,7 @@ def demo(
     seed: Annotated[int, typer.Option(help="The same seed gives the same grasps.")] = 0,
     json: JsonFlag = False,
 ) -> None:
-    """The main job on built-in data: grasps, scenes, pictures, and a page that shows them."""
+    """Make grasps, scenes and pictures from built-in data, and a page that shows them."""
     request = validated(
         JobRequest,
         {

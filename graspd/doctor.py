@@ -39,9 +39,9 @@ def doctor(
     data_dir: Annotated[Path | None, typer.Option(help="Folder of everything graspd keeps; GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Look at disk, clocks, versions, Redis, store, index, GPU, kernels and ports; say the mend of what is wrong.
+    """Check disk, clocks, versions, Redis, store, index, GPU, kernels and ports; suggest fixes.
 
-    Changes nothing, and may run beside the service. Exit code 1 says that something has to be mended.
+    Changes nothing, and may run beside the service. Exit code 1: something needs a fix.
     """
     settings = load_settings(data_dir=data_dir)
     logging.basicConfig(level=logging.ERROR)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -46,10 +44,3 @@ def test_a_size_that_is_none_is_refused_by_name(size):
     result = CliRunner().invoke(app, ["bench-render", "--device", "cpu", "--size", size])
     assert result.exit_code == 2
     assert size in result.output
-
-
-def test_the_benchmark_is_found_under_bench_too() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "graspd", "bench", "render", "--help"], capture_output=True, text=True, check=True
-    )
-    assert "Images per second" in done.stdout
