@@ -112,6 +112,6 @@ def test_every_page_gives_a_million_grasps_the_same_cost() -> None:
         for page in pages
         for number in re.findall(r"\ba million\b[^|]{0,90}?\b([\d,]+) core hours", page.read_text(), re.DOTALL)
     }
-    assert cited == {("README.md", hours), ("million.md", hours)}
+    assert cited == {("figures.md", hours), ("million.md", hours)}
     first = re.search(r"\| core hours \| ([\d,.]+) \|", PAGE)
     assert first and f"{float(first[1].replace(',', '')):,.0f}" == hours
