@@ -1,4 +1,4 @@
-"""Prometheus text of one API process: what it answered itself, and the service as queue, index and keeper know it."""
+"""Prometheus text of one API process: its own requests, and the service as queue, index and controller see it."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Snapshot:
             self._set("graspd_workers", state, value=states.count(state))
         for name, pulse in queue.workers.items():
             self._set("graspd_worker_lease_age_seconds", name, pulse.device, value=pulse.lease_age_s)
-        self._set("graspd_keeper_up", value=float(is_kept))
+        self._set("graspd_controller_up", value=float(is_kept))
 
     def add_index(self, index: IndexNow) -> None:
         for state, count in index.jobs.items():
@@ -80,7 +80,7 @@ class Snapshot:
         self._set("graspd_grasps_per_second", "valid", value=index.valid_per_s)
 
     def add_sums(self, sums: Mapping[str, float]) -> None:
-        """What the keeper counted."""
+        """What the controller counted."""
         self._sums = sums
 
     def collect(self) -> Iterator[Metric]:
@@ -97,14 +97,14 @@ class Snapshot:
 
 
 def _families(sums: Mapping[str, float]) -> Iterable[Metric]:
-    """Counters and histograms of the keeper; what does not fit the list of series is left out."""
+    """Counters and histograms of the controller; what does not fit the list of series is left out."""
     found: Values = defaultdict(dict)
     for text, amount in sums.items():
         if (parsed := parse_field(text)) is not None:
             name, labels = parsed
             found[name][labels] = amount
     for series in SERIES.values():
-        if series.source != "keeper":
+        if series.source != "controller":
             continue
         if series.kind == "histogram":
             yield _histogram(series.name, series.meaning, found)

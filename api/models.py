@@ -255,7 +255,9 @@ class Health(BaseModel):
 
     ok: bool = Field(description="redis, index and store answer")
     parts: dict[str, Part]
-    keeper: bool = Field(False, description="a keeper gave a sign of life lately: without one no task is queued anew")
+    controller: bool = Field(
+        False, description="a controller gave a sign of life lately: without one no task is queued anew"
+    )
     workers: int = Field(0, ge=0, description="workers that hold their lease")
 
 

@@ -83,12 +83,12 @@ class Measured:
     redis_ops_per_task: float = 109.0
     redis_bytes_per_task: float = 19_500.0
     """Over the wire, both ways."""
-    redis_ops_keeper: float = 34.0
-    """Of the keeper while nothing happens [1/s]."""
+    redis_ops_controller: float = 34.0
+    """Of the controller while nothing happens [1/s]."""
     redis_ops_worker: float = 9.0
     """Signs of life of one busy worker [1/s]."""
-    keeper_core_s_per_task: float = 0.0013
-    """CPU time of the keeper from queueing a task to its rows in the index [core s]."""
+    controller_core_s_per_task: float = 0.0013
+    """CPU time of the controller from queueing a task to its rows in the index [core s]."""
     store_reads_per_task: float = 4.0
     """Objects a task reads or asks for: its inputs, whether its output is there."""
 
@@ -106,7 +106,7 @@ class Prices:
     thousand_writes: float = 0.005
     thousand_reads: float = 0.0004
     service_hour: float = 0.25
-    """Redis, database, two front doors and keeper, while the dataset is made."""
+    """Redis, database, two front doors and controller, while the dataset is made."""
 
 
 @dataclass(frozen=True)
@@ -124,8 +124,8 @@ class Estimate:
     tasks_per_second: float
     redis_ops_per_second: float
     redis_megabits_per_second: float
-    keeper_cores: float
-    """Share of a core that the one keeper needs; near 1 it is the bottleneck."""
+    controller_cores: float
+    """Share of a core that the one controller needs; near 1 it is the bottleneck."""
     objects: int
     writes: int
     reads: int
@@ -186,9 +186,9 @@ def estimate(work: Work, measured: Measured, prices: Prices, *, cores_per_worker
         tasks_per_second=rate,
         redis_ops_per_second=rate * measured.redis_ops_per_task
         + workers * measured.redis_ops_worker
-        + measured.redis_ops_keeper,
+        + measured.redis_ops_controller,
         redis_megabits_per_second=rate * measured.redis_bytes_per_task * 8 / 1e6,
-        keeper_cores=rate * measured.keeper_core_s_per_task,
+        controller_cores=rate * measured.controller_core_s_per_task,
         objects=objects,
         writes=objects,
         reads=reads,

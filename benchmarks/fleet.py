@@ -1,11 +1,11 @@
-"""How many workers a keeper serves: real Redis, PostgreSQL, store and keeper, and workers that do no work.
+"""How many workers a controller serves: real Redis, PostgreSQL, store and controller, and workers that do no work.
 
 usage: python -m benchmarks.fleet [--workers 64 512 4096] [--seconds 20] [--tasks 6000]
                                   [--sqlite] [--s3] [--json FILE]
 
 For each number of workers two runs. First all workers hold tasks that end at --rate a second in all,
 beat and tell their progress: how old is the oldest event that is not in the index, and how long does it take to read
-all leases? Then their tasks take no time: how many a second come through keeper and index? Everything shares this
+all leases? Then their tasks take no time: how many a second come through controller and index? Everything shares this
 machine, the workers too; the processor time of each part is counted beside its clock.
 What the workers do is in
 `benchmarks.fleet_workers`.
@@ -63,14 +63,14 @@ class Result:
     sweep_ms: float
     """Median time in which all leases are read."""
     tasks_per_s: float
-    keeper_ms: float
-    """Processor time of the keeper for a task."""
+    controller_ms: float
+    """Processor time of the controller for a task."""
     database_ms: float
     redis_ms: float
     events: float
     """Events of the second run for a task."""
     objects: float
-    """Objects that the keeper reads of the store for a task: manifests."""
+    """Objects that the controller reads of the store for a task: manifests."""
 
 
 class Machine:
@@ -98,7 +98,7 @@ class Machine:
         return {name: _tree_cpu(pid) for name, pid in self._pids.items()}
 
     def lag_s(self) -> float:
-        """Age of the oldest event that its keeper has not acknowledged."""
+        """Age of the oldest event that its controller has not acknowledged."""
         connection = self.queue.connection
         groups = connection.xinfo_groups(EVENTS)
         if not groups:
@@ -139,8 +139,8 @@ def machine(*, sqlite: bool, s3: bool) -> Iterator[Machine]:
         stack.callback(parts.close)
         _wait(lambda: _answers(parts), "Redis answers")
         add_assets(parts)
-        pids["keeper"] = _started(stack, [sys.executable, "-m", "graspd", "keeper"], environment(settings))
-        _wait(lambda: parts.queue.announced(PART), "a keeper works")
+        pids["controller"] = _started(stack, [sys.executable, "-m", "graspd", "controller"], environment(settings))
+        _wait(lambda: parts.queue.announced(PART), "a controller works")
         yield Machine(settings, parts, pids | {"redis": redis})
 
 
@@ -194,7 +194,7 @@ def measure(workers: int, given: argparse.Namespace) -> Result:
         worst_lag_s=max(lags),
         sweep_ms=1000 * statistics.median(sweeps),
         tasks_per_s=given.tasks / seconds,
-        keeper_ms=spent["keeper"],
+        controller_ms=spent["controller"],
         database_ms=spent.get("database", 0.0),
         redis_ms=spent["redis"],
         events=events / given.tasks,
@@ -260,7 +260,7 @@ def main() -> None:
     given = parser.parse_args()
     say(
         "| workers | lag of events, p95 | worst | lease sweep | tasks/s "
-        "| keeper, of a task | database | Redis | events | objects |"
+        "| controller, of a task | database | Redis | events | objects |"
     )
     say(f"|{' --: |' * 10}")
     results = []
@@ -269,7 +269,7 @@ def main() -> None:
         results.append(one)
         say(
             f"| {workers:,} | {one.lag_s:.2f} s | {one.worst_lag_s:.2f} s | {one.sweep_ms:.0f} ms "
-            f"| {one.tasks_per_s:.0f} | {one.keeper_ms:.1f} ms | {one.database_ms:.1f} ms "
+            f"| {one.tasks_per_s:.0f} | {one.controller_ms:.1f} ms | {one.database_ms:.1f} ms "
             f"| {one.redis_ms:.1f} ms | {one.events:.2f} | {one.objects:.3f} |"
         )
     if given.json:

@@ -3,8 +3,8 @@
 usage: python -m benchmarks.fleet_workers WORKERS TASK_S      (settings from the environment)
 
 A worker that holds a task beats, tells its progress, and after `TASK_S` seconds puts the manifest of its shard and says
-that it finished. Manifests are those of one true shard under other names; the shard's own file, which no keeper reads,
-is not put. Commands of many workers share a pipeline: a thousand interpreters do not fit a machine that is to be
+that it finished. Manifests are those of one true shard under other names; the shard's own file, which no controller
+reads, is not put. Commands of many workers share a pipeline: a thousand interpreters do not fit a machine that is to be
 measured, and Redis is asked as much.
 """
 

@@ -129,7 +129,7 @@ def workers() -> None:
 
 
 def indexer(url: str | None) -> None:
-    """Shards of 32 grasps a second that the keeper can index, a hundred in a transaction."""
+    """Shards of 32 grasps a second that the controller can index, a hundred in a transaction."""
     with tempfile.TemporaryDirectory(prefix="graspd-bench-") as folder:
         index = Index(url or f"sqlite:///{folder}/index.sqlite")
         parts = Parts(Settings(data_dir=Path(folder)), open_store("memory://"), index, MemoryQueue())

@@ -4,16 +4,16 @@ usage: python -m benchmarks.week [--nodes 1000] [--days 7] [--cores 1] [--seed 0
 
 Costs are those of `benchmarks.cost_model` and `benchmarks.fleet`; rates are options of this file (`Rates`, `HARSH`),
 no cloud's promise. Events are what interrupts: nodes reclaimed with notice, killed, cut off, a zone that fails, and
-keeper, Redis and store that are away. Between two of them nothing that a node does depends on another, so its tasks are
-drawn at once.
+controller, Redis and store that are away. Between two of them nothing that a node does depends on another, so its tasks
+are drawn at once.
 
 What the parts do about it is taken from what the tests of `tests/system` hold real processes to:
 
 - a node with notice hands its task back: the work on it is lost, no attempt is used up;
-- one that is killed loses the work and an attempt; its task waits for `GRASPD_LEASE_S` and a look of the keeper;
+- one that is killed loses the work and an attempt; its task waits for `GRASPD_LEASE_S` and a look of the controller;
 - one that is cut off for longer than that goes on; another does the same task meanwhile, and one of both is work for
   nothing. The second result is refused by the store (create-only), so there is one;
-- while the keeper is away workers live on what waits; while Redis is away each ends its task and waits;
+- while the controller is away workers live on what waits; while Redis is away each ends its task and waits;
 - while the store is away a task that ends cannot put its result: it is handed back, and its work is lost. The next ones
   are handed back before they begin.
 """
@@ -36,10 +36,10 @@ from benchmarks.cost_model import Measured
 from benchmarks.service_load import say
 
 _DAY_S: Final = 86_400.0
-#: Waiting tasks that a keeper that is away leaves behind for each worker, `service/pipeline/keeper.py`.
+#: Waiting tasks that a controller that is away leaves behind for each worker, `service/pipeline/controller.py`.
 _WAITING_A_WORKER: Final = 2
-#: Tasks a second through keeper and index with 512 workers and more, `python -m benchmarks.fleet`.
-KEEPER_TASKS_PER_S: Final = 336.0
+#: Tasks a second through controller and index with 512 workers and more, `python -m benchmarks.fleet`.
+CONTROLLER_TASKS_PER_S: Final = 336.0
 #: Spread of the time of a task: batches of one pair differ by as much as their valid grasps do (log-normal sigma).
 _SPREAD: Final = 0.3
 _ATTEMPTS: Final = 3
@@ -61,7 +61,7 @@ class Rates:
     """A third of all nodes killed at once."""
     replaced_after_s: float = 180.0
     """Until a fresh node's worker takes tasks: boot, pull of images, check of its engine."""
-    keeper_killed_per_day: float = 1.0
+    controller_killed_per_day: float = 1.0
     redis_restarts_per_week: float = 2.0
     redis_away_s: float = 60.0
     store_outages_per_week: float = 2.0
@@ -74,7 +74,7 @@ HARSH: Final = Rates(
     killed_per_day=2.0,
     cut_off_per_day=4.0,
     zone_per_week=7.0,
-    keeper_killed_per_day=24.0,
+    controller_killed_per_day=24.0,
     redis_restarts_per_week=14.0,
     store_outages_per_week=7.0,
 )
@@ -101,10 +101,10 @@ class Told:
     failed_for_good: float = 0.0
     """Tasks expected to lose all their attempts, each as likely as any other."""
     most_behind: float = 0.0
-    """Most events that waited for a keeper."""
+    """Most events that waited for a controller."""
     longest_catch_up_s: float = 0.0
-    keeper_busy: float = 0.0
-    """Share of its time that the keeper works."""
+    controller_busy: float = 0.0
+    """Share of its time that the controller works."""
 
     @property
     def lost(self) -> float:
@@ -157,7 +157,7 @@ class Week:
             node = self._nodes[number]
             self.told.useful_s += node.into  # the week ends, the work does not
         per_s = self.told.done / self._end
-        self.told.keeper_busy = per_s / KEEPER_TASKS_PER_S
+        self.told.controller_busy = per_s / CONTROLLER_TASKS_PER_S
         self.told.failed_for_good = self.told.done * (self.told.attempts_lost / max(1, self.told.done)) ** _ATTEMPTS
         return self.told
 
@@ -173,7 +173,7 @@ class Week:
                     self._add(at, what, who)
         for what, per_day in {
             "zone": rates.zone_per_week / 7,
-            "keeper": rates.keeper_killed_per_day,
+            "controller": rates.controller_killed_per_day,
             "redis": rates.redis_restarts_per_week / 7,
             "store": rates.store_outages_per_week / 7,
         }.items():
@@ -253,15 +253,15 @@ class Week:
             if at >= self._nodes[who].since:
                 self._interrupt(at, "killed", who)
 
-    def _keeper(self, at: float) -> None:
+    def _controller(self, at: float) -> None:
         """Another takes over; workers live on what waits, and events wait for it."""
         away = self._lease_s * 4 / 3
         rate = self._rate()
-        self._stall(at, "keeper", at + _WAITING_A_WORKER * self._task_s, at + away)
+        self._stall(at, "controller", at + _WAITING_A_WORKER * self._task_s, at + away)
         behind = rate * away
         self.told.most_behind = max(self.told.most_behind, behind)
-        if rate < KEEPER_TASKS_PER_S:
-            self.told.longest_catch_up_s = max(self.told.longest_catch_up_s, behind / (KEEPER_TASKS_PER_S - rate))
+        if rate < CONTROLLER_TASKS_PER_S:
+            self.told.longest_catch_up_s = max(self.told.longest_catch_up_s, behind / (CONTROLLER_TASKS_PER_S - rate))
 
     def _redis(self, at: float) -> None:
         self._stall(at, "redis", at, at + self._rates.redis_away_s)
@@ -341,8 +341,8 @@ def table(told: Told) -> list[str]:
         ("attempts used up", f"{told.attempts_lost:,}"),
         ("tasks expected to fail for good", f"{told.failed_for_good:.2g}"),
         *((f"idle, {what.replace('_', ' ')}", f"{100 * s / told.node_s:.4f} %") for what, s in idle),
-        ("keeper busy", f"{100 * told.keeper_busy:.0f} %"),
-        ("events behind a keeper that took over", f"{told.most_behind:,.0f}"),
+        ("controller busy", f"{100 * told.controller_busy:.0f} %"),
+        ("events behind a controller that took over", f"{told.most_behind:,.0f}"),
         ("they were made up for in", f"{told.longest_catch_up_s:.0f} s"),
     ]
     return ["| what | |", "| --- | --: |", *(f"| {name} | {value} |" for name, value in rows)]

@@ -52,7 +52,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("webhooks", "api.client.commands", "Service", "Notify URLs when jobs and datasets end."),
     ("doctor", "graspd.doctor", "Administration", "Check Redis, store, index, GPU and more; suggest fixes."),
     ("api", "api.server_command", "Administration", "Run the HTTP API and the dashboard."),
-    ("keeper", "service.run.commands", "Administration", "Run the keeper: retries, lost leases, index."),
+    ("controller", "service.run.commands", "Administration", "Run the controller: retries, lost leases, index."),
     ("worker", "worker.commands.worker", "Administration", "Run workers, each on one device."),
     ("keys", "api.client.commands", "Administration", "Make, list and revoke API keys."),
     ("projects", "api.client.commands", "Administration", "List projects of keys, and limit what each may use."),

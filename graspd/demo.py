@@ -83,7 +83,7 @@ def demo(
     out.mkdir(parents=True, exist_ok=True)
     settings = load_settings(data_dir=out / "service", host="127.0.0.1", port=0)
     with Supervisor(settings, workers=1) as service:
-        with console.status("starting Redis, API, keeper and a worker"):
+        with console.status("starting Redis, API, controller and a worker"):
             service.wait_ready(say=lambda line: console.print(line, soft_wrap=True))
         console.print(f"the service runs at {service.api_url} until the job is done")
         with Client(service.api_url) as client:

@@ -49,7 +49,7 @@ def set_up(settings: Settings, process: str = "graspd") -> None:
     """Send the lines of this process to stderr.
 
     Args:
-        process: its name in every JSON line, e.g. api, keeper, worker.
+        process: its name in every JSON line, e.g. api, controller, worker.
     """
     is_text = settings.log_format == "text" or (settings.log_format == "auto" and sys.stderr.isatty())
     handler = logging.StreamHandler(sys.stderr)

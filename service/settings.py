@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 #: Variables that no setting follows any more, with what to do instead.
 GONE: Final = {
     "GRASPD_SHARD_PACK": "a task makes one shard of all its batches; unset it, and see GRASPD_TASK_S",
-    "GRASPD_KEEPER_SHARDS": "one keeper leads and the others stand by; unset it",
+    "GRASPD_KEEPER_SHARDS": "one controller leads and the others stand by; unset it",
+    "GRASPD_KEEPER_INTERVAL_S": "it is GRASPD_CONTROLLER_INTERVAL_S now",
+    "GRASPD_KEEPER_NAME": "it is GRASPD_CONTROLLER_NAME now",
 }
 
 
@@ -67,7 +69,7 @@ class Settings(BaseSettings):
     webhook_secret: SecretStr | None = Field(
         None,
         min_length=16,
-        description="what the secrets of webhooks follow from, of API and keeper; unset: no webhooks",
+        description="what the secrets of webhooks follow from, of API and controller; unset: no webhooks",
     )
     webhook_networks: str | None = Field(
         None, description="networks that webhooks may reach besides public addresses, with commas"
@@ -93,11 +95,11 @@ class Settings(BaseSettings):
         description="batches of a task that a worker plans in one launch; auto: what fills its GPU, on a CPU 1",
     )
     lease_s: float = Field(6.0, gt=0.5, description="a worker silent for this long has lost its task [s]")
-    keeper_interval_s: float = Field(1.0, gt=0, description="pause between two rounds of the keeper [s]")
-    keeper_name: str | None = Field(
+    controller_interval_s: float = Field(1.0, gt=0, description="pause between two rounds of the controller [s]")
+    controller_name: str | None = Field(
         None,
         max_length=200,
-        description="of a keeper: started again under the same name, it leads without a wait; unset: a fresh one",
+        description="of a controller: started again under the same name, it leads without a wait; unset: a fresh one",
     )
     task_attempts: int = Field(3, ge=1, le=20, description="attempts of a task before its job fails")
     task_s: float = Field(
@@ -123,7 +125,7 @@ class Settings(BaseSettings):
         description="how long what was deleted can be restored, and its shards stay where no job needs them [s]",
     )
     scrub_mb_per_s: float = Field(
-        1.0, ge=0, description="how fast the keeper reads through the store for damage [MiB/s]; 0: never"
+        1.0, ge=0, description="how fast the controller reads through the store for damage [MiB/s]; 0: never"
     )
     stop_grace_s: float = Field(10.0, gt=0, description="time a process has to stop before it is killed [s]")
     kernels: Path | None = Field(
@@ -131,7 +133,7 @@ class Settings(BaseSettings):
         description="folder of `graspd admin kernels`: compiled kernels, copied to Warp's cache where it lacks them",
     )
     heartbeat_file: Path | None = Field(
-        None, description="file that a keeper or worker touches while it lives, for health checks; unset: none"
+        None, description="file that a controller or worker touches while it lives, for health checks; unset: none"
     )
     log_level: str = Field("INFO", description="DEBUG, INFO, WARNING or ERROR")
     log_format: Literal["auto", "json", "text"] = Field(
@@ -165,6 +167,6 @@ class Settings(BaseSettings):
 
 def sqlite_url(path: Path) -> URL:
     """SQLAlchemy's URL of a file, whatever its path holds: as a text, it would end at a question mark."""
-    from sqlalchemy import URL  # only API and keeper need it, and it takes long to import
+    from sqlalchemy import URL  # only API and controller need it, and it takes long to import
 
     return URL.create("sqlite", database=str(path))

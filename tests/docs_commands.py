@@ -49,7 +49,7 @@ _PRINTED_URL: Final = "http://127.0.0.1:8000"
 _NOBODY: Final = "http://127.0.0.1:9"
 #: What needs a service; one that is not started saves half a minute of a core.
 _ASKS: Final = re.compile(
-    r"graspd (submit|jobs|datasets|grasps|tags|admin (index|store)|doctor|keeper|worker)\b|"
+    r"graspd (submit|jobs|datasets|grasps|tags|admin (index|store)|doctor|controller|worker)\b|"
     r"graspd (objects|hands|networks) (?!check)|http://|\$API|graspd-data"
 )
 _FENCED: Final = re.compile(r"^```(\w*)\n(.*?)^```\n?", re.DOTALL | re.MULTILINE)
@@ -81,7 +81,7 @@ NOT_RUN: Final = (
         r"^make |^\. \.venv|pre-commit",
         "the repository's own verbs and environment, which are tested and used without this",
     ),
-    (r"graspd (up|api|keeper|worker|view)\b(?!.*--check)", "does not end"),
+    (r"graspd (up|api|controller|worker|view)\b(?!.*--check)", "does not end"),
     (r"graspd (keys|projects|webhooks)\b", "with the first key every other line needs one; tests/api runs them"),
     (r"datasets (cancel|retry|delete)", "the dataset that stands in has ended, and is read below; tests/api runs them"),
     (r"--grasps 1000|kitchen\.toml --yes|my-objects --yes$", "takes hours; a small dataset of that name stands for it"),

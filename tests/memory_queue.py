@@ -126,7 +126,7 @@ class MemoryQueue:
         self._acknowledged |= set(event_ids)
 
     def restart_consumer(self) -> None:
-        """What a new keeper sees: everything that was not acknowledged."""
+        """What a new controller sees: everything that was not acknowledged."""
         left = (i for i in range(len(self._stream)) if str(i + 1) not in self._acknowledged)
         self._read = next(left, len(self._stream))
 

@@ -1,4 +1,4 @@
-"""Datasets planned at once, as the keeper would round by round."""
+"""Datasets planned at once, as the controller would round by round."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ class Assets:
         shared: bool = False,
         rename: bool = False,
     ) -> AssetView:
-        """Keep what was uploaded. The keeper queues the check of a hand or an object, which ends with grasps if
+        """Keep what was uploaded. The controller queues the check of a hand or an object, which ends with grasps if
         `self_test` says so; a network is checked here.
 
         Args:

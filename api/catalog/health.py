@@ -17,7 +17,7 @@ from service.pipeline.leading import PART
 KEPT_S: Final = 2.0
 #: A part that has not answered by then counts as away [s].
 PATIENCE_S: Final = 2.0
-_INCOMPLETE: Final = "the keeper makes it from the store now; until it has, jobs are missing from it"
+_INCOMPLETE: Final = "the controller makes it from the store now; until it has, jobs are missing from it"
 
 
 class Probes:
@@ -33,7 +33,7 @@ class Probes:
         self._lock = threading.Lock()
 
     def health(self) -> Health:
-        """State of the parts; ready while all three answer. Keeper and workers are told, and not waited for."""
+        """State of the parts; ready while all three answer. Controller and workers are told, and not waited for."""
         with self._lock:
             now = time.monotonic()
             if self._known is None or now - self._known[0] > KEPT_S:
@@ -50,11 +50,11 @@ class Probes:
         deadline = time.monotonic() + self._patience_s
         parts = {name: probe.part(deadline) for name, probe in probes.items()}
         self._hanging = {name: probe for name, probe in probes.items() if probe.thread.is_alive()}
-        keeper, workers = self._others() if parts["redis"].ok else (False, 0)
-        return Health(ok=all(part.ok for part in parts.values()), parts=parts, keeper=keeper, workers=workers)
+        controller, workers = self._others() if parts["redis"].ok else (False, 0)
+        return Health(ok=all(part.ok for part in parts.values()), parts=parts, controller=controller, workers=workers)
 
     def _redis(self) -> Part:
-        """A Redis of another service is not ready: its keeper and workers know nothing of this one's jobs."""
+        """A Redis of another service is not ready: its controller and workers know nothing of this one's jobs."""
         part, service = _answering(self._parts.queue.ping()), self._parts.queue.service()
         if service != self._service:
             try:

@@ -38,7 +38,9 @@ class Webhooks:
         """
         master = self._parts.settings.webhook_secret
         if master is None:
-            raise ConflictError("webhooks are switched off; the operator sets GRASPD_WEBHOOK_SECRET for API and keeper")
+            raise ConflictError(
+                "webhooks are switched off; the operator sets GRASPD_WEBHOOK_SECRET for API and controller"
+            )
         project = reach().project
         hook = Webhook(
             id=secrets.token_hex(16),

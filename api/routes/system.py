@@ -35,7 +35,7 @@ async def healthz() -> dict[str, bool]:
 
 @router.get("/readyz", responses={503: {"model": Health, "description": "A part does not answer"}})
 def readyz(request: Request, overview: OverviewOf, response: Response) -> Health:
-    """Redis, index and store, each with the time it took to answer; whether a keeper lives, and how many workers.
+    """Redis, index and store, each with the time it took to answer; whether a controller lives, and how many workers.
 
     What is wrong with a part is told to those who may read.
     """

@@ -339,7 +339,7 @@ STUDIES: Final = (
     ),
     Study(
         "fleet",
-        "how many workers one keeper serves",
+        "how many workers one controller serves",
         ("results/fleet.*",),
         ("python -m benchmarks.fleet --seconds 8 --tasks 4000 --json OUT/results/fleet.json",),
         ("python -m benchmarks.fleet --workers 8 --seconds 2 --tasks 100 --sqlite --json OUT/results/fleet.json",),

@@ -18,7 +18,7 @@ ROWS: dict[str, list[tuple[str, str, int, dict[str, str]]]] = {
         ("Workers", "short", 4, {"": 'max(sum without (state) (graspd_workers{state=~"idle|busy"}))'}),
         ("Tasks that wait", "short", 4, {"": "sum(max by (lane, stage) (graspd_queue_depth))"}),
         ("Unfinished jobs", "short", 4, {"": "sum(max by (state) (graspd_jobs_unfinished))"}),
-        ("Keeper", "bool_yes_no", 4, {"": "max(graspd_keeper_up)"}),
+        ("Controller", "bool_yes_no", 4, {"": "max(graspd_controller_up)"}),
         ("Damaged objects", "short", 4, {"": "max(graspd_store_damaged)"}),
     ],
     "Work": [

@@ -1,4 +1,4 @@
-"""The index as the API and the keeper see it."""
+"""The index as the API and the controller see it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from service.index.tags import Tags
 class Index:
     """SQL rows derived from the store; `url` is an SQLAlchemy URL.
 
-    Reads answer the API; writes come from the API and the keeper only. Every method of every part raises
+    Reads answer the API; writes come from the API and the controller only. Every method of every part raises
     IndexUnavailable when the database is away. Cursors are opaque, `limit` is cut to 200; an unknown id is a
     NotFoundError.
     """

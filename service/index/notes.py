@@ -48,7 +48,7 @@ class Marked:
 
 @dataclass(frozen=True)
 class ScrubNote:
-    """How far the keeper has read through the store in this round."""
+    """How far the controller has read through the store in this round."""
 
     started: str = ""
     ended: str = ""
@@ -97,7 +97,7 @@ class Notes:
         return known or identity
 
     def set_incomplete(self) -> None:
-        """The index may lack what the store has; the keeper makes it anew."""
+        """The index may lack what the store has; the controller makes it anew."""
         with self.database.writing() as connection:
             connection.execute(delete(notes).where(notes.c.name == _REBUILT))
 
@@ -123,7 +123,7 @@ class Notes:
             upsert(connection, notes, [{"name": _MARK, "value": asdict(marked)}])
 
     def scrub_note(self) -> ScrubNote:
-        """How far the keeper has read through the store; nothing read yet: a note of defaults."""
+        """How far the controller has read through the store; nothing read yet: a note of defaults."""
         with self.database.reading() as connection:
             value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCRUB))
         return ScrubNote(**value) if value else ScrubNote()
@@ -132,19 +132,24 @@ class Notes:
         with self.database.writing() as connection:
             upsert(connection, notes, [{"name": _SCRUB, "value": asdict(note)}])
 
-    def take_scrub_turn(self, holder: str, *, is_keeper: bool, lasts_s: float) -> bool:
+    def take_scrub_turn(self, holder: str, *, is_controller: bool, lasts_s: float) -> bool:
         """Take or keep the right to read through the whole store; False: somebody else has it.
 
         Args:
             holder: who asks.
-            is_keeper: a keeper gives way to who is none.
+            is_controller: a controller gives way to who is none.
             lasts_s: after so long without a call the right is free again [s].
         """
         with self.database.writing() as connection:
             held: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCRUB_TURN))
-            if held and held["holder"] != holder and held["until"] > timestamp() and (is_keeper or not held["keeper"]):
+            if (
+                held
+                and held["holder"] != holder
+                and held["until"] > timestamp()
+                and (is_controller or not held["controller"])
+            ):
                 return False
-            value = {"holder": holder, "keeper": is_keeper, "until": timestamp(-lasts_s)}
+            value = {"holder": holder, "controller": is_controller, "until": timestamp(-lasts_s)}
             upsert(connection, notes, [{"name": _SCRUB_TURN, "value": value}])
         return True
 

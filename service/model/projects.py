@@ -33,7 +33,7 @@ class Reach:
         return self.everything or project == self.project
 
 
-#: The reach of an admin, of the keeper, and of everybody while the service is open.
+#: The reach of an admin, of the controller, and of everybody while the service is open.
 EVERYTHING: Final = Reach()
 
 

@@ -1,1 +1,1 @@
-"""What becomes of jobs and datasets: actions of users, and the keeper that carries them out."""
+"""What becomes of jobs and datasets: actions of users, and the controller that carries them out."""

@@ -36,7 +36,7 @@ Post = Callable[..., Answer]
 
 
 class Courier:
-    """Works beside the rounds of the keeper: an address that does not answer keeps nothing else waiting.
+    """Works beside the rounds of the controller: an address that does not answer keeps nothing else waiting.
 
     Args:
         send: sends a body to an address; as `posting.post`.

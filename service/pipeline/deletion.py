@@ -1,7 +1,7 @@
 """What a user takes away: assets, jobs, datasets. A record of the deletion is the fact; the rest follows.
 
 `deletions/{what}/{id}.json` is written while nobody else writes the index, in the same step as the rows go. From then
-on the thing is gone: a rebuild leaves it out, and nothing of that id is taken in. The keeper
+on the thing is gone: a rebuild leaves it out, and nothing of that id is taken in. The controller
 (`service.pipeline.sweeper`) removes the objects behind it, then the record itself; killed at any moment, it begins
 again.
 """
@@ -172,7 +172,7 @@ def _restore(
         _enter(parts, deletion, connection)
     except ConflictError:
         if not store.exists(waiting):
-            put_record(store, waiting, deletion)  # the keeper puts it away again
+            put_record(store, waiting, deletion)  # the controller puts it away again
         raise
     store.delete(waiting)
     store.delete(f"{folder}/deletion.json")

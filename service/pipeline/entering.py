@@ -1,4 +1,4 @@
-"""Enters the tasks of large jobs piece by piece, beside the keeper's rounds: others write between the pieces."""
+"""Enters the tasks of large jobs piece by piece, beside the controller's rounds: others write between the pieces."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ def identify(
         folder: data folder that remembers the service, too.
         ask_redis: False while Redis is not started.
         take_over: be the service of the store from now on, whichever it was before.
-        holds_redis: this process has the lease of the keeper, so Redis is its service's whatever it says.
+        holds_redis: this process has the lease of the controller, so Redis is its service's whatever it says.
 
     Returns:
         id of the service.

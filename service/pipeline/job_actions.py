@@ -94,7 +94,7 @@ def prepare(
 
 
 def enter(parts: Parts, record: JobRecord, *, keeps_assets: bool = False) -> tuple[JobView, bool]:
-    """Keep a planned job and queue its first tasks. The keeper enters those that are too many for one turn.
+    """Keep a planned job and queue its first tasks. The controller enters those that are too many for one turn.
 
     Args:
         keeps_assets: a dataset keeps hand, object, neighbours and network from being deleted meanwhile.
@@ -166,7 +166,7 @@ def retry(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
 def queue_tasks(parts: Parts, ready: Sequence[ReadyTask], *, routes: Routes, again: bool = False) -> set[str]:
     """Put tasks into the queue and mark them in the index; what no worker can do waits, and its job says why.
 
-    The mark comes first: a task marked but not queued is found missing and queued by the keeper; one queued but not
+    The mark comes first: a task marked but not queued is found missing and queued by the controller; one queued but not
     marked might run twice.
 
     Args:
@@ -195,7 +195,7 @@ def queue_tasks(parts: Parts, ready: Sequence[ReadyTask], *, routes: Routes, aga
 
 
 def _start(parts: Parts, job_id: str) -> None:
-    """Queue as much of a job as the queue's window holds; the keeper feeds the rest, and all of it if Redis is away."""
+    """Queue as much of a job as the queue's window holds; the controller feeds the rest, or all if Redis is away."""
     try:
         room = parts.settings.queue_window - sum(parts.queue.depths().values())
         if room > 0:

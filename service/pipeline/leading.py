@@ -1,4 +1,4 @@
-"""Of several keepers one leads, by a lease in Redis, and the others stand by.
+"""Of several controllers one leads, by a lease in Redis, and the others stand by.
 
 Two that both believe to lead, one of them having been stopped for longer than its lease, do no harm for the moment that
 it lasts: what they write follows from facts in the store, a task is queued once for each attempt, and writers of the
@@ -22,7 +22,7 @@ from service.model.errors import QueueUnavailable
 from service.queue.port import Presence
 
 log = logging.getLogger(__name__)
-#: As what the keeper that leads announces itself.
+#: As what the controller that leads announces itself; an API of graspd 0.2 looks for the same name.
 PART: Final = "keeper"
 #: So many renewals fit a lease.
 _RENEWALS: Final = 3.0
@@ -51,10 +51,10 @@ class Leadership:
             self._alive.touch()
             try:
                 if self._queue.lead(self.holder, self._lease_s):
-                    log.info("this keeper leads")
+                    log.info("this controller leads")
                     return True
                 if not told:
-                    log.info("another keeper leads; this one waits to take over")
+                    log.info("another controller leads; this one waits to take over")
                 told = True
             except QueueUnavailable as error:
                 log.warning("%s", error)
@@ -68,7 +68,7 @@ class Leadership:
         The lease is lost only where Redis says that another has it: while Redis is away nobody else can take it.
         """
         over, done = threading.Event(), threading.Event()
-        thread = threading.Thread(target=self._renew, args=(stop, over, done), name="keeper-lease", daemon=True)
+        thread = threading.Thread(target=self._renew, args=(stop, over, done), name="controller-lease", daemon=True)
         thread.start()
         try:
             yield over
@@ -80,17 +80,17 @@ class Leadership:
                 try:
                     self._queue.resign(self.holder)
                 except QueueUnavailable:
-                    log.debug("the lease of the keeper runs out by itself")
+                    log.debug("the lease of the controller runs out by itself")
 
     def _renew(self, stop: threading.Event, over: threading.Event, done: threading.Event) -> None:
         # Also while the work is laid down.
         while not done.is_set():
             try:
                 if not self._queue.lead(self.holder, self._lease_s) and not over.is_set():
-                    log.warning("this keeper was silent for too long, and another leads now")
+                    log.warning("this controller was silent for too long, and another leads now")
                     over.set()
             except QueueUnavailable:
-                log.debug("the lease of the keeper cannot be renewed now")
+                log.debug("the lease of the controller cannot be renewed now")
             end = time.monotonic() + self._lease_s / _RENEWALS
             while not (stop.is_set() or done.wait(_LOOK_S)) and time.monotonic() < end:
                 pass

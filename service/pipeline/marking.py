@@ -1,7 +1,7 @@
 """Keeps the mark of store and index in step, and finds that one of them is an older copy.
 
-Every record that a user makes counts a change in the index. The keeper then gives store and index a new mark: an index
-that was copied before has another one than the store, and is made anew.
+Every record that a user makes counts a change in the index. The controller then gives store and index a new mark: an
+index that was copied before has another one than the store, and is made anew.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from service.store.marks import newest_mark, next_mark, set_mark
 
 
 class Marking:
-    """What the keeper of the first shard does about it."""
+    """What the controller does about it."""
 
     def __init__(self, parts: Parts) -> None:
         self._parts = parts
@@ -23,7 +23,7 @@ class Marking:
         """Whether the index is as old as the store, which is asked where the index has another mark than before."""
         present = self._parts.index.notes.marked()
         if present.mark != self._known:
-            # Killed between the two, a keeper leaves the store with the mark before.
+            # Killed between the two, a controller leaves the store with the mark before.
             if newest_mark(self._parts.store) not in (present.mark, present.before):
                 return False
             self._known = present.mark

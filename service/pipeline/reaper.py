@@ -117,7 +117,7 @@ class Reaper:
             number=task.attempt,
             kind=type(error).__name__,
             reason=str(error),
-            worker="keeper",
+            worker="controller",
             ended=timestamp(),
             last=True,
         )

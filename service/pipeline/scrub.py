@@ -43,7 +43,7 @@ _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
     (r"webhooks/[^/]+\.json", Webhook),
     (r"tags/[^/]+/[^/]+\.json", Tag),
 )
-#: In the order of the keeper's rounds, which remember a place in it.
+#: In the order of the controller's rounds, which remember a place in it.
 FOLDERS: Final = (
     names.SHARDS, names.ASSETS, names.JOBS, names.TASKS, names.DATASETS, names.OBJECT_SETS,
     names.DELETIONS, names.RELEASED, names.WEBHOOKS, names.TAGS, CHARTS, IN_SCENES, STABILITY,

@@ -1,4 +1,4 @@
-"""The keeper's slow look through the store: round after round, at a bounded rate, on from where it stopped."""
+"""The controller's slow look through the store: round after round, at a bounded rate, on from where it stopped."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ class Interrupted(Exception):
 
 
 class Turn:
-    """The right to read through the store: one has it at a time, a `store verify` before the keeper."""
+    """The right to read through the store: one has it at a time, a `store verify` before the controller."""
 
-    def __init__(self, parts: Parts, *, is_keeper: bool, clock: Callable[[], float] = time.monotonic) -> None:
-        self._parts, self._is_keeper, self._clock = parts, is_keeper, clock
+    def __init__(self, parts: Parts, *, is_controller: bool, clock: Callable[[], float] = time.monotonic) -> None:
+        self._parts, self._is_controller, self._clock = parts, is_controller, clock
         self._holder = uuid4().hex
         self._said = -_TURN_S
 
@@ -53,7 +53,7 @@ class Turn:
         now = self._clock()
         if now - self._said >= _TURN_S:
             if not self._parts.index.notes.take_scrub_turn(
-                self._holder, is_keeper=self._is_keeper, lasts_s=3 * _TURN_S
+                self._holder, is_controller=self._is_controller, lasts_s=3 * _TURN_S
             ):
                 return False
             self._said = now
@@ -74,7 +74,7 @@ class Scrubber:
     def __init__(self, parts: Parts, stop: threading.Event, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._parts, self._stop, self._clock = parts, stop, clock
         self._rate = parts.settings.scrub_mb_per_s * 2**20
-        self._turn = Turn(parts, is_keeper=True, clock=clock)
+        self._turn = Turn(parts, is_controller=True, clock=clock)
         self._paid = clock()
         self._looked = clock()
 

@@ -19,7 +19,7 @@ class Series:
     kind: Literal["gauge", "counter", "histogram"]
     labels: tuple[str, ...]
     meaning: str
-    source: Literal["queue", "index", "probe", "keeper", "process"]
+    source: Literal["queue", "index", "probe", "controller", "process"]
 
 
 _ALL: Final = (
@@ -34,7 +34,7 @@ _ALL: Final = (
         "queue",
     ),
     Series("graspd_worker_lease_age_seconds", "gauge", ("worker", "device"), "time since its last beat", "queue"),
-    Series("graspd_keeper_up", "gauge", (), "1: a keeper gave a sign of life lately", "queue"),
+    Series("graspd_controller_up", "gauge", (), "1: a controller gave a sign of life lately", "queue"),
     Series("graspd_jobs_unfinished", "gauge", ("state",), "queued and running jobs, counted up to 10,000", "index"),
     Series("graspd_job_oldest_seconds", "gauge", ("state",), "age of the oldest queued and running job", "index"),
     Series("graspd_grasps_per_second", "gauge", ("verdict",), "grasps kept in the last minute: all, valid", "index"),
@@ -46,14 +46,18 @@ _ALL: Final = (
         "counter",
         ("verdict",),
         "grasps kept: all, valid; tried ones: judged",
-        "keeper",
+        "controller",
     ),
-    Series("graspd_shards_total", "counter", ("stage",), "shards written", "keeper"),
-    Series("graspd_shard_bytes_total", "counter", ("stage",), "bytes of them", "keeper"),
-    Series("graspd_stage_seconds", "histogram", ("stage",), "time a worker spent on one task", "keeper"),
-    Series("graspd_task_failures_total", "counter", ("stage", "kind"), "failed attempts by the error's name", "keeper"),
-    Series("graspd_task_handbacks_total", "counter", ("stage", "kind"), "deferred, returned, cancelled", "keeper"),
-    Series("graspd_jobs_ended_total", "counter", ("state",), "jobs that succeeded, failed or were cancelled", "keeper"),
+    Series("graspd_shards_total", "counter", ("stage",), "shards written", "controller"),
+    Series("graspd_shard_bytes_total", "counter", ("stage",), "bytes of them", "controller"),
+    Series("graspd_stage_seconds", "histogram", ("stage",), "time a worker spent on one task", "controller"),
+    Series(
+        "graspd_task_failures_total", "counter", ("stage", "kind"), "failed attempts by the error's name", "controller"
+    ),
+    Series("graspd_task_handbacks_total", "counter", ("stage", "kind"), "deferred, returned, cancelled", "controller"),
+    Series(
+        "graspd_jobs_ended_total", "counter", ("state",), "jobs that succeeded, failed or were cancelled", "controller"
+    ),
     Series("graspd_http_requests_total", "counter", ("method", "route", "status"), "requests answered", "process"),
     Series("graspd_http_request_seconds", "histogram", ("method", "route"), "time to answer", "process"),
 )

@@ -1,4 +1,4 @@
-"""Puts away what users deleted, a little in each round of the keeper; after a grace time it goes for good, with the
+"""Puts away what users deleted, a little in each round of the controller; after a grace time it goes for good, with the
 shards that no job needs any more."""
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from service.store.deletions import Deletion, Released, removed_before
 from service.store.records import read_record
 
 log = logging.getLogger(__name__)
-#: Time for deletions in one round of the keeper [s].
+#: Time for deletions in one round of the controller [s].
 BUDGET_S: Final = 0.5
 _AT_ONCE: Final = 200
 

@@ -1,4 +1,4 @@
-"""What the keeper counts as it indexes. The sums lie in one small hash in Redis, so every API process shows the same.
+"""What the controller counts as it indexes. The sums lie in one hash in Redis, so every API process shows the same.
 
 They start from zero when Redis is lost, which Prometheus takes for a restart; an event that comes twice counts twice.
 """

@@ -36,8 +36,8 @@ def run_task(message: dict[str, Any]) -> None:
 
 
 def new_job(function: str | TaskFunction, message: dict[str, Any], **options: Any) -> Job:
-    """A job without end by time, results, retries, callbacks or webhooks: `worker.process.main` and the keeper see to
-    what is needed of these."""
+    """A job without end by time, results, retries, callbacks or webhooks: `worker.process.main` and the controller see
+    to what is needed of these."""
     return Job.create(
         function,
         args=(message,),

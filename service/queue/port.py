@@ -29,7 +29,7 @@ def lane_order(taken: int) -> tuple[Lane, ...]:
 
 
 class EventKind(StrEnum):
-    """What happened. Events of a task come from its worker, `job` events from the keeper and the API."""
+    """What happened. Events of a task come from its worker, `job` events from the controller and the API."""
 
     STARTED = "started"
     FINISHED = "finished"
@@ -76,7 +76,7 @@ class Event(Model):
     output: Annotated[str, Field(pattern=r"^([a-z]{1,10}/)?[A-Za-z0-9_-]{0,64}$")] = ""
     """Shard id of a finished stage; kind and digest (`hand/...`) of a finished check."""
 
-    # A newer worker may say more than an older keeper knows.
+    # A newer worker may say more than an older controller knows.
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
@@ -157,7 +157,7 @@ class Tasks(Protocol):
         """Number of waiting tasks of each lane and stage."""
 
     def clear_untaken(self, present: Collection[WorkerBeat]) -> None:
-        """Forget tasks that wait apart for workers of a kind that is gone. The keeper then finds them missing."""
+        """Forget tasks that wait apart for workers of a kind that is gone. The controller then finds them missing."""
 
     def leases(self) -> list[Lease]:
         """Tasks held by workers, living or dead. Reading changes nothing."""
@@ -189,7 +189,7 @@ class Events(Protocol):
         """Take reports away whose tasks nobody holds."""
 
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
-        """Next events for the keeper, the oldest first; those never acknowledged come again to the next one."""
+        """Next events for the controller, the oldest first; those never acknowledged come again to the next one."""
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
         """Say that the events are in the index."""
@@ -206,7 +206,7 @@ class Presence(Protocol):
         """Workers that gave a sign of life within the last lease."""
 
     def announce(self, part: str, seconds: float) -> None:
-        """Say that a part of the service (the keeper) lives, for that long."""
+        """Say that a part of the service (the controller) lives, for that long."""
 
     def announced(self, part: str) -> bool:
         """Whether a part said so."""
@@ -218,7 +218,7 @@ class Presence(Protocol):
         """Say which service the queue belongs to, where nobody said it before or `instead` of that."""
 
     def lead(self, holder: str, seconds: float) -> bool:
-        """Lead the keepers for that long, or go on to; False: another one does."""
+        """Lead the controllers for that long, or go on to; False: another one does."""
 
     def resign(self, holder: str) -> None:
         """Lead no longer; nothing happens where this one does not."""

@@ -1,4 +1,4 @@
-"""How often workers speak, so that what Redis and the keeper hear does not grow with their number."""
+"""How often workers speak, so that what Redis and the controller hear does not grow with their number."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Final
 _BEATS_PER_S: Final = 2500.0
 #: A cancelled task must stop within two seconds, so where there is room the key that says so is read twice in them.
 _LEAST_BEAT_S: Final = 0.8
-#: Reports on how far tasks are, of all workers together [1/s]; the keeper writes as many rows.
+#: Reports on how far tasks are, of all workers together [1/s]; the controller writes as many rows.
 _REPORTS_PER_S: Final = 500.0
 #: Enough for a smooth bar.
 _LEAST_REPORT_S: Final = 0.25

@@ -1,7 +1,7 @@
 """The queue on Redis: RQ for tasks and leases, a bounded stream for events.
 
 One RQ queue a lane and stage, so that a worker may serve some stages only. RQ's own retries, scheduler, maintenance and
-result storage are not used: each of them loses or repeats work in ways the keeper does not.
+result storage are not used: each of them loses or repeats work in ways the controller does not.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from service.queue.streams import EVENTS, EventReader, put_event, readable
 from service.settings import Settings
 
 WORKERS: Final = "graspd:workers"
-#: Lease of the keeper that leads. A graspd of 0.2 takes and keeps the same one: so the two give way to each other.
+#: Lease of the controller that leads. A graspd of 0.2 takes and keeps the same one: so the two give way to each other.
 LEAD: Final = "graspd:lead:keeper"
 #: Sums for Prometheus, a few hundred fields.
 METRICS: Final = "graspd:metrics"

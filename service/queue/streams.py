@@ -1,4 +1,4 @@
-"""The bounded stream of events: workers, API and keeper append, the keeper that leads reads."""
+"""The bounded stream of events: workers, API and controller append, the controller that leads reads."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from service.queue import entries
 from service.queue.port import Event
 
 EVENTS: Final = "graspd:events"
-#: Events kept, 20 MB at most: a minute of a keeper that is away and four hundred tasks a second. Those lost are made
-#: good from the store.
+#: Events kept, 20 MB at most: a minute of a controller that is away and four hundred tasks a second. Lost ones are
+#: made good from the store.
 EVENTS_KEPT: Final = 50_000
+#: Group of readers, by the name that graspd 0.2 gave it: a controller goes on where one of 0.2 ended.
 _GROUP: Final = "keeper"
 Found = list[tuple[str, Event]]
 
@@ -30,12 +31,12 @@ def readable(reply: Any) -> Found:
 
 
 class EventReader:
-    """Reads the stream for the keeper: first what an earlier one did not acknowledge."""
+    """Reads the stream for the controller: first what an earlier one did not acknowledge."""
 
     def __init__(self, connection: Any) -> None:
         self._connection = connection
         self._unread = "0"
-        """Up to where what an earlier keeper took was read; ">": all of it."""
+        """Up to where what an earlier controller took was read; ">": all of it."""
 
     def read(self, *, limit: int, wait_s: float) -> Found:
         """Next events, the oldest first."""

@@ -1,1 +1,1 @@
-"""Runs the service on one machine: `graspd up`, `keeper` and `index`."""
+"""Runs the service on one machine: `graspd up`, `controller` and `index`."""

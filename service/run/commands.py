@@ -1,4 +1,4 @@
-"""Commands that run the service itself: up, keeper, index."""
+"""Commands that run the service itself: up, controller, index."""
 
 from __future__ import annotations
 
@@ -73,41 +73,41 @@ def up(
         supervisor.stop()
 
 
-@app.command(epilog="graspd keeper")
+@app.command(epilog="graspd controller")
 @reporting_errors
-def keeper(
+def controller(
     check: Annotated[bool, typer.Option("--check", help="Start none; exit code 1 says that none lives.")] = False,
     data_dir: DataDir = None,
 ) -> None:
     """Reaper, delayed retries and indexer. Of several one leads and the others stand by; `graspd up` starts one."""
     settings = load_settings(data_dir=data_dir)
-    log_to_stderr(settings, "keeper")
+    log_to_stderr(settings, "controller")
     keep_private(settings)
     if check:
-        check_keeper(settings)
+        check_controller(settings)
         return
-    _run_keeper(settings, stop_on_signals())
+    _run_controller(settings, stop_on_signals())
 
 
-def _run_keeper(settings: Settings, stop: threading.Event) -> None:
+def _run_controller(settings: Settings, stop: threading.Event) -> None:
     """Lead, or stand by; from the start again where another led meanwhile."""
     from service.pipeline.backends import Parts
-    from service.pipeline.keeper import Keeper
+    from service.pipeline.controller import Controller
     from service.pipeline.leading import Leadership
     from service.queue.rq_queue import open_queue
 
     alive = HeartbeatFile(settings.heartbeat_file)
     queue = open_queue(settings, patience=0)
-    leadership = Leadership(queue, lease_s=settings.lease_s, alive=alive, name=settings.keeper_name)
+    leadership = Leadership(queue, lease_s=settings.lease_s, alive=alive, name=settings.controller_name)
     try:
-        # A keeper of another service must not even wait: it would be a standby that all take for their own.
+        # A controller of another service must not even wait: it would be a standby that all take for their own.
         _identify(settings, stop, alive)
         while leadership.wait(stop):
             with leadership.held(stop) as over:
-                # What an earlier keeper took in and did not finish comes again to a fresh one.
+                # What an earlier controller took in and did not finish comes again to a fresh one.
                 parts = Parts.open(settings)
                 try:
-                    Keeper(parts).run(over)
+                    Controller(parts).run(over)
                 finally:
                     parts.close()
     finally:
@@ -227,15 +227,15 @@ def _check_rooms(workers: int) -> None:
         raise UnavailableError("`graspd up` is not part of this install; run pip install 'graspd[all]'")
 
 
-def check_keeper(settings: Settings) -> None:
-    """UnavailableError if no keeper gave a sign of life lately."""
+def check_controller(settings: Settings) -> None:
+    """UnavailableError if no controller gave a sign of life lately."""
     from service.pipeline.leading import PART
     from service.queue.rq_queue import open_queue
 
     queue = open_queue(settings, patience=0)
     try:
         if not queue.announced(PART):
-            raise UnavailableError("no keeper gave a sign of life lately; start `graspd keeper`")
+            raise UnavailableError("no controller gave a sign of life lately; start `graspd controller`")
     finally:
         queue.close()
 

@@ -32,7 +32,7 @@ def verify(
 ) -> None:
     """Read everything that the store keeps and say what is damaged or missing. Exit code 1 says that something is.
 
-    The keeper's own reading pauses meanwhile; a second call is refused.
+    The controller's own reading pauses meanwhile; a second call is refused.
     """
     from service.pipeline.backends import Parts
     from service.pipeline.identity import identify_if_redis_answers
@@ -43,7 +43,7 @@ def verify(
     parts = Parts.open(load_settings(data_dir=data_dir), make=False)
     if repair:
         identify_if_redis_answers(parts)
-    turn = Turn(parts, is_keeper=False)
+    turn = Turn(parts, is_controller=False)
     try:
         if not turn.is_mine():
             raise ConflictError("another `graspd admin store verify` reads this store; wait until it is done")
@@ -86,7 +86,7 @@ def upgrade(
     data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Folder of everything graspd keeps.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Give every shard that graspd 0.2 put into a pack a file of its own; a keeper does the same when it starts."""
+    """Give every shard that graspd 0.2 put into a pack a file of its own; a controller does the same when it starts."""
     from service.store.packs import take_apart
     from service.store.store import open_store
 

@@ -1,4 +1,4 @@
-"""`graspd up`: Redis, API, keeper and workers as child processes of one parent."""
+"""`graspd up`: Redis, API, controller and workers as child processes of one parent."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ class Supervisor:
         say: Callable[[str], object] | None = None,
         stop: threading.Event | None = None,
     ) -> bool:
-        """Until Redis, keeper, a worker and the API answer; False: `stop` was set before.
+        """Until Redis, controller, a worker and the API answer; False: `stop` was set before.
 
         A busy machine takes as long as it takes: what ends the wait early is a process that ends again and again, or a
         Redis of somebody else that does not answer.
@@ -178,7 +178,7 @@ class Supervisor:
         missing = []
         try:
             if not queue.announced(PART):
-                missing.append("keeper")
+                missing.append("controller")
             beats = queue.workers()
             if sum(beat.state != "quarantined" for beat in beats) < self._workers:
                 missing.append("; ".join(["workers", *sorted({beat.reason for beat in beats if beat.reason})]))
@@ -244,8 +244,8 @@ class Supervisor:
             redis.mend = lambda output: give_up_log(self.settings, output)
             children.append(redis)
         # One that is started again need not wait until its predecessor's lease has run out.
-        name = self._wanted.keeper_name or f"{socket.gethostname()}-up-{secrets.token_hex(8)}"
-        children.append(child("keeper", *_PROGRAM, "keeper", GRASPD_KEEPER_NAME=name))
+        name = self._wanted.controller_name or f"{socket.gethostname()}-up-{secrets.token_hex(8)}"
+        children.append(child("controller", *_PROGRAM, "controller", GRASPD_CONTROLLER_NAME=name))
         if self._api:
             children.append(child("api", *_PROGRAM, "api"))
         children += [
@@ -272,8 +272,8 @@ class Supervisor:
             self._stop_children()
 
     def _stop_children(self) -> None:
-        """Workers hand their tasks back while Redis and keeper still take them."""
-        for some in (self._named("worker"), self._named("api", "keeper"), self._named("redis")):
+        """Workers hand their tasks back while Redis and controller still take them."""
+        for some in (self._named("worker"), self._named("api", "controller"), self._named("redis")):
             for child in some:
                 child.ask_to_stop()
             deadline = time.monotonic() + self.settings.stop_grace_s

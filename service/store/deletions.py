@@ -74,7 +74,7 @@ def deletions(store: Store, what: str = "") -> list[Deletion]:
                 deletion = read_record(Deletion, store, key)
                 found[removed_folder(deletion)] = deletion
 
-    # What the keeper moves meanwhile is in the second folder before it leaves the first.
+    # What the controller moves meanwhile is in the second folder before it leaves the first.
     waiting = [entry.key for entry in store.list(names.DELETIONS) if entry.key.count("/") == 2]
     read(key for key in waiting if not what or key.split("/")[1] == what)
     removed = [entry.key for entry in store.list(names.REMOVED) if entry.key.count("/") == 2]

@@ -82,7 +82,7 @@ class Store:
             return True
 
     def delete(self, key: str) -> None:
-        """Remove an object; nothing happens if there is none. Only the keeper does this, to what a user took away."""
+        """Remove an object; nothing happens if there is none. Only the controller does this, to what a user deleted."""
         try:
             with _mapped(key, self.url):
                 obstore.delete(self._backend, check_key(key))

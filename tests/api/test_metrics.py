@@ -23,7 +23,7 @@ def test_workers_are_counted_in_every_state_that_they_can_be_in() -> None:
 
 
 @pytest.mark.parametrize("lives", [True, False])
-def test_the_keeper_is_up_while_one_gives_signs_of_life(lives: bool) -> None:
+def test_the_controller_is_up_while_one_gives_signs_of_life(lives: bool) -> None:
     snapshot = Snapshot()
     snapshot.add_queue(QueueNow(), is_kept=lives)
-    assert f"graspd_keeper_up {float(lives)}" in Metrics().render(snapshot).decode().splitlines()
+    assert f"graspd_controller_up {float(lives)}" in Metrics().render(snapshot).decode().splitlines()

@@ -143,7 +143,7 @@ def test_a_session_of_one_opens_the_other_until_its_key_is_revoked(twins: Twins)
 def followed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, dict[str, Any], Callable[[], str]]]:
     """A service with fake engines in which one job of two stages was submitted as request `follow-me` and has ended:
     its folder of logs, the job, and its metrics."""
-    wanted = Settings(data_dir=tmp_path_factory.mktemp("followed"), port=0, keeper_interval_s=0.2)
+    wanted = Settings(data_dir=tmp_path_factory.mktemp("followed"), port=0, controller_interval_s=0.2)
     with Supervisor(wanted, worker_command=(sys.executable, "-m", "tests.fakes")) as supervisor:
         supervisor.wait_ready(PATIENCE_S)
         parts = Parts.open(supervisor.settings)
@@ -153,7 +153,7 @@ def followed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, d
             job = http.post("/v1/jobs", json=body, headers={"X-Request-Id": "follow-me"}).json()
             until(lambda: http.get(f"/v1/jobs/{job['id']}").json()["state"] == "succeeded", "the job ends")
             told = 'graspd_jobs_ended_total{state="succeeded"}'
-            until(lambda: told in http.get("/metrics").text, "the keeper passes its sums on every two seconds")
+            until(lambda: told in http.get("/metrics").text, "the controller passes its sums on every two seconds")
             yield supervisor.settings.data_dir / "logs", job, lambda: http.get("/metrics").text
         parts.close()
 
@@ -173,10 +173,11 @@ def test_the_id_of_a_request_is_in_the_logs_of_api_and_worker(followed: Any, pro
 def test_every_task_of_the_job_knows_its_request(followed: Any) -> None:
     logs, job, _ = followed
     lines = lines_of(logs, "worker-0", request="follow-me", job=job["id"])
-    assert len({line["task"] for line in lines}) == 4  # two batches of two stages; the keeper queues the second stage
+    # Two batches of two stages; the controller queues the second stage.
+    assert len({line["task"] for line in lines}) == 4
 
 
-@pytest.mark.parametrize("process", ["api", "keeper", "worker-0"])
+@pytest.mark.parametrize("process", ["api", "controller", "worker-0"])
 def test_the_id_of_a_job_is_in_the_logs_of_every_process(followed: Any, process: str) -> None:
     logs, job, _ = followed
     assert lines_of(logs, process, job=job["id"])
@@ -191,7 +192,7 @@ def test_the_id_of_a_job_is_in_the_logs_of_every_process(followed: Any, process:
         'graspd_stage_seconds_count{stage="scene"} 2.0',
         'graspd_jobs_ended_total{state="succeeded"} 1.0',
         'graspd_workers{state="idle"} 1.0',
-        "graspd_keeper_up 1.0",
+        "graspd_controller_up 1.0",
         'graspd_part_up{part="store"} 1.0',
     ],
 )

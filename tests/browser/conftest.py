@@ -102,8 +102,8 @@ def page(address: str, chromium: Any) -> Iterator[Any]:
 
 @pytest.fixture(scope="session")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Address of a whole service: Redis, API, keeper, and a worker with the real engine on the CPU."""
-    wanted = Settings(data_dir=tmp_path_factory.mktemp("service"), port=0, device="cpu", keeper_interval_s=0.5)
+    """Address of a whole service: Redis, API, controller, and a worker with the real engine on the CPU."""
+    wanted = Settings(data_dir=tmp_path_factory.mktemp("service"), port=0, device="cpu", controller_interval_s=0.5)
     worker = (sys.executable, "-m", "graspd", "worker")
     supervisor = Supervisor(wanted, workers=1, worker_command=worker)
     supervisor.start()

@@ -43,7 +43,7 @@ CLAW = robot(
 
 
 def checked(parts: Parts, name: str) -> None:
-    """What a worker and the keeper make of an upload."""
+    """What a worker and the controller make of an upload."""
     asset = parts.index.assets.get(AssetKind.HAND, name)
     message = IngestMessage(schema_=1, task_id="i", kind=AssetKind.HAND, name=asset.name, digest=asset.digest)
     ingest.run(message, TaskContext(parts.store))

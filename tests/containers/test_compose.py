@@ -66,7 +66,7 @@ def until(met: Callable[[], object], what: str, project: Project, seconds: float
 def test_profiles_of_the_env_file_bring_s3_and_postgresql(project: Project) -> None:
     assert set(project.compose("config", "--services").split()) == {
         "api",
-        "keeper",
+        "controller",
         "worker-cpu",
         "redis",
         "postgres",
@@ -133,7 +133,7 @@ def test_a_job_over_http_outlives_two_killed_workers(project: Project) -> None:
 
         until(
             lambda: get("/readyz") and get("/v1/objects").get("items"),
-            "the API is ready, and the keeper published objects",
+            "the API is ready, and the controller published objects",
             project,
         )
         assert httpx.get(f"{url}/v1/jobs", trust_env=False).status_code == 401
@@ -172,9 +172,9 @@ def test_a_job_over_http_outlives_two_killed_workers(project: Project) -> None:
         assert len({row["shard_id"] for row in rows}) == BATCHES
 
     # Both end with 1 where something differs, is damaged or is missing.
-    project.compose("exec", "-T", "keeper", "graspd", "admin", "index", "rebuild", "--check")
-    project.compose("exec", "-T", "keeper", "graspd", "admin", "store", "verify")
-    for service in ("api", "keeper", "worker-cpu", "redis", "postgres", "s3"):
+    project.compose("exec", "-T", "controller", "graspd", "admin", "index", "rebuild", "--check")
+    project.compose("exec", "-T", "controller", "graspd", "admin", "store", "verify")
+    for service in ("api", "controller", "worker-cpu", "redis", "postgres", "s3"):
         for container in project.containers(service):
             found = project.looked_at(container)
             until(
@@ -183,7 +183,7 @@ def test_a_job_over_http_outlives_two_killed_workers(project: Project) -> None:
                 project,
                 300,
             )
-            if service in ("api", "keeper", "worker-cpu"):
+            if service in ("api", "controller", "worker-cpu"):
                 assert found["HostConfig"]["ReadonlyRootfs"] and found["Config"]["User"] == "10001:10001"
 
 

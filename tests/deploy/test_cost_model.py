@@ -29,7 +29,7 @@ ONE_OF_EACH = Measured(
     manifest_bytes=0.0,
     redis_ops_per_task=86_400.0,
     redis_ops_worker=1.0,
-    redis_ops_keeper=5.0,
+    redis_ops_controller=5.0,
 )
 
 
@@ -39,7 +39,7 @@ def test_the_model_is_the_sum_done_by_hand() -> None:
     assert (found.batches, found.tasks, found.jobs, found.pictures) == (2, 6, 2, 24)
     assert found.core_hours == pytest.approx(5008 / 3600)
     assert found.cores == 1
-    # 6 tasks in 86400 s at 86400 each, one worker, the keeper.
+    # 6 tasks in 86400 s at 86400 each, one worker, the controller.
     assert found.redis_ops_per_second == pytest.approx(6 + 1 + 5)
     assert found.gigabytes == pytest.approx((64 + 4 * 1000 + 24 * 1e6) / 1e9)
     assert (found.objects, found.index_rows) == (14, 64 + 12 + 2)

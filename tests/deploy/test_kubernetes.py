@@ -85,7 +85,7 @@ def test_the_pods_that_keda_starts_are_what_kubernetes_takes() -> None:
 
 
 def test_a_wrong_field_would_be_found() -> None:
-    broken = next(yaml.safe_load_all((FOLDER / "base" / "keeper.yaml").read_text()))
+    broken = next(yaml.safe_load_all((FOLDER / "base" / "controller.yaml").read_text()))
     broken["spec"]["replica"] = 2
     with pytest.raises(kubernetes_validate.ValidationError):
         kubernetes_validate.validate(broken, "1.34.0", strict=True)
@@ -150,15 +150,17 @@ def test_kubernetes_waits_longer_than_a_process_may_take_to_stop() -> None:
         assert pod["terminationGracePeriodSeconds"] > float(settings["data"]["GRASPD_STOP_GRACE_S"]), name
 
 
-def test_a_second_keeper_takes_over_where_the_first_is_lost() -> None:
-    (keeper,) = [found for found in documents("Deployment") if found["metadata"]["name"] == "keeper"]
-    assert keeper["spec"]["replicas"] == 2
-    assert keeper["spec"]["strategy"]["rollingUpdate"]["maxUnavailable"] == 1, "one leads while the other is exchanged"
-    environment = {one["name"]: one for one in keeper["spec"]["template"]["spec"]["containers"][0]["env"]}
-    named = environment["GRASPD_KEEPER_NAME"]["valueFrom"]["fieldRef"]["fieldPath"]
+def test_a_second_controller_takes_over_where_the_first_is_lost() -> None:
+    (controller,) = [found for found in documents("Deployment") if found["metadata"]["name"] == "controller"]
+    assert controller["spec"]["replicas"] == 2
+    assert controller["spec"]["strategy"]["rollingUpdate"]["maxUnavailable"] == 1, (
+        "one leads while the other is exchanged"
+    )
+    environment = {one["name"]: one for one in controller["spec"]["template"]["spec"]["containers"][0]["env"]}
+    named = environment["GRASPD_CONTROLLER_NAME"]["valueFrom"]["fieldRef"]["fieldPath"]
     assert named == "metadata.name", "two under one name would both lead"
     budgets = [found["spec"]["selector"] for found in documents("PodDisruptionBudget")]
-    assert keeper["spec"]["selector"] in budgets, "a drain of two nodes takes one after the other"
+    assert controller["spec"]["selector"] in budgets, "a drain of two nodes takes one after the other"
 
 
 def test_the_environment_is_made_of_settings() -> None:
@@ -234,7 +236,7 @@ def test_the_api_is_not_restarted_because_a_part_is_away() -> None:
 
 
 @pytest.mark.parametrize("name", sorted({name for name, _ in pods()} - {"api", "redis"}))
-def test_a_keeper_or_worker_that_stands_still_is_started_again(name: str) -> None:
+def test_a_controller_or_worker_that_stands_still_is_started_again(name: str) -> None:
     for found, container in containers():
         if found == name:
             assert container["livenessProbe"]["periodSeconds"] * container["livenessProbe"]["failureThreshold"] >= 60

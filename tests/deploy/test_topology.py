@@ -26,7 +26,7 @@ _READY_S = 120.0
 
 @dataclass
 class Topology:
-    """Two front doors, a keeper and two workers without an engine."""
+    """Two front doors, a controller and two workers without an engine."""
 
     folder: Path
     variables: dict[str, str]
@@ -121,7 +121,7 @@ def test_the_services_of_the_compose_file_do_a_job_together(
     key = key_of(topology)
     for number, port in enumerate(topology.ports):
         topology.start(f"api-{number}", "api", "graspd", "api", GRASPD_PORT=str(port))
-    topology.start("keeper", "keeper", "graspd", "keeper")
+    topology.start("controller", "controller", "graspd", "controller")
     for number in range(2):
         topology.start(f"worker-{number}", "worker-cpu", "tests.fakes", GRASPD_DEVICE="cpu")
     topology.until_ready()
@@ -138,7 +138,7 @@ def test_the_services_of_the_compose_file_do_a_job_together(
     with first, second:
         assert httpx.get(f"{first.base_url}/v1/jobs", trust_env=False, timeout=60).status_code == 401
         deadline = time.monotonic() + _READY_S
-        while not first.get("/v1/objects").json()["items"]:  # the keeper publishes what comes with graspd
+        while not first.get("/v1/objects").json()["items"]:  # the controller publishes what comes with graspd
             assert time.monotonic() < deadline, topology.logs()
             time.sleep(0.2)
         job = first.post("/v1/jobs", json={"hand": "allegro", "object": "mug", "grasps": 128, "scenes": 1})
@@ -148,7 +148,7 @@ def test_the_services_of_the_compose_file_do_a_job_together(
             time.sleep(0.2)
         assert second.get("/v1/stats").json()["grasps"] == 128
 
-    assert topology.graspd("keeper", "keeper", "--check").returncode == 0
+    assert topology.graspd("controller", "controller", "--check").returncode == 0
     assert topology.graspd("worker-cpu", "worker", "--check").returncode == 0
     for name, value in topology.environment("api").items():
         monkeypatch.setenv(name, value)
@@ -161,7 +161,7 @@ def test_the_services_of_the_compose_file_do_a_job_together(
 
 @pytest.mark.s3
 def test_a_check_fails_where_nothing_lives(topology: Topology) -> None:
-    for service, command in (("keeper", "keeper"), ("worker-cpu", "worker")):
+    for service, command in (("controller", "controller"), ("worker-cpu", "worker")):
         done = topology.graspd(service, command, "--check")
         assert done.returncode == 1
         assert len(done.stderr.splitlines()) == 1

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 
-from benchmarks.week import HARSH, KEEPER_TASKS_PER_S, Rates, Told, Week, table, task_seconds
+from benchmarks.week import CONTROLLER_TASKS_PER_S, HARSH, Rates, Told, Week, table, task_seconds
 
 NOTHING = Rates(
     reclaimed_per_day=0,
     killed_per_day=0,
     cut_off_per_day=0,
     zone_per_week=0,
-    keeper_killed_per_day=0,
+    controller_killed_per_day=0,
     redis_restarts_per_week=0,
     store_outages_per_week=0,
 )
@@ -58,7 +58,7 @@ def test_one_cut_off_for_longer_than_its_lease_does_work_for_nothing() -> None:
     assert 0 < told.done_twice < told.attempts_lost
 
 
-def test_outages_of_keeper_redis_and_store_cost_waiting_and_one_task_a_node() -> None:
+def test_outages_of_controller_redis_and_store_cost_waiting_and_one_task_a_node() -> None:
     away = replace(NOTHING, redis_restarts_per_week=7.0, redis_away_s=600.0)
     told = week(away)
     assert told.lost == 0.0
@@ -66,7 +66,7 @@ def test_outages_of_keeper_redis_and_store_cost_waiting_and_one_task_a_node() ->
     assert each == pytest.approx(600 - 60 * 2.718281828 ** (1.5 * 0.09) / 2, rel=0.03)
     told = week(replace(NOTHING, store_outages_per_week=7.0, store_away_s=600.0))
     assert told.lost_s["store"] == pytest.approx(told.interruptions["store"] * 50 * 60 * 1.144, rel=0.1)
-    assert week(replace(NOTHING, keeper_killed_per_day=24.0)).idle_s == {}, "two tasks a worker wait for that long"
+    assert week(replace(NOTHING, controller_killed_per_day=24.0)).idle_s == {}, "two tasks a worker wait for that long"
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -75,5 +75,5 @@ def test_under_a_hundred_of_the_work_is_lost(rates: Rates, seed: int) -> None:
     told = week(rates, nodes=30, task_s=task_seconds(1), seed=seed)
     assert 0 < told.lost < 0.01
     assert told.failed_for_good < 1e-2
-    assert told.keeper_busy < 1 and 30 / task_seconds(1) < KEEPER_TASKS_PER_S
+    assert told.controller_busy < 1 and 30 / task_seconds(1) < CONTROLLER_TASKS_PER_S
     assert any(row.startswith("| work lost |") for row in table(told))

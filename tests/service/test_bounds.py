@@ -75,7 +75,7 @@ def test_an_index_grows_by_about_a_kilobyte_a_grasp(tmp_path: Path) -> None:
 def test_everything_in_redis_that_is_not_of_a_fixed_number_has_an_end(rq_queue: RqQueue) -> None:
     rq_queue.enqueue([message_for()], Lane.BULK)
     rq_queue.discard(["0" * 32])
-    rq_queue.announce("keeper", 5)
+    rq_queue.announce("controller", 5)
     rq_queue.lead("a", 5)
     rq_queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), task_id="a"))
     rq_queue.report("a", Report(done=1.0, total=2.0))

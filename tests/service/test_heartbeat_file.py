@@ -1,4 +1,4 @@
-"""A file whose age tells health checks whether a keeper or a worker lives."""
+"""A file whose age tells health checks whether a controller or a worker lives."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from service.heartbeat_file import HeartbeatFile
 from service.model.errors import QueueUnavailable
 from service.pipeline.backends import Parts
-from service.pipeline.keeper import Keeper
+from service.pipeline.controller import Controller
 from tests.deploy.test_kubernetes import AGE_OF_THE_FILE
 from tests.waiting import until
 
@@ -37,7 +37,9 @@ def test_the_check_follows_the_age_of_the_file(tmp_path: Path) -> None:
     assert not is_healthy(file)
 
 
-def test_a_keeper_lives_also_while_redis_is_away(parts: Parts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_controller_lives_also_while_redis_is_away(
+    parts: Parts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def away(*_: object) -> None:
         raise QueueUnavailable("Redis does not answer")
 
@@ -45,7 +47,9 @@ def test_a_keeper_lives_also_while_redis_is_away(parts: Parts, tmp_path: Path, m
     settings = parts.settings.model_copy(update={"heartbeat_file": file, "scrub_mb_per_s": 0.0})
     monkeypatch.setattr(parts.queue, "depths", away)
     stop = threading.Event()
-    thread = threading.Thread(target=Keeper(Parts(settings, parts.store, parts.index, parts.queue)).run, args=(stop,))
+    thread = threading.Thread(
+        target=Controller(Parts(settings, parts.store, parts.index, parts.queue)).run, args=(stop,)
+    )
     thread.start()
     try:
         until(file.exists, "the file is touched")

@@ -32,10 +32,10 @@ def lines(written: Callable[[], str]) -> list[dict[str, Any]]:
 
 
 def test_a_line_is_one_json_object_with_process_and_message(written: Callable[[], str]) -> None:
-    logs.set_up(Settings(), "keeper")
+    logs.set_up(Settings(), "controller")
     log.info("two\nlines, %d", 2)
     (line,) = lines(written)
-    assert (line["process"], line["level"], line["logger"]) == ("keeper", "INFO", "graspd.test")
+    assert (line["process"], line["level"], line["logger"]) == ("controller", "INFO", "graspd.test")
     assert line["message"] == "two\nlines, 2"
     assert line["time"].endswith("Z")
 

@@ -78,7 +78,7 @@ def starting(folder: Path, patch: pytest.MonkeyPatch) -> Iterator[Started]:
         for name, value in {"FAKE_HOLD": str(folder / "hold"), **(environment or {})}.items():
             patch.setenv(name, value)
         wanted = Settings(
-            data_dir=folder / "data", port=0, device="cpu", keeper_interval_s=0.5, **{"task_s": 0.0, **settings}
+            data_dir=folder / "data", port=0, device="cpu", controller_interval_s=0.5, **{"task_s": 0.0, **settings}
         )
         command = ("-m", "tests.fakes") if fakes else ("-m", "graspd", "worker")
         supervisor = Supervisor(wanted, workers=workers, api=api, worker_command=(sys.executable, *command))

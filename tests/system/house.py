@@ -1,4 +1,4 @@
-"""Redis, keepers and workers as processes that a test starts, kills and listens to one by one."""
+"""Redis, controllers and workers as processes that a test starts, kills and listens to one by one."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ LEASE_S = 2.0
 
 
 class House:
-    """Redis, keepers and a worker as processes, each with a log. While there is a file `hold` no task ends."""
+    """Redis, controllers and a worker as processes, each with a log. While there is a file `hold` no task ends."""
 
     def __init__(self, folder: Path, *, lease_s: float = LEASE_S) -> None:
-        self.settings = Settings(data_dir=folder / "data", lease_s=lease_s, keeper_interval_s=0.3, task_s=0.0)
+        self.settings = Settings(data_dir=folder / "data", lease_s=lease_s, controller_interval_s=0.3, task_s=0.0)
         self._logs = folder / "logs"
         self._logs.mkdir()
         self.hold = folder / "hold"
@@ -48,7 +48,7 @@ class House:
             "GRASPD_DATA_DIR": str(self.settings.data_dir),
             "GRASPD_REDIS_URL": redis_url(self.settings),
             "GRASPD_LEASE_S": str(self.settings.lease_s),
-            "GRASPD_KEEPER_INTERVAL_S": "0.3",
+            "GRASPD_CONTROLLER_INTERVAL_S": "0.3",
             "GRASPD_TASK_S": "0",
             "GRASPD_LOG_FORMAT": "text",
             "FAKE_HOLD": str(self.hold),
@@ -57,8 +57,8 @@ class House:
         with (self._logs / f"{name}.log").open("ab") as log:
             self.processes[name] = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
 
-    def keeper(self, name: str, **more: str) -> None:
-        self.start(name, sys.executable, "-m", "graspd", "keeper", **more)
+    def controller(self, name: str, **more: str) -> None:
+        self.start(name, sys.executable, "-m", "graspd", "controller", **more)
 
     def says(self, name: str, what: str) -> int:
         """How often a process said something."""

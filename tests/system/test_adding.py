@@ -1,4 +1,4 @@
-"""A user's own files through the whole service: command line, API, keeper, worker with the real engine."""
+"""A user's own files through the whole service: command line, API, controller, worker with the real engine."""
 
 from __future__ import annotations
 

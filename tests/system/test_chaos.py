@@ -64,7 +64,7 @@ def test_a_task_whose_worker_is_killed_runs_again_and_its_result_appears_once(sy
     assert attempt.kind == "WorkerLost"
     settings = system.parts.settings
     assert f"no sign of life for {settings.lease_s:g} s" in attempt.reason
-    assert settings.lease_s + settings.keeper_interval_s + settings.retry_backoff_s < RECOVERY_S
+    assert settings.lease_s + settings.controller_interval_s + settings.retry_backoff_s < RECOVERY_S
     assert len(system.parts.index.grasps.page(GraspFilter(job=job), limit=200).items) == 32
     (base,) = system.parts.index.shards.page(job=job, kind="base").items
     kept = read_shard(system.parts.store.get(base.key))["grasp/joint_positions"]
@@ -184,7 +184,7 @@ def test_a_second_up_on_the_same_data_is_refused_and_says_by_whom(system: System
 
 
 def test_any_child_that_is_killed_is_started_again(system: System) -> None:
-    for name in ("keeper", "worker-0", "redis"):
+    for name in ("controller", "worker-0", "redis"):
         pid = system.kill(name)
         system.until(lambda n=name, p=pid: system.supervisor.pids.get(n, p) != p, f"{name} is back")
     system.supervisor.wait_ready(PATIENCE_S)
@@ -212,7 +212,7 @@ def test_no_process_outlives_a_killed_supervisor_and_the_next_one_starts(tmp_pat
     with subprocess.Popen(command, stdout=subprocess.PIPE) as parent:
         assert parent.stdout is not None
         pids = json.loads(parent.stdout.readline())
-        assert set(pids) == {"redis", "keeper", "worker-0"}
+        assert set(pids) == {"redis", "controller", "worker-0"}
         parent.kill()
     until(lambda: not any(alive(pid) for pid in pids.values()), "its children end with it")
     settings = Settings(data_dir=tmp_path / "data", port=0, device="cpu")
@@ -234,7 +234,7 @@ def test_no_process_outlives_a_killed_supervisor_and_the_next_one_starts(tmp_pat
 def test_random_kills_lose_nothing_and_repeat_nothing(
     start: Start, request: pytest.FixtureRequest, batches: int, kills: int, remote: bool
 ) -> None:
-    """Redis, API, keeper and workers are killed; with the store on S3 and the index in PostgreSQL too."""
+    """Redis, API, controller and workers are killed; with the store on S3 and the index in PostgreSQL too."""
     places: dict[str, str] = {}
     if remote:
         url = request.getfixturevalue("postgres_server").database()
@@ -257,11 +257,11 @@ def test_random_kills_lose_nothing_and_repeat_nothing(
         everyone |= set(system.supervisor.pids.values())
         # Those not killed yet come first, so that every part is killed at least once.
         names_now = sorted(system.supervisor.pids)
-        name = rng.choice(sorted(set(names_now) - killed) or names_now or ["keeper"])
+        name = rng.choice(sorted(set(names_now) - killed) or names_now or ["controller"])
         if name in system.supervisor.pids:
             system.kill(name)
             killed.add(name)
-    assert killed >= {"redis", "api", "keeper", "worker-0"}
+    assert killed >= {"redis", "api", "controller", "worker-0"}
     done = system.finish(*jobs, seconds=PATIENCE_S + batches)
     assert {job.state for job in done} == {State.SUCCEEDED}
     manifests = [e.key for e in system.parts.store.list(names.SHARDS) if e.key.endswith(".json")]

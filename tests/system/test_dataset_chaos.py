@@ -68,9 +68,9 @@ def test_a_dataset_that_is_cancelled_stops_and_stays_so(start: Callable[..., Sys
     system.hold.touch()
     actions.cancel(system.parts, "kitchen")
     system.until(lambda: system.parts.index.datasets.get("kitchen").state is State.CANCELLED, "it is cancelled")
-    system.kill("keeper")
+    system.kill("controller")
     system.until(lambda: _waits_for_nothing(system), "nothing waits for it any more")
-    # A task that was at its end when the cancellation came has succeeded; the new keeper hears of it.
+    # A task that was at its end when the cancellation came has succeeded; the new controller hears of it.
     system.until(lambda: not differences(system.parts.index, system.parts.store), "the index is what the store says")
     states = {cell.state for cell in status(system.parts.index, "kitchen").cells}
     assert states == {State.SUCCEEDED, State.CANCELLED}

@@ -1,4 +1,4 @@
-"""A network from its upload to the grasps that set out from it, through API, Redis, keeper and a real worker."""
+"""A network from its upload to the grasps that set out from it, through API, Redis, controller and a real worker."""
 
 from __future__ import annotations
 

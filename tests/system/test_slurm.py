@@ -56,7 +56,7 @@ def test_preemption_a_lost_node_and_a_time_limit_lose_nothing(tmp_path: Path, sl
     settings = Settings(
         data_dir=tmp_path / "data",
         store_url=(shared / "store").as_uri(),
-        keeper_interval_s=0.3,
+        controller_interval_s=0.3,
         lease_s=2.0,
         task_s=0.0,
     )
@@ -110,7 +110,7 @@ def test_the_service_of_a_lost_node_starts_anew_elsewhere_and_the_workers_find_i
     fakes = command(tmp_path / "bin" / "fake" / "graspd", "tests.fakes")
     quick = {
         "GRASPD_LEASE_S": "2",
-        "GRASPD_KEEPER_INTERVAL_S": "0.3",
+        "GRASPD_CONTROLLER_INTERVAL_S": "0.3",
         "GRASPD_PORT": "0",
         "GRASPD_TASK_S": "0",
         "JOIN_HOST": "127.0.0.1",

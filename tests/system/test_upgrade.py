@@ -50,7 +50,7 @@ def older_worker(house: House, folder: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.chaos
-def test_each_version_of_worker_takes_what_it_can_and_the_keeper_holds_back_the_rest(
+def test_each_version_of_worker_takes_what_it_can_and_the_controller_holds_back_the_rest(
     house: House, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def submit(seed: int, *, revision: int) -> str:
@@ -65,11 +65,15 @@ def test_each_version_of_worker_takes_what_it_can_and_the_keeper_holds_back_the_
     # While there is no worker, those of this version are expected.
     house.until(house.parts.queue.workers, "the older worker says that it is there")
     before = submit(1, revision=OLD)
-    house.start("keeper", sys.executable, "-c", MAKES.format(NEW) + "from graspd.cli import main; main()", "keeper")
+    house.start(
+        "controller", sys.executable, "-c", MAKES.format(NEW) + "from graspd.cli import main; main()", "controller"
+    )
     house.until(lambda: state(before) is State.SUCCEEDED, "the older worker does what was planned before the upgrade")
 
     after = submit(2, revision=NEW)
-    house.until(lambda: house.says("keeper", "held back, no worker that is here can do it"), "the keeper says so")
+    house.until(
+        lambda: house.says("controller", "held back, no worker that is here can do it"), "the controller says so"
+    )
     assert state(after) is State.QUEUED
     tasks = house.parts.index.jobs.tasks(job=after, limit=10).items
     assert [task.attempt for task in tasks] == [1] * 3

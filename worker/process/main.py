@@ -127,7 +127,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         try:
             self._outcome = self._await("done", self._keep_lease)
         except EngineLost as error:
-            # As if this process had been killed: the lease stays, and the keeper finds that nobody keeps it.
+            # As if this process had been killed: the lease stays, and the controller finds that nobody keeps it.
             log.error("this worker ends: %s", error)
             os._exit(1)
         self._prepare_end()
@@ -172,7 +172,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         try:
             self._queue.publish(event)
         except QueueUnavailable as error:
-            log.warning("what became of task %s is for the keeper to find: %s", event.task_id, error)
+            log.warning("what became of task %s is for the controller to find: %s", event.task_id, error)
 
     def _keep_lease(self) -> None:
         """A sign of life for the task in hand, which hears if it is not wanted any more."""

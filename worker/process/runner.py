@@ -74,7 +74,7 @@ class Runner:
         """Do a task.
 
         Returns:
-            what to tell the keeper; None if the task is no longer this worker's.
+            what to tell the controller; None if the task is no longer this worker's.
 
         Raises:
             TaskRefused: the message cannot be read, so there is no task to fail.
@@ -91,7 +91,7 @@ class Runner:
         started, clock = timestamp(), time.monotonic()
         try:
             if lacking := own_ability().lacks(need_of(message)):
-                # For another worker: the keeper sees who is there, and tells what none of them can do.
+                # For another worker: the controller sees who is there, and tells what none of them can do.
                 return self._event(EventKind.DEFERRED, message, message=f"another version of worker does it: {lacking}")
             return self._do(message, context)
         except TaskCancelled:

@@ -1,4 +1,4 @@
-"""What the store says of jobs and datasets, as rows. Only the API and the keeper call these; each is idempotent."""
+"""What the store says of jobs and datasets, as rows. Only the API and the controller call these; each is idempotent."""
 
 from __future__ import annotations
 

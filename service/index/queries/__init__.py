@@ -1,1 +1,1 @@
-"""What the API and the keeper ask the index."""
+"""What the API and the controller ask the index."""

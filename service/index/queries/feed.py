@@ -1,4 +1,4 @@
-"""What the keeper asks the index: which tasks should be queued, and which it believes are."""
+"""What the controller asks the index: which tasks should be queued, and which it believes are."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class ReadyCheck:
 
 @dataclass(frozen=True)
 class Feed:
-    """Reads of the keeper."""
+    """Reads of the controller."""
 
     database: Database
 

@@ -30,7 +30,7 @@ from service.store.records import Put, read_record
 def create(
     parts: Parts, request: DatasetRequest, *, owner: str = "", reach: Reach = EVERYTHING
 ) -> tuple[DatasetView, bool]:
-    """Record a dataset; the keeper plans its jobs. The same hands, objects and options again are the same dataset.
+    """Record a dataset; the controller plans its jobs. The same hands, objects and options again are the same dataset.
 
     Args:
         owner: id of the API key that submits it; its jobs get the same.

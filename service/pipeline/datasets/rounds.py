@@ -1,4 +1,4 @@
-"""Carries out what users want of datasets, a little in each round of the keeper: plans jobs, cancels and retries them.
+"""Carries out users' actions on datasets, a little in each round of the controller: plans, cancels and retries jobs.
 
 Killed at any moment, its successor goes on: which cells have a job is in the index, and a job's event names the event
 of the dataset that caused it, so none is passed on twice.
@@ -21,7 +21,7 @@ from service.pipeline.ranges import TaskRanges
 from service.store.records import job_events
 
 log = logging.getLogger(__name__)
-#: Time for datasets in one round of the keeper [s]: the queue and lost workers must not wait for long.
+#: Time for datasets in one round of the controller [s]: the queue and lost workers must not wait for long.
 BUDGET_S: Final = 0.5
 _CELLS_AT_ONCE: Final = 20
 

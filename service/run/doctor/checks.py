@@ -30,7 +30,7 @@ def checks_of(settings: Settings, *, full: bool = False) -> list[Check]:
         ),
         Check("damage", partial(database.damage, settings)),
         Check("clocks", partial(clocks.clocks, settings), limit_s=120.0),
-        Check("keeper", partial(fleet.keeper, settings)),
+        Check("controller", partial(fleet.controller, settings)),
         Check("workers", partial(fleet.workers, settings)),
         Check("port", partial(fleet.port, settings)),
     ]

@@ -23,7 +23,7 @@ from service.settings import Settings
 from service.store.store import open_store
 
 _NONE_HERE: Final = (
-    "no index is here: GRASPD_INDEX_URL is unset and there is no index.sqlite; only api and keeper need one"
+    "no index is here: GRASPD_INDEX_URL is unset and there is no index.sqlite; only api and controller need one"
 )
 _REBUILD: Final = (
     "graspd admin index rebuild --check shows all of it; graspd admin index rebuild mends it while the service runs"
@@ -31,7 +31,7 @@ _REBUILD: Final = (
 _CROWDED: Final = 0.8
 #: With more shards than this only a sample is compared.
 _ALL_SHARDS: Final = 2000
-#: What a keeper has to take up between two looks [s].
+#: What a controller has to take up between two looks [s].
 _SETTLES_S: Final = 3.0
 
 
@@ -143,7 +143,7 @@ def index_is_store(settings: Settings, *, full: bool = False, settles_s: float =
         made = opened.notes.completeness()
         if made is None:
             return warning(
-                name, "the index is new, and lacks what the store has", "start graspd keeper: it fills the index"
+                name, "the index is new, and lacks what the store has", "start graspd controller: it fills the index"
             )
         with opened.database.reading() as connection:
             count = int(connection.scalar(select(func.count()).select_from(shards)) or 0)
@@ -164,7 +164,7 @@ def index_is_store(settings: Settings, *, full: bool = False, settles_s: float =
 
 
 def damage(settings: Settings) -> Finding:
-    """What the keeper's reading through the store found, or `graspd admin store verify`."""
+    """What the controller's reading through the store found, or `graspd admin store verify`."""
     name = "damage"
     if why := _openable(settings):
         return skipped(name, why)

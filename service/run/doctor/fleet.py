@@ -1,4 +1,4 @@
-"""Who is there: a keeper, workers that fit to this graspd, and the port of the API."""
+"""Who is there: a controller, workers that fit to this graspd, and the port of the API."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ _IDLE: Final = "no service runs on this data folder"
 _AWAY: Final = "Redis does not answer"
 
 
-def keeper(settings: Settings) -> Finding:
+def controller(settings: Settings) -> Finding:
     """Whether one gave a sign of life lately."""
-    name = "keeper"
+    name = "controller"
     if not is_there(settings):
         return skipped(name, _IDLE)
     try:
@@ -39,10 +39,10 @@ def keeper(settings: Settings) -> Finding:
     if not lives:
         return bad(
             name,
-            "no keeper gave a sign of life: finished tasks are not taken up, and nothing is queued",
-            "graspd keeper",
+            "no controller gave a sign of life: finished tasks are not taken up, and nothing is queued",
+            "graspd controller",
         )
-    return good(name, "a keeper lives")
+    return good(name, "a controller lives")
 
 
 def workers(settings: Settings) -> Finding:

@@ -131,7 +131,7 @@ def persistence(settings: Settings) -> Finding:
         )
     return warning(
         name,
-        "the log of writes is off: after a crash nothing runs until the keeper has queued everything again",
+        "the log of writes is off: after a crash nothing runs until the controller has queued everything again",
         "redis-cli config set appendonly yes, and `appendonly yes` in its configuration",
     )
 

@@ -29,7 +29,7 @@ def test_an_index_that_lacks_what_the_store_has_is_not_ready(settings: Settings,
     fresh.write.add_job(record)
     assert (found := asked_anew(app))["status"] == 503
     assert not found["ok"]
-    assert "keeper" in str(found["detail"])
+    assert "controller" in str(found["detail"])
     rebuild(fresh, parts.store)
     assert asked_anew(app)["status"] == 200
     fresh.close()

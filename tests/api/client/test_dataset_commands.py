@@ -1,4 +1,4 @@
-"""`graspd datasets` against the real service: Redis, keeper, API. No worker, so cells wait."""
+"""`graspd datasets` against the real service: Redis, controller, API. No worker, so cells wait."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CREATE = ("datasets", "create", "kitchen", "--hands", "allegro,barrett", "--obje
 
 
 def until(service: Supervisor, name: str, state: State) -> None:
-    """Wait until the keeper has brought every cell to a state."""
+    """Wait until the controller has brought every cell to a state."""
     with Client(service.api_url) as client:
         cells = client.cells
         waiting.until(

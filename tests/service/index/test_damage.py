@@ -20,7 +20,7 @@ from service.model.records import AttemptRecord, JobRecord
 from service.model.states import AssetKind, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
-from service.pipeline.keeper import Keeper
+from service.pipeline.controller import Controller
 from service.run.commands import app
 from service.settings import Settings
 from service.store.library import stored_assets
@@ -116,7 +116,7 @@ def test_a_damaged_record_is_left_out_of_a_lost_index_and_named(parts: Parts, re
     key = record(parts)
     overwrite(parts.store, key, DAMAGED)
     fresh = lost(parts)
-    Keeper(fresh).round()
+    Controller(fresh).round()
     assert shown(fresh.index) == GOOD - (record is of_job)
     made = fresh.index.notes.completeness()
     assert made is not None
@@ -129,9 +129,9 @@ def test_a_record_that_was_mended_is_there_again(parts: Parts) -> None:
     whole = parts.store.get(key)
     overwrite(parts.store, key, DAMAGED)
     fresh = lost(parts)
-    Keeper(fresh).round()
+    Controller(fresh).round()
     overwrite(parts.store, key, whole)
-    Keeper(fresh).round()
+    Controller(fresh).round()
     assert shown(fresh.index) == GOOD
     assert (made := fresh.index.notes.completeness()) is not None
     assert made.left_out == 0
@@ -142,7 +142,7 @@ def test_one_new_job_does_not_make_a_lost_index_whole(parts: Parts) -> None:
     fresh = lost(parts)
     fresh.index.write.add_job(read_record(JobRecord, parts.store, of_job(parts)))
     assert fresh.index.notes.completeness() is None
-    Keeper(fresh).round()
+    Controller(fresh).round()
     assert shown(fresh.index) == GOOD
     assert differences(fresh.index, fresh.store) == []
     fresh.index.close()
@@ -150,14 +150,14 @@ def test_one_new_job_does_not_make_a_lost_index_whole(parts: Parts) -> None:
 
 def test_a_damaged_attempt_fails_its_task_and_stops_no_round(parts: Parts) -> None:
     clock = Clock()
-    keeper = Keeper(parts, clock=clock)
-    keeper.round()
+    controller = Controller(parts, clock=clock)
+    controller.round()
     overwrite(parts.store, of_attempt(parts), DAMAGED)
     delivery = parts.queue.take("w")  # type: ignore[attr-defined]
     parts.queue._held.clear()  # type: ignore[attr-defined]
     for _ in range(6):
         clock.now += 1.0
-        keeper.round()
+        controller.round()
     assert delivery is not None
     assert sum(job.state is State.FAILED for job in parts.index.jobs.page().items) <= 1
 
@@ -182,12 +182,12 @@ def remove_only_the_file(folder: Path) -> None:
 def test_an_index_removed_under_its_readers_is_made_again_for_all_of_them(
     parts: Parts, remove: Callable[[Path], None]
 ) -> None:
-    keeper = Keeper(parts)
-    keeper.round()
+    controller = Controller(parts)
+    controller.round()
     other = Index(parts.settings.resolved_index_url)
     assert shown(other) == GOOD
     remove(parts.settings.data_dir)
-    keeper.round()
+    controller.round()
     assert shown(other) == shown(parts.index) == GOOD
     job_actions.submit(Parts(parts.settings, parts.store, other, parts.queue), request(seed=50))
     assert shown(parts.index) == GOOD + 1
@@ -232,13 +232,13 @@ def test_a_damaged_file_gives_way_to_a_rebuilt_one(parts: Parts, harm: Callable[
 
 
 @pytest.mark.parametrize("harm", HARMS)
-def test_a_keeper_outlives_a_damaged_index(parts: Parts, harm: Callable[[Path], None]) -> None:
-    keeper = Keeper(parts)
-    keeper.round()
+def test_a_controller_outlives_a_damaged_index(parts: Parts, harm: Callable[[Path], None]) -> None:
+    controller = Controller(parts)
+    controller.round()
     harm(parts.settings.data_dir)
     for _ in range(4):
         try:
-            keeper.round()
+            controller.round()
         except IndexUnavailable:
             continue
     assert shown(parts.index) == GOOD

@@ -452,7 +452,7 @@ def test_what_was_made_adds_up_in_intervals_of_any_length(parts: Parts) -> None:
 
 
 def test_writers_at_once_leave_the_rows_that_follow_from_the_store(parts: Parts, index_url: str) -> None:
-    """The keeper indexes shards while the API of another process cancels and retries the same job, over and over."""
+    """The controller indexes shards while the API of another process cancels and retries their job, over and over."""
     job, _ = job_actions.submit(parts, request(grasps=32 * 12, scenes=1))
     record = read_record(JobRecord, parts.store, names.job_record(job.id))
     messages = [message_of(record, task, attempt=1, max_attempt=3) for task in plan(record)]

@@ -100,7 +100,7 @@ def test_an_index_of_another_revision_is_emptied_where_that_is_asked_for(url: st
     index = Index(url, anew=True)
     assert index.database.was == "0007"
     assert not index.feed.has_jobs()
-    assert index.notes.completeness() is None, "the keeper fills it if nobody else does"
+    assert index.notes.completeness() is None, "the controller fills it if nobody else does"
     index.close()
     assert columns(engine) == wanted
     Index(url).close()

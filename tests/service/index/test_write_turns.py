@@ -1,4 +1,4 @@
-"""Several processes write one index at once, as for a moment where one keeper follows another."""
+"""Several processes write one index at once, as for a moment where one controller follows another."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 from tests.waiting import PATIENCE_S
 
-KEEPERS = 4
+CONTROLLERS = 4
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def processes(index_url: str, tmp_path: Path) -> Iterator[list[Parts]]:
     with ExitStack() as stack:
         store = open_store("memory://")
         made = [
-            Parts(Settings(data_dir=tmp_path), store, empty_index(index_url), MemoryQueue()) for _ in range(KEEPERS)
+            Parts(Settings(data_dir=tmp_path), store, empty_index(index_url), MemoryQueue()) for _ in range(CONTROLLERS)
         ]
         for parts in made:
             stack.callback(parts.index.close)
@@ -61,12 +61,12 @@ def enter(parts: Parts, place: int, seed: int, *, batches: int = 1) -> JobRecord
     return record
 
 
-def test_keepers_that_index_at_once_leave_the_rows_that_follow_from_the_store(processes: list[Parts]) -> None:
+def test_controllers_that_index_at_once_leave_the_rows_that_follow_from_the_store(processes: list[Parts]) -> None:
     """Each indexes two jobs of eight; each job wants what a job of another wants as well."""
     jobs = [enter(processes[0], 2 * place, place % 4, batches=2) for place in range(8)]
     messages = {job.id: [message_of(job, task, attempt=1, max_attempt=3) for task in plan(job)] for job in jobs}
     made = {message.output: make_shard(processes[0].store, message) for job in jobs[:4] for message in messages[job.id]}
-    begun = threading.Barrier(KEEPERS)
+    begun = threading.Barrier(CONTROLLERS)
 
     def keep(number: int) -> None:
         parts = processes[number]
@@ -79,8 +79,8 @@ def test_keepers_that_index_at_once_leave_the_rows_that_follow_from_the_store(pr
             parts.index.live.set_running({message.task_id: f"worker-{number}" for message in some})
             parts.index.write.add_manifests([made[message.output] for message in some])
 
-    with ThreadPoolExecutor(KEEPERS) as pool:
-        for done in [pool.submit(keep, number) for number in range(KEEPERS)]:
+    with ThreadPoolExecutor(CONTROLLERS) as pool:
+        for done in [pool.submit(keep, number) for number in range(CONTROLLERS)]:
             done.result(PATIENCE_S)
     assert {processes[0].index.jobs.get(job.id).state for job in jobs} == {State.SUCCEEDED}
     assert differences(processes[0].index, processes[0].store) == []

@@ -1,4 +1,4 @@
-"""What a user deletes is gone at once, from the index and from one made anew; its objects go with the keeper."""
+"""What a user deletes is gone at once, from the index and from one made anew; its objects go with the controller."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def graceless(parts: Parts) -> Sweeper:
     return Sweeper(Parts(eager, parts.store, parts.index, parts.queue))
 
 
-def test_a_deleted_job_is_gone_at_once_and_its_objects_with_the_keeper(parts: Parts) -> None:
+def test_a_deleted_job_is_gone_at_once_and_its_objects_with_the_controller(parts: Parts) -> None:
     job = finished(parts)
     delete_job(parts, job)
     with pytest.raises(NotFoundError):
@@ -208,7 +208,7 @@ def test_a_job_entered_while_its_hand_is_deleted_is_not_kept(parts: Parts) -> No
 
 
 @pytest.mark.parametrize("what", ["job", "dataset", "object"])
-def test_a_deletion_that_broke_off_is_carried_out_by_the_next_keeper(
+def test_a_deletion_that_broke_off_is_carried_out_by_the_next_controller(
     parts: Parts, what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At each removal of an object in turn, and between the record and the rows."""
@@ -247,7 +247,7 @@ def test_a_dataset_with_a_snapshot_is_deleted_only_by_a_further_word(parts: Part
     assert not pending(parts.store)
 
 
-SWEPT = pytest.mark.parametrize("swept", [False, True], ids=["at once", "after the keeper"])
+SWEPT = pytest.mark.parametrize("swept", [False, True], ids=["at once", "after the controller"])
 
 
 def sweep(parts: Parts) -> None:

@@ -85,8 +85,8 @@ def test_a_job_whose_record_is_gone_is_given_up(parts: Parts) -> None:
 @pytest.mark.slow
 def test_five_jobs_of_a_million_grasps_delay_a_small_one_by_less_than_three_seconds(parts: Parts) -> None:
     stop, waits = threading.Event(), list[float]()
-    keeper = threading.Thread(target=Entering(parts, stop).run)
-    keeper.start()
+    controller = threading.Thread(target=Entering(parts, stop).run)
+    controller.start()
     with ThreadPoolExecutor(5) as pool:
         large = [pool.submit(job_actions.submit, parts, request(grasps=10**6, seed=seed)) for seed in range(5)]
         number = 0
@@ -96,7 +96,7 @@ def test_five_jobs_of_a_million_grasps_delay_a_small_one_by_less_than_three_seco
             job_actions.submit(parts, request(grasps=1, seed=100 + number))
             waits.append(time.monotonic() - start)
     stop.set()
-    keeper.join()
+    controller.join()
     print(f"{number} small jobs beside five large ones: longest wait {max(waits):.2f} s")
     assert entered(parts) == 5 * 31_250 + number
     assert max(waits) < 3

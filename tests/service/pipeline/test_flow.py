@@ -1,4 +1,4 @@
-"""Many tasks through one keeper: reports, events in bulk, and stages that follow one another between two sweeps."""
+"""Many tasks through one controller: reports, events in bulk, and stages that follow one another between two sweeps."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from service.model.states import Lane, Stage, State
 from service.model.worker_beat import WorkerBeat
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
-from service.pipeline.keeper import Keeper
+from service.pipeline.controller import Controller
 from service.queue.port import Event, EventKind, Report
 from tests.fakes import make_shard, request
 from tests.memory_queue import Delivery, MemoryQueue
@@ -46,52 +46,52 @@ def _event(delivery: Delivery, kind: EventKind) -> Event:
 
 
 def test_the_next_stage_is_queued_without_waiting_for_a_sweep(parts: Parts) -> None:
-    keeper = Keeper(parts, clock=Clock())
-    keeper.round()
+    controller = Controller(parts, clock=Clock())
+    controller.round()
     job_actions.submit(parts, request(scenes=2))
     (first,) = taken(parts)
     finish(parts, first)
-    keeper.round()
+    controller.round()
     assert [delivery.message.stage for delivery in taken(parts)] == [Stage.SCENE]
 
 
 def test_a_task_that_runs_is_not_queued_again_between_two_sweeps(parts: Parts) -> None:
-    keeper = Keeper(parts, clock=Clock())
-    keeper.round()
+    controller = Controller(parts, clock=Clock())
+    controller.round()
     job_actions.submit(parts, request(grasps=96), lane=Lane.BULK)
     held = taken(parts)
     finish(parts, held[0])
-    keeper.round()
+    controller.round()
     assert parts.queue.waiting() == set()
 
 
 def test_many_ends_at_once_are_one_round(parts: Parts) -> None:
-    keeper = Keeper(parts, clock=Clock())
-    keeper.round()
+    controller = Controller(parts, clock=Clock())
+    controller.round()
     job, _ = job_actions.submit(parts, request(grasps=32 * 150), lane=Lane.BULK)
     for delivery in taken(parts):
         finish(parts, delivery)
-    keeper.round()
+    controller.round()
     done = parts.index.jobs.get(job.id)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 150)
 
 
 def test_how_far_a_task_is_reaches_the_index_and_goes_with_its_worker(parts: Parts) -> None:
     clock = Clock()
-    keeper = Keeper(parts, clock=clock)
-    keeper.round()
+    controller = Controller(parts, clock=clock)
+    controller.round()
     job, _ = job_actions.submit(parts, request())
     (held,) = taken(parts)
     parts.queue.report(held.message.task_id, Report(attempt=1, done=3.0, total=4.0, message="descending"))
     clock.now += 1.0
-    keeper.round()
+    controller.round()
     (task,) = parts.index.jobs.tasks(job=job.id).items
     assert (task.done, task.total, task.message) == (3.0, 4.0, "descending")
     assert isinstance(parts.queue, MemoryQueue)
     parts.queue.finish(held)  # it was killed before it said anything more
     for _ in range(2):
         clock.now += 1.0
-        keeper.round()
+        controller.round()
     assert parts.queue.reports() == {}
 
 
@@ -117,9 +117,9 @@ def test_a_fleet_larger_than_the_window_finds_work(parts: Parts) -> None:
             dict(own.revisions),
         )
     clock = Clock()
-    keeper = Keeper(small, clock=clock)
-    keeper.round()
+    controller = Controller(small, clock=clock)
+    controller.round()
     job_actions.submit(small, request(grasps=32 * 100), lane=Lane.BULK)
     clock.now += 1.0
-    keeper.round()
+    controller.round()
     assert len(parts.queue.waiting()) == 40

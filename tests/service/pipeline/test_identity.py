@@ -10,8 +10,8 @@ import pytest
 from service.index.index import Index
 from service.model.errors import BusyError
 from service.pipeline.backends import Parts
+from service.pipeline.controller import Controller
 from service.pipeline.identity import check_queue, identify, services
-from service.pipeline.keeper import Keeper
 from service.queue.port import TaskQueue
 from service.settings import Settings
 from service.store.store import Store, open_store
@@ -135,17 +135,17 @@ def test_an_index_of_another_store_is_refused(first: Parts, tmp_path: Path) -> N
         identify(mixed)
 
 
-def test_a_keeper_ends_when_another_service_takes_over_its_store(first: Parts, tmp_path: Path) -> None:
+def test_a_controller_ends_when_another_service_takes_over_its_store(first: Parts, tmp_path: Path) -> None:
     now = [0.0]
-    keeper = Keeper(first, clock=lambda: now[0])
-    keeper.round()
+    controller = Controller(first, clock=lambda: now[0])
+    controller.round()
     identify(service(tmp_path / "second", store=first.store), take_over=True)
     now[0] += 60.0
     with pytest.raises(BusyError, match="was taken over"):
-        keeper.round()
+        controller.round()
 
 
-def test_what_is_forged_in_redis_stops_no_keeper(first: Parts) -> None:
+def test_what_is_forged_in_redis_stops_no_controller(first: Parts) -> None:
     first.queue.set_service("forged", instead=True)
-    Keeper(first).round()
+    Controller(first).round()
     assert first.queue.service() == first.index.notes.service()

@@ -1,4 +1,4 @@
-"""The lease of the keeper that leads is held, renewed, lost and given back."""
+"""The lease of the controller that leads is held, renewed, lost and given back."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from service.index import rebuild as rebuilding
 from service.index.index import Index
 from service.index.notes import Notes
 from service.index.rebuild import differences
-from service.pipeline import job_actions, keeper
+from service.pipeline import controller, job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
 from service.settings import Settings
@@ -31,17 +31,17 @@ def rebuilt(monkeypatch: pytest.MonkeyPatch) -> list[object]:
         made.append(store)
         return rebuilding.rebuild(index, store, **more)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(keeper, "rebuild", noted)
+    monkeypatch.setattr(controller, "rebuild", noted)
     return made
 
 
 def in_service(folder: Path, act: Callable[[Parts], object] = lambda parts: None) -> list[str]:
-    """A keeper starts, a user does something, the keeper stops; how the index then differs from the store."""
+    """A controller starts, a user does something, the controller stops; how the index then differs from the store."""
     settings = Settings(data_dir=folder)
     store = open_store(settings.resolved_store_url)
     parts = Parts(settings, store, Index(settings.resolved_index_url), MemoryQueue())
     try:
-        working = keeper.Keeper(parts)
+        working = controller.Controller(parts)
         working.round()
         add_assets(parts)
         act(parts)
@@ -111,7 +111,7 @@ def test_a_copy_that_is_as_new_as_the_store_is_kept(tmp_path: Path, rebuilt: lis
     assert rebuilt == []
 
 
-def test_an_index_exchanged_while_the_keeper_runs_is_made_anew(tmp_path: Path, rebuilt: list[object]) -> None:
+def test_an_index_exchanged_while_the_controller_runs_is_made_anew(tmp_path: Path, rebuilt: list[object]) -> None:
     data, backup = tmp_path / "data", tmp_path / "backup"
     in_service(data, submit(1))
     copy_index(data, backup)
@@ -119,7 +119,7 @@ def test_an_index_exchanged_while_the_keeper_runs_is_made_anew(tmp_path: Path, r
     settings = Settings(data_dir=data)
     store = open_store(settings.resolved_store_url)
     parts = Parts(settings, store, Index(settings.resolved_index_url), MemoryQueue())
-    working = keeper.Keeper(parts)
+    working = controller.Controller(parts)
     working.round()
     for file in data.glob("index.sqlite*"):
         file.unlink()
@@ -129,7 +129,7 @@ def test_an_index_exchanged_while_the_keeper_runs_is_made_anew(tmp_path: Path, r
     parts.close()
 
 
-def test_a_keeper_killed_between_index_and_store_leaves_nothing_to_mend(
+def test_a_controller_killed_between_index_and_store_leaves_nothing_to_mend(
     tmp_path: Path, rebuilt: list[object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data, real = tmp_path / "data", Notes.set_marked

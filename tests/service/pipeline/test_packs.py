@@ -29,7 +29,7 @@ from tests.damage import flipped, overwrite
 from tests.fakes import request
 from tests.packs import pack, tasks_of
 from tests.service.pipeline.on_store import parts_on
-from tests.service.pipeline.test_keeper import Bench
+from tests.service.pipeline.test_controller import Bench
 from tests.service.pipeline.test_scrub import work_off
 
 
@@ -48,10 +48,10 @@ def is_whole(parts: Parts, job: str) -> bool:
     return parts.index.jobs.get(job).state is State.SUCCEEDED and differences(parts.index, parts.store) == []
 
 
-def test_a_keeper_takes_packs_apart_when_it_starts(parts: Parts) -> None:
+def test_a_controller_takes_packs_apart_when_it_starts(parts: Parts) -> None:
     job, tasks = submit(parts, 3)
     pack(parts.store, tasks)
-    Bench(parts).keeper.round()
+    Bench(parts).controller.round()
     assert not has_packs(parts.store)
     assert is_whole(parts, job)
     assert not parts.index.jobs.attempts(job=job)
@@ -59,7 +59,7 @@ def test_a_keeper_takes_packs_apart_when_it_starts(parts: Parts) -> None:
 
 def test_what_a_worker_of_0_2_packs_meanwhile_is_found_and_no_attempt_is_used_up(parts: Parts) -> None:
     bench = Bench(parts)
-    bench.keeper.round()
+    bench.controller.round()
     job, tasks = submit(parts, 3)
     in_hand = [bench.take() for _ in tasks]
     bench.pass_time(1)
@@ -76,7 +76,7 @@ def test_what_is_harmed_in_a_pack_is_made_again_with_the_checksum_it_had(parts: 
     job, tasks = submit(parts, 2)
     key = pack(parts.store, tasks)
     overwrite(parts.store, key, flipped(parts.store.get(key), len(parts.store.get(key)) - 200))
-    Bench(parts).keeper.round()
+    Bench(parts).controller.round()
     found = [wrong for _, wrong in scan(parts.store) if wrong is not None]
     assert [wrong.shard for wrong in found] == [tasks[1].output]
     assert repair(parts, found) == (found, [])

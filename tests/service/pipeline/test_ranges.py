@@ -29,7 +29,7 @@ from service.store.library import publish_asset
 from service.store.manifests import ShardManifest, publish_shard
 from tests.fakes import OBJECT_FILES, fake_stages, request
 from tests.planning import plan_all
-from tests.service.pipeline.test_keeper import Bench
+from tests.service.pipeline.test_controller import Bench
 from worker.stages.context import TaskContext
 from worker.stages.output import shard_of
 
@@ -164,7 +164,7 @@ def test_rates_and_workers_are_read_once_for_many_jobs(parts: Parts) -> None:
 
 def test_a_job_of_ranges_goes_through_its_stages_and_the_index_is_the_store(parts: Parts) -> None:
     bench = Bench(parts)
-    bench.keeper.round()
+    bench.controller.round()
     here(parts, worker())
     job = job_actions.prepare(parts, request(grasps=32 * 6 + 5, scenes=2), lane=Lane.BULK)
     assert job.span == 4
@@ -182,7 +182,7 @@ def test_a_job_of_ranges_goes_through_its_stages_and_the_index_is_the_store(part
 
 def test_shards_of_many_batches_enter_the_index_in_short_turns(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(parts)
-    bench.keeper.round()
+    bench.controller.round()
     record = job_actions.prepare(parts, request(grasps=32 * 64 * 5), lane=Lane.BULK)
     job, _ = job_actions.enter(parts, record.model_copy(update={"span": 64}))
     turns: list[int] = []

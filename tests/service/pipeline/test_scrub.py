@@ -14,7 +14,7 @@ from service.model.errors import DamagedShard
 from service.model.states import State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
-from service.pipeline.keeper import Keeper
+from service.pipeline.controller import Controller
 from service.pipeline.repair import repair
 from service.pipeline.scrub import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, scan
 from service.queue.port import EventKind
@@ -44,9 +44,9 @@ def shards(parts: Parts) -> list[ShardManifest]:
 
 
 def work_off(parts: Parts, *, device: str = "cpu", seed: int = 0) -> list[EventKind]:
-    """Worker and keeper in turns until nothing waits."""
-    keeper, ends = Keeper(parts), []
-    keeper.round()
+    """Worker and controller in turns until nothing waits."""
+    controller, ends = Controller(parts), []
+    controller.round()
     while (delivery := parts.queue.take("w")) is not None:  # type: ignore[attr-defined]
         # The name of a device is all that these stages see of it.
         runner = Runner(fake_stages(), worker="w", publish=parts.queue.publish, check_device=lambda device: None)
@@ -56,7 +56,7 @@ def work_off(parts: Parts, *, device: str = "cpu", seed: int = 0) -> list[EventK
         assert outcome is not None
         parts.queue.publish(outcome)
         ends.append(outcome.kind)
-        keeper.round()
+        controller.round()
     return ends
 
 

@@ -1,4 +1,4 @@
-"""The keeper's slow look through the store: what it finds, how fast, where it goes on, and for whom it makes way."""
+"""The controller's slow look through the store: findings, speed, place to go on from, and whom it makes way for."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from service.model import names
 from service.pipeline.backends import Parts
-from service.pipeline.keeper import Keeper
+from service.pipeline.controller import Controller
 from service.pipeline.scrub import FOLDERS, MISSING, NO_MANIFEST
 from service.pipeline.scrubber import Interrupted, Scrubber, Turn
 from service.settings import Settings
@@ -124,21 +124,21 @@ def test_a_small_store_is_not_read_over_and_over(parts: Parts, shards: list[Shar
 def test_it_makes_way_for_a_verify_and_goes_on_afterwards(parts: Parts, shards: list[ShardManifest]) -> None:
     stop = Slept()
     scrubber = Scrubber(parts, stop, clock=stop.clock)
-    verify = Turn(parts, is_keeper=False)
+    verify = Turn(parts, is_controller=False)
     assert verify.is_mine()
     with pytest.raises(Interrupted):
         scrubber.advance()
-    assert not Turn(parts, is_keeper=False).is_mine()
-    assert not Turn(parts, is_keeper=True).is_mine()
+    assert not Turn(parts, is_controller=False).is_mine()
+    assert not Turn(parts, is_controller=True).is_mine()
     verify.end()
     assert scrubber.advance()
 
 
-def test_a_verify_takes_the_turn_from_a_keeper(parts: Parts) -> None:
-    keeper = Turn(parts, is_keeper=True)
-    assert keeper.is_mine()
-    assert not Turn(parts, is_keeper=True).is_mine()
-    assert Turn(parts, is_keeper=False).is_mine()
+def test_a_verify_takes_the_turn_from_a_controller(parts: Parts) -> None:
+    controller = Turn(parts, is_controller=True)
+    assert controller.is_mine()
+    assert not Turn(parts, is_controller=True).is_mine()
+    assert Turn(parts, is_controller=False).is_mine()
 
 
 def test_a_second_verify_is_refused(
@@ -153,7 +153,7 @@ def test_a_second_verify_is_refused(
     other = Parts(
         settings, open_store(settings.resolved_store_url), empty_index(settings.resolved_index_url), MemoryQueue()
     )
-    assert Turn(other, is_keeper=False).is_mine()
+    assert Turn(other, is_controller=False).is_mine()
     command = ["store", "verify", "--data-dir", str(folder)]
     refused = CliRunner().invoke(app, command)
     other.close()
@@ -162,16 +162,16 @@ def test_a_second_verify_is_refused(
 
 
 @pytest.mark.parametrize("rate", [100.0, 0.0])
-def test_the_keeper_scrubs_beside_its_rounds_unless_it_is_off(
+def test_the_controller_scrubs_beside_its_rounds_unless_it_is_off(
     parts: Parts, shards: list[ShardManifest], rate: float
 ) -> None:
     flip(parts.store, shards[0].key)
     set_so = Parts(
-        parts.settings.model_copy(update={"scrub_mb_per_s": rate, "keeper_interval_s": 0.05}),
+        parts.settings.model_copy(update={"scrub_mb_per_s": rate, "controller_interval_s": 0.05}),
         parts.store, parts.index, parts.queue,
     )  # fmt: skip
     stop = threading.Event()
-    thread = threading.Thread(target=Keeper(set_so).run, args=(stop,))
+    thread = threading.Thread(target=Controller(set_so).run, args=(stop,))
     thread.start()
     names_now = {one.name for one in threading.enumerate()}
     try:

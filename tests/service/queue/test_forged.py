@@ -1,4 +1,4 @@
-"""Whoever writes to Redis can forge entries: the keeper goes on feeding and reaping, and pages go on showing."""
+"""Whoever writes to Redis can forge entries: the controller goes on feeding and reaping, and pages go on showing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from service.model.errors import UnavailableError
 from service.model.states import Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
-from service.pipeline.keeper import Keeper
+from service.pipeline.controller import Controller
+from service.pipeline.leading import PART
 from service.queue.port import Event, EventKind
 from service.queue.rq_queue import METRICS, WORKERS, RqQueue, worker_key
 from service.queue.streams import EVENTS
@@ -90,27 +91,27 @@ def parts(tmp_path: Path, rq_queue: RqQueue) -> Parts:
 @pytest.mark.parametrize("what", FORGERIES)
 def test_a_forged_entry_stops_neither_feeding_nor_reaping_nor_pages(parts: Parts, what: str) -> None:
     now = [1000.0]
-    keeper = Keeper(parts, clock=lambda: now[0])
+    controller = Controller(parts, clock=lambda: now[0])
     queue: Any = parts.queue
-    keeper.round()
+    controller.round()
     queue.connection.zadd(WIP, {"b" * 32 + "-1:execution": 1})  # of a worker that died
     FORGERIES[what](queue.connection)
     for _ in range(8):
         now[0] += 2.0
         with contextlib.suppress(UnavailableError):  # a round may find a part out of order; it puts that right
-            keeper.round()
-    keeper.round()
+            controller.round()
+    controller.round()
     job, _ = job_actions.submit(parts, request())
     (task,) = parts.index.jobs.tasks(job=job.id).items
     assert task.id in queue.waiting(), "feeding goes on"
     assert queue.leases() == [], "what nobody holds is taken off"
     queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), task_id=task.id, stage=Stage.SYNTHESIZE))
-    keeper.round()
+    controller.round()
     assert parts.index.jobs.get(job.id).state is State.RUNNING, "events are read"
     queue.discard([task.id])
     assert task.id not in queue.waiting()
     page = Snapshot()
-    page.add_queue(queue.now(lease_s=6), is_kept=queue.announced("keeper"))
+    page.add_queue(queue.now(lease_s=6), is_kept=queue.announced(PART))
     page.add_sums(queue.counted())
     assert b"graspd_workers" in Metrics().render(page)
     assert [beat.name for beat in queue.workers()] == []

@@ -257,7 +257,7 @@ def test_events_come_once_in_order_and_again_if_not_acknowledged(sides: tuple[Ta
 
 
 def _restarted(queue: TaskQueue) -> TaskQueue:
-    """The queue as a new keeper process finds it."""
+    """The queue as a new controller process finds it."""
     if isinstance(queue, MemoryQueue):
         queue.restart_consumer()
         return queue
@@ -285,11 +285,11 @@ def test_a_check_travels_like_any_task(sides: tuple[TaskQueue, Worker]) -> None:
 
 def test_a_part_is_there_as_long_as_it_says_so(sides: tuple[TaskQueue, Worker]) -> None:
     queue, _ = sides
-    assert not queue.announced("keeper")
-    queue.announce("keeper", 600)
+    assert not queue.announced("controller")
+    queue.announce("controller", 600)
     queue.announce("brief", 0.05)
     until(lambda: not queue.announced("brief"), "its time is over")
-    assert queue.announced("keeper")
+    assert queue.announced("controller")
 
 
 def test_of_those_who_want_to_lead_one_does_until_it_is_silent_or_resigns(sides: tuple[TaskQueue, Worker]) -> None:
@@ -306,14 +306,14 @@ def test_of_those_who_want_to_lead_one_does_until_it_is_silent_or_resigns(sides:
     assert not queue.lead("b", 600)
 
 
-def test_a_keeper_that_is_started_again_under_its_name_leads_at_once(rq_queue: RqQueue) -> None:
+def test_a_controller_that_is_started_again_under_its_name_leads_at_once(rq_queue: RqQueue) -> None:
     assert rq_queue.lead("node-1", 600)
     again = RqQueue(rq_queue.connection)
     assert not again.lead("node-2", 600)
     assert again.lead("node-1", 600)
 
 
-def test_a_keeper_of_graspd_0_2_holds_the_same_lease(rq_queue: RqQueue) -> None:
+def test_a_controller_of_graspd_0_2_holds_the_same_lease(rq_queue: RqQueue) -> None:
     rq_queue.connection.set(LEAD, "a keeper of 0.2", px=600_000)
     assert not rq_queue.lead("a", 600)
     rq_queue.connection.delete(LEAD)

@@ -31,7 +31,7 @@ from tests.service.index.test_index import run_all
 runner = CliRunner()
 
 
-@pytest.mark.parametrize("command", [["up"], ["keeper"], ["admin", "index", "path"]])
+@pytest.mark.parametrize("command", [["up"], ["controller"], ["admin", "index", "path"]])
 def test_every_command_shows_an_example(command: list[str]) -> None:
     shown = runner.invoke(program.build(), [*command, "--help"])
     assert shown.exit_code == 0
@@ -85,6 +85,22 @@ def test_a_bad_setting_names_its_variable(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setenv("GRASPD_LEASE_S", "soon")
     with pytest.raises(InputError, match=r"^GRASPD_LEASE_S: "):
         load_settings()
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("GRASPD_KEEPER_INTERVAL_S", "GRASPD_CONTROLLER_INTERVAL_S"),
+        ("GRASPD_KEEPER_NAME", "GRASPD_CONTROLLER_NAME"),
+    ],
+)
+def test_a_setting_of_0_2_is_refused_with_its_new_name(monkeypatch: pytest.MonkeyPatch, old: str, new: str) -> None:
+    monkeypatch.setenv(old, "1")
+    with pytest.raises(InputError, match=rf"^{old} is gone: it is {new} now$"):
+        load_settings()
+    monkeypatch.delenv(old)
+    monkeypatch.setenv(new, "1")
+    assert float(getattr(load_settings(), new.removeprefix("GRASPD_").lower())) == 1.0
 
 
 def on_disk(parts: Parts) -> Parts:
@@ -174,16 +190,16 @@ def test_what_is_waited_for_is_told_and_the_wait_can_be_stopped(
     assert str(tmp_path / "logs") in told[-1]
 
 
-def test_the_keeper_ends_well_on_sigterm(tmp_path: Path) -> None:
+def test_the_controller_ends_well_on_sigterm(tmp_path: Path) -> None:
     environment = os.environ | {"GRASPD_DATA_DIR": str(tmp_path), "GRASPD_REDIS_URL": f"unix://{tmp_path}/none.sock"}
-    code = "from service.run.commands import app; app(['keeper'])"
-    with subprocess.Popen([sys.executable, "-c", code], env=environment, stderr=subprocess.PIPE) as keeper:
-        assert keeper.stderr is not None
+    code = "from service.run.commands import app; app(['controller'])"
+    with subprocess.Popen([sys.executable, "-c", code], env=environment, stderr=subprocess.PIPE) as controller:
+        assert controller.stderr is not None
         # It waits for Redis instead of giving up.
-        assert any("Redis does not answer" in line.decode() for line in keeper.stderr)
-        keeper.send_signal(signal.SIGTERM)
-        keeper.stderr.read()
-        assert keeper.wait(timeout=60) == 0
+        assert any("Redis does not answer" in line.decode() for line in controller.stderr)
+        controller.send_signal(signal.SIGTERM)
+        controller.stderr.read()
+        assert controller.wait(timeout=60) == 0
 
 
 def test_the_children_of_up_get_every_setting() -> None:

@@ -13,7 +13,7 @@ from service.settings import Settings
 
 #: Values of each setting that its default is none of; texts hold what shells, JSON and URLs give a meaning.
 _ODD = "a b\"c'd%20#e?f,ü{}"
-_TEXTS = ("store_url", "store_public_endpoint", "proxy_addresses", "webhook_networks", "keeper_name", "device")
+_TEXTS = ("store_url", "store_public_endpoint", "proxy_addresses", "webhook_networks", "controller_name", "device")
 _SECRETS = ("index_url", "api_key", "proxy_secret", "webhook_secret")
 _PATHS = ("keys_file", "kernels", "heartbeat_file")
 VALUES: dict[str, Any] = {

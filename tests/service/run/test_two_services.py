@@ -18,7 +18,7 @@ from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from tests.indexes import empty_index
 
-COMMANDS = [["up", "--workers", "0", "--port", "0"], ["api", "--port", "0"], ["keeper"], ["worker"]]
+COMMANDS = [["up", "--workers", "0", "--port", "0"], ["api", "--port", "0"], ["controller"], ["worker"]]
 
 
 @pytest.fixture

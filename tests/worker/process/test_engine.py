@@ -138,10 +138,10 @@ def test_no_engine_outlives_its_worker(start: Start) -> None:
     worker.process.kill()
     worker.process.wait()
     until(lambda: is_stopped(engine), "the engine ended")
-    assert worker.queue.leases(), "the keeper finds the lease"
+    assert worker.queue.leases(), "the controller finds the lease"
 
 
-def test_a_worker_ends_with_its_engine_and_leaves_the_lease_to_the_keeper(start: Start) -> None:
+def test_a_worker_ends_with_its_engine_and_leaves_the_lease_to_the_controller(start: Start) -> None:
     worker = start()
     worker.begin()
     os.kill(worker.engine, signal.SIGKILL)

@@ -86,7 +86,7 @@ def test_a_row_that_says_something_else_is_bad(kept: Parts, look: Look) -> None:
 
 
 def test_what_is_on_its_way_in_is_no_difference(kept: Parts, look: Look, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between the two looks a keeper takes up what was written."""
+    """Between the two looks a controller takes up what was written."""
     key = shard_of(kept)
     data = key.read_bytes()
     key.unlink()

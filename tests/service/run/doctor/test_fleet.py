@@ -1,4 +1,4 @@
-"""Keeper, workers, port and clocks as the doctor sees them, on a real Redis and real sockets."""
+"""Controller, workers, port and clocks as the doctor sees them, on a real Redis and real sockets."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from service.pipeline.leading import PART
 from service.queue.rq_queue import WORKERS, RqQueue, worker_key
 from service.run.address import record_address
 from service.run.doctor.clocks import clocks
-from service.run.doctor.fleet import keeper, port, workers
+from service.run.doctor.fleet import controller, port, workers
 from service.settings import Settings
 from tests.servers import PostgresServer, free_ports
 from tests.service.queue.test_queue import task
@@ -41,12 +41,12 @@ def present(queue: RqQueue, name: str = "w", **facts: Any) -> None:
     queue.connection.set(worker_key(name), json.dumps(asdict(replace(beat, **facts))), ex=60)
 
 
-def test_a_keeper_that_lives_and_one_that_does_not(settings: Settings, rq_queue: RqQueue) -> None:
-    found = keeper(settings)
+def test_a_controller_that_lives_and_one_that_does_not(settings: Settings, rq_queue: RqQueue) -> None:
+    found = controller(settings)
     assert not found.ok
-    assert found.mend == "graspd keeper"
+    assert found.mend == "graspd controller"
     rq_queue.announce(PART, 60)
-    assert keeper(settings).condition is Condition.GOOD
+    assert controller(settings).condition is Condition.GOOD
 
 
 def test_workers_that_fit_are_counted(settings: Settings, rq_queue: RqQueue) -> None:
@@ -87,7 +87,7 @@ def test_tasks_of_a_stage_that_nobody_serves_are_bad(settings: Settings, rq_queu
 
 def test_where_nothing_runs_nothing_is_asked(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path)
-    assert {look(settings).condition for look in (keeper, workers, clocks)} == {Condition.SKIPPED}
+    assert {look(settings).condition for look in (controller, workers, clocks)} == {Condition.SKIPPED}
 
 
 def test_clocks_that_agree_are_good(settings: Settings, rq_queue: RqQueue) -> None:

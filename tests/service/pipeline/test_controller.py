@@ -1,4 +1,4 @@
-"""The keeper on the in-memory parts: lost workers, lost events, lost queue, lost index, parts that are away."""
+"""The controller on the in-memory parts: lost workers, lost events, lost queue, lost index, parts that are away."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import AssetKind, Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
-from service.pipeline.keeper import Keeper
+from service.pipeline.controller import Controller
 from service.pipeline.reaper import LOST_AFTER_S
 from service.pipeline.routes import Routes
 from service.queue.port import Event, EventKind
@@ -40,20 +40,20 @@ class Clock:
 
 
 class Bench:
-    """A keeper and one worker, both moved step by step."""
+    """A controller and one worker, both moved step by step."""
 
     def __init__(self, parts: Parts) -> None:
         assert isinstance(parts.queue, MemoryQueue)
         self.parts, self.queue, self.clock = parts, parts.queue, Clock()
-        self.keeper = Keeper(parts, clock=self.clock)
+        self.controller = Controller(parts, clock=self.clock)
 
     def pass_time(self, seconds: float, *, beating: Delivery | None = None) -> None:
-        """Rounds of the keeper, one a second."""
+        """Rounds of the controller, one a second."""
         for _ in range(round(seconds)):
             self.clock.now += 1.0
             if beating is not None:
                 self.queue.beat(beating)
-            self.keeper.round()
+            self.controller.round()
 
     def take(self) -> Delivery:
         delivery = self.queue.take("w")
@@ -73,7 +73,7 @@ class Bench:
         return outcome
 
     def work_off(self, **stages: Any) -> None:
-        """Worker and keeper in turns until nothing waits."""
+        """Worker and controller in turns until nothing waits."""
         self.pass_time(1)
         while (delivery := self.queue.take("w")) is not None:
             self.do(delivery, **stages)
@@ -83,7 +83,7 @@ class Bench:
 @pytest.fixture
 def bench(parts: Parts) -> Bench:
     made = Bench(parts)
-    made.keeper.round()
+    made.controller.round()
     return made
 
 
@@ -129,12 +129,12 @@ def test_a_worker_that_gives_signs_of_life_keeps_its_task(bench: Bench) -> None:
     assert [lease.key for lease in bench.queue.leases()] == [delivery.key]
 
 
-def test_time_in_which_the_keeper_did_not_look_is_no_silence(bench: Bench) -> None:
+def test_time_in_which_the_controller_did_not_look_is_no_silence(bench: Bench) -> None:
     job_actions.submit(bench.parts, request())
     bench.take()
     bench.pass_time(2)
     bench.clock.now += 3600
-    bench.keeper.round()
+    bench.controller.round()
     assert len(bench.queue.leases()) == 1
 
 
@@ -151,7 +151,7 @@ def test_while_redis_takes_no_writes_nobody_is_called_silent(bench: Bench, monke
         for _ in range(10 * round(bench.parts.settings.lease_s)):
             bench.clock.now += 1.0
             with pytest.raises(QueueUnavailable):
-                bench.keeper.round()
+                bench.controller.round()
     bench.pass_time(2, beating=held)
     assert [lease.key for lease in bench.queue.leases()] == [held.key]
     assert bench.parts.index.jobs.attempts() == []
@@ -233,7 +233,7 @@ def test_a_store_that_is_away_costs_no_attempt_and_says_so(bench: Bench) -> None
     outcome = bench.do(bench.take(), synthesize=away)
     assert outcome is not None
     assert outcome.kind is EventKind.DEFERRED
-    bench.keeper._index_events(0)
+    bench.controller._index_events(0)
     waiting = bench.parts.index.jobs.tasks(job=job.id).items[0]
     assert (waiting.state, waiting.message) == (State.QUEUED, "waits: the store is full")
     bench.work_off()
@@ -314,10 +314,10 @@ def test_a_damaged_manifest_fails_its_task_and_stops_no_other(bench: Bench) -> N
     assert "remove it and retry its job" in (failed.reason or "")
 
 
-def test_tasks_that_their_job_queues_while_the_keeper_looks_are_queued_once(
+def test_tasks_that_their_job_queues_while_the_controller_looks_are_queued_once(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The keeper has read the queue before, and the index before the job's tasks are marked there."""
+    """The controller has read the queue before, and the index before the job's tasks are marked there."""
     with monkeypatch.context() as late:
         late.setattr(job_actions, "queue_tasks", lambda *_, **__: set())
         job, _ = job_actions.submit(bench.parts, request())
@@ -334,21 +334,21 @@ def test_tasks_that_their_job_queues_while_the_keeper_looks_are_queued_once(
 
     taken: list[Delivery] = []
     monkeypatch.setattr(feed, "ready_tasks", beside)
-    bench.keeper._look_after_queue()
+    bench.controller._look_after_queue()
     assert len(taken) == 1 and bench.queue.waiting() == set(), "the worker's task waits a second time"
 
 
-def test_a_check_that_is_queued_while_the_keeper_looks_is_queued_once(
+def test_a_check_that_is_queued_while_the_controller_looks_is_queued_once(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The keeper has read the queue before, and the index before the check is marked there."""
+    """The controller has read the queue before, and the index before the check is marked there."""
     asset = publish_asset(bench.parts.store, AssetKind.HAND, "upload", HAND_FILES | {"extra": b"3"})
     bench.parts.index.write.add_asset(asset, None)
     bench.pass_time(1)
     assert isinstance(bench.take().message, IngestMessage)
     bench.parts.index.live.set_asset_waiting([asset.digest], queued=False)
     monkeypatch.setattr(MemoryQueue, "leases", lambda _: [])
-    bench.keeper._look_after_queue()
+    bench.controller._look_after_queue()
     assert bench.queue.waiting() == set(), "the worker's check waits a second time"
 
 
@@ -363,7 +363,7 @@ def test_a_check_that_failed_is_told_and_tried_again(bench: Bench) -> None:
     with pytest.raises(ConflictError, match="the planner lost its way"):
         job_actions.submit(bench.parts, request(hand="upload"))
     assert differences(bench.parts.index, bench.parts.store) == []
-    until(lambda: bench.keeper.round() or bench.queue.waiting(), "tried again")
+    until(lambda: bench.controller.round() or bench.queue.waiting(), "tried again")
 
 
 def test_a_task_between_queue_and_worker_is_not_taken_for_lost(bench: Bench) -> None:
@@ -377,10 +377,10 @@ def test_a_task_between_queue_and_worker_is_not_taken_for_lost(bench: Bench) -> 
     assert bench.queue.waiting() == set()
 
 
-def test_files_below_an_asset_do_not_stop_a_keeper_or_a_rebuild(bench: Bench) -> None:
+def test_files_below_an_asset_do_not_stop_a_controller_or_a_rebuild(bench: Bench) -> None:
     (digest, *_) = [digest for kind, digest in stored_assets(bench.parts.store) if kind is AssetKind.OBJECT]
     bench.parts.store.put(names.object_pieces(digest, "32"), b"pieces")
-    bench.keeper.round()
+    bench.controller.round()
     assert differences(bench.parts.index, bench.parts.store) == []
 
 
@@ -390,7 +390,7 @@ def test_an_index_lost_whole_is_made_again_from_the_store(bench: Bench) -> None:
     bench.pass_time(1)
     fresh = empty_index(f"sqlite:///{bench.parts.settings.data_dir / 'fresh.sqlite'}")
     bench = Bench(Parts(bench.parts.settings, bench.parts.store, fresh, bench.queue))
-    bench.keeper.round()
+    bench.controller.round()
     waiting = len(bench.queue.waiting())
     bench.pass_time(LOST_AFTER_S + 2)
     assert len(bench.queue.waiting()) == waiting == 2, "what was in the queue is not queued twice"
@@ -400,7 +400,7 @@ def test_an_index_lost_whole_is_made_again_from_the_store(bench: Bench) -> None:
     fresh.close()
 
 
-def test_events_not_yet_in_the_index_come_again_to_the_next_keeper(
+def test_events_not_yet_in_the_index_come_again_to_the_next_controller(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job, _ = job_actions.submit(bench.parts, request())
@@ -412,10 +412,10 @@ def test_events_not_yet_in_the_index_come_again_to_the_next_keeper(
     with monkeypatch.context() as patch:
         patch.setattr(bench.parts.store, "get", away)
         with pytest.raises(StoreUnavailable):
-            bench.keeper.round()
+            bench.controller.round()
     bench.queue.restart_consumer()
     bench = Bench(bench.parts)
-    bench.keeper.round()
+    bench.controller.round()
     assert bench.parts.index.jobs.get(job.id).state is State.SUCCEEDED
 
 
@@ -442,7 +442,7 @@ def test_a_cancelled_task_that_still_runs_is_stopped(bench: Bench, monkeypatch: 
         assert job_actions.cancel(bench.parts, job.id).state is State.CANCELLED
     assert bench.queue.beat(delivery) == (False, False)
     bench.pass_time(1)
-    assert bench.queue.beat(delivery)[0], "the keeper tells it"
+    assert bench.queue.beat(delivery)[0], "the controller tells it"
 
 
 def test_the_window_is_refilled_as_it_empties(bench: Bench) -> None:
@@ -495,9 +495,9 @@ def test_the_loop_outlives_parts_that_are_away_and_ends_when_told(
             stop.set()
         raise (QueueUnavailable("away"), KeyError("a bug"))[rounds % 2]
 
-    keeper = Keeper(parts)
-    monkeypatch.setattr(keeper, "round", failing)
+    controller = Controller(parts)
+    monkeypatch.setattr(controller, "round", failing)
     # What goes on beside the rounds ends by it.
     monkeypatch.setattr(stop, "wait", lambda seconds: stop.is_set())
-    keeper.run(stop)
+    controller.run(stop)
     assert rounds == 3

@@ -1,7 +1,7 @@
-"""The keeper: one loop that runs what must not run in a worker. Killed at any moment, its successor goes on.
+"""The controller: one loop that runs what must not run in a worker. Killed at any moment, its successor goes on.
 
 It reconciles: events become rows, and what the index calls unfinished and the queue does not know is queued again. Of
-several keepers one leads, and the others stand by (`service.pipeline.leading`).
+several controllers one leads, and the others stand by (`service.pipeline.leading`).
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ _LONGEST_PAUSE_S: Final = 5.0
 _SWEEP_EVERY_S: Final = 5.0
 #: How often it looks whether store and index are still its service's.
 _IDENTIFY_EVERY_S: Final = 30.0
-#: What a read of the store that is under way has to end, once the keeper stops [s].
+#: What a read of the store that is under way has to end, once the controller stops [s].
 _LAST_READ_S: Final = 3.0
 
 
-class Keeper:
+class Controller:
     """Indexes events, queues what is ready, takes tasks from lost workers, keeps the list of workers."""
 
     def __init__(self, parts: Parts, *, clock: Callable[[], float] = time.monotonic) -> None:
@@ -90,7 +90,7 @@ class Keeper:
         """Workers that were there when they were last counted."""
         self._clock = clock
         self._reports = Reports(parts)
-        interval_s = parts.settings.keeper_interval_s
+        interval_s = parts.settings.controller_interval_s
         # Each lease is seen three times before it can be called lost.
         self._looking = Pace(clock, interval_s, longest_s=parts.settings.lease_s / 3)
         self._feeding = Pace(clock, 0.0)
@@ -123,20 +123,20 @@ class Keeper:
     def _run(self, stop: threading.Event) -> None:
         pause = 0.0
         while not stop.is_set():
-            # Also while a part is away: a fresh keeper would wait for it just as long.
+            # Also while a part is away: a fresh controller would wait for it just as long.
             self._alive.touch()
             try:
-                self.round(wait_s=self._parts.settings.keeper_interval_s)
+                self.round(wait_s=self._parts.settings.controller_interval_s)
                 pause = 0.0
             except BusyError:
                 raise  # another service works here: to go on would undo its work
             except UnavailableError as error:
                 pause = min(_LONGEST_PAUSE_S, max(0.25, 2 * pause))
-                log.warning("%s; the keeper tries again in %.2g s", error, pause)
+                log.warning("%s; the controller tries again in %.2g s", error, pause)
                 stop.wait(pause)
             except Exception:
                 pause = min(_LONGEST_PAUSE_S, max(1.0, 2 * pause))
-                log.exception("a round broke off; the keeper goes on in %.2g s", pause)
+                log.exception("a round broke off; the controller goes on in %.2g s", pause)
                 stop.wait(pause)
         if self._started:
             with _noted([]):
@@ -186,7 +186,7 @@ class Keeper:
         if self._has_plans or now >= self._plan_again:
             with _noted(away):
                 self._has_plans = self._planner.advance()
-                self._plan_again = now + self._parts.settings.keeper_interval_s
+                self._plan_again = now + self._parts.settings.controller_interval_s
         if now >= self._sweep_again:
             with _noted(away):
                 is_left = self._sweeper.advance() or self._sweeper.collect()
@@ -267,7 +267,7 @@ class Keeper:
             raise StoreUnavailable(f"the store does not answer, and {len(waiting)} events wait for it")
 
     def _announce(self) -> None:
-        self._parts.queue.announce(PART, 5 * self._parts.settings.keeper_interval_s + 5)
+        self._parts.queue.announce(PART, 5 * self._parts.settings.controller_interval_s + 5)
 
     def _look_after_queue(self) -> None:
         # While Redis can be read but not written, as on a full disk, no worker can give a sign of life: then this fails
@@ -337,7 +337,7 @@ class Keeper:
 
 @contextmanager
 def _noted(away: list[UnavailableError]) -> Iterator[None]:
-    """A part that is away, or one damaged record, must not keep the keeper from what does not need it."""
+    """A part that is away, or one damaged record, must not keep the controller from what does not need it."""
     try:
         yield
     except UnavailableError as error:

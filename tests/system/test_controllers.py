@@ -1,4 +1,4 @@
-"""Several keepers: one leads, and where it is killed or stands still another takes over."""
+"""Several controllers: one leads, and where it is killed or stands still another takes over."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def house(tmp_path: Path) -> Iterator[House]:
 
 
 @pytest.mark.chaos
-def test_a_keeper_that_is_killed_or_stands_still_gives_way_and_nothing_is_lost(house: House) -> None:
-    house.keeper("first")
-    house.until(lambda: house.says("first", "this keeper leads"), "the first leads")
-    house.keeper("second")
-    house.until(lambda: house.says("second", "another keeper leads"), "the second waits")
+def test_a_controller_that_is_killed_or_stands_still_gives_way_and_nothing_is_lost(house: House) -> None:
+    house.controller("first")
+    house.until(lambda: house.says("first", "this controller leads"), "the first leads")
+    house.controller("second")
+    house.until(lambda: house.says("second", "another controller leads"), "the second waits")
     early = job_actions.submit(house.parts, request(seed=1))[0].id
     house.start("worker", sys.executable, "-m", "tests.fakes", FAKE_SECONDS="0.2")
     house.until(lambda: house.done(early) == 1, "the first keeps")
@@ -38,16 +38,16 @@ def test_a_keeper_that_is_killed_or_stands_still_gives_way_and_nothing_is_lost(h
     house.until(lambda: house.parts.index.jobs.tasks(job=job, state=State.RUNNING).items, "the worker has a task")
     house.processes["first"].kill()
     house.processes["first"].wait()
-    house.until(lambda: house.says("second", "this keeper leads"), "the second takes over")
+    house.until(lambda: house.says("second", "this controller leads"), "the second takes over")
     assert house.done(job) == 0
     house.hold.unlink()
     house.until(lambda: house.done(job) >= 2, "the second keeps")
 
     house.hold.touch()
-    house.keeper("third")
-    house.until(lambda: house.says("third", "another keeper leads"), "the third waits")
+    house.controller("third")
+    house.until(lambda: house.says("third", "another controller leads"), "the third waits")
     house.processes["second"].send_signal(signal.SIGSTOP)
-    house.until(lambda: house.says("third", "this keeper leads"), "the third takes over")
+    house.until(lambda: house.says("third", "this controller leads"), "the third takes over")
     house.processes["second"].send_signal(signal.SIGCONT)
     house.until(lambda: house.says("second", "another leads now"), "the second notices")
     house.hold.unlink()
@@ -59,18 +59,18 @@ def test_a_keeper_that_is_killed_or_stands_still_gives_way_and_nothing_is_lost(h
     assert house.says("worker", "synthesize took") == 1 + 24, "none was done twice"
     house.until(lambda: differences(house.parts.index, house.parts.store) == [], "the index is the store")
 
-    # A keeper that ends in order gives its lease back: the next one need not wait for it to run out.
+    # A controller that ends in order gives its lease back: the next one need not wait for it to run out.
     house.processes["third"].terminate()
     assert house.processes["third"].wait(60) == 0
-    house.until(lambda: house.says("second", "this keeper leads") == 2, "the second leads again")
+    house.until(lambda: house.says("second", "this controller leads") == 2, "the second leads again")
 
 
 @pytest.mark.slow
 @pytest.mark.chaos
 def test_one_that_is_started_again_under_its_name_need_not_wait(house: House) -> None:
-    house.keeper("first", GRASPD_KEEPER_NAME="node-1", GRASPD_LEASE_S="600")
-    house.until(lambda: house.says("first", "this keeper leads"), "the first leads")
+    house.controller("first", GRASPD_CONTROLLER_NAME="node-1", GRASPD_LEASE_S="600")
+    house.until(lambda: house.says("first", "this controller leads"), "the first leads")
     house.processes["first"].kill()
     house.processes["first"].wait()
-    house.keeper("again", GRASPD_KEEPER_NAME="node-1", GRASPD_LEASE_S="600")
-    house.until(lambda: house.says("again", "this keeper leads"), "it leads again")
+    house.controller("again", GRASPD_CONTROLLER_NAME="node-1", GRASPD_LEASE_S="600")
+    house.until(lambda: house.says("again", "this controller leads"), "it leads again")
