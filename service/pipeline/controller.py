@@ -29,6 +29,7 @@ from service.pipeline.backends import Parts
 from service.pipeline.courier import Courier
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.entering import Entering
+from service.pipeline.garbage_collector import GarbageCollector
 from service.pipeline.identity import identify
 from service.pipeline.indexer import Indexer
 from service.pipeline.job_actions import HELD_S, queue_tasks
@@ -39,7 +40,6 @@ from service.pipeline.reaper import Reaper
 from service.pipeline.reports import Reports
 from service.pipeline.routes import Routes
 from service.pipeline.scrubber import Scrubber
-from service.pipeline.sweeper import Sweeper
 from service.queue.port import Event, EventKind
 from service.store.library import publish_builtins, stored_assets
 from service.store.packs import take_apart
@@ -56,7 +56,7 @@ _REMEMBERED_S: Final = 60.0
 #: How often the progress of tasks is passed on: as often as pages ask for it.
 _REPORTS_EVERY_S: Final = 0.5
 _LONGEST_PAUSE_S: Final = 5.0
-_SWEEP_EVERY_S: Final = 5.0
+_COLLECT_EVERY_S: Final = 5.0
 #: How often it looks whether store and index are still its service's.
 _IDENTIFY_EVERY_S: Final = 30.0
 #: What a read of the store that is under way has to end, once the controller stops [s].
@@ -71,7 +71,7 @@ class Controller:
         self._indexer = Indexer(parts)
         self._reaper = Reaper(parts, self._indexer, clock=clock)
         self._planner = DatasetRounds(parts, clock=clock)
-        self._sweeper = Sweeper(parts, clock=clock)
+        self._garbage = GarbageCollector(parts, clock=clock)
         self._marking = Marking(parts)
         self._has_plans = False
         self._turns = Turns()
@@ -96,7 +96,7 @@ class Controller:
         self._feeding = Pace(clock, 0.0)
         self._reporting = Pace(clock, min(_REPORTS_EVERY_S, interval_s), share=0.1)
         self._counting = Pace(clock, _WORKERS_EVERY_S, share=0.1)
-        self._plan_again = self._sweep_again = self._identify_again = -math.inf
+        self._plan_again = self._collect_again = self._identify_again = -math.inf
 
     def run(self, stop: threading.Event) -> None:
         """Rounds until told to stop. Where a part is away, waits longer and longer, and loses nothing."""
@@ -182,15 +182,15 @@ class Controller:
             raise away[0]
 
     def _do_what_users_want(self, now: float, away: list[UnavailableError]) -> None:
-        """Datasets and deletions, a little of each."""
+        """Plan datasets and collect garbage, a little of each."""
         if self._has_plans or now >= self._plan_again:
             with _noted(away):
                 self._has_plans = self._planner.advance()
                 self._plan_again = now + self._parts.settings.controller_interval_s
-        if now >= self._sweep_again:
+        if now >= self._collect_again:
             with _noted(away):
-                is_left = self._sweeper.advance() or self._sweeper.collect()
-                self._sweep_again = now if is_left else now + _SWEEP_EVERY_S
+                is_left = self._garbage.advance() or self._garbage.collect()
+                self._collect_again = now if is_left else now + _COLLECT_EVERY_S
 
     def _look_after_workers(self) -> None:
         self._announce()

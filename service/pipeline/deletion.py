@@ -1,9 +1,9 @@
 """What a user takes away: assets, jobs, datasets. A record of the deletion is the fact; the rest follows.
 
 `deletions/{what}/{id}.json` is written while nobody else writes the index, in the same step as the rows go. From then
-on the thing is gone: a rebuild leaves it out, and nothing of that id is taken in. The controller
-(`service.pipeline.sweeper`) removes the objects behind it, then the record itself; killed at any moment, it begins
-again.
+on the thing is gone: a rebuild leaves it out, and nothing of that id is taken in. The garbage collector
+(`service.pipeline.garbage_collector`) removes the objects behind it, then the record itself; killed at any moment, it
+begins again.
 """
 
 from __future__ import annotations

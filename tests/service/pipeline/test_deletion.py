@@ -18,7 +18,7 @@ from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.deletion import delete_asset, delete_dataset, delete_job, restore
-from service.pipeline.sweeper import Sweeper
+from service.pipeline.garbage_collector import GarbageCollector
 from service.store.deletions import deletions, pending
 from service.store.library import publish_asset
 from tests.fakes import OBJECT_FILES, make_shard, request
@@ -57,10 +57,10 @@ def keys(parts: Parts, *prefixes: str) -> set[str]:
     return {entry.key for prefix in prefixes for entry in parts.store.list(prefix)}
 
 
-def graceless(parts: Parts) -> Sweeper:
-    """A sweeper to which every released shard is old."""
+def graceless(parts: Parts) -> GarbageCollector:
+    """A garbage collector to which every released shard is old."""
     eager = parts.settings.model_copy(update={"shard_grace_s": -1.0})
-    return Sweeper(Parts(eager, parts.store, parts.index, parts.queue))
+    return GarbageCollector(Parts(eager, parts.store, parts.index, parts.queue))
 
 
 def test_a_deleted_job_is_gone_at_once_and_its_objects_with_the_controller(parts: Parts) -> None:
@@ -69,7 +69,7 @@ def test_a_deleted_job_is_gone_at_once_and_its_objects_with_the_controller(parts
     with pytest.raises(NotFoundError):
         parts.index.jobs.get(job)
     assert differences(parts.index, parts.store) == [], "an index made anew knows it as little"
-    assert not Sweeper(parts).advance()
+    assert not GarbageCollector(parts).advance()
     assert keys(parts, "jobs", "tasks", "deletions") == set()
     assert differences(parts.index, parts.store) == []
 
@@ -77,8 +77,8 @@ def test_a_deleted_job_is_gone_at_once_and_its_objects_with_the_controller(parts
 def test_shards_that_nobody_needs_go_after_the_grace_time(parts: Parts) -> None:
     job = finished(parts)
     delete_job(parts, job)
-    Sweeper(parts).advance()
-    assert not Sweeper(parts).collect()
+    GarbageCollector(parts).advance()
+    assert not GarbageCollector(parts).collect()
     assert len(keys(parts, "shards")) == 2, "there is grace"
     assert not graceless(parts).collect(budget_s=60)
     assert keys(parts, "shards", "released") == set()
@@ -89,7 +89,7 @@ def test_shards_that_nobody_needs_go_after_the_grace_time(parts: Parts) -> None:
 def test_a_shard_that_another_job_needs_stays(parts: Parts) -> None:
     short, long = finished(parts), finished(parts, grasps=64)
     delete_job(parts, short)
-    Sweeper(parts).advance()
+    GarbageCollector(parts).advance()
     assert not graceless(parts).collect(budget_s=60)
     assert len(keys(parts, "shards")) == 4
     assert parts.index.jobs.get(long).grasps == 64
@@ -101,7 +101,7 @@ def test_a_deleted_job_may_be_submitted_again_and_finds_its_shards(parts: Parts)
     with pytest.raises(ConflictError, match="still being removed"):
         job_actions.submit(parts, request())
     assert names.job_record(job) in keys(parts, "jobs")
-    Sweeper(parts).advance()
+    GarbageCollector(parts).advance()
     again, new = job_actions.submit(parts, request())
     assert (again.id, new, again.state) == (job, True, State.SUCCEEDED)
     assert not graceless(parts).collect(budget_s=60)
@@ -132,9 +132,9 @@ def test_a_deleted_dataset_takes_its_own_jobs_with_it(parts: Parts) -> None:
     assert differences(parts.index, parts.store) == []
     with pytest.raises(ConflictError, match="still being removed"):
         dataset(parts)
-    while Sweeper(parts).advance():
+    while GarbageCollector(parts).advance():
         pass
-    Sweeper(parts).advance()
+    GarbageCollector(parts).advance()
     assert {view.name for view in parts.index.datasets.page().items} == {"other"}
     assert len(parts.index.jobs.page().items) == 2
     assert parts.index.jobs.get(own)
@@ -155,7 +155,7 @@ def test_a_dataset_that_was_just_cancelled_can_be_deleted(parts: Parts) -> None:
     plan_all(parts)
     assert actions.cancel(parts, "d").state is State.CANCELLED
     delete_dataset(parts, "d")
-    Sweeper(parts).advance()
+    GarbageCollector(parts).advance()
     assert not parts.index.jobs.page().items
 
 
@@ -166,7 +166,7 @@ def test_a_cancelled_dataset_has_ended_though_another_waits_for_its_jobs(parts: 
     assert actions.cancel(parts, "d").state is State.CANCELLED
     plan_all(parts)
     delete_dataset(parts, "d")
-    while Sweeper(parts).advance():
+    while GarbageCollector(parts).advance():
         pass
     (job,) = parts.index.jobs.page().items
     assert job.state is State.QUEUED, "the other dataset waits for it"
@@ -194,7 +194,7 @@ def test_a_deleted_object_frees_its_name_and_its_files(parts: Parts) -> None:
     assert differences(parts.index, parts.store) == []
     with pytest.raises(ConflictError, match="still being removed"):
         publish_asset(parts.store, AssetKind.OBJECT, "ball", OBJECT_FILES)
-    Sweeper(parts).advance()
+    GarbageCollector(parts).advance()
     assert keys(parts, f"assets/object/{digest}", "deletions") == set()
     assert publish_asset(parts.store, AssetKind.OBJECT, "orb", OBJECT_FILES).name == "orb"
 
@@ -229,7 +229,7 @@ def test_a_deletion_that_broke_off_is_carried_out_by_the_next_controller(
     while keys(parts, "deletions"):
         with monkeypatch.context() as patch, pytest.raises((KeyboardInterrupt, StopIteration)):
             patch.setattr(type(parts.store), "delete", _after(place, real))
-            if not Sweeper(parts).advance():
+            if not GarbageCollector(parts).advance():
                 raise StopIteration
         place += 1
     assert differences(parts.index, parts.store) == []
@@ -247,53 +247,53 @@ def test_a_dataset_with_a_snapshot_is_deleted_only_by_a_further_word(parts: Part
     assert not pending(parts.store)
 
 
-SWEPT = pytest.mark.parametrize("swept", [False, True], ids=["at once", "after the controller"])
+COLLECTED = pytest.mark.parametrize("collected", [False, True], ids=["at once", "after the controller"])
 
 
-def sweep(parts: Parts) -> None:
-    while Sweeper(parts).advance():
+def collect_garbage(parts: Parts) -> None:
+    while GarbageCollector(parts).advance():
         pass
-    Sweeper(parts).advance()
+    GarbageCollector(parts).advance()
 
 
-@SWEPT
-def test_a_deleted_job_is_restored_as_it_was(parts: Parts, swept: bool) -> None:
+@COLLECTED
+def test_a_deleted_job_is_restored_as_it_was(parts: Parts, collected: bool) -> None:
     """One that had failed, with its attempts: it is not run again."""
     job, _ = job_actions.submit(parts, request())
     fail(parts, job.id)
     before = parts.index.jobs.get(job.id), parts.index.jobs.attempts(job=job.id)
     delete_job(parts, job.id)
-    if swept:
-        sweep(parts)
+    if collected:
+        collect_garbage(parts)
     restore(parts, "job", job.id, permit=lambda _: None)
     assert (parts.index.jobs.get(job.id), parts.index.jobs.attempts(job=job.id)) == before
     assert not deletions(parts.store)
-    assert not Sweeper(parts).advance()
+    assert not GarbageCollector(parts).advance()
     assert differences(parts.index, parts.store) == []
 
 
-@SWEPT
-def test_a_deleted_dataset_is_restored_with_its_jobs_and_snapshots(parts: Parts, swept: bool) -> None:
+@COLLECTED
+def test_a_deleted_dataset_is_restored_with_its_jobs_and_snapshots(parts: Parts, collected: bool) -> None:
     dataset(parts)
     actions.snapshot(parts, "d")
     before = parts.index.datasets.get("d"), parts.index.datasets.snapshots("d").items, _jobs(parts)
     delete_dataset(parts, "d", with_snapshots=True)
-    if swept:
-        sweep(parts)
+    if collected:
+        collect_garbage(parts)
         assert _jobs(parts) == []
     restore(parts, "dataset", "d", permit=lambda _: None)
-    sweep(parts)
+    collect_garbage(parts)
     assert (parts.index.datasets.get("d"), parts.index.datasets.snapshots("d").items, _jobs(parts)) == before
     assert not deletions(parts.store)
     assert differences(parts.index, parts.store) == []
 
 
-@SWEPT
-def test_a_deleted_object_is_restored_under_its_name(parts: Parts, swept: bool) -> None:
+@COLLECTED
+def test_a_deleted_object_is_restored_under_its_name(parts: Parts, collected: bool) -> None:
     before = parts.index.assets.get(AssetKind.OBJECT, "ball")
     delete_asset(parts, AssetKind.OBJECT, "ball")
-    if swept:
-        sweep(parts)
+    if collected:
+        collect_garbage(parts)
     restore(parts, "object", "ball", permit=lambda _: None)
     assert parts.index.assets.get(AssetKind.OBJECT, "ball") == before
     assert differences(parts.index, parts.store) == []
@@ -302,7 +302,7 @@ def test_a_deleted_object_is_restored_under_its_name(parts: Parts, swept: bool) 
 def test_what_was_made_again_is_not_written_over(parts: Parts) -> None:
     dataset(parts)
     delete_dataset(parts, "d")
-    sweep(parts)
+    collect_garbage(parts)
     dataset(parts, "d", grasps=64)
     with pytest.raises(ConflictError, match="there is a dataset 'd' again"):
         restore(parts, "dataset", "d", permit=lambda _: None)
@@ -313,10 +313,10 @@ def test_a_job_is_not_restored_without_its_object(parts: Parts) -> None:
     job = finished(parts)
     delete_job(parts, job)
     delete_asset(parts, AssetKind.OBJECT, "ball")
-    sweep(parts)
+    collect_garbage(parts)
     with pytest.raises(ConflictError, match="graspd objects restore first"):
         restore(parts, "job", job, permit=lambda _: None)
-    sweep(parts)
+    collect_garbage(parts)
     assert differences(parts.index, parts.store) == []
     restore(parts, "object", "ball", permit=lambda _: None)
     restore(parts, "job", job, permit=lambda _: None)
@@ -336,7 +336,7 @@ def test_a_deleted_tag_is_restored_with_its_grasps(parts: Parts) -> None:
 def test_after_the_grace_time_nothing_comes_back(parts: Parts) -> None:
     job = finished(parts)
     delete_job(parts, job)
-    sweep(parts)
+    collect_garbage(parts)
     assert not graceless(parts).collect(budget_s=60)
     assert keys(parts, "removed") == set()
     with pytest.raises(NotFoundError, match="was deleted in the last 7 days"):

@@ -21,7 +21,7 @@ from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.deletion import delete_asset
-from service.pipeline.sweeper import Sweeper
+from service.pipeline.garbage_collector import GarbageCollector
 from service.store.library import publish_asset
 from service.store.network_check import check_network
 from service.store.records import read_record
@@ -88,7 +88,7 @@ def test_a_network_is_needed_until_its_job_and_its_dataset_are_deleted(parts: Pa
     needed_until_its_users_are_deleted(parts, AssetKind.NETWORK, "net", job.id, wanted)
     with pytest.raises(NotFoundError, match="there is no network 'net'"):
         submit(parts)
-    while Sweeper(parts).advance():
+    while GarbageCollector(parts).advance():
         pass
     assert [entry.key for entry in parts.store.list(f"{names.ASSETS}/network")] == []
 

@@ -1,5 +1,7 @@
-"""Puts away what users deleted, a little in each round of the controller; after a grace time it goes for good, with the
-shards that no job needs any more."""
+"""Garbage collector of the store: moves what users deleted aside, a little in each round of the controller.
+
+After the grace time it goes for good, with the shards that no job needs any more.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ BUDGET_S: Final = 0.5
 _AT_ONCE: Final = 200
 
 
-class Sweeper:
+class GarbageCollector:
     """Carries out deletions; killed at any moment, its successor does the rest."""
 
     def __init__(self, parts: Parts, *, clock: Callable[[], float] = time.monotonic) -> None:
