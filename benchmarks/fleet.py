@@ -123,7 +123,12 @@ def machine(*, sqlite: bool, s3: bool) -> Iterator[Machine]:
     """A service of real processes that ends with the block."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="graspd-fleet-")))
-        options: dict[str, Any] = {"data_dir": folder, "log_level": "WARNING", "scrub_mb_per_s": 0.0, "lease_s": 20.0}
+        options: dict[str, Any] = {
+            "data_dir": folder,
+            "log_level": "WARNING",
+            "integrity_scan_mb_per_s": 0.0,
+            "lease_s": 20.0,
+        }
         pids = {}
         if not sqlite:
             server = stack.enter_context(PostgresServer())

@@ -20,6 +20,7 @@ GONE: Final = {
     "GRASPD_KEEPER_SHARDS": "one controller leads and the others stand by; unset it",
     "GRASPD_KEEPER_INTERVAL_S": "it is GRASPD_CONTROLLER_INTERVAL_S now",
     "GRASPD_KEEPER_NAME": "it is GRASPD_CONTROLLER_NAME now",
+    "GRASPD_SCRUB_MB_PER_S": "it is GRASPD_INTEGRITY_SCAN_MB_PER_S now",
 }
 
 
@@ -124,8 +125,8 @@ class Settings(BaseSettings):
         ge=0,
         description="how long what was deleted can be restored, and its shards stay where no job needs them [s]",
     )
-    scrub_mb_per_s: float = Field(
-        1.0, ge=0, description="how fast the controller reads through the store for damage [MiB/s]; 0: never"
+    integrity_scan_mb_per_s: float = Field(
+        1.0, ge=0, description="rate at which the controller's integrity scan reads the store [MiB/s]; 0: off"
     )
     stop_grace_s: float = Field(10.0, gt=0, description="time a process has to stop before it is killed [s]")
     kernels: Path | None = Field(

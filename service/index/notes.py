@@ -14,10 +14,10 @@ from service.index.tables import notes
 from service.model.clock import timestamp
 
 _REBUILT: Final = "rebuilt"
-_SCRUB: Final = "scrub"
+_SCAN: Final = "integrity scan"
 _CHANGES: Final = "changes"
 _MARK: Final = "mark"
-_SCRUB_TURN: Final = "scrub turn"
+_SCAN_TURN: Final = "integrity scan turn"
 _SERVICE: Final = "service"
 #: Names of records that are kept; the count is of all.
 _NAMED: Final = 50
@@ -47,7 +47,7 @@ class Marked:
 
 
 @dataclass(frozen=True)
-class ScrubNote:
+class ScanNote:
     """How far the controller has read through the store in this round."""
 
     started: str = ""
@@ -122,17 +122,17 @@ class Notes:
         with self.database.writing(within) as connection:
             upsert(connection, notes, [{"name": _MARK, "value": asdict(marked)}])
 
-    def scrub_note(self) -> ScrubNote:
+    def scan_note(self) -> ScanNote:
         """How far the controller has read through the store; nothing read yet: a note of defaults."""
         with self.database.reading() as connection:
-            value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCRUB))
-        return ScrubNote(**value) if value else ScrubNote()
+            value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCAN))
+        return ScanNote(**value) if value else ScanNote()
 
-    def set_scrub_note(self, note: ScrubNote) -> None:
+    def set_scan_note(self, note: ScanNote) -> None:
         with self.database.writing() as connection:
-            upsert(connection, notes, [{"name": _SCRUB, "value": asdict(note)}])
+            upsert(connection, notes, [{"name": _SCAN, "value": asdict(note)}])
 
-    def take_scrub_turn(self, holder: str, *, is_controller: bool, lasts_s: float) -> bool:
+    def take_scan_turn(self, holder: str, *, is_controller: bool, lasts_s: float) -> bool:
         """Take or keep the right to read through the whole store; False: somebody else has it.
 
         Args:
@@ -141,7 +141,7 @@ class Notes:
             lasts_s: after so long without a call the right is free again [s].
         """
         with self.database.writing() as connection:
-            held: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCRUB_TURN))
+            held: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCAN_TURN))
             if (
                 held
                 and held["holder"] != holder
@@ -150,12 +150,12 @@ class Notes:
             ):
                 return False
             value = {"holder": holder, "controller": is_controller, "until": timestamp(-lasts_s)}
-            upsert(connection, notes, [{"name": _SCRUB_TURN, "value": value}])
+            upsert(connection, notes, [{"name": _SCAN_TURN, "value": value}])
         return True
 
-    def end_scrub_turn(self, holder: str) -> None:
+    def end_scan_turn(self, holder: str) -> None:
         """Free the right, if this one has it."""
         with self.database.writing() as connection:
-            held: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCRUB_TURN))
+            held: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCAN_TURN))
             if held and held["holder"] == holder:
-                connection.execute(delete(notes).where(notes.c.name == _SCRUB_TURN))
+                connection.execute(delete(notes).where(notes.c.name == _SCAN_TURN))

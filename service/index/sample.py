@@ -106,7 +106,7 @@ def _manifest(store: Store, stage: Stage, shard: str) -> tuple[str, int, int] | 
     try:
         found = load_manifest(store, stage, shard)
     except (NotFoundError, DamagedError):
-        # A damaged one is for the scrub to tell; the index leaves it out.
+        # A damaged one is for the integrity scan to report; the index leaves it out.
         return None
     return found.sha256, found.count, found.valid
 

@@ -32,6 +32,7 @@ from service.pipeline.entering import Entering
 from service.pipeline.garbage_collector import GarbageCollector
 from service.pipeline.identity import identify
 from service.pipeline.indexer import Indexer
+from service.pipeline.integrity_scan import IntegrityScan
 from service.pipeline.job_actions import HELD_S, queue_tasks
 from service.pipeline.leading import PART
 from service.pipeline.marking import Marking
@@ -39,7 +40,6 @@ from service.pipeline.pace import Pace
 from service.pipeline.reaper import Reaper
 from service.pipeline.reports import Reports
 from service.pipeline.routes import Routes
-from service.pipeline.scrubber import Scrubber
 from service.queue.port import Event, EventKind
 from service.store.library import publish_builtins, stored_assets
 from service.store.packs import take_apart
@@ -108,8 +108,8 @@ class Controller:
         """What goes on beside the rounds: webhooks are told what ended, large jobs are entered, and the store is read
         through, where the settings want it."""
         duties = {"webhooks": Courier(self._parts, stop).run, "entering": Entering(self._parts, stop).run}
-        if self._parts.settings.scrub_mb_per_s:
-            duties["scrub"] = Scrubber(self._parts, stop).run
+        if self._parts.settings.integrity_scan_mb_per_s:
+            duties["integrity scan"] = IntegrityScan(self._parts, stop).run
         threads = [threading.Thread(target=duty, name=name, daemon=True) for name, duty in duties.items()]
         for thread in threads:
             thread.start()

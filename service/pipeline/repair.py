@@ -16,7 +16,7 @@ from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane, Stage
 from service.model.version import STAGE_REVISIONS
 from service.pipeline.backends import Parts
-from service.pipeline.scrub import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, STAGES, is_on_its_way
+from service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, STAGES, is_on_its_way
 from service.store.library import builtin_assets, load_asset, publish_builtins
 from service.store.records import read_record, task_attempts
 

@@ -154,7 +154,7 @@ def rebuild(
     from service.index.rebuild import rebuild as fill
     from service.pipeline.backends import Parts
     from service.pipeline.identity import identify_if_redis_answers
-    from service.pipeline.scrub import scan
+    from service.pipeline.integrity import scan
     from service.store.packs import take_apart
 
     parts = Parts.open(load_settings(data_dir=data_dir), patience=0, make=False, anew=not check)

@@ -32,13 +32,13 @@ def verify(
 ) -> None:
     """Read everything that the store keeps and say what is damaged or missing. Exit code 1 says that something is.
 
-    The controller's own reading pauses meanwhile; a second call is refused.
+    The controller's integrity scan pauses meanwhile; a second call is refused.
     """
     from service.pipeline.backends import Parts
     from service.pipeline.identity import identify_if_redis_answers
+    from service.pipeline.integrity import MISSING, scan
+    from service.pipeline.integrity_scan import Turn
     from service.pipeline.repair import repair as mend
-    from service.pipeline.scrub import MISSING, scan
-    from service.pipeline.scrubber import Turn
 
     parts = Parts.open(load_settings(data_dir=data_dir), make=False)
     if repair:

@@ -44,7 +44,7 @@ def test_a_controller_lives_also_while_redis_is_away(
         raise QueueUnavailable("Redis does not answer")
 
     file = tmp_path / "alive"
-    settings = parts.settings.model_copy(update={"heartbeat_file": file, "scrub_mb_per_s": 0.0})
+    settings = parts.settings.model_copy(update={"heartbeat_file": file, "integrity_scan_mb_per_s": 0.0})
     monkeypatch.setattr(parts.queue, "depths", away)
     stop = threading.Event()
     thread = threading.Thread(

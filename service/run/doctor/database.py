@@ -164,13 +164,13 @@ def index_is_store(settings: Settings, *, full: bool = False, settles_s: float =
 
 
 def damage(settings: Settings) -> Finding:
-    """What the controller's reading through the store found, or `graspd admin store verify`."""
+    """Findings of the controller's integrity scan, or of `graspd admin store verify`."""
     name = "damage"
     if why := _openable(settings):
         return skipped(name, why)
     with closing(Index(settings.resolved_index_url)) as opened:
         count, known = opened.damage.known(limit=1)
-        note, made = opened.notes.scrub_note(), opened.notes.completeness()
+        note, made = opened.notes.scan_note(), opened.notes.completeness()
     if count:
         return bad(
             name,
@@ -180,11 +180,11 @@ def damage(settings: Settings) -> Finding:
     if made is not None and made.left_out:
         mend = "put copies in their place, then graspd admin index rebuild"
         return bad(name, f"{made.left_out} damaged records are left out of the index, {made.names[0]}", mend)
-    if not settings.scrub_mb_per_s:
+    if not settings.integrity_scan_mb_per_s:
         return warning(
             name,
-            "nothing is known, and nobody reads the store through",
-            "GRASPD_SCRUB_MB_PER_S=1, or graspd admin store verify at times",
+            "no damage is known, and the integrity scan is off",
+            "GRASPD_INTEGRITY_SCAN_MB_PER_S=1, or graspd admin store verify at times",
         )
     when = (
         f"last read through by {note.ended}"

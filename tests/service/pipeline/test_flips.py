@@ -24,8 +24,8 @@ from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.identity import ServiceRecord
+from service.pipeline.integrity import FOLDERS, examine, scan
 from service.pipeline.repair import repair
-from service.pipeline.scrub import FOLDERS, examine, scan
 from service.store.assets import pack as pack_files
 from service.store.deletions import Deletion, Released, removed_folder
 from service.store.library import builtin_assets, load_check, publish_builtins, store_files

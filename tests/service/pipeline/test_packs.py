@@ -19,8 +19,8 @@ from service.model.records import JobRecord
 from service.model.states import Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
+from service.pipeline.integrity import scan
 from service.pipeline.repair import repair
-from service.pipeline.scrub import scan
 from service.readers import open_shards
 from service.run import commands, store_commands
 from service.store.packs import has_packs
@@ -30,7 +30,7 @@ from tests.fakes import request
 from tests.packs import pack, tasks_of
 from tests.service.pipeline.on_store import parts_on
 from tests.service.pipeline.test_controller import Bench
-from tests.service.pipeline.test_scrub import work_off
+from tests.service.pipeline.test_integrity import work_off
 
 
 @pytest.fixture

@@ -92,6 +92,7 @@ def test_a_bad_setting_names_its_variable(monkeypatch: pytest.MonkeyPatch) -> No
     [
         ("GRASPD_KEEPER_INTERVAL_S", "GRASPD_CONTROLLER_INTERVAL_S"),
         ("GRASPD_KEEPER_NAME", "GRASPD_CONTROLLER_NAME"),
+        ("GRASPD_SCRUB_MB_PER_S", "GRASPD_INTEGRITY_SCAN_MB_PER_S"),
     ],
 )
 def test_a_setting_of_0_2_is_refused_with_its_new_name(monkeypatch: pytest.MonkeyPatch, old: str, new: str) -> None:

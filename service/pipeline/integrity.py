@@ -1,4 +1,4 @@
-"""Looks through a store for what is not what it was: shards, records, uploads, all that is kept. Changes nothing."""
+"""Integrity of a store: shards, records, uploads, all that is kept, against their checksums. Changes nothing."""
 
 from __future__ import annotations
 

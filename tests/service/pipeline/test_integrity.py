@@ -15,8 +15,8 @@ from service.model.states import State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.controller import Controller
+from service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, scan
 from service.pipeline.repair import repair
-from service.pipeline.scrub import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, scan
 from service.queue.port import EventKind
 from service.store.manifests import ShardManifest, load_manifest, load_shard
 from tests.damage import cut, flip, overwrite, remove

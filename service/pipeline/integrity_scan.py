@@ -1,4 +1,4 @@
-"""The controller's slow look through the store: round after round, at a bounded rate, on from where it stopped."""
+"""Integrity scan of the store by the controller: round after round, at a bounded rate, on from where it stopped."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from typing import Final
 from uuid import uuid4
 
 from service.index.damage import Damage
-from service.index.notes import ScrubNote
+from service.index.notes import ScanNote
 from service.model.clock import age_of, timestamp
 from service.model.errors import GraspdError
 from service.pipeline.backends import Parts
-from service.pipeline.scrub import FOLDERS, examine, is_checked, is_on_its_way
+from service.pipeline.integrity import FOLDERS, examine, is_checked, is_on_its_way
 
 log = logging.getLogger(__name__)
 #: A small store is not read more often than this [s].
@@ -52,7 +52,7 @@ class Turn:
         """Take the turn, or keep it; asks the index every few seconds."""
         now = self._clock()
         if now - self._said >= _TURN_S:
-            if not self._parts.index.notes.take_scrub_turn(
+            if not self._parts.index.notes.take_scan_turn(
                 self._holder, is_controller=self._is_controller, lasts_s=3 * _TURN_S
             ):
                 return False
@@ -64,16 +64,16 @@ class Turn:
         self.is_mine()
 
     def end(self) -> None:
-        self._parts.index.notes.end_scrub_turn(self._holder)
+        self._parts.index.notes.end_scan_turn(self._holder)
         self._said = -_TURN_S
 
 
-class Scrubber:
+class IntegrityScan:
     """Reads through the store and notes in the index what is damaged, or no longer is."""
 
     def __init__(self, parts: Parts, stop: threading.Event, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._parts, self._stop, self._clock = parts, stop, clock
-        self._rate = parts.settings.scrub_mb_per_s * 2**20
+        self._rate = parts.settings.integrity_scan_mb_per_s * 2**20
         self._turn = Turn(parts, is_controller=True, clock=clock)
         self._paid = clock()
         self._looked = clock()
@@ -87,10 +87,10 @@ class Scrubber:
             except Interrupted:
                 self._stop.wait(_PAUSE_S)
             except GraspdError as error:
-                log.warning("%s; the scrub of the store goes on later", error)
+                log.warning("%s; the integrity scan goes on later", error)
                 self._stop.wait(_PAUSE_S)
             except Exception:
-                log.exception("the scrub of the store broke off; it goes on later")
+                log.exception("the integrity scan broke off; it goes on later")
                 self._stop.wait(_PAUSE_S)
         with suppress(GraspdError):
             self.end()
@@ -107,11 +107,11 @@ class Scrubber:
             UnavailableError: a part is away; call again.
         """
         self._look_again_in_time(None)
-        note = self._parts.index.notes.scrub_note()
+        note = self._parts.index.notes.scan_note()
         if note.folder >= len(FOLDERS):
             if (age_of(note.started) or 0.0) < ROUND_S:
                 return False
-            note = ScrubNote()
+            note = ScanNote()
         note = note if note.started else replace(note, started=timestamp())
         keys = self._keys(FOLDERS[note.folder], note.after)
         for key in keys:
@@ -122,13 +122,13 @@ class Scrubber:
         note = replace(note, folder=note.folder + over, after="" if over else keys[-1])
         if note.folder == len(FOLDERS):
             note = replace(note, ended=timestamp())
-        self._parts.index.notes.set_scrub_note(note)
+        self._parts.index.notes.set_scan_note(note)
         return True
 
-    def _look_again_in_time(self, reached: ScrubNote | None) -> None:
+    def _look_again_in_time(self, reached: ScanNote | None) -> None:
         if self._clock() - self._looked > _AGAIN_S:
             if reached is not None:
-                self._parts.index.notes.set_scrub_note(reached)
+                self._parts.index.notes.set_scan_note(reached)
             self.look_again()
 
     def look_again(self) -> None:

@@ -1,4 +1,4 @@
-"""The controller's slow look through the store: findings, speed, place to go on from, and whom it makes way for."""
+"""The controller's integrity scan: findings, speed, place to go on from, and whom it makes way for."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 from service.model import names
 from service.pipeline.backends import Parts
 from service.pipeline.controller import Controller
-from service.pipeline.scrub import FOLDERS, MISSING, NO_MANIFEST
-from service.pipeline.scrubber import Interrupted, Scrubber, Turn
+from service.pipeline.integrity import FOLDERS, MISSING, NO_MANIFEST
+from service.pipeline.integrity_scan import IntegrityScan, Interrupted, Turn
 from service.settings import Settings
 from service.store.manifests import ShardManifest
 from service.store.store import open_store
@@ -45,11 +45,11 @@ def shards(parts: Parts) -> list[ShardManifest]:
 
 def a_round(parts: Parts, stop: Slept | None = None) -> None:
     stop = stop or Slept()
-    scrubber = Scrubber(parts, stop, clock=stop.clock)
+    scan = IntegrityScan(parts, stop, clock=stop.clock)
     for _ in FOLDERS:
-        scrubber.advance()
-    scrubber.end()
-    assert parts.index.notes.scrub_note().ended
+        scan.advance()
+    scan.end()
+    assert parts.index.notes.scan_note().ended
 
 
 def found(parts: Parts) -> dict[str, str]:
@@ -59,7 +59,7 @@ def found(parts: Parts) -> dict[str, str]:
 def test_a_round_notes_what_is_damaged_and_nothing_else(parts: Parts, shards: list[ShardManifest]) -> None:
     a_round(parts)
     assert parts.index.damage.known() == (0, [])
-    parts.index.notes.set_scrub_note(type(parts.index.notes.scrub_note())())
+    parts.index.notes.set_scan_note(type(parts.index.notes.scan_note())())
     flip(parts.store, shards[0].key)
     remove(parts.store, shards[1].key)
     a_round(parts)
@@ -80,7 +80,7 @@ def test_what_is_mended_or_removed_since_is_forgotten(parts: Parts, shards: list
     remove(parts.store, names.shard_manifest(shards[1].stage, shards[1].shard_id))
     remove(parts.store, shards[1].key)
     remove(parts.store, "shards/base/notes.txt")
-    Scrubber(parts, Slept()).look_again()
+    IntegrityScan(parts, Slept()).look_again()
     assert found(parts).keys() == {shards[2].shard_id}
 
 
@@ -94,7 +94,10 @@ def test_it_reads_no_faster_than_the_settings_say(parts: Parts, shards: list[Sha
     size = sum(manifest.size_bytes for manifest in shards)
     stop = Slept()
     slow = Parts(
-        parts.settings.model_copy(update={"scrub_mb_per_s": size / 2**20 / 100}), parts.store, parts.index, parts.queue
+        parts.settings.model_copy(update={"integrity_scan_mb_per_s": size / 2**20 / 100}),
+        parts.store,
+        parts.index,
+        parts.queue,
     )
     a_round(slow, stop)
     assert stop.now > 99.0
@@ -104,8 +107,8 @@ def test_a_successor_goes_on_where_it_stopped(parts: Parts, shards: list[ShardMa
     for manifest in shards:
         flip(parts.store, manifest.key)
     ordered = sorted(names.shard_manifest(one.stage, one.shard_id) for one in shards)
-    note = parts.index.notes.scrub_note()
-    parts.index.notes.set_scrub_note(type(note)(started="2026-01-01T00:00:00.000Z", after=ordered[1]))
+    note = parts.index.notes.scan_note()
+    parts.index.notes.set_scan_note(type(note)(started="2026-01-01T00:00:00.000Z", after=ordered[1]))
     a_round(parts)
     assert {names.shard_manifest(shards[0].stage, shard) for shard in found(parts)} == set(ordered[2:])
 
@@ -113,25 +116,25 @@ def test_a_successor_goes_on_where_it_stopped(parts: Parts, shards: list[ShardMa
 def test_a_small_store_is_not_read_over_and_over(parts: Parts, shards: list[ShardManifest]) -> None:
     a_round(parts)
     flip(parts.store, shards[0].key)
-    scrubber = Scrubber(parts, Slept())
-    assert not scrubber.advance()
-    note = parts.index.notes.scrub_note()
-    parts.index.notes.set_scrub_note(type(note)(**vars(note) | {"started": "2026-01-01T00:00:00.000Z"}))
-    assert scrubber.advance()
+    scan = IntegrityScan(parts, Slept())
+    assert not scan.advance()
+    note = parts.index.notes.scan_note()
+    parts.index.notes.set_scan_note(type(note)(**vars(note) | {"started": "2026-01-01T00:00:00.000Z"}))
+    assert scan.advance()
     assert found(parts).keys() == {shards[0].shard_id}
 
 
 def test_it_makes_way_for_a_verify_and_goes_on_afterwards(parts: Parts, shards: list[ShardManifest]) -> None:
     stop = Slept()
-    scrubber = Scrubber(parts, stop, clock=stop.clock)
+    scan = IntegrityScan(parts, stop, clock=stop.clock)
     verify = Turn(parts, is_controller=False)
     assert verify.is_mine()
     with pytest.raises(Interrupted):
-        scrubber.advance()
+        scan.advance()
     assert not Turn(parts, is_controller=False).is_mine()
     assert not Turn(parts, is_controller=True).is_mine()
     verify.end()
-    assert scrubber.advance()
+    assert scan.advance()
 
 
 def test_a_verify_takes_the_turn_from_a_controller(parts: Parts) -> None:
@@ -162,12 +165,12 @@ def test_a_second_verify_is_refused(
 
 
 @pytest.mark.parametrize("rate", [100.0, 0.0])
-def test_the_controller_scrubs_beside_its_rounds_unless_it_is_off(
+def test_the_controller_scans_beside_its_rounds_unless_it_is_off(
     parts: Parts, shards: list[ShardManifest], rate: float
 ) -> None:
     flip(parts.store, shards[0].key)
     set_so = Parts(
-        parts.settings.model_copy(update={"scrub_mb_per_s": rate, "controller_interval_s": 0.05}),
+        parts.settings.model_copy(update={"integrity_scan_mb_per_s": rate, "controller_interval_s": 0.05}),
         parts.store, parts.index, parts.queue,
     )  # fmt: skip
     stop = threading.Event()
@@ -185,5 +188,5 @@ def test_the_controller_scrubs_beside_its_rounds_unless_it_is_off(
         stop.set()
         thread.join(WAIT_S)
     assert found(parts).keys() == ({shards[0].shard_id} if rate else set())
-    assert ("scrub" in names_now) <= bool(rate)
-    assert not any(one.name == "scrub" for one in threading.enumerate())
+    assert ("integrity scan" in names_now) <= bool(rate)
+    assert not any(one.name == "integrity scan" for one in threading.enumerate())
