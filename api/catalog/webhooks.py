@@ -26,7 +26,7 @@ class Webhooks:
 
     def ends(self, since: int, *, limit: int) -> list[EndView]:
         """The next ends of jobs and datasets within reach, behind a number."""
-        return self._parts.index.outgoing.ends(since, limit=limit, reach=reach())
+        return self._parts.index.outbox.ends(since, limit=limit, reach=reach())
 
     def add(self, url: str, states: tuple[End, ...]) -> tuple[WebhookView, str]:
         """A webhook and its secret, which is told this once.
@@ -51,17 +51,17 @@ class Webhooks:
             project=project,
         )
         with recording(self._parts) as (connection, put):
-            if len(self._parts.index.outgoing.hooks(reach=Reach(project, everything=False))) >= MOST_HOOKS:
+            if len(self._parts.index.outbox.hooks(reach=Reach(project, everything=False))) >= MOST_HOOKS:
                 raise LimitError(f"there are {MOST_HOOKS} webhooks, which is the most; delete one")
             put(names.webhook(hook.id), hook)
-            self._parts.index.outgoing.add(hook, within=connection)
+            self._parts.index.outbox.add(hook, within=connection)
         key = caller.get()
         log.info("webhook %s made by %s", hook.id, key.name if key else "this machine")
-        return self._parts.index.outgoing.hook(hook.id), secret_of(master.get_secret_value(), hook.id)
+        return self._parts.index.outbox.hook(hook.id), secret_of(master.get_secret_value(), hook.id)
 
     def all(self) -> list[WebhookView]:
         """Webhooks that the caller may change: the addresses of others may hold words that let somebody in."""
-        return [hook for hook in self._parts.index.outgoing.hooks(reach=reach()) if self._is_theirs(hook)]
+        return [hook for hook in self._parts.index.outbox.hooks(reach=reach()) if self._is_theirs(hook)]
 
     def log(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
         """Deliveries of a webhook, the newest first.
@@ -69,7 +69,7 @@ class Webhooks:
         Raises:
             NotYours: another key made it.
         """
-        return self._parts.index.outgoing.log(self._owned(webhook).id, limit=limit)
+        return self._parts.index.outbox.log(self._owned(webhook).id, limit=limit)
 
     def delete(self, webhook: str) -> None:
         """Take a webhook away; what waits for it is not sent.
@@ -80,11 +80,11 @@ class Webhooks:
         hook = self._owned(webhook)
         # The record first: what is left of a broken-off deletion is a row that a rebuild drops.
         self._parts.store.delete(names.webhook(hook.id))
-        self._parts.index.outgoing.remove(hook.id)
+        self._parts.index.outbox.remove(hook.id)
         log.info("webhook %s deleted", hook.id)
 
     def _owned(self, webhook: str) -> WebhookView:
-        hook = self._parts.index.outgoing.hook(webhook, reach=reach())
+        hook = self._parts.index.outbox.hook(webhook, reach=reach())
         must_own(hook.owner, f"webhook {webhook}", hook.project)
         return hook
 

@@ -10,7 +10,7 @@ from service.index.changes.removals import Removals
 from service.index.damage import KnownDamage
 from service.index.database import Database
 from service.index.notes import Notes
-from service.index.outgoing import Outgoing
+from service.index.outbox import Outbox
 from service.index.queries.assets import Assets, ObjectSets
 from service.index.queries.costs import Costs
 from service.index.queries.dataset_feed import DatasetFeed
@@ -57,7 +57,7 @@ class Index:
         # What is both.
         self.notes = Notes(database)
         self.damage = KnownDamage(database)
-        self.outgoing = Outgoing(database)
+        self.outbox = Outbox(database)
         self.tags = Tags(database)
 
     def close(self) -> None:

@@ -79,9 +79,9 @@ class _Rebuild:
         self.counts = dict.fromkeys(("assets", "jobs", "attempts", "shards", "datasets", "snapshots", "object_sets"), 0)
         self.left_out: list[str] = []
         self._gone = pending(store)
-        self._last = index.outgoing.last(within=connection)
-        self._seen = index.outgoing.seen(within=connection)
-        self._told = index.outgoing.told(within=connection)
+        self._last = index.outbox.last(within=connection)
+        self._seen = index.outbox.seen(within=connection)
+        self._told = index.outbox.told(within=connection)
 
     def assets(self) -> None:
         for kind, digest in stored_assets(self._store):
@@ -123,7 +123,7 @@ class _Rebuild:
                 if events := self._events(DatasetEvent, names.dataset_events(record.name)):
                     self._index.write_dataset.set_events(record.name, events, within=self._connection)
         ended = self._index.datasets.ended(within=self._connection)
-        self._index.outgoing.set_told(ended | self._told, within=self._connection)
+        self._index.outbox.set_told(ended | self._told, within=self._connection)
         for key, data in self._read(names.DATASETS, lambda key: "/snapshots/" in key):
             with self._each(key, "snapshots"):
                 self._index.write_dataset.add_snapshot(parse_record(Snapshot, data, key), within=self._connection)
@@ -136,7 +136,7 @@ class _Rebuild:
             with self._each(key):
                 hook = parse_record(Webhook, data, key)
                 seen = self._seen.get(hook.id, self._last)
-                self._index.outgoing.add(hook, seen=seen, within=self._connection)
+                self._index.outbox.add(hook, seen=seen, within=self._connection)
 
     def tags(self) -> None:
         """The last version of each tag: those before it are left of a change that broke off."""

@@ -26,7 +26,6 @@ from service.model.states import Lane
 from service.model.turns import Turns
 from service.model.worker_beat import WorkerBeat
 from service.pipeline.backends import Parts
-from service.pipeline.courier import Courier
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.entering import Entering
 from service.pipeline.garbage_collector import GarbageCollector
@@ -40,6 +39,7 @@ from service.pipeline.pace import Pace
 from service.pipeline.reaper import Reaper
 from service.pipeline.reports import Reports
 from service.pipeline.routes import Routes
+from service.pipeline.webhook_dispatcher import WebhookDispatcher
 from service.queue.port import Event, EventKind
 from service.store.library import publish_builtins, stored_assets
 from service.store.packs import take_apart
@@ -107,7 +107,7 @@ class Controller:
     def _beside(self, stop: threading.Event) -> Iterator[None]:
         """What goes on beside the rounds: webhooks are told what ended, large jobs are entered, and the store is read
         through, where the settings want it."""
-        duties = {"webhooks": Courier(self._parts, stop).run, "entering": Entering(self._parts, stop).run}
+        duties = {"webhooks": WebhookDispatcher(self._parts, stop).run, "entering": Entering(self._parts, stop).run}
         if self._parts.settings.integrity_scan_mb_per_s:
             duties["integrity scan"] = IntegrityScan(self._parts, stop).run
         threads = [threading.Thread(target=duty, name=name, daemon=True) for name, duty in duties.items()]

@@ -10,7 +10,7 @@ from typing import Any, Final
 from sqlalchemy import ColumnElement, Connection, exists, func, literal, select, tuple_, update
 
 from service.index.database import chunks
-from service.index.outgoing import note_ends
+from service.index.outbox import note_ends
 from service.index.tables import attempts, jobs, notes, tasks
 from service.model.errors import LoadError, SceneError
 from service.model.planning import TaskFacts, batch_ready, batch_states, job_state

@@ -17,12 +17,12 @@ from starlette.testclient import TestClient
 from api.access.keys import KeyFile, Scope
 from api.app import create_app
 from service.index.index import Index
-from service.index.outgoing import note_ends
+from service.index.outbox import note_ends
 from service.index.rebuild import rebuild
 from service.model.webhooks import MOST_HOOKS, WAITS_S, Webhook
 from service.pipeline.backends import Parts
-from service.pipeline.courier import AT_ONCE, SLOW_AT_ONCE, Courier
-from service.pipeline.posting import Answer
+from service.pipeline.http_client import Answer
+from service.pipeline.webhook_dispatcher import AT_ONCE, SLOW_AT_ONCE, WebhookDispatcher
 from service.settings import Settings
 from tests.api.factories import add_job, finish_all
 from tests.planning import plan_all
@@ -45,15 +45,15 @@ class Ear:
         self.parts = parts
         self.heard: list[tuple[str, bytes, dict[str, str]]] = []
         self.answer = Answer(200)
-        self.courier = Courier(parts, threading.Event(), send=self.send)
+        self.dispatcher = WebhookDispatcher(parts, threading.Event(), send=self.send)
 
     def send(self, url: str, body: bytes, headers: dict[str, str], **_: Any) -> Answer:
         self.heard.append((url, body, headers))
         return self.answer
 
     def round(self, later_s: float = 0.0) -> int:
-        self.courier.tell_datasets()
-        return self.courier.deliver(now=time.time() + later_s)
+        self.dispatcher.tell_datasets()
+        return self.dispatcher.deliver(now=time.time() + later_s)
 
 
 @pytest.fixture
@@ -152,9 +152,9 @@ def test_webhooks_are_in_the_store_and_tell_nothing_old_after_a_rebuild(
     fresh = Index("sqlite://")
     try:
         rebuild(fresh, parts.store)
-        assert [one.id for one in fresh.outgoing.hooks()] == [hook["id"]]
-        fresh.outgoing.plan()
-        assert fresh.outgoing.due(time.time()) == []
+        assert [one.id for one in fresh.outbox.hooks()] == [hook["id"]]
+        fresh.outbox.plan()
+        assert fresh.outbox.due(time.time()) == []
     finally:
         fresh.close()
     rebuild(parts.index, parts.store)
@@ -217,7 +217,7 @@ def hooks(parts: Parts, count: int, project: str, host: str) -> None:
             created=f"2026-01-01T00:00:{number % 60:02}Z",
             project=project,
         )
-        parts.index.outgoing.add(hook)
+        parts.index.outbox.add(hook)
 
 
 def end_jobs_of(parts: Parts, projects: str, seq: str = "") -> None:
@@ -251,36 +251,36 @@ class Silent(Ear):
 def test_silent_addresses_keep_no_other_waiting(parts: Parts, dead: int, theirs: str) -> None:
     ear = Silent(parts)
     hooks(parts, dead, theirs, "dead")
-    hooks(parts, 1, "b", "good") if theirs != "b" else parts.index.outgoing.add(
+    hooks(parts, 1, "b", "good") if theirs != "b" else parts.index.outbox.add(
         Webhook(id="c" * 32, url="https://good/", states=("succeeded",), created="2026-02-01T00:00:00Z", project="b")
     )
     end_jobs_of(parts, "ab")
     try:
-        ear.courier.start_deliveries()
+        ear.dispatcher.start_deliveries()
         assert ear.good.wait(30)
         # What is silent is not asked again while it is asked.
         end_jobs_of(parts, "ab", "again")
-        ear.courier.start_deliveries()
+        ear.dispatcher.start_deliveries()
         assert len(set(ear.asked)) == len(ear.asked)
     finally:
         ear.let_go.set()
 
 
 def test_a_burst_of_ends_is_told_without_a_pause_between_them(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.pipeline.courier._PAUSE_S", PATIENCE_S)
+    monkeypatch.setattr("service.pipeline.webhook_dispatcher._PAUSE_S", PATIENCE_S)
     ear, stop = Ear(parts), threading.Event()
-    ear.courier = Courier(parts, stop, send=ear.send)
+    ear.dispatcher = WebhookDispatcher(parts, stop, send=ear.send)
     hooks(parts, 1, "a", "good")
     for number in range(20):
         end_jobs_of(parts, "a", str(number))
-    ear.courier.deliver()
-    thread = threading.Thread(target=ear.courier.run)
+    ear.dispatcher.deliver()
+    thread = threading.Thread(target=ear.dispatcher.run)
     thread.start()
     try:
         until(lambda: len(ear.heard) == 20, "all are told")
     finally:
         stop.set()
-        ear.courier._ended.set()
+        ear.dispatcher._ended.set()
         thread.join()
 
 
@@ -302,10 +302,10 @@ def test_addresses_that_failed_leave_half_of_the_room_to_the_others(parts: Parts
     hooks(parts, AT_ONCE, "a", "dead")
     end_jobs_of(parts, "a")
     ear.let_go.set()
-    assert ear.courier.deliver() == AT_ONCE
+    assert ear.dispatcher.deliver() == AT_ONCE
     ear.let_go.clear()
     try:
-        started = ear.courier.start_deliveries(now=time.time() + WAITS_S[0] + 1)
+        started = ear.dispatcher.start_deliveries(now=time.time() + WAITS_S[0] + 1)
         assert len(started) == SLOW_AT_ONCE
     finally:
         ear.let_go.set()
@@ -317,4 +317,4 @@ def test_an_address_that_may_not_be_reached_is_given_up_at_once(parts: Parts, ea
     end_jobs_of(parts, "a", "2")
     ear.answer = Answer(None, "the address is not one of the public internet", is_final=True)
     assert ear.round() == 1 and ear.round(10 * WAITS_S[-1]) == 0
-    assert {one.state for one in parts.index.outgoing.log(f"a{0:031}")} == {"failed"}
+    assert {one.state for one in parts.index.outbox.log(f"a{0:031}")} == {"failed"}

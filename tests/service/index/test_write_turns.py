@@ -84,6 +84,6 @@ def test_controllers_that_index_at_once_leave_the_rows_that_follow_from_the_stor
             done.result(PATIENCE_S)
     assert {processes[0].index.jobs.get(job.id).state for job in jobs} == {State.SUCCEEDED}
     assert differences(processes[0].index, processes[0].store) == []
-    ends = processes[0].index.outgoing.ends(0, limit=99)
+    ends = processes[0].index.outbox.ends(0, limit=99)
     assert sorted(end.subject for end in ends) == sorted(job.id for job in jobs), "each is told once"
     assert len({end.seq for end in ends}) == len(jobs)

@@ -1,4 +1,4 @@
-"""POST to an address that a stranger named: to public machines only, within bounds of time and bytes.
+"""HTTP client of webhooks: POST to an address that a stranger named, public machines only, bounded time and bytes.
 
 The name is resolved here, every address that it has is looked at, and the connection goes to one of these very
 addresses: a name that means another machine a moment later (DNS rebinding) changes nothing. Redirects are not followed.

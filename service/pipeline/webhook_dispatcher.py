@@ -1,4 +1,4 @@
-"""Tells webhooks what ended: signed, tried again with longer and longer waits, one at a time to each address.
+"""Webhook dispatcher: signed reports of what ended, one at a time to each address, tried again after longer waits.
 
 An address that does not take a delivery rests, with all that waits for it. Projects take turns, and within one the
 address that was tried last comes last; addresses that failed last share half of the room, so that silent ones keep
@@ -17,12 +17,12 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import zip_longest
 from typing import Final
 
-from service.index.outgoing import Due
+from service.index.outbox import Due
 from service.index.views import EndView
 from service.model.errors import UnavailableError
 from service.model.webhooks import SIGNATURE, secret_of, signature
 from service.pipeline.backends import Parts
-from service.pipeline.posting import Answer, Networks, networks, post
+from service.pipeline.http_client import Answer, Networks, networks, post
 
 log = logging.getLogger(__name__)
 #: Deliveries under way at once, and of them those to addresses that failed last.
@@ -35,11 +35,11 @@ _FORGET_EVERY_S: Final = 3600.0
 Post = Callable[..., Answer]
 
 
-class Courier:
-    """Works beside the rounds of the controller: an address that does not answer keeps nothing else waiting.
+class WebhookDispatcher:
+    """Runs beside the rounds of the controller: an address that does not answer keeps nothing else waiting.
 
     Args:
-        send: sends a body to an address; as `posting.post`.
+        send: sends a body to an address; as `http_client.post`.
     """
 
     def __init__(self, parts: Parts, stop: threading.Event, *, send: Post = post) -> None:
@@ -83,7 +83,7 @@ class Courier:
 
     def start_deliveries(self, *, now: float | None = None) -> list[Future[None]]:
         """Make deliveries of what is new, and begin those that are due and have room."""
-        out = self._parts.index.outgoing
+        out = self._parts.index.outbox
         if time.monotonic() > self._forget_again:
             out.forget_old()
             self._forget_again = time.monotonic() + _FORGET_EVERY_S
@@ -113,12 +113,12 @@ class Courier:
 
     def tell_datasets(self) -> None:
         """Put datasets that ended into the feed."""
-        untold = dict(self._parts.index.outgoing.untold_datasets())
+        untold = dict(self._parts.index.outbox.untold_datasets())
         for name in untold.keys() - self._parts.index.datasets.unfinished(untold):
             dataset = self._parts.index.datasets.get(name)
             row = {"kind": "dataset", "subject": name, "state": dataset.state.value}
             row |= {"project": dataset.project, "owner": dataset.owner}
-            self._parts.index.outgoing.tell_dataset(name, untold[name], row)
+            self._parts.index.outbox.tell_dataset(name, untold[name], row)
 
     def _try(self, due: Due) -> None:
         is_settled = False
@@ -146,7 +146,7 @@ class Courier:
         }
         answer = self._send(due.hook.url, body, headers, allowed=self._allowed)
         self._last[due.hook.id] = (time.monotonic(), not answer.is_taken)
-        self._parts.index.outgoing.settle(
+        self._parts.index.outbox.settle(
             due, status=answer.status, detail=answer.detail, done=answer.is_taken, final=answer.is_final
         )
 

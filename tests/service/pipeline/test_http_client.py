@@ -13,8 +13,8 @@ import pytest
 
 from service.model.errors import InputError
 from service.model.webhooks import check_url
-from service.pipeline import posting
-from service.pipeline.posting import is_public, networks, post
+from service.pipeline import http_client
+from service.pipeline.http_client import is_public, networks, post
 
 LOOPBACK = networks("127.0.0.0/8")
 
@@ -93,15 +93,15 @@ def test_a_name_is_looked_at_once_and_asked_where_it_was_then(
         dialled.append(address)
         raise OSError("no way there in a test")
 
-    monkeypatch.setattr(posting.socket, "getaddrinfo", resolve)
-    monkeypatch.setattr(posting.socket, "create_connection", dial)
+    monkeypatch.setattr(http_client.socket, "getaddrinfo", resolve)
+    monkeypatch.setattr(http_client.socket, "create_connection", dial)
     assert post(f"http://rebound.example:{port}/in/200", b"{}", {}).status is None
     assert dialled == [("93.184.216.34", port)] and not ear[1]
 
 
 def test_a_name_of_which_one_address_is_private_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     found = [(socket.AF_INET, 1, 6, "", (one, 80)) for one in ("93.184.216.34", "10.0.0.7")]
-    monkeypatch.setattr(posting.socket, "getaddrinfo", lambda *_, **__: found)
+    monkeypatch.setattr(http_client.socket, "getaddrinfo", lambda *_, **__: found)
     answer = post("http://both.example/", b"{}", {})
     assert answer.status is None and "GRASPD_WEBHOOK_NETWORKS" in answer.detail
 
@@ -140,22 +140,22 @@ def test_what_is_no_address_is_refused_when_it_is_made(url: str) -> None:
 
 def test_a_refusal_tells_nothing_of_what_a_name_means_inside(monkeypatch: pytest.MonkeyPatch) -> None:
     found = [(socket.AF_INET, 1, 6, "", ("10.20.30.40", 80))]
-    monkeypatch.setattr(posting.socket, "getaddrinfo", lambda *_, **__: found)
+    monkeypatch.setattr(http_client.socket, "getaddrinfo", lambda *_, **__: found)
     answer = post("http://db.internal/", b"{}", {})
     assert answer.is_final and "10.20" not in answer.detail
 
     def unknown(*_: object, **__: object) -> None:
         raise OSError("resolver 10.0.0.2: NXDOMAIN")
 
-    monkeypatch.setattr(posting.socket, "getaddrinfo", unknown)
+    monkeypatch.setattr(http_client.socket, "getaddrinfo", unknown)
     answer = post("http://nothing.internal/", b"{}", {})
     assert not answer.is_final and answer.detail == "the host of the address cannot be looked up"
 
 
 def test_a_look_up_that_does_not_end_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     let_go = threading.Event()
-    monkeypatch.setattr(posting, "LOOK_UP_S", 0.05)
-    monkeypatch.setattr(posting.socket, "getaddrinfo", lambda *_, **__: let_go.wait(60) and [])
+    monkeypatch.setattr(http_client, "LOOK_UP_S", 0.05)
+    monkeypatch.setattr(http_client.socket, "getaddrinfo", lambda *_, **__: let_go.wait(60) and [])
     try:
         assert post("http://slow.example/", b"{}", {}).status is None
     finally:
@@ -170,8 +170,8 @@ def test_all_addresses_of_a_name_together_get_the_time_of_one(monkeypatch: pytes
         clock[0] += min(timeout, 4.0)
         raise TimeoutError
 
-    monkeypatch.setattr(posting.socket, "getaddrinfo", lambda *_, **__: found)
-    monkeypatch.setattr(posting.socket, "create_connection", silent)
-    monkeypatch.setattr(posting.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(http_client.socket, "getaddrinfo", lambda *_, **__: found)
+    monkeypatch.setattr(http_client.socket, "create_connection", silent)
+    monkeypatch.setattr(http_client.time, "monotonic", lambda: clock[0])
     assert post("http://many.example/", b"{}", {}, patience_s=10).status is None
     assert clock[0] == 110.0

@@ -1,4 +1,4 @@
-"""What is told to others: the ends of jobs and datasets in their order, webhooks, and their deliveries."""
+"""Outbox: ends of jobs and datasets in their order, webhooks, and their deliveries."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def note_ends(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
 
 
 @dataclass(frozen=True)
-class Outgoing:
+class Outbox:
     """Reads and writes of the feed and of webhooks."""
 
     database: Database
