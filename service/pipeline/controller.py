@@ -34,9 +34,9 @@ from service.pipeline.indexer import Indexer
 from service.pipeline.integrity_scan import IntegrityScan
 from service.pipeline.job_actions import HELD_S, queue_tasks
 from service.pipeline.leading import PART
+from service.pipeline.lease_reaper import LeaseReaper
 from service.pipeline.marking import Marking
 from service.pipeline.pace import Pace
-from service.pipeline.reaper import Reaper
 from service.pipeline.reports import Reports
 from service.pipeline.routes import Routes
 from service.pipeline.webhook_dispatcher import WebhookDispatcher
@@ -69,7 +69,7 @@ class Controller:
     def __init__(self, parts: Parts, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._parts = parts
         self._indexer = Indexer(parts)
-        self._reaper = Reaper(parts, self._indexer, clock=clock)
+        self._reaper = LeaseReaper(parts, self._indexer, clock=clock)
         self._planner = DatasetRounds(parts, clock=clock)
         self._garbage = GarbageCollector(parts, clock=clock)
         self._marking = Marking(parts)

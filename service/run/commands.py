@@ -79,7 +79,7 @@ def controller(
     check: Annotated[bool, typer.Option("--check", help="Start none; exit code 1 says that none lives.")] = False,
     data_dir: DataDir = None,
 ) -> None:
-    """Reaper, delayed retries and indexer. Of several one leads and the others stand by; `graspd up` starts one."""
+    """Lease reaper, delayed retries and indexer. One leads and the others stand by; `graspd up` starts one."""
     settings = load_settings(data_dir=data_dir)
     log_to_stderr(settings, "controller")
     keep_private(settings)

@@ -17,7 +17,7 @@ from service.model.states import AssetKind, Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.controller import Controller
-from service.pipeline.reaper import LOST_AFTER_S
+from service.pipeline.lease_reaper import LOST_AFTER_S
 from service.pipeline.routes import Routes
 from service.queue.port import Event, EventKind
 from service.store.library import publish_asset, stored_assets

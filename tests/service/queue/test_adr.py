@@ -25,7 +25,7 @@ from service.model.states import Lane, Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.indexer import Indexer
-from service.pipeline.reaper import Reaper
+from service.pipeline.lease_reaper import LeaseReaper
 from service.queue.lists import queue_name
 from service.queue.rq_keys import held_key
 from service.queue.rq_queue import RqQueue, cancel_key, rq_id
@@ -57,7 +57,7 @@ def test_a_clock_that_is_ahead_takes_no_task_from_a_worker_that_lives(
     parts, job = held
     registry = StartedJobRegistry(NAME, connection=parts.queue.connection, serializer=JSONSerializer)  # type: ignore[attr-defined]
     now = [0.0]
-    reaper = Reaper(parts, Indexer(parts), clock=lambda: now[0])
+    reaper = LeaseReaper(parts, Indexer(parts), clock=lambda: now[0])
     ahead = time.time() + 10 * LEASE_S
     monkeypatch.setattr(time, "time", lambda: ahead)
     for _ in range(50):
@@ -105,7 +105,7 @@ def test_retries_that_redis_counts_are_lost_with_it_and_those_of_the_store_are_n
     waits = ScheduledJobRegistry(queue=plain)
     assert (failed.get_status(), waits.get_job_ids()) == ("scheduled", [failed.id])
     now = [0.0]
-    reaper = Reaper(parts, Indexer(parts), clock=lambda: now[0])
+    reaper = LeaseReaper(parts, Indexer(parts), clock=lambda: now[0])
     while not reaper.reap(parts.queue.leases()):  # a worker that is silent
         now[0] += 1.0
     connection.flushdb()

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 LOST_AFTER_S: Final = 3.0
 
 
-class Reaper:
+class LeaseReaper:
     """Watches leases by whether they change, on this process's own monotonic clock: set clocks do not matter."""
 
     def __init__(self, parts: Parts, indexer: Indexer, *, clock: Callable[[], float] = time.monotonic) -> None:
