@@ -20,11 +20,11 @@ from api.hosts import host_name, is_loopback
 from api.metrics import Metrics
 from api.middleware.body_limit import BodyLimit
 from api.middleware.head import Head
+from api.middleware.rate_limit import RateLimit
 from api.middleware.rates import Rates
 from api.middleware.request_context import RequestContext
 from api.middleware.root_path import RootPath
 from api.middleware.same_origin import SameOrigin
-from api.middleware.turnstile import Turnstile
 from api.routes import datasets, deletions, grasps, hand_corrections, jobs, shards, system, tags, usage, webhooks
 from api.routes.assets import asset_router
 from api.routes.dependencies import provide
@@ -113,7 +113,7 @@ def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile, proxy: Prox
     app.add_middleware(Head)
     uploads = frozenset({*(f"/v1/{kind.value}s" for kind in AssetKind), "/submit"})
     app.add_middleware(BodyLimit, upload_paths=uploads, upload_bytes=settings.max_upload_bytes)
-    app.add_middleware(Turnstile, keys=keys, proxy=proxy, settings=settings, rates=rates)
+    app.add_middleware(RateLimit, keys=keys, proxy=proxy, settings=settings, rates=rates)
     allowed = _LOOPBACK_NAMES | {host_name(settings.host)} if keys.is_open else None
     app.add_middleware(SameOrigin, allowed_hosts=allowed)
     app.add_middleware(RequestContext, metrics=app.state.metrics)

@@ -1,4 +1,4 @@
-"""The middleware that knows who asks and holds everybody to their limits, before anything of the request is read."""
+"""Rate-limit middleware: identifies the caller and enforces limits before anything of the request is read."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ from service.settings import Settings
 _FREE: Final = ("/static/", "/healthz", "/readyz")
 
 
-class Turnstile:
-    """Finds the key of a request (`scope["state"]["key"]`) and counts the request against the limits of that key, or of
-    its address where it shows none. Nothing is counted while the service is open: then it serves one machine.
+class RateLimit:
+    """Finds the key of a request (`scope["state"]["key"]`) and counts the request against the limits of that key.
+
+    A request without a key counts against its address. An open service serves one machine and counts nothing.
 
     Refusals are 429 with Retry-After; every counted answer carries RateLimit and RateLimit-Policy
     (draft-ietf-httpapi-ratelimit-headers-10).
