@@ -33,7 +33,7 @@ from service.index.rebuild import complete_if_new
 from service.model.errors import InputError, UnavailableError
 from service.model.states import AssetKind
 from service.model.version import PACKAGE_VERSION
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.identity import identify_if_redis_answers
 from service.queue.address import redis_url
 from service.settings import Settings
@@ -42,8 +42,8 @@ _log = logging.getLogger("graspd.api")
 _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 
 
-def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
-    """The application over given parts, or over parts it opens from the settings and closes at its end.
+def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
+    """The application over given services, or over those it opens from the settings and closes at its end.
 
     Raises:
         InputError: the address to bind is reachable from elsewhere and no key exists; or what the settings say of a
@@ -55,8 +55,8 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
     keys = KeyFile(settings.resolved_keys_file, closed=proxy.is_on)
     if not proxy.is_on:
         check_exposure(settings.host, keys)
-    opened = parts or Parts.open(settings)
-    if parts is None:
+    opened = services or Services.open(settings)
+    if services is None:
         identify_if_redis_answers(opened)
     with suppress(UnavailableError):
         complete_if_new(opened.index, opened.store)
@@ -66,7 +66,7 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         yield
         await rates.close()
-        if parts is None:
+        if services is None:
             opened.close()
 
     app = FastAPI(

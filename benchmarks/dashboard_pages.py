@@ -27,7 +27,7 @@ import uvicorn
 from api.app import create_app
 from api.server import bind
 from service.index.index import Index
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 from service.store.store import open_store
 from tests.memory_queue import MemoryQueue
@@ -44,17 +44,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     settings = Settings(data_dir=given.data_dir)
     index = Index(settings.resolved_index_url)
-    parts = Parts(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
+    services = Services(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
     stats = index.overview.stats()
     say(f"{stats.grasps:,} grasps, {sum(stats.jobs.values()):,} jobs, {stats.shards:,} shards")
-    paths = pages(parts)
-    with serving(settings, parts) as address:
+    paths = pages(services)
+    with serving(settings, services) as address:
         rows = server_times(address, paths, given.repeats)
         paints = first_paints(address, paths) if given.paint else {}
     say(f"{'page':<34} {'median':>8} {'slowest':>8} {'cpu':>8}" + (f" {'paint':>8}" if paints else "") + "  [ms]")
     for path, (median, slowest, cpu) in rows.items():
         say(f"{path[:34]:<34} {median:8.1f} {slowest:8.1f} {cpu:8.1f}" + (f" {paints[path]:8.0f}" if paints else ""))
-    parts.close()
+    services.close()
     return 0
 
 
@@ -64,10 +64,10 @@ def say(line: str) -> None:
     sys.stdout.flush()
 
 
-def pages(parts: Parts) -> list[str]:
+def pages(services: Services) -> list[str]:
     """One address of each kind of page that the index can show."""
-    jobs = [job.id for job in parts.index.jobs.page(limit=3).items]
-    pairs = parts.index.overview.matrix()[:1]
+    jobs = [job.id for job in services.index.jobs.page(limit=3).items]
+    pairs = services.index.overview.matrix()[:1]
     found = ["/", "/?state=failed", "/datasets", *(f"/jobs/{job}" for job in jobs), "/grasps", "/grasps?view=table"]
     found += [f"/grasps?hand={pair.hand}&object={pair.object}&sort=penetration_depth_mm&order=asc" for pair in pairs]
     found += ["/grasps?valid=true&min_epsilon=0.3&max_penetration_depth_mm=0.5", "/workers", "/chart", "/submit"]
@@ -112,10 +112,10 @@ def first_paints(address: str, paths: Sequence[str]) -> dict[str, float]:
 
 
 @contextmanager
-def serving(settings: Settings, parts: Parts) -> Iterator[str]:
+def serving(settings: Settings, services: Services) -> Iterator[str]:
     """The application on a free port of this machine."""
     listener = bind("127.0.0.1", 0)
-    app = create_app(settings, parts)
+    app = create_app(settings, services)
     server = uvicorn.Server(uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()

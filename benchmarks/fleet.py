@@ -34,7 +34,7 @@ from service.index.tables import tasks
 from service.model import names
 from service.model.states import Lane, Stage, State
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.leading import PART
 from service.queue.lists import queue_name
 from service.queue.rq_keys import held_key
@@ -74,23 +74,23 @@ class Result:
 
 
 class Machine:
-    """The parts of a service without workers, each a process of its own."""
+    """The services of a fleet without workers, each a process of its own."""
 
-    def __init__(self, settings: Settings, parts: Parts, pids: dict[str, int]) -> None:
-        self.settings, self.parts, self._pids = settings, parts, pids
+    def __init__(self, settings: Settings, services: Services, pids: dict[str, int]) -> None:
+        self.settings, self.services, self._pids = settings, services, pids
         self._seed = 0
 
     @property
     def queue(self) -> RqQueue:
-        assert isinstance(self.parts.queue, RqQueue)
-        return self.parts.queue
+        assert isinstance(self.services.queue, RqQueue)
+        return self.services.queue
 
     def submit(self, tasks: int) -> None:
         """Jobs of so many tasks in all."""
         while tasks > 0:
             some = min(tasks, _BATCHES_A_JOB)
             self._seed += 1
-            job_actions.submit(self.parts, request(grasps=32 * some, seed=self._seed), lane=Lane.BULK)
+            job_actions.submit(self.services, request(grasps=32 * some, seed=self._seed), lane=Lane.BULK)
             tasks -= some
 
     def cpu(self) -> dict[str, float]:
@@ -140,13 +140,13 @@ def machine(*, sqlite: bool, s3: bool) -> Iterator[Machine]:
             options["store_url"] = f"{bucket.url}/fleet"
         settings = Settings(**options, task_s=0)
         redis = _started(stack, server_command(settings), {})
-        parts = Parts.open(settings)
-        stack.callback(parts.close)
-        _wait(lambda: _answers(parts), "Redis answers")
-        add_assets(parts)
+        services = Services.open(settings)
+        stack.callback(services.close)
+        _wait(lambda: _answers(services), "Redis answers")
+        add_assets(services)
         pids["controller"] = _started(stack, [sys.executable, "-m", "graspd", "controller"], environment(settings))
-        _wait(lambda: parts.queue.announced(PART), "a controller works")
-        yield Machine(settings, parts, pids | {"redis": redis})
+        _wait(lambda: services.queue.announced(PART), "a controller works")
+        yield Machine(settings, services, pids | {"redis": redis})
 
 
 @contextmanager
@@ -185,14 +185,14 @@ def measure(workers: int, given: argparse.Namespace) -> Result:
         begun = time.perf_counter()
         with fleet(at.settings, workers, 0.0):
             _wait(
-                lambda: _finished(at.parts) >= given.tasks,
+                lambda: _finished(at.services) >= given.tasks,
                 "all tasks are in the index",
-                lambda: f"({_finished(at.parts)} of {given.tasks})",
+                lambda: f"({_finished(at.services)} of {given.tasks})",
             )
             seconds = time.perf_counter() - begun
             spent = {name: 1000 * (used - before[name]) / given.tasks for name, used in at.cpu().items()}
             events = at.queue.connection.xinfo_stream(EVENTS)["entries-added"]
-            objects = sum(1 for _ in at.parts.store.list(names.SHARDS))
+            objects = sum(1 for _ in at.services.store.list(names.SHARDS))
     return Result(
         workers=workers,
         lag_s=statistics.quantiles(lags, n=20)[-1],
@@ -218,15 +218,15 @@ def _looks(at: Machine, seconds: float) -> tuple[list[float], list[float]]:
     return lags, sweeps
 
 
-def _finished(parts: Parts) -> int:
-    with parts.index.database.reading() as connection:
+def _finished(services: Services) -> int:
+    with services.index.database.reading() as connection:
         done = select(func.count()).select_from(tasks).where(tasks.c.state == State.SUCCEEDED.value)
         return int(connection.scalar(done) or 0)
 
 
-def _answers(parts: Parts) -> bool:
+def _answers(services: Services) -> bool:
     try:
-        parts.queue.ping()
+        services.queue.ping()
     except Exception:
         return False
     return True

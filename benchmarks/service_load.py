@@ -30,7 +30,7 @@ from service.model.planning import message_of, plan, task_id
 from service.model.records import JobRecord
 from service.model.states import Lane, Stage, State
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.run.supervisor import Supervisor
 from service.settings import Settings
 from service.store.records import read_record
@@ -61,14 +61,14 @@ def say(line: str) -> None:
 
 
 @contextmanager
-def service(*, workers: int, task_s: float = 0.0, **settings: Any) -> Iterator[Parts]:
-    """The parts of `running`, for one that needs no API."""
-    with running(workers=workers, task_s=task_s, api=False, **settings) as (_, parts):
-        yield parts
+def service(*, workers: int, task_s: float = 0.0, **settings: Any) -> Iterator[Services]:
+    """Services of `running`, for one that needs no API."""
+    with running(workers=workers, task_s=task_s, api=False, **settings) as (_, services):
+        yield services
 
 
 @contextmanager
-def running(*, workers: int, task_s: float, api: bool, **settings: Any) -> Iterator[tuple[Supervisor, Parts]]:
+def running(*, workers: int, task_s: float, api: bool, **settings: Any) -> Iterator[tuple[Supervisor, Services]]:
     """A whole service of real processes with workers that wait `task_s` for each task."""
     os.environ["FAKE_SECONDS"] = str(task_s)
     with tempfile.TemporaryDirectory(prefix="graspd-bench-") as folder:
@@ -76,17 +76,17 @@ def running(*, workers: int, task_s: float, api: bool, **settings: Any) -> Itera
         fakes = (sys.executable, "-m", "tests.fakes")
         with Supervisor(wanted, workers=workers, api=api, worker_command=fakes) as supervisor:
             supervisor.wait_ready()
-            parts = Parts.open(supervisor.settings)
-            add_assets(parts)
-            yield supervisor, parts
-            parts.close()
+            services = Services.open(supervisor.settings)
+            add_assets(services)
+            yield supervisor, services
+            services.close()
 
 
-def run(parts: Parts, batches: int, seed: int) -> float:
+def run(services: Services, batches: int, seed: int) -> float:
     """Seconds from the submission of a bulk job to its end."""
     start = time.perf_counter()
-    job = job_actions.submit(parts, request(grasps=32 * batches, seed=seed), lane=Lane.BULK)[0].id
-    while parts.index.jobs.get(job).state is not State.SUCCEEDED:
+    job = job_actions.submit(services, request(grasps=32 * batches, seed=seed), lane=Lane.BULK)[0].id
+    while services.index.jobs.get(job).state is not State.SUCCEEDED:
         time.sleep(0.05)
     return time.perf_counter() - start
 
@@ -103,11 +103,11 @@ def queue() -> None:
             finally:
                 spent.append(time.perf_counter() - start)
 
-    with service(workers=0) as parts:
-        job_actions.submit(parts, request(grasps=32 * 500), lane=Lane.BULK)
+    with service(workers=0) as services:
+        job_actions.submit(services, request(grasps=32 * 500), lane=Lane.BULK)
         worker.process.engine.Runner = Timed  # type: ignore[misc]
         start = time.perf_counter()
-        worker.process.main.run_worker(parts.settings, start=engine_of(fake_stages()), max_tasks=400)
+        worker.process.main.run_worker(services.settings, start=engine_of(fake_stages()), max_tasks=400)
         whole = (time.perf_counter() - start) / len(spent)
     alone = whole - statistics.fmean(spent)
     say("| what | measured | beside |\n| --- | --: | --: |")
@@ -121,9 +121,9 @@ def workers() -> None:
     first = 0.0
     say("| workers | tasks a second | of N times one |\n| --: | --: | --: |")
     for count in (1, 2, 4, 8):
-        with service(workers=count, task_s=task_s) as parts:
-            run(parts, 2 * count, 0)
-            rate = 20 * count / run(parts, 20 * count, 1)
+        with service(workers=count, task_s=task_s) as services:
+            run(services, 2 * count, 0)
+            rate = 20 * count / run(services, 20 * count, 1)
         first = first or rate
         say(f"| {count} | {rate:.2f} | {rate / first / count:.0%} |")
 
@@ -132,11 +132,11 @@ def indexer(url: str | None) -> None:
     """Shards of 32 grasps a second that the controller can index, a hundred in a transaction."""
     with tempfile.TemporaryDirectory(prefix="graspd-bench-") as folder:
         index = Index(url or f"sqlite:///{folder}/index.sqlite")
-        parts = Parts(Settings(data_dir=Path(folder)), open_store("memory://"), index, MemoryQueue())
-        add_assets(parts)
-        job = job_actions.submit(parts, request(grasps=32 * 1000, seed=time.time_ns() % 10**6))[0].id
-        record = read_record(JobRecord, parts.store, names.job_record(job))
-        made = [make_shard(parts.store, message_of(record, t, attempt=1, max_attempt=3)) for t in plan(record)]
+        services = Services(Settings(data_dir=Path(folder)), open_store("memory://"), index, MemoryQueue())
+        add_assets(services)
+        job = job_actions.submit(services, request(grasps=32 * 1000, seed=time.time_ns() % 10**6))[0].id
+        record = read_record(JobRecord, services.store, names.job_record(job))
+        made = [make_shard(services.store, message_of(record, t, attempt=1, max_attempt=3)) for t in plan(record)]
         start = time.perf_counter()
         for begin in range(0, len(made), 100):
             index.write.add_manifests(made[begin : begin + 100])
@@ -204,7 +204,7 @@ def _requests(http: httpx.Client, pid: int) -> None:
 
 def beside(url: str | None) -> None:
     """How long small jobs of one key wait for an answer and for the queue, while large ones of another are entered."""
-    with running(workers=2, task_s=1.0, api=True, **({"index_url": url} if url else {})) as (supervisor, parts):
+    with running(workers=2, task_s=1.0, api=True, **({"index_url": url} if url else {})) as (supervisor, services):
         keys = KeyFile(supervisor.settings.resolved_keys_file)
         large, small = (keys.add(name, Scope.SUBMIT) for name in ("large", "small"))
         seeds = iter(range(10**6))
@@ -220,11 +220,11 @@ def beside(url: str | None) -> None:
         with httpx.Client(base_url=supervisor.api_url, timeout=120, trust_env=False) as http:
             of_large = [post(http, large, LARGE)[1] for _ in range(LARGE_JOBS)]
             start = time.perf_counter()
-            while not answers or parts.index.write.entering():
+            while not answers or services.index.write.entering():
                 job, answered = post(http, small, 32)
                 began, task = time.perf_counter(), task_id(job, Stage.SYNTHESIZE, 0)
                 # What a worker has is in the queue no more, and in the index no longer queued.
-                while task not in parts.queue.waiting() and parts.index.jobs.task(task).state is State.QUEUED:
+                while task not in services.queue.waiting() and services.index.jobs.task(task).state is State.QUEUED:
                     time.sleep(0.01)
                 answers.append(answered)
                 queued.append(answered + time.perf_counter() - began)

@@ -23,7 +23,7 @@ from service.model.messages import TaskMessage
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane, Stage
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.library import publish_asset
 from service.store.manifests import ShardManifest, load_shard, publish_shard
 from service.store.seals import put_document
@@ -116,13 +116,13 @@ def make_shard(store: Store, message: TaskMessage, *, worker: str = "w") -> Shar
     return manifest
 
 
-def add_assets(parts: Parts) -> None:
+def add_assets(services: Services) -> None:
     """A hand and an object that were found good, named `gripper` and `ball`."""
     for kind, name, files in ((AssetKind.HAND, "gripper", HAND_FILES), (AssetKind.OBJECT, "ball", OBJECT_FILES)):
-        asset = publish_asset(parts.store, kind, name, files)
+        asset = publish_asset(services.store, kind, name, files)
         check = {"verdict": "accept", "message": "fine", "repairs": [], "facts": {}}
-        put_document(parts.store, names.asset_check(kind, asset.digest), check)
-        parts.index.write.add_asset(asset, {"verdict": "accept", "message": "fine"})
+        put_document(services.store, names.asset_check(kind, asset.digest), check)
+        services.index.write.add_asset(asset, {"verdict": "accept", "message": "fine"})
 
 
 def request(**changes: Any) -> JobRequest:

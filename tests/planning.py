@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets.rounds import DatasetRounds
 
 
-def plan_all(parts: Parts) -> None:
+def plan_all(services: Services) -> None:
     """Rounds of the planner until nothing is left, however slow the machine."""
-    planner = DatasetRounds(parts)
+    planner = DatasetRounds(services)
     while planner.advance():
         pass

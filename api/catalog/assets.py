@@ -19,7 +19,7 @@ from service.model.fitting_names import MOST, fitted
 from service.model.projects import marks_of
 from service.model.states import AssetKind
 from service.pipeline import deletion
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.recording import recording
 from service.store import library
 from service.store.assets import ZipFiles, asset_json
@@ -36,21 +36,21 @@ class Assets:
     """Hands, objects and networks within the caller's reach; what takes one away asks whose it is. A `name` may be a
     digest."""
 
-    def __init__(self, parts: Parts) -> None:
-        self._parts = parts
+    def __init__(self, services: Services) -> None:
+        self._services = services
 
     def page(
         self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None, refused: bool = False
     ) -> Page[AssetView]:
         """All of a kind, newest first; those that the check refused only where asked for."""
-        return self._parts.index.assets.page(kind, limit=limit, cursor=cursor, refused=refused, reach=reach())
+        return self._services.index.assets.page(kind, limit=limit, cursor=cursor, refused=refused, reach=reach())
 
     def one(self, kind: AssetKind, name: str) -> AssetView:
-        return self._parts.index.assets.get(kind, name, reach=reach())
+        return self._services.index.assets.get(kind, name, reach=reach())
 
     def files(self, asset: AssetView) -> Mapping[str, bytes]:
         """Its files as they were uploaded, `asset.json` among them."""
-        return library.load_asset_files(self._parts.store, asset.kind, asset.digest)
+        return library.load_asset_files(self._services.store, asset.kind, asset.digest)
 
     def model(self, asset: AssetView) -> bytes:
         """The prepared hand or object as binary glTF.
@@ -59,7 +59,7 @@ class Assets:
             NotFoundError: it has not been checked yet, or was refused.
             DamagedError: its bytes are not those that were made.
         """
-        return get_sealed(self._parts.store, names.asset_model(asset.kind, asset.digest))
+        return get_sealed(self._services.store, names.asset_model(asset.kind, asset.digest))
 
     def add(
         self,
@@ -95,14 +95,14 @@ class Assets:
         if rename:
             name = self._free_name(kind, name)
         self._refuse_taken(kind, name, digest)
-        index, store = self._parts.index, self._parts.store
+        index, store = self._services.index, self._services.store
         said = {"owner": caller_id(), "project": project, "shared": shared, "self_test": self_test}
         asset = library.store_files(store, kind, name, files, said=said)
         if found is not None:
             # Before the record: from then on it counts, and no worker is asked about it.
             put_document(store, names.asset_check(kind, asset.digest), found)
         # Of two uploads at once that want one name, the later one must see the earlier one's record.
-        with recording(self._parts) as (connection, put):
+        with recording(self._services) as (connection, put):
             self._refuse_taken(kind, name, asset.digest)
             asset = library.record_asset(store, asset, put)
             index.write.add_asset(asset, library.load_check(store, kind, asset.digest), within=connection)
@@ -132,7 +132,7 @@ class Assets:
         """
         hand = self.one(AssetKind.HAND, name)
         facts = self.hand_facts(hand)
-        archive = self._parts.store.get(names.asset_files(AssetKind.HAND, hand.digest))
+        archive = self._services.store.get(names.asset_files(AssetKind.HAND, hand.digest))
         files = ZipFiles(io.BytesIO(archive), limit_bytes=library.UNPACKED_LIMIT_BYTES)
         if digest_files(AssetKind.HAND, files) != hand.digest:
             raise DamagedError(f"the files of the hand {hand.name!r} in the store are damaged; upload it again")
@@ -170,7 +170,7 @@ class Assets:
         asset = self.one(kind, name)
         if not asset.builtin:
             must_own(asset.owner, f"{kind.value} {name!r}", asset.project)
-        deletion.delete_asset(self._parts, kind, asset.digest, owner=caller_id(), reach=reach())
+        deletion.delete_asset(self._services, kind, asset.digest, owner=caller_id(), reach=reach())
         log.info("%s %s deleted", kind, asset.name)
 
     def _mark(self, kind: AssetKind, name: str, files: MutableMapping[str, bytes], project: str) -> str:
@@ -190,7 +190,7 @@ class Assets:
     def _refuse_hidden(self, kind: AssetKind, digest: str) -> None:
         known = None
         with contextlib.suppress(NotFoundError):
-            known = self._parts.index.assets.get(kind, digest)
+            known = self._services.index.assets.get(kind, digest)
         if known is not None:
             with contextlib.suppress(NotFoundError):
                 self.one(kind, digest)
@@ -201,7 +201,7 @@ class Assets:
         """Digest of what a name stands for; empty: it is free."""
         with contextlib.suppress(NotFoundError):
             # Another project's names take none from this one, an admin's neither.
-            known = self._parts.index.assets.get(kind, name, reach=replace(reach(), everything=False))
+            known = self._services.index.assets.get(kind, name, reach=replace(reach(), everything=False))
             # A refused upload holds no name: the same file with the fix must get in.
             return known.digest if known.verdict != "refuse" else ""
         return ""

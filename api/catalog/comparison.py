@@ -11,7 +11,7 @@ from api.catalog.grasps import MEAN_METRICS
 from service.index.dataset_views import CellView, DatasetView
 from service.index.filters import GraspFilter, Metric
 from service.index.queries.statistics import Distribution
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 
 #: Cells of a dataset that are compared one by one: nobody reads more rows.
 MOST_CELLS: Final = 1000
@@ -60,8 +60,8 @@ class Comparison:
 class Comparisons:
     """Compares datasets within the caller's reach."""
 
-    def __init__(self, parts: Parts, datasets: Datasets) -> None:
-        self._parts = parts
+    def __init__(self, services: Services, datasets: Datasets) -> None:
+        self._services = services
         self._datasets = datasets
 
     def of(self, one: str, other: str) -> Comparison:
@@ -74,7 +74,7 @@ class Comparisons:
         filters = [
             GraspFilter(dataset=each.name, valid=True if each.options.standing == "valid" else None) for each in both
         ]
-        metrics = self._parts.index.statistics.side_by_side(filters, MEAN_METRICS)
+        metrics = self._services.index.statistics.side_by_side(filters, MEAN_METRICS)
         few = max(each.cells for each in both) <= MOST_CELLS
         return Comparison(*both, list(_settings(*both)), self._pairs(one, other) if few else [], metrics)
 

@@ -15,7 +15,7 @@ from service.index.views import MatrixCell, Page
 from service.model.dataset_records import Snapshot
 from service.model.states import State
 from service.pipeline import deletion
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.cost import estimate
 from service.pipeline.datasets.estimate import Estimate
@@ -29,8 +29,8 @@ log = logging.getLogger(__name__)
 class Datasets:
     """Datasets within the caller's reach; what changes one asks whose it is."""
 
-    def __init__(self, parts: Parts, quotas: Quotas) -> None:
-        self._parts = parts
+    def __init__(self, services: Services, quotas: Quotas) -> None:
+        self._services = services
         self._quotas = quotas
 
     def create(self, request: DatasetRequest) -> DatasetView:
@@ -39,10 +39,10 @@ class Datasets:
         Raises:
             QuotaError: the caller's key has all it may have.
         """
-        hands, objects = actions.members(self._parts, request, reach())
+        hands, objects = actions.members(self._services, request, reach())
         asked = len(hands) * len(objects) * request.grasps
         with self._quotas.claim(caller.get(), DATASET_PREFIX + request.name, asked) as claim:
-            dataset, claim.counts = actions.create(self._parts, request, owner=caller_id(), reach=reach())
+            dataset, claim.counts = actions.create(self._services, request, owner=caller_id(), reach=reach())
         return dataset
 
     def cancel(self, name: str) -> DatasetView:
@@ -52,7 +52,7 @@ class Datasets:
             NotYours: another key submitted it.
         """
         self._owned(name)
-        return actions.cancel(self._parts, name)
+        return actions.cancel(self._services, name)
 
     def retry(self, name: str) -> DatasetView:
         """`actions.retry` of the caller's own dataset within his quota: it counts the cells that are started again.
@@ -65,7 +65,7 @@ class Datasets:
         again = dataset.states[State.FAILED] + dataset.states[State.CANCELLED]
         grasps = again * dataset.options.grasps
         with self._quotas.claim(caller.get(), DATASET_PREFIX + name, grasps, is_new=False):
-            return actions.retry(self._parts, name)
+            return actions.retry(self._services, name)
 
     def delete(self, name: str, *, with_snapshots: bool = False) -> None:
         """Take a dataset away that has ended; one with snapshots only where they may go too.
@@ -74,43 +74,43 @@ class Datasets:
             NotYours: another key submitted it.
         """
         self._owned(name)
-        deletion.delete_dataset(self._parts, name, owner=caller_id(), with_snapshots=with_snapshots)
+        deletion.delete_dataset(self._services, name, owner=caller_id(), with_snapshots=with_snapshots)
         log.info("dataset %s deleted", name)
 
     def estimate(self, matrix: Matrix) -> Estimate:
         """What a matrix will cost. Nothing is recorded."""
-        return estimate(self._parts.index, matrix, Resolver(self._parts.store), reach=reach())
+        return estimate(self._services.index, matrix, Resolver(self._services.store), reach=reach())
 
     def page(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
         """Datasets, the newest first."""
-        return self._parts.index.datasets.page(limit=limit, cursor=cursor, reach=reach())
+        return self._services.index.datasets.page(limit=limit, cursor=cursor, reach=reach())
 
     def one(self, name: str) -> DatasetView:
-        return self._parts.index.datasets.get(name, reach=reach())
+        return self._services.index.datasets.get(name, reach=reach())
 
     def cells(
         self, name: str, *, state: State | None = None, limit: int = 50, cursor: str | None = None
     ) -> Page[CellView]:
         """Each hand x object of a dataset with its job, hand by hand."""
-        return self._parts.index.datasets.cells(name, state=state, limit=limit, cursor=cursor, reach=reach())
+        return self._services.index.datasets.cells(name, state=state, limit=limit, cursor=cursor, reach=reach())
 
     def matrix(self) -> list[MatrixCell]:
         """Each hand x object of which there is a job, of a dataset or not."""
-        return self._parts.index.overview.matrix(reach=reach())
+        return self._services.index.overview.matrix(reach=reach())
 
     def take_snapshot(self, name: str) -> tuple[Snapshot, bool]:
         """Write down which shards a dataset holds now; and whether that made a new snapshot."""
         self.one(name)
-        return actions.snapshot(self._parts, name)
+        return actions.snapshot(self._services, name)
 
     def snapshots(self, name: str, *, limit: int = 50, cursor: str | None = None) -> Page[SnapshotView]:
         """Snapshots of a dataset, the newest first."""
-        return self._parts.index.datasets.snapshots(name, limit=limit, cursor=cursor, reach=reach())
+        return self._services.index.datasets.snapshots(name, limit=limit, cursor=cursor, reach=reach())
 
     def snapshot(self, name: str, digest: str) -> Snapshot:
         """A snapshot with its list of shards."""
         self.one(name)
-        return load_snapshot(self._parts.store, name, digest)
+        return load_snapshot(self._services.store, name, digest)
 
     def add_object_set(self, name: str, objects: tuple[str, ...]) -> ObjectSetView:
         """Give objects a name together; others under the same name are its next version.
@@ -119,7 +119,7 @@ class Datasets:
             NotYours: another key made the set.
         """
         return actions.add_object_set(
-            self._parts,
+            self._services,
             name,
             objects,
             owner=caller_id(),
@@ -129,10 +129,10 @@ class Datasets:
 
     def object_sets(self) -> list[ObjectSetView]:
         """The newest version of each set, by name."""
-        return self._parts.index.object_sets.newest(reach=reach())
+        return self._services.index.object_sets.newest(reach=reach())
 
     def object_set(self, name: str) -> ObjectSetView:
-        return self._parts.index.object_sets.get(name, reach=reach())
+        return self._services.index.object_sets.get(name, reach=reach())
 
     def _owned(self, name: str) -> DatasetView:
         dataset = self.one(name)

@@ -10,7 +10,7 @@ from pydantic import Field
 from api.access.auth import must_own, reach
 from service.index.views import View
 from service.pipeline import deletion
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.deletions import Deletion, What, deletions
 
 log = logging.getLogger(__name__)
@@ -31,12 +31,12 @@ class DeletionView(View):
 class Deletions:
     """Deletions within the caller's reach; who may delete a thing may restore it."""
 
-    def __init__(self, parts: Parts) -> None:
-        self._parts = parts
+    def __init__(self, services: Services) -> None:
+        self._services = services
 
     def recent(self) -> list[DeletionView]:
         """What can be restored, the newest first."""
-        return [self._view(one) for one in deletions(self._parts.store) if self._is_seen(one)]
+        return [self._view(one) for one in deletions(self._services.store) if self._is_seen(one)]
 
     def restore(self, what: What, name: str) -> DeletionView:
         """Bring a thing back, by its name or id.
@@ -50,7 +50,7 @@ class Deletions:
         def permit(one: Deletion) -> None:
             must_own(one.submitter, f"{what} {name!r}", one.project)
 
-        found = deletion.restore(self._parts, what, name, permit=permit, among=self._is_seen)
+        found = deletion.restore(self._services, what, name, permit=permit, among=self._is_seen)
         log.info("%s %s restored", what, found.name or found.id)
         return self._view(found)
 
@@ -58,7 +58,7 @@ class Deletions:
         return reach().everything or one.project == reach().project
 
     def _view(self, one: Deletion) -> DeletionView:
-        ends = datetime.fromisoformat(one.at) + timedelta(seconds=self._parts.settings.shard_grace_s)
+        ends = datetime.fromisoformat(one.at) + timedelta(seconds=self._services.settings.shard_grace_s)
         until = ends.isoformat(timespec="seconds").replace("+00:00", "Z")
         said = {"name": one.name or one.id, "owner": one.submitter}
         return DeletionView(what=one.what, id=one.id, at=one.at, until=until, project=one.project, **said)

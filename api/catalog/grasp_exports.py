@@ -21,7 +21,7 @@ from api.catalog.tags import Tags
 from service.index.views import GraspView
 from service.model.errors import InputError, LimitError
 from service.model.tags import Grasp, by_shard
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.integrity import read_checked
 from service.store.shards import read_shard
 from service.store.subsets import part_of_shard, place_of
@@ -47,8 +47,8 @@ class Export:
 class GraspExports:
     """Writes chosen grasps into files, each on the disk of the service until it is sent."""
 
-    def __init__(self, parts: Parts, grasps: Grasps, tags: Tags) -> None:
-        self._parts = parts
+    def __init__(self, services: Services, grasps: Grasps, tags: Tags) -> None:
+        self._services = services
         self._grasps = grasps
         self._tags = tags
 
@@ -105,9 +105,9 @@ class GraspExports:
         looked_at, names = 0, list[PurePosixPath]()
         with zipfile.ZipFile(file, "w") as packed:
             for shard_id, rows in shards.items():
-                known = self._parts.index.shards.get(shard_id, reach=reach())
+                known = self._services.index.shards.get(shard_id, reach=reach())
                 shard = read_shard(
-                    read_checked(self._parts.store, known.key, known.sha256), kind="base", name=known.key
+                    read_checked(self._services.store, known.key, known.sha256), kind="base", name=known.key
                 )
                 mask = np.zeros(known.count, bool)
                 mask[list(rows)] = True

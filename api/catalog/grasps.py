@@ -15,7 +15,7 @@ from service.model.diversity import CELLS, GraspType, entropy_bits, evenness
 from service.model.errors import LimitError
 from service.model.metrics import Indexed, indexed
 from service.model.tags import MOST_TAGGED, Grasp
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 
 _KEPT_HISTOGRAMS: Final = 256
 MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(metric.name for metric in indexed(Indexed.OFFERED))
@@ -24,9 +24,9 @@ MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(metric.name for metric in indexe
 class Grasps:
     """Grasps of the jobs within the caller's reach; they never change."""
 
-    def __init__(self, parts: Parts) -> None:
-        self._index = parts.index
-        self._files = GraspFiles(parts.store)
+    def __init__(self, services: Services) -> None:
+        self._index = services.index
+        self._files = GraspFiles(services.store)
         self._histograms: dict[tuple[str, int], list[Histogram]] = {}
         self._diversities: dict[tuple[str, int], Diversity | None] = {}
 

@@ -9,7 +9,7 @@ from typing import Final
 
 from api.models import Health, Part
 from service.model.errors import BusyError, GraspdError, StoreUnavailable, UnavailableError
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.identity import check_queue
 from service.pipeline.leading import PART
 
@@ -23,8 +23,8 @@ _INCOMPLETE: Final = "the controller makes it from the store now; until it has, 
 class Probes:
     """Asks Redis, index and store at the same time, each in a thread of its own; one that hangs is not asked again."""
 
-    def __init__(self, parts: Parts, *, patience_s: float = PATIENCE_S) -> None:
-        self._parts = parts
+    def __init__(self, services: Services, *, patience_s: float = PATIENCE_S) -> None:
+        self._services = services
         self._patience_s = patience_s
         self._known: tuple[float, Health] | None = None
         self._hanging: dict[str, _Probe] = {}
@@ -44,7 +44,7 @@ class Probes:
         questions: dict[str, Callable[[], Part]] = {
             "redis": self._redis,
             "index": self._index,
-            "store": lambda: _answering(self._parts.store.probe()),
+            "store": lambda: _answering(self._services.store.probe()),
         }
         probes = {name: self._hanging.get(name) or _Probe(name, question) for name, question in questions.items()}
         deadline = time.monotonic() + self._patience_s
@@ -55,10 +55,10 @@ class Probes:
 
     def _redis(self) -> Part:
         """A Redis of another service is not ready: its controller and workers know nothing of this one's jobs."""
-        part, service = _answering(self._parts.queue.ping()), self._parts.queue.service()
+        part, service = _answering(self._services.queue.ping()), self._services.queue.service()
         if service != self._service:
             try:
-                check_queue(self._parts.store, self._parts.queue)
+                check_queue(self._services.store, self._services.queue)
             except BusyError as error:
                 return part.model_copy(update={"ok": False, "detail": str(error)})
             except StoreUnavailable:
@@ -68,7 +68,7 @@ class Probes:
 
     def _index(self) -> Part:
         """An index that may lack what the store has is not ready: jobs would seem to be gone."""
-        part, made = _answering(self._parts.index.database.ping()), self._parts.index.notes.completeness()
+        part, made = _answering(self._services.index.database.ping()), self._services.index.notes.completeness()
         if made is None:
             return part.model_copy(update={"ok": False, "detail": _INCOMPLETE})
         if made.left_out:
@@ -79,8 +79,8 @@ class Probes:
 
     def _others(self) -> tuple[bool, int]:
         try:
-            fit = [beat for beat in self._parts.queue.workers() if beat.state != "quarantined"]
-            return self._parts.queue.announced(PART), len(fit)
+            fit = [beat for beat in self._services.queue.workers() if beat.state != "quarantined"]
+            return self._services.queue.announced(PART), len(fit)
         except UnavailableError:
             return False, 0
 

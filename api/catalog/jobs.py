@@ -19,7 +19,7 @@ from service.logs import bind
 from service.model.domain import JobRequest
 from service.model.states import Stage, State
 from service.pipeline import deletion, job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 
 log = logging.getLogger(__name__)
 _PAGE: Final = 200
@@ -33,8 +33,10 @@ _LOSS_BATCHES: Final = 8
 class Jobs:
     """Jobs within the caller's reach; what changes one asks whose it is."""
 
-    def __init__(self, parts: Parts, quotas: Quotas, idempotency: Idempotency, grasps: Grasps, shards: Shards) -> None:
-        self._parts = parts
+    def __init__(
+        self, services: Services, quotas: Quotas, idempotency: Idempotency, grasps: Grasps, shards: Shards
+    ) -> None:
+        self._services = services
         self._quotas = quotas
         self._idempotency = idempotency
         self._grasps = grasps
@@ -54,9 +56,9 @@ class Jobs:
         if idempotency_key is not None:
             bound = self._idempotency.claim(key.name if key else "", idempotency_key, request)
         with bound:
-            record = job_actions.prepare(self._parts, request, owner=caller_id(), reach=reach())
+            record = job_actions.prepare(self._services, request, owner=caller_id(), reach=reach())
             with bind(job=record.id), self._quotas.claim(key, record.id, record.request.grasps) as claim:
-                job, is_new = job_actions.enter(self._parts, record)
+                job, is_new = job_actions.enter(self._services, record)
                 claim.counts = is_new
                 log.info("job submitted" if is_new else "job was there already")
         # The same job may be there by its fidelity's name: whoever asked with a target is told what it came to.
@@ -70,7 +72,7 @@ class Jobs:
         """
         self._owned(job_id)
         with bind(job=job_id):
-            job = job_actions.cancel(self._parts, job_id)
+            job = job_actions.cancel(self._services, job_id)
             log.info("job cancelled")
         return self._detail(job)
 
@@ -83,7 +85,7 @@ class Jobs:
         """
         grasps = self._owned(job_id).request.grasps
         with bind(job=job_id), self._quotas.claim(caller.get(), job_id, grasps, is_new=False):
-            job = job_actions.retry(self._parts, job_id)
+            job = job_actions.retry(self._services, job_id)
             log.info("job retried")
         return self._detail(job)
 
@@ -95,7 +97,7 @@ class Jobs:
         """
         self._owned(job_id)
         with bind(job=job_id):
-            deletion.delete_job(self._parts, job_id, owner=caller_id())
+            deletion.delete_job(self._services, job_id, owner=caller_id())
             log.info("job deleted")
 
     def page(
@@ -108,18 +110,18 @@ class Jobs:
         cursor: str | None = None,
     ) -> Page[Job]:
         """Jobs, newest first."""
-        page = self._parts.index.jobs.page(
+        page = self._services.index.jobs.page(
             state=state, hand=hand, object=object, limit=limit, cursor=cursor, reach=reach()
         )
         return Page[Job](items=[self._job(job, ()) for job in page.items], next=page.next)
 
     def one(self, job_id: str) -> JobDetail:
         """A job with its attempts, mean metrics and shards."""
-        return self._detail(self._parts.index.jobs.get(job_id, reach=reach()))
+        return self._detail(self._services.index.jobs.get(job_id, reach=reach()))
 
     def moving(self, job_id: str) -> Job:
         """A job with the progress of its stages and nothing else: what a stream of events repeats."""
-        return self._job(self._parts.index.jobs.get(job_id, reach=reach()), self._running(job_id))
+        return self._job(self._services.index.jobs.get(job_id, reach=reach()), self._running(job_id))
 
     def loss_curve(self, job: JobDetail) -> LossCurve | None:
         """Mean loss of the planner over the first batches of a job; None where the planner keeps none."""
@@ -135,7 +137,7 @@ class Jobs:
     def _loss(self, shard_id: str) -> tuple[int, list[float]] | None:
         """Iterations between two values, and the values; a shard never changes, so its answer is kept."""
         if shard_id not in self._losses:
-            info = self._parts.index.shards.get(shard_id).manifest.get("info", {})
+            info = self._services.index.shards.get(shard_id).manifest.get("info", {})
             curve = [value for value in info.get("loss_curve") or [] if value is not None]
             if len(self._losses) >= _KEPT_LOSSES:
                 self._losses.clear()
@@ -143,7 +145,7 @@ class Jobs:
         return self._losses[shard_id]
 
     def _owned(self, job_id: str) -> JobView:
-        job = self._parts.index.jobs.get(job_id, reach=reach())
+        job = self._services.index.jobs.get(job_id, reach=reach())
         must_own(job.owner, f"job {job_id}", job.project)
         return job
 
@@ -160,7 +162,7 @@ class Jobs:
             audit_held=job.audit_held,
             hand_digest=job.hand_digest,
             object_digest=job.object_digest,
-            attempts=self._parts.index.jobs.attempts(job=job.id, limit=50),
+            attempts=self._services.index.jobs.attempts(job=job.id, limit=50),
             mean=MeanMetrics(**{metric: mean.get(metric) for metric in MEAN_METRICS}),
             diversity=self._grasps.diversity(job),
             shards=sorted(shards, key=lambda shard: (shard.batch, _ORDER[shard.stage])),
@@ -194,7 +196,7 @@ class Jobs:
 
     def _running(self, job_id: str) -> list[TaskView]:
         """Running tasks, then the first of those that say why they wait."""
-        tasks = self._parts.index.jobs.tasks
+        tasks = self._services.index.jobs.tasks
         running = tasks(job=job_id, state=State.RUNNING, limit=_PAGE).items
         waiting = tasks(job=job_id, state=State.QUEUED, limit=_LOOKED_AT).items
         return [*running, *(task for task in waiting if task.message)]

@@ -21,7 +21,7 @@ from service.model.digests import digest_json
 from service.model.errors import NotFoundError, UnavailableError
 from service.model.projects import Reach
 from service.model.states import Lane, Stage
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.leading import PART
 from service.queue.port import QueueNow
 
@@ -37,17 +37,17 @@ class Overview:
     Workers, queue and health are everybody's; what the jobs are and made is told within the caller's reach.
     """
 
-    def __init__(self, parts: Parts, jobs: Jobs) -> None:
-        self._parts = parts
+    def __init__(self, services: Services, jobs: Jobs) -> None:
+        self._services = services
         self._jobs = jobs
-        self._probes = Probes(parts)
+        self._probes = Probes(services)
         self._fingerprints: dict[Reach, tuple[float, str]] = {}
         self._lock = threading.Lock()
 
     def workers(self) -> list[Worker]:
         """Workers, the living first, each with the stage it does and the age of its lease."""
-        known = self._parts.index.overview.workers()
-        doing = self._parts.index.feed.outputs([worker.task_id for worker in known if worker.task_id])
+        known = self._services.index.overview.workers()
+        doing = self._services.index.feed.outputs([worker.task_id for worker in known if worker.task_id])
         seen = self._seen(worker.task_id for worker in known if worker.task_id)
         try:
             pulses = self._queue_now().workers
@@ -67,18 +67,18 @@ class Overview:
         if worker.state != "busy" or not worker.task_id:
             return None
         try:
-            return self._parts.index.jobs.task(worker.task_id, reach=reach())
+            return self._services.index.jobs.task(worker.task_id, reach=reach())
         except NotFoundError:
             return None
 
     def stats(self) -> Stats:
-        return self._parts.index.overview.stats(reach=reach())
+        return self._services.index.overview.stats(reach=reach())
 
     def valid_per_minute(self, *, minutes: int = 60) -> list[int]:
         """Valid grasps made in each of the last minutes, the oldest first."""
         start = datetime.now(UTC).replace(second=0, microsecond=0) - timedelta(minutes=minutes - 1)
         made = [0] * minutes
-        for bucket in self._parts.index.overview.throughput(
+        for bucket in self._services.index.overview.throughput(
             since=start.isoformat().replace("+00:00", "Z"), bucket_s=60, reach=reach()
         ):
             minute = int((datetime.fromisoformat(bucket.start) - start).total_seconds() // 60)
@@ -86,11 +86,11 @@ class Overview:
         return made
 
     def failures(self, *, limit: int = 5) -> list[FailureGroup]:
-        return self._parts.index.overview.failures(limit=limit, reach=reach())
+        return self._services.index.overview.failures(limit=limit, reach=reach())
 
     def depths(self) -> dict[tuple[Lane, Stage], int]:
         """Waiting tasks by lane and stage."""
-        return self._parts.queue.depths()
+        return self._services.queue.depths()
 
     def health(self) -> Health:
         """State of the three parts; asked anew at most every two seconds."""
@@ -101,7 +101,7 @@ class Overview:
         reach."""
         if not reach().everything:
             return 0, []
-        return self._parts.index.damage.known(limit=_DAMAGE_SHOWN)
+        return self._services.index.damage.known(limit=_DAMAGE_SHOWN)
 
     def snapshot(self) -> Snapshot:
         """The service as Prometheus sees it; a part that is away leaves its numbers out."""
@@ -109,11 +109,11 @@ class Overview:
         parts = self.health().parts
         found.add_parts({name: _seconds(part) for name, part in parts.items()})
         with contextlib.suppress(UnavailableError):
-            queue = self._parts.queue
+            queue = self._services.queue
             found.add_queue(self._queue_now(), is_kept=queue.announced(PART))
             found.add_sums(queue.counted())
         with contextlib.suppress(UnavailableError):
-            found.add_index(read_index(self._parts.index.database))
+            found.add_index(read_index(self._services.index.database))
         return found
 
     def fingerprint(self) -> str:
@@ -135,11 +135,11 @@ class Overview:
     def _seen(self, tasks: Iterable[str]) -> set[str]:
         """Of these tasks, those within reach, and those that no job owns, such as the check of an upload."""
         wanted = set(tasks)
-        return wanted if reach().everything else wanted - self._parts.index.jobs.out_of_reach(wanted, reach())
+        return wanted if reach().everything else wanted - self._services.index.jobs.out_of_reach(wanted, reach())
 
     def _queue_now(self) -> QueueNow:
         # A worker's registration lives for whole seconds: see `worker.process.heartbeat`.
-        return self._parts.queue.now(lease_s=max(2, round(self._parts.settings.lease_s)))
+        return self._services.queue.now(lease_s=max(2, round(self._services.settings.lease_s)))
 
 
 def _seconds(part: Part) -> float | None:

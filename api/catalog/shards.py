@@ -8,16 +8,16 @@ from typing import Literal
 from api.access.auth import reach
 from api.models import Shard
 from service.index.views import Page, ShardView
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.integrity import Checked
 
 
 class Shards:
     """Shards of the jobs within the caller's reach; they never change."""
 
-    def __init__(self, parts: Parts) -> None:
-        self._parts = parts
-        self._checked = Checked(parts.store)
+    def __init__(self, services: Services) -> None:
+        self._services = services
+        self._checked = Checked(services.store)
 
     def page(
         self,
@@ -28,11 +28,11 @@ class Shards:
         cursor: str | None = None,
     ) -> Page[Shard]:
         """Shards, all or those of a job."""
-        page = self._parts.index.shards.page(job=job, kind=kind, limit=limit, cursor=cursor, reach=reach())
+        page = self._services.index.shards.page(job=job, kind=kind, limit=limit, cursor=cursor, reach=reach())
         return Page[Shard](items=[_shard(shard) for shard in page.items], next=page.next)
 
     def one(self, shard_id: str) -> Shard:
-        return _shard(self._parts.index.shards.get(shard_id, reach=reach()))
+        return _shard(self._services.index.shards.get(shard_id, reach=reach()))
 
     def intact(self, shard_id: str) -> Shard:
         """A shard whose file is what its checksum says; read through once, then again only where it was changed.
@@ -46,11 +46,11 @@ class Shards:
 
     def address(self, shard: Shard) -> str | None:
         """Where the store itself hands the file out to a GET; None where it does not."""
-        return self._parts.store.sign(shard.key)
+        return self._services.store.sign(shard.key)
 
     def size(self, shard: Shard) -> int:
         """Bytes of the file as it lies in the store."""
-        return self._parts.store.size(shard.key)
+        return self._services.store.size(shard.key)
 
     def stream(self, shard: Shard, start: int, length: int) -> Iterator[bytes]:
         """Bytes of the file, in chunks that are what they were when it was found intact.
@@ -62,11 +62,11 @@ class Shards:
 
     def job_of(self, shard_id: str) -> str | None:
         """A job that a shard belongs to; None where it is gone."""
-        return self._parts.index.shards.job_of(shard_id, reach=reach())
+        return self._services.index.shards.job_of(shard_id, reach=reach())
 
     def assets_of(self, ids: Collection[str]) -> dict[str, tuple[str, str]]:
         """Digests of the hand and the object of each shard."""
-        return self._parts.index.shards.assets_of(ids)
+        return self._services.index.shards.assets_of(ids)
 
 
 def _shard(shard: ShardView) -> Shard:

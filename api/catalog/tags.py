@@ -13,7 +13,7 @@ from service.model.errors import InputError, LimitError, NotFoundError
 from service.model.projects import Reach
 from service.model.tags import MOST_TAGS, Grasp, Tag, tag_id
 from service.pipeline import tagging
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 
 log = logging.getLogger(__name__)
 
@@ -21,22 +21,22 @@ log = logging.getLogger(__name__)
 class Tags:
     """Tags of the caller's project, and the grasps that have them."""
 
-    def __init__(self, parts: Parts, grasps: Grasps) -> None:
-        self._parts = parts
+    def __init__(self, services: Services, grasps: Grasps) -> None:
+        self._services = services
         self._grasps = grasps
 
     def all(self) -> list[TagView]:
         """Tags within reach, by name."""
-        return self._parts.index.tags.all(reach=reach())
+        return self._services.index.tags.all(reach=reach())
 
     def one(self, name: str) -> TagView:
         """A tag by its name or id."""
-        wanted = self._parts.index.tags.named(name, reach=reach())
+        wanted = self._services.index.tags.named(name, reach=reach())
         return next(tag for tag in self.all() if tag.id == wanted)
 
     def of(self, grasps: Collection[Grasp]) -> dict[Grasp, list[str]]:
         """Names of the tags of each of these grasps that has one."""
-        return self._parts.index.tags.of(grasps, reach=reach())
+        return self._services.index.tags.of(grasps, reach=reach())
 
     def chosen(self, selection: Selection) -> list[Grasp]:
         """The grasps of a selection, each once, in order.
@@ -47,7 +47,7 @@ class Tags:
         if selection.filter is not None:
             return self._grasps.members(selection.filter)
         named = sorted({(grasp.shard_id, grasp.row) for grasp in selection.grasps or ()})
-        there = self._parts.index.tags.there(named, reach=reach())
+        there = self._services.index.tags.there(named, reach=reach())
         for shard, row in named:
             if (shard, row) not in there:
                 raise NotFoundError(f"there is no grasp {row} in shard {shard!r}")
@@ -70,7 +70,7 @@ class Tags:
             if tag is None and self._mine(project) >= MOST_TAGS:
                 raise LimitError(f"there are {MOST_TAGS} tags, which is the most; delete one")
 
-        changed = tagging.give(self._parts, name, grasps, project=project, owner=caller_id(), permit=permit)
+        changed = tagging.give(self._services, name, grasps, project=project, owner=caller_id(), permit=permit)
         log.info("tag %s given to %d grasps", name, changed)
         return TagChange(tag=self.one(tag_id(name, project)), changed=changed)
 
@@ -80,8 +80,8 @@ class Tags:
         Raises:
             NotYours: another key made it.
         """
-        tag = self._parts.index.tags.named(name, reach=reach())
-        changed = tagging.take_off(self._parts, tag, self.chosen(selection), permit=_permit)
+        tag = self._services.index.tags.named(name, reach=reach())
+        changed = tagging.take_off(self._services, tag, self.chosen(selection), permit=_permit)
         return TagChange(tag=self.one(tag), changed=changed)
 
     def remove(self, name: str) -> None:
@@ -90,13 +90,13 @@ class Tags:
         Raises:
             NotYours: another key made it.
         """
-        tag = self._parts.index.tags.named(name, reach=reach())
-        tagging.remove(self._parts, tag, permit=_permit, owner=caller_id())
+        tag = self._services.index.tags.named(name, reach=reach())
+        tagging.remove(self._services, tag, permit=_permit, owner=caller_id())
         log.info("tag %s removed", name)
 
     def _mine(self, project: str) -> int:
         """Tags of the project; where it has no name, those of the caller's key."""
-        found = self._parts.index.tags.all(reach=Reach(project, everything=False))
+        found = self._services.index.tags.all(reach=Reach(project, everything=False))
         return sum(bool(project) or may_change(tag.owner, tag.project) for tag in found)
 
 

@@ -11,7 +11,7 @@ from api.access.auth import caller, reach
 from api.access.keys import KeyFile, ProjectLimits
 from service.index.views import UsageDay
 from service.model.errors import InputError
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 
 #: Days that are told where nobody asks for others.
 DAYS: Final = 31
@@ -22,8 +22,8 @@ _COLUMNS: Final = tuple(UsageDay.model_fields)
 class Usage:
     """Use within the caller's reach: of the project of the key, and with `admin` of all."""
 
-    def __init__(self, parts: Parts, keys: KeyFile) -> None:
-        self._parts = parts
+    def __init__(self, services: Services, keys: KeyFile) -> None:
+        self._services = services
         self._keys = keys
 
     def days(self, since: date | None = None, until: date | None = None) -> list[UsageDay]:
@@ -38,7 +38,7 @@ class Usage:
             raise InputError(f"since {first} is after until {last}")
         if (last - first).days >= MOST_DAYS:
             raise InputError(f"at most {MOST_DAYS} days are told at once; ask for fewer")
-        return self._parts.index.usage.days(first.isoformat(), last.isoformat(), reach=reach())
+        return self._services.index.usage.days(first.isoformat(), last.isoformat(), reach=reach())
 
     def limits(self) -> dict[str, ProjectLimits]:
         """What each project within reach may use together."""

@@ -12,7 +12,7 @@ from service.model.clock import timestamp
 from service.model.errors import ConflictError, LimitError
 from service.model.projects import Reach
 from service.model.webhooks import MOST_HOOKS, End, Webhook, check_url, secret_of
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.recording import recording
 
 log = logging.getLogger(__name__)
@@ -21,12 +21,12 @@ log = logging.getLogger(__name__)
 class Webhooks:
     """Webhooks of the caller's project, and what was delivered to them."""
 
-    def __init__(self, parts: Parts) -> None:
-        self._parts = parts
+    def __init__(self, services: Services) -> None:
+        self._services = services
 
     def ends(self, since: int, *, limit: int) -> list[EndView]:
         """The next ends of jobs and datasets within reach, behind a number."""
-        return self._parts.index.outbox.ends(since, limit=limit, reach=reach())
+        return self._services.index.outbox.ends(since, limit=limit, reach=reach())
 
     def add(self, url: str, states: tuple[End, ...]) -> tuple[WebhookView, str]:
         """A webhook and its secret, which is told this once.
@@ -36,7 +36,7 @@ class Webhooks:
             LimitError: the project has `MOST_HOOKS` of them.
             ConflictError: the operator has not switched webhooks on.
         """
-        master = self._parts.settings.webhook_secret
+        master = self._services.settings.webhook_secret
         if master is None:
             raise ConflictError(
                 "webhooks are switched off; the operator sets GRASPD_WEBHOOK_SECRET for API and controller"
@@ -50,18 +50,18 @@ class Webhooks:
             owner=caller_id(),
             project=project,
         )
-        with recording(self._parts) as (connection, put):
-            if len(self._parts.index.outbox.hooks(reach=Reach(project, everything=False))) >= MOST_HOOKS:
+        with recording(self._services) as (connection, put):
+            if len(self._services.index.outbox.hooks(reach=Reach(project, everything=False))) >= MOST_HOOKS:
                 raise LimitError(f"there are {MOST_HOOKS} webhooks, which is the most; delete one")
             put(names.webhook(hook.id), hook)
-            self._parts.index.outbox.add(hook, within=connection)
+            self._services.index.outbox.add(hook, within=connection)
         key = caller.get()
         log.info("webhook %s made by %s", hook.id, key.name if key else "this machine")
-        return self._parts.index.outbox.hook(hook.id), secret_of(master.get_secret_value(), hook.id)
+        return self._services.index.outbox.hook(hook.id), secret_of(master.get_secret_value(), hook.id)
 
     def all(self) -> list[WebhookView]:
         """Webhooks that the caller may change: the addresses of others may hold words that let somebody in."""
-        return [hook for hook in self._parts.index.outbox.hooks(reach=reach()) if self._is_theirs(hook)]
+        return [hook for hook in self._services.index.outbox.hooks(reach=reach()) if self._is_theirs(hook)]
 
     def log(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
         """Deliveries of a webhook, the newest first.
@@ -69,7 +69,7 @@ class Webhooks:
         Raises:
             NotYours: another key made it.
         """
-        return self._parts.index.outbox.log(self._owned(webhook).id, limit=limit)
+        return self._services.index.outbox.log(self._owned(webhook).id, limit=limit)
 
     def delete(self, webhook: str) -> None:
         """Take a webhook away; what waits for it is not sent.
@@ -79,12 +79,12 @@ class Webhooks:
         """
         hook = self._owned(webhook)
         # The record first: what is left of a broken-off deletion is a row that a rebuild drops.
-        self._parts.store.delete(names.webhook(hook.id))
-        self._parts.index.outbox.remove(hook.id)
+        self._services.store.delete(names.webhook(hook.id))
+        self._services.index.outbox.remove(hook.id)
         log.info("webhook %s deleted", hook.id)
 
     def _owned(self, webhook: str) -> WebhookView:
-        hook = self._parts.index.outbox.hook(webhook, reach=reach())
+        hook = self._services.index.outbox.hook(webhook, reach=reach())
         must_own(hook.owner, f"webhook {webhook}", hook.project)
         return hook
 

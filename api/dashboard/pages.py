@@ -28,7 +28,7 @@ from api.dashboard.pictures import Pictures
 from api.dashboard.rendering import environment, render
 from api.routes.dependencies import OverviewOf, may_read
 from service.model.errors import ERRORS
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 
 router = APIRouter(include_in_schema=False)
 #: Those of all pages, in the order in which they are asked.
@@ -53,11 +53,11 @@ routers: Final = (
 )
 
 
-def install(app: FastAPI, parts: Parts) -> None:
+def install(app: FastAPI, services: Services) -> None:
     """What the pages need of the application, besides their routes."""
     app.state.templates = environment()
-    app.state.pictures = Pictures(parts.store)
-    app.state.expectations = Expectations(parts.index)
+    app.state.pictures = Pictures(services.store)
+    app.state.expectations = Expectations(services.index)
 
 
 @router.get("/events", dependencies=[Depends(may_read)], response_class=EventSourceResponse)

@@ -24,7 +24,7 @@ from api.catalog.shards import Shards
 from api.catalog.tags import Tags
 from api.catalog.usage import Usage
 from api.catalog.webhooks import Webhooks
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.queue.address import redis_url
 from service.queue.connection import connect
 from service.store.store import Store
@@ -32,26 +32,26 @@ from service.store.store import Store
 MAX_LIMIT = 200
 
 
-def provide(app: FastAPI, parts: Parts) -> None:
-    """Put what routes ask for over these parts."""
-    redis = connect(redis_url(parts.settings), patience=1)
+def provide(app: FastAPI, services: Services) -> None:
+    """Put what routes ask for over these services."""
+    redis = connect(redis_url(services.settings), patience=1)
     state = app.state
     quotas = Quotas(
-        parts.settings,
+        services.settings,
         redis,
-        lambda ids: unfinished(parts.index, ids),
+        lambda ids: unfinished(services.index, ids),
         limits_of=state.keys.limits_of,
-        gpu_seconds=parts.index.usage.gpu_seconds,
+        gpu_seconds=services.index.usage.gpu_seconds,
     )
-    state.store = parts.store
-    state.grasps, state.shards = Grasps(parts), Shards(parts)
-    state.jobs = Jobs(parts, quotas, Idempotency(redis), state.grasps, state.shards)
-    state.datasets, state.assets = Datasets(parts, quotas), Assets(parts)
-    state.comparisons = Comparisons(parts, state.datasets)
-    state.overview, state.usage = Overview(parts, state.jobs), Usage(parts, state.keys)
-    state.webhooks, state.tags = Webhooks(parts), Tags(parts, state.grasps)
-    state.deletions = Deletions(parts)
-    state.grasp_exports = GraspExports(parts, state.grasps, state.tags)
+    state.store = services.store
+    state.grasps, state.shards = Grasps(services), Shards(services)
+    state.jobs = Jobs(services, quotas, Idempotency(redis), state.grasps, state.shards)
+    state.datasets, state.assets = Datasets(services, quotas), Assets(services)
+    state.comparisons = Comparisons(services, state.datasets)
+    state.overview, state.usage = Overview(services, state.jobs), Usage(services, state.keys)
+    state.webhooks, state.tags = Webhooks(services), Tags(services, state.grasps)
+    state.deletions = Deletions(services)
+    state.grasp_exports = GraspExports(services, state.grasps, state.tags)
 
 
 def may_read(request: Request) -> None:

@@ -1,4 +1,4 @@
-"""The three parts every process of graspd talks to, opened from the settings."""
+"""Store, index and queue, which every process of graspd talks to, opened from the settings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Parts:
+class Services:
     """Store, index and queue. Only API and controller open the index; a worker uses `open_store` and the queue."""
 
     settings: Settings

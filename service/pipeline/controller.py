@@ -25,7 +25,7 @@ from service.model.planning import ingest_id, ingest_message
 from service.model.states import Lane
 from service.model.turns import Turns
 from service.model.worker_beat import WorkerBeat
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.entering import Entering
 from service.pipeline.garbage_collector import GarbageCollector
@@ -66,13 +66,13 @@ _LAST_READ_S: Final = 3.0
 class Controller:
     """Indexes events, queues what is ready, takes tasks from lost workers, keeps the list of workers."""
 
-    def __init__(self, parts: Parts, *, clock: Callable[[], float] = time.monotonic) -> None:
-        self._parts = parts
-        self._indexer = Indexer(parts)
-        self._reaper = LeaseReaper(parts, self._indexer, clock=clock)
-        self._planner = DatasetRounds(parts, clock=clock)
-        self._garbage = GarbageCollector(parts, clock=clock)
-        self._marking = Marking(parts)
+    def __init__(self, services: Services, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._services = services
+        self._indexer = Indexer(services)
+        self._reaper = LeaseReaper(services, self._indexer, clock=clock)
+        self._planner = DatasetRounds(services, clock=clock)
+        self._garbage = GarbageCollector(services, clock=clock)
+        self._marking = Marking(services)
         self._has_plans = False
         self._turns = Turns()
         self._backlog: list[tuple[str, Event]] = []
@@ -85,14 +85,14 @@ class Controller:
         self._made = False
         """Whether anything came in since store and index got their mark."""
         self._started = False
-        self._alive = HeartbeatFile(parts.settings.heartbeat_file)
+        self._alive = HeartbeatFile(services.settings.heartbeat_file)
         self._workers = 0
         """Workers that were there when they were last counted."""
         self._clock = clock
-        self._reports = Reports(parts)
-        interval_s = parts.settings.controller_interval_s
+        self._reports = Reports(services)
+        interval_s = services.settings.controller_interval_s
         # Each lease is seen three times before it can be called lost.
-        self._looking = Pace(clock, interval_s, longest_s=parts.settings.lease_s / 3)
+        self._looking = Pace(clock, interval_s, longest_s=services.settings.lease_s / 3)
         self._feeding = Pace(clock, 0.0)
         self._reporting = Pace(clock, min(_REPORTS_EVERY_S, interval_s), share=0.1)
         self._counting = Pace(clock, _WORKERS_EVERY_S, share=0.1)
@@ -107,9 +107,12 @@ class Controller:
     def _beside(self, stop: threading.Event) -> Iterator[None]:
         """What goes on beside the rounds: webhooks are told what ended, large jobs are entered, and the store is read
         through, where the settings want it."""
-        duties = {"webhooks": WebhookDispatcher(self._parts, stop).run, "entering": Entering(self._parts, stop).run}
-        if self._parts.settings.integrity_scan_mb_per_s:
-            duties["integrity scan"] = IntegrityScan(self._parts, stop).run
+        duties = {
+            "webhooks": WebhookDispatcher(self._services, stop).run,
+            "entering": Entering(self._services, stop).run,
+        }
+        if self._services.settings.integrity_scan_mb_per_s:
+            duties["integrity scan"] = IntegrityScan(self._services, stop).run
         threads = [threading.Thread(target=duty, name=name, daemon=True) for name, duty in duties.items()]
         for thread in threads:
             thread.start()
@@ -126,7 +129,7 @@ class Controller:
             # Also while a part is away: a fresh controller would wait for it just as long.
             self._alive.touch()
             try:
-                self.round(wait_s=self._parts.settings.controller_interval_s)
+                self.round(wait_s=self._services.settings.controller_interval_s)
                 pause = 0.0
             except BusyError:
                 raise  # another service works here: to go on would undo its work
@@ -150,7 +153,7 @@ class Controller:
             BusyError: another service has taken over the store.
         """
         if self._clock() >= self._identify_again:
-            identify(self._parts, holds_redis=True)
+            identify(self._services, holds_redis=True)
             self._identify_again = self._clock() + _IDENTIFY_EVERY_S
         self._see_to_the_index()
         away: list[UnavailableError] = []
@@ -159,7 +162,7 @@ class Controller:
         now = self._clock()
         if self._counting.is_due:
             with _noted(away):
-                self._parts.queue.tidy()
+                self._services.queue.tidy()
             with _noted(away):
                 self._marking.advance(news=self._made)
                 self._made = False
@@ -186,7 +189,7 @@ class Controller:
         if self._has_plans or now >= self._plan_again:
             with _noted(away):
                 self._has_plans = self._planner.advance()
-                self._plan_again = now + self._parts.settings.controller_interval_s
+                self._plan_again = now + self._services.settings.controller_interval_s
         if now >= self._collect_again:
             with _noted(away):
                 is_left = self._garbage.advance() or self._garbage.collect()
@@ -195,7 +198,7 @@ class Controller:
     def _look_after_workers(self) -> None:
         self._announce()
         # One that ended as it should says so, but its registration is gone a moment before that is read.
-        present = self._parts.queue.workers()
+        present = self._services.queue.workers()
         self._workers = len(present)
         # One that is silent for a moment is still there for what it cannot do.
         now = self._clock()
@@ -203,10 +206,10 @@ class Controller:
         self._seen = {name: one for name, one in self._seen.items() if now - one[0] < _REMEMBERED_S}
         known = [beat for _, beat in self._seen.values()]
         self._routes = Routes(known)
-        self._parts.queue.clear_untaken(known)
-        self._parts.index.live.set_workers(
+        self._services.queue.clear_untaken(known)
+        self._services.index.live.set_workers(
             present,
-            lost_before=timestamp(self._parts.settings.lease_s),
+            lost_before=timestamp(self._services.settings.lease_s),
             forget_before=timestamp(_FORGET_WORKERS_AFTER_S),
         )
 
@@ -214,16 +217,16 @@ class Controller:
         """It must be whole before events are taken up, and may be lost at any time."""
         if not self._started:
             self._start()
-        elif self._parts.index.notes.completeness() is None or self._is_stale():
+        elif self._services.index.notes.completeness() is None or self._is_stale():
             self._make_whole()
 
     def _start(self) -> None:
-        publish_builtins(self._parts.store)
-        for manifest in take_apart(self._parts.store):
+        publish_builtins(self._services.store)
+        for manifest in take_apart(self._services.store):
             self._alive.touch()
             self._indexer.made(manifest)
-        complete_if_new(self._parts.index, self._parts.store)
-        made = self._parts.index.notes.completeness()
+        complete_if_new(self._services.index, self._services.store)
+        made = self._services.index.notes.completeness()
         # What was left out may have been mended since.
         if made is None or made.left_out or self._is_stale():
             self._make_whole()
@@ -236,15 +239,15 @@ class Controller:
         if self._marking.agrees():
             return False
         log.warning("index and store have different marks: one of them is an older copy")
-        self._parts.index.notes.set_incomplete()
+        self._services.index.notes.set_incomplete()
         return True
 
     def _make_whole(self) -> None:
         log.warning("the index may lack what the store has: it is made from the store")
-        rebuild(self._parts.index, self._parts.store, progress=lambda *_: self._alive.touch())
+        rebuild(self._services.index, self._services.store, progress=lambda *_: self._alive.touch())
 
     def _index_assets(self) -> None:
-        for kind, digest in stored_assets(self._parts.store):
+        for kind, digest in stored_assets(self._services.store):
             try:
                 self._indexer.checked(kind, digest)
             except DamagedError as error:
@@ -254,33 +257,33 @@ class Controller:
         """Take up what came in; what the store is needed for waits while that is away."""
         if len(self._backlog) < _LONGEST_BACKLOG:
             wait_s = wait_s if not self._backlog else 0.0
-            self._backlog += self._parts.queue.consume(limit=_EVENTS_A_ROUND, wait_s=wait_s)
+            self._backlog += self._services.queue.consume(limit=_EVENTS_A_ROUND, wait_s=wait_s)
         if not self._backlog:
             return
         waiting = set(self._indexer.apply([event for _, event in self._backlog]))
         done = [entry for place, entry in enumerate(self._backlog) if place not in waiting]
         self._backlog = [entry for place, entry in enumerate(self._backlog) if place in waiting]
-        self._parts.queue.acknowledge([event_id for event_id, _ in done])
+        self._services.queue.acknowledge([event_id for event_id, _ in done])
         self._news |= (made := any(event.kind is not EventKind.JOB for _, event in done))
         self._made |= made
         if waiting:
             raise StoreUnavailable(f"the store does not answer, and {len(waiting)} events wait for it")
 
     def _announce(self) -> None:
-        self._parts.queue.announce(PART, 5 * self._parts.settings.controller_interval_s + 5)
+        self._services.queue.announce(PART, 5 * self._services.settings.controller_interval_s + 5)
 
     def _look_after_queue(self) -> None:
         # While Redis can be read but not written, as on a full disk, no worker can give a sign of life: then this fails
         # first, and nobody's silence is judged.
         self._announce()
         # Waiting tasks are read before leases: one that a worker takes in between is then seen as held.
-        waiting = self._parts.queue.waiting()
-        leases = self._parts.queue.leases()
+        waiting = self._services.queue.waiting()
+        leases = self._services.queue.leases()
         self._reports.sweep({lease.task_id for lease in leases})
         lost = self._reaper.reap(leases)
         present = waiting | {lease.task_id for lease in leases if lease not in lost}
-        if stray := self._parts.index.feed.cancelled(present):
-            self._parts.queue.discard(stray)
+        if stray := self._services.index.feed.cancelled(present):
+            self._services.queue.discard(stray)
         missing = {*self._reaper.find_missing(present), *(lease.task_id for lease in lost)}
         self._feed(present, missing)
 
@@ -288,35 +291,35 @@ class Controller:
         """Queue what is ready. Where nobody knows what is in the queue (`present`), the index's own marks say so, and
         what the queue knows of a task keeps it from being queued twice: also one that its job queues at this moment.
         Only those that are `missing` are queued whatever the queue knows of them."""
-        depths = self._parts.queue.depths()
+        depths = self._services.queue.depths()
         now = time.time()
         # Every worker finds a task waiting when it ends one.
-        window = max(self._parts.settings.queue_window, 2 * self._workers)
+        window = max(self._services.settings.queue_window, 2 * self._workers)
         held: set[str] = set()
         for lane in Lane:
             room = window - sum(n for (of, _), n in depths.items() if of is lane)
             ready = self._ready(lane, now, room) if room > 0 else []
             if present is None:
-                held |= queue_tasks(self._parts, ready, routes=self._routes)
+                held |= queue_tasks(self._services, ready, routes=self._routes)
                 continue
             # After a rebuild the index does not know what is in the queue already.
-            self._parts.index.live.set_queued([task.task.id for task in ready if task.task.id in present])
+            self._services.index.live.set_queued([task.task.id for task in ready if task.task.id in present])
             left = [task for task in ready if task.task.id not in present]
             for again in (False, True):
                 if some := [task for task in left if (task.task.id in missing) == again]:
-                    held |= queue_tasks(self._parts, some, again=again, routes=self._routes)
+                    held |= queue_tasks(self._services, some, again=again, routes=self._routes)
         for why in sorted(held - self._held):
             log.warning("tasks are %s", why)
         self._held = held
         self._feed_checks(present, missing, now)
 
     def _ready(self, lane: Lane, now: float, room: int) -> list[ReadyTask]:
-        return self._parts.index.feed.ready_tasks(lane, self._turns, now=now, limit=room)
+        return self._services.index.feed.ready_tasks(lane, self._turns, now=now, limit=room)
 
     def _feed_checks(self, present: set[str] | None, missing: Collection[str], now: float) -> None:
-        for check in self._parts.index.feed.ready_checks(now=now, limit=self._parts.settings.queue_window):
-            self._parts.index.live.set_asset_waiting([check.digest], queued=True)
-            if self._parts.store.exists(names.asset_check(check.kind, check.digest)):
+        for check in self._services.index.feed.ready_checks(now=now, limit=self._services.settings.queue_window):
+            self._services.index.live.set_asset_waiting([check.digest], queued=True)
+            if self._services.store.exists(names.asset_check(check.kind, check.digest)):
                 with _noted([]):
                     self._indexer.checked(check.kind, check.digest)
             elif ingest_id(check.kind, check.digest) not in (present or ()):
@@ -325,14 +328,14 @@ class Controller:
                     check.name,
                     check.digest,
                     attempt=check.last_attempt + 1,
-                    max_attempt=self._parts.settings.task_attempts,
+                    max_attempt=self._services.settings.task_attempts,
                 )
                 place = self._routes.place(need_of(message))
                 if place.held:
-                    self._parts.index.live.set_asset_waiting([check.digest], queued=False, not_before=now + HELD_S)
+                    self._services.index.live.set_asset_waiting([check.digest], queued=False, not_before=now + HELD_S)
                 else:
                     again = message.task_id in missing
-                    self._parts.queue.enqueue([message], Lane.INTERACTIVE, again=again, apart=place.apart)
+                    self._services.queue.enqueue([message], Lane.INTERACTIVE, again=again, apart=place.apart)
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from service.model.records import AttemptRecord, JobRecord
 from service.model.states import AssetKind
 from service.model.tags import Tag
 from service.pipeline import tagging
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.recording import recording
 from service.store.datasets import dataset_events, load_dataset
 from service.store.deletions import Deletion, Released, What, deletions, released_key, removed_folder
@@ -32,7 +32,7 @@ from service.store.records import Put, job_events, put_record, read_record
 from service.store.store import Store
 
 
-def delete_asset(parts: Parts, kind: AssetKind, name: str, *, owner: str = "", reach: Reach = EVERYTHING) -> None:
+def delete_asset(services: Services, kind: AssetKind, name: str, *, owner: str = "", reach: Reach = EVERYTHING) -> None:
     """Take a hand, object or network away.
 
     Args:
@@ -43,42 +43,42 @@ def delete_asset(parts: Parts, kind: AssetKind, name: str, *, owner: str = "", r
         NotFoundError: there is none of that name or digest.
         ConflictError: it comes with graspd, or a job, a dataset or a set of objects needs it.
     """
-    asset = parts.index.assets.get(kind, name)
+    asset = services.index.assets.get(kind, name)
     if asset.builtin:
         raise ConflictError(f"the {kind.value} {asset.name!r} comes with graspd and cannot be deleted")
-    with recording(parts) as (connection, put):
-        if user := parts.index.removals.user_of_asset(asset, within=connection):
+    with recording(services) as (connection, put):
+        if user := services.index.removals.user_of_asset(asset, within=connection):
             if asset.shared and not reach.everything:
                 user = "a job, a dataset or a set of objects"
             raise ConflictError(f"the {kind.value} {asset.name!r} is needed by {user}; delete that first")
         said = {"name": asset.name, "submitter": asset.owner, "project": asset.project}
         _record(put, Deletion(what=kind.value, id=asset.digest, at=timestamp(), owner=owner, **said))
-        parts.index.removals.remove_asset(kind, asset.digest, within=connection)
+        services.index.removals.remove_asset(kind, asset.digest, within=connection)
 
 
-def delete_job(parts: Parts, job_id: str, *, owner: str = "") -> None:
+def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
     """Take a job away; its shards, where no other job needs them, follow after a grace time.
 
     Raises:
         NotFoundError: there is no such job.
         ConflictError: it has not ended, or a dataset holds it.
     """
-    job = parts.index.jobs.get(job_id)
+    job = services.index.jobs.get(job_id)
     try:
-        record = read_record(JobRecord, parts.store, names.job_record(job_id))
+        record = read_record(JobRecord, services.store, names.job_record(job_id))
     except (NotFoundError, DamagedError):
         record = None  # then its shards cannot be told, and stay
-    with recording(parts) as (connection, put):
-        if user := parts.index.removals.user_of_job(job_id, within=connection):
+    with recording(services) as (connection, put):
+        if user := services.index.removals.user_of_job(job_id, within=connection):
             raise ConflictError(f"job {job_id} {user}")
-        attempts = parts.index.removals.attempts_of(job_id, within=connection)
+        attempts = services.index.removals.attempts_of(job_id, within=connection)
         said = {"name": f"{job.request.hand} on {job.request.object}", "submitter": job.owner, "project": job.project}
         deletion = Deletion(what="job", id=job_id, at=timestamp(), owner=owner, job=record, attempts=attempts, **said)
         _record(put, deletion)
-        parts.index.removals.remove_job(job_id, within=connection)
+        services.index.removals.remove_job(job_id, within=connection)
 
 
-def delete_dataset(parts: Parts, name: str, *, owner: str = "", with_snapshots: bool = False) -> None:
+def delete_dataset(services: Services, name: str, *, owner: str = "", with_snapshots: bool = False) -> None:
     """Take a dataset away; those of its jobs follow that were planned for it alone.
 
     Args:
@@ -88,11 +88,11 @@ def delete_dataset(parts: Parts, name: str, *, owner: str = "", with_snapshots: 
         NotFoundError: there is no such dataset.
         ConflictError: it has not ended, or has snapshots that are to stay.
     """
-    dataset = parts.index.datasets.get(name)
+    dataset = services.index.datasets.get(name)
     if not dataset.state.is_final:
         raise ConflictError(f"dataset {name!r} is {dataset.state}; cancel it first: graspd datasets cancel {name}")
-    with recording(parts) as (connection, put):
-        taken = parts.index.removals.snapshots_of(name, within=connection)
+    with recording(services) as (connection, put):
+        taken = services.index.removals.snapshots_of(name, within=connection)
         if taken and not with_snapshots:
             raise ConflictError(
                 f"dataset {name!r} has {taken} snapshot{'s' * (taken > 1)}, which papers and training runs may name; "
@@ -100,28 +100,28 @@ def delete_dataset(parts: Parts, name: str, *, owner: str = "", with_snapshots: 
             )
         said = {"submitter": dataset.owner, "project": dataset.project}
         _record(put, Deletion(what="dataset", id=name, at=timestamp(), owner=owner, **said))
-        parts.index.removals.remove_dataset(name, within=connection)
+        services.index.removals.remove_dataset(name, within=connection)
 
 
-def put_away(parts: Parts, deletion: Deletion) -> None:
+def put_away(services: Services, deletion: Deletion) -> None:
     """Move the objects of what is gone below `removed/`, its own record last; then the deletion's record goes. Nothing
     happens to what was restored meanwhile."""
     record = _record_of(deletion)
-    with parts.index.database.writing():
-        if not parts.store.exists(names.deletion(deletion.what, deletion.id)):
+    with services.index.database.writing():
+        if not services.store.exists(names.deletion(deletion.what, deletion.id)):
             return
         folder = removed_folder(deletion)
-        put_record(parts.store, f"{folder}/deletion.json", deletion)
+        put_record(services.store, f"{folder}/deletion.json", deletion)
         if deletion.job is not None:
-            put_record(parts.store, released_key(deletion), Released(at=deletion.at, job=deletion.job))
+            put_record(services.store, released_key(deletion), Released(at=deletion.at, job=deletion.job))
         attempts = [names.attempt(task, number) for task, number in deletion.attempts]
-        for key in [*attempts, *_last(_below(parts.store, record.rpartition("/")[0]), record)]:
-            parts.store.move(key, f"{folder}/{key}")
-        parts.store.delete(names.deletion(deletion.what, deletion.id))
+        for key in [*attempts, *_last(_below(services.store, record.rpartition("/")[0]), record)]:
+            services.store.move(key, f"{folder}/{key}")
+        services.store.delete(names.deletion(deletion.what, deletion.id))
 
 
 def restore(
-    parts: Parts,
+    services: Services,
     what: What,
     name: str,
     *,
@@ -139,27 +139,27 @@ def restore(
         NotFoundError: nothing of that name was deleted within the grace time.
         ConflictError: there is one of that name again, or what it needs is deleted too.
     """
-    known = [one for one in deletions(parts.store, what) if name in (one.id, one.name) and among(one)]
+    known = [one for one in deletions(services.store, what) if name in (one.id, one.name) and among(one)]
     if not known:
-        raise NotFoundError(f"no {what} {name!r} was deleted in the last {_days(parts.settings.shard_grace_s)}")
+        raise NotFoundError(f"no {what} {name!r} was deleted in the last {_days(services.settings.shard_grace_s)}")
     permit(known[0])
     if what == "tag":
-        _restore_tag(parts, known[0])
+        _restore_tag(services, known[0])
         return known[0]
-    with parts.index.database.writing() as connection:
+    with services.index.database.writing() as connection:
         connection.execution_options(**{QUIET: True})
         if what == "dataset":
-            _restore(parts, known[0], connection, before=lambda: _restore_jobs(parts, known[0], connection))
+            _restore(services, known[0], connection, before=lambda: _restore_jobs(services, known[0], connection))
         else:
-            _restore(parts, known[0], connection)
+            _restore(services, known[0], connection)
     return known[0]
 
 
 def _restore(
-    parts: Parts, deletion: Deletion, connection: Connection, *, before: Callable[[], None] = lambda: None
+    services: Services, deletion: Deletion, connection: Connection, *, before: Callable[[], None] = lambda: None
 ) -> None:
     """Objects, then rows, then the deletion is forgotten. Called in the turn of the index's writers."""
-    store, record, folder = parts.store, _record_of(deletion), removed_folder(deletion)
+    store, record, folder = services.store, _record_of(deletion), removed_folder(deletion)
     waiting = names.deletion(deletion.what, deletion.id)
     if not store.exists(waiting) and store.exists(record):
         called = deletion.id if deletion.what in ("job", "dataset") else deletion.name
@@ -169,7 +169,7 @@ def _restore(
         store.move(f"{folder}/{key}", key)
     try:
         before()
-        _enter(parts, deletion, connection)
+        _enter(services, deletion, connection)
     except ConflictError:
         if not store.exists(waiting):
             put_record(store, waiting, deletion)  # the controller puts it away again
@@ -178,12 +178,12 @@ def _restore(
     store.delete(f"{folder}/deletion.json")
 
 
-def _enter(parts: Parts, deletion: Deletion, connection: Connection) -> None:
+def _enter(services: Services, deletion: Deletion, connection: Connection) -> None:
     """The rows that follow from the records of a job, a dataset, a hand, an object or a network."""
-    store, index = parts.store, parts.index
+    store, index = services.store, services.index
     if deletion.what == "job":
         record = read_record(JobRecord, store, names.job_record(deletion.id))
-        _require(parts, record.assets, connection)
+        _require(services, record.assets, connection)
         index.write.add_job(record, within=connection)
         tried = [read_record(AttemptRecord, store, names.attempt(*one)) for one in deletion.attempts]
         for attempt in sorted(tried, key=lambda one: one.number):
@@ -193,7 +193,7 @@ def _enter(parts: Parts, deletion: Deletion, connection: Connection) -> None:
     elif deletion.what == "dataset":
         dataset = load_dataset(store, deletion.id)
         members = [(AssetKind.HAND, one.digest) for one in dataset.hands]
-        _require(parts, [*members, *((AssetKind.OBJECT, one.digest) for one in dataset.objects)], connection)
+        _require(services, [*members, *((AssetKind.OBJECT, one.digest) for one in dataset.objects)], connection)
         index.write_dataset.add(dataset, within=connection)
         index.write_dataset.set_events(dataset.name, dataset_events(store, dataset.name), within=connection)
         for key in _below(store, names.dataset_snapshots(dataset.name)):
@@ -208,28 +208,28 @@ def _enter(parts: Parts, deletion: Deletion, connection: Connection) -> None:
         index.write.add_asset(asset, load_check(store, kind, asset.digest), within=connection)
 
 
-def _restore_jobs(parts: Parts, deletion: Deletion, connection: Connection) -> None:
+def _restore_jobs(services: Services, deletion: Deletion, connection: Connection) -> None:
     """The jobs of a dataset that were deleted with it, or after it."""
-    wanted = set(load_dataset(parts.store, deletion.id).jobs)
+    wanted = set(load_dataset(services.store, deletion.id).jobs)
     newest: dict[str, Deletion] = {}
-    for one in deletions(parts.store, "job"):
+    for one in deletions(services.store, "job"):
         if one.id in wanted and one.at >= deletion.at:
             newest.setdefault(one.id, one)
     for one in newest.values():
-        if parts.store.exists(names.deletion("job", one.id)) or not parts.store.exists(names.job_record(one.id)):
-            _restore(parts, one, connection)
+        if services.store.exists(names.deletion("job", one.id)) or not services.store.exists(names.job_record(one.id)):
+            _restore(services, one, connection)
 
 
-def _restore_tag(parts: Parts, deletion: Deletion) -> None:
+def _restore_tag(services: Services, deletion: Deletion) -> None:
     folder = removed_folder(deletion)
-    key = next(key for key in _below(parts.store, folder) if not key.endswith("/deletion.json"))
-    tagging.bring_back(parts, read_record(Tag, parts.store, key))
+    key = next(key for key in _below(services.store, folder) if not key.endswith("/deletion.json"))
+    tagging.bring_back(services, read_record(Tag, services.store, key))
     for done in (key, f"{folder}/deletion.json"):
-        parts.store.delete(done)
+        services.store.delete(done)
 
 
-def _require(parts: Parts, wanted: Collection[tuple[AssetKind, str]], connection: Connection) -> None:
-    if missing := parts.index.assets.missing(wanted, within=connection):
+def _require(services: Services, wanted: Collection[tuple[AssetKind, str]], connection: Connection) -> None:
+    if missing := services.index.assets.missing(wanted, within=connection):
         kind = missing[0].partition(" ")[0]
         raise ConflictError(f"it needs the {missing[0]}, which was deleted too: graspd {kind}s restore first")
 

@@ -10,7 +10,7 @@ from typing import Final
 from service.model import names
 from service.model.errors import DamagedError, NotFoundError, UnavailableError
 from service.model.records import JobRecord
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.records import read_record
 
 log = logging.getLogger(__name__)
@@ -23,8 +23,8 @@ _GAP_S: Final = 0.15
 class Entering:
     """Killed at any moment, its successor goes on: a note in the index says where."""
 
-    def __init__(self, parts: Parts, stop: threading.Event) -> None:
-        self._parts = parts
+    def __init__(self, services: Services, stop: threading.Event) -> None:
+        self._services = services
         self._stop = stop
 
     def run(self) -> None:
@@ -33,7 +33,7 @@ class Entering:
         while not self._stop.wait(pause):
             pause = _PAUSE_S
             try:
-                for job in self._parts.index.write.entering():
+                for job in self._services.index.write.entering():
                     start = time.monotonic()
                     self.enter(job)
                     pause = max(_GAP_S, time.monotonic() - start)
@@ -48,7 +48,7 @@ class Entering:
         """The next piece of a job."""
         record = None
         try:
-            record = read_record(JobRecord, self._parts.store, names.job_record(job))
+            record = read_record(JobRecord, self._services.store, names.job_record(job))
         except (NotFoundError, DamagedError) as error:
             log.error("the rest of job %s is not entered: %s", job, error)
-        self._parts.index.write.enter_more(job, record)
+        self._services.index.write.enter_more(job, record)

@@ -17,7 +17,7 @@ from service.model.errors import ConflictError, DamagedError, NotFoundError
 from service.model.planning import plan
 from service.model.states import AssetKind, Stage
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.deletion import delete_job, put_away
 from service.store.datasets import load_dataset
 from service.store.deletions import Deletion, Released, removed_before
@@ -32,8 +32,8 @@ _AT_ONCE: Final = 200
 class GarbageCollector:
     """Carries out deletions; killed at any moment, its successor does the rest."""
 
-    def __init__(self, parts: Parts, *, clock: Callable[[], float] = time.monotonic) -> None:
-        self._parts = parts
+    def __init__(self, services: Services, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._services = services
         self._clock = clock
 
     def advance(self, budget_s: float = BUDGET_S) -> bool:
@@ -43,11 +43,11 @@ class GarbageCollector:
             UnavailableError: a part is away; call again later.
         """
         deadline = self._clock() + budget_s
-        for entry in list(self._parts.store.list(names.DELETIONS)):
+        for entry in list(self._services.store.list(names.DELETIONS)):
             if self._clock() > deadline:
                 return True
             try:
-                deletion = read_record(Deletion, self._parts.store, entry.key)
+                deletion = read_record(Deletion, self._services.store, entry.key)
             except DamagedError as error:
                 log.warning("%s", error)
                 continue
@@ -60,19 +60,21 @@ class GarbageCollector:
         """Remove what was deleted before the grace time, and shards that have not been needed since. Returns whether
         something is left to do."""
         deadline = self._clock() + budget_s
-        before = timestamp(self._parts.settings.shard_grace_s)
+        before = timestamp(self._services.settings.shard_grace_s)
         # What tells of the deletion sorts first and goes last.
-        for entry in sorted(self._parts.store.list(names.REMOVED), key=lambda one: one.key.endswith("/deletion.json")):
+        for entry in sorted(
+            self._services.store.list(names.REMOVED), key=lambda one: one.key.endswith("/deletion.json")
+        ):
             if self._clock() > deadline:
                 return True
             if removed_before(entry.key, before):
-                self._parts.store.delete(entry.key)
-        known = self._parts.index.notes.completeness()
+                self._services.store.delete(entry.key)
+        known = self._services.index.notes.completeness()
         if known is not None and known.left_out:
             return False  # a job whose record cannot be read may need one of them
-        for entry in sorted(self._parts.store.list(names.RELEASED), key=lambda one: one.key):
+        for entry in sorted(self._services.store.list(names.RELEASED), key=lambda one: one.key):
             try:
-                released = read_record(Released, self._parts.store, entry.key)
+                released = read_record(Released, self._services.store, entry.key)
             except DamagedError as error:
                 log.warning("%s", error)
                 continue
@@ -82,15 +84,15 @@ class GarbageCollector:
                 if self._clock() > deadline:
                     return True
                 self._remove_shard(stage, shard)
-            self._parts.store.delete(entry.key)
+            self._services.store.delete(entry.key)
         return False
 
     def _carry_out(self, deletion: Deletion, deadline: float) -> bool:
         """Rows once more, in case the process ended between record and rows; then the objects. Whether all is done."""
-        with self._parts.index.database.writing() as connection:
-            if not self._parts.store.exists(names.deletion(deletion.what, deletion.id)):
+        with self._services.index.database.writing() as connection:
+            if not self._services.store.exists(names.deletion(deletion.what, deletion.id)):
                 return True  # restored since it was listed
-            removals = self._parts.index.removals
+            removals = self._services.index.removals
             if deletion.what == "job":
                 removals.remove_job(deletion.id, within=connection)
             elif deletion.what == "dataset":
@@ -99,24 +101,24 @@ class GarbageCollector:
                 removals.remove_asset(AssetKind(deletion.what), deletion.id, within=connection)
         if deletion.what == "dataset" and not self._remove_jobs_of(deletion.id, deadline):
             return False
-        put_away(self._parts, deletion)
+        put_away(self._services, deletion)
         return True
 
     def _remove_jobs_of(self, dataset: str, deadline: float) -> bool:
         """Delete the jobs that the planner made for a dataset and that no other one holds; whether all are gone."""
         try:
-            jobs = load_dataset(self._parts.store, dataset).jobs
+            jobs = load_dataset(self._services.store, dataset).jobs
         except (NotFoundError, DamagedError):
             return True
         for start in range(0, len(jobs), _AT_ONCE):
-            for job in self._parts.index.removals.planned_only(jobs[start : start + _AT_ONCE]):
+            for job in self._services.index.removals.planned_only(jobs[start : start + _AT_ONCE]):
                 if self._clock() > deadline:
                     return False
                 try:
                     # The dataset was cancelled, perhaps too short a time ago for its jobs to be.
                     with contextlib.suppress(ConflictError):
-                        job_actions.cancel(self._parts, job)
-                    delete_job(self._parts, job)
+                        job_actions.cancel(self._services, job)
+                    delete_job(self._services, job)
                 except (ConflictError, NotFoundError) as error:
                     log.info("job %s of the deleted dataset %s stays: %s", job, dataset, error)
         return True
@@ -125,13 +127,13 @@ class GarbageCollector:
         planned = [(task.stage, task.output) for task in plan(released.job)]
         for start in range(0, len(planned), _AT_ONCE):
             some = planned[start : start + _AT_ONCE]
-            unneeded = self._parts.index.removals.unneeded_shards([shard for _, shard in some])
+            unneeded = self._services.index.removals.unneeded_shards([shard for _, shard in some])
             yield from ((stage, shard) for stage, shard in some if shard in unneeded)
 
     def _remove_shard(self, stage: Stage, shard: str) -> None:
         """The manifest first: without it the shard does not exist. A job that is entered meanwhile waits for the lock,
         and makes the shard anew."""
-        with self._parts.index.database.writing() as connection:
-            if self._parts.index.removals.remove_shard(shard, within=connection):
-                self._parts.store.delete(names.shard_manifest(stage, shard))
-                self._parts.store.delete(names.shard_file(stage, shard))
+        with self._services.index.database.writing() as connection:
+            if self._services.index.removals.remove_shard(shard, within=connection):
+                self._services.store.delete(names.shard_manifest(stage, shard))
+                self._services.store.delete(names.shard_file(stage, shard))

@@ -21,7 +21,7 @@ from service.model.records import Record
 from service.store.records import put_record, read_record
 
 if TYPE_CHECKING:
-    from service.pipeline.backends import Parts
+    from service.pipeline.backends import Services
     from service.queue.port import Presence
     from service.store.store import Store
 
@@ -77,7 +77,7 @@ class Identity:
 
 
 def identify(
-    parts: Parts,
+    services: Services,
     *,
     folder: Path | None = None,
     ask_redis: bool = True,
@@ -100,43 +100,43 @@ def identify(
         StoreUnavailable, IndexUnavailable, QueueUnavailable: they cannot be asked.
     """
     # Redis first and the store last: of processes that begin a service at once, each finds what the others wrote.
-    redis = parts.queue.service() if ask_redis else None
+    redis = services.queue.service() if ask_redis else None
     left = _read(folder)
-    chain = services(parts.store)
-    index = parts.index.notes.service()
+    chain = service_ids(services.store)
+    index = services.index.notes.service()
     if not chain:
         # An index that was never filled is left of a start that was killed here.
-        if index is not None and not take_over and parts.index.notes.completeness() is not None:
-            raise BusyError(_others_index(parts.store.url))
-        index = parts.index.notes.name_service(index or secrets.token_hex(_BYTES))
+        if index is not None and not take_over and services.index.notes.completeness() is not None:
+            raise BusyError(_others_index(services.store.url))
+        index = services.index.notes.name_service(index or secrets.token_hex(_BYTES))
         if redis not in (None, index) and not holds_redis:
             raise BusyError(_REDIS)
-        _add(parts.store, 1, index)
-        chain = services(parts.store)
+        _add(services.store, 1, index)
+        chain = service_ids(services.store)
     found = Identity(
-        chain, index, None if holds_redis and redis not in chain else redis, left, parts.settings.store_url is None
+        chain, index, None if holds_redis and redis not in chain else redis, left, services.settings.store_url is None
     )
-    if why := found.refusal(parts.store.url, take_over=take_over):
+    if why := found.refusal(services.store.url, take_over=take_over):
         raise BusyError(why)
     if take_over and not found.is_same:
-        _add(parts.store, len(chain) + 1, secrets.token_hex(_BYTES))
-        chain = services(parts.store)
-    mine = parts.index.notes.name_service(chain[-1], instead=take_over)
+        _add(services.store, len(chain) + 1, secrets.token_hex(_BYTES))
+        chain = service_ids(services.store)
+    mine = services.index.notes.name_service(chain[-1], instead=take_over)
     if ask_redis and redis != mine:
-        parts.queue.set_service(mine, instead=redis is not None)
-        if not holds_redis and parts.queue.service() not in chain:
+        services.queue.set_service(mine, instead=redis is not None)
+        if not holds_redis and services.queue.service() not in chain:
             raise BusyError(_REDIS)
     if folder is not None and left != mine:
         (folder / _FILE).write_text(mine)
     return mine
 
 
-def identify_if_redis_answers(parts: Parts, *, folder: Path | None = None, take_over: bool = False) -> str:
+def identify_if_redis_answers(services: Services, *, folder: Path | None = None, take_over: bool = False) -> str:
     """`identify`, by what store, index and folder say where Redis is away."""
     try:
-        return identify(parts, folder=folder, take_over=take_over)
+        return identify(services, folder=folder, take_over=take_over)
     except QueueUnavailable:
-        return identify(parts, folder=folder, take_over=take_over, ask_redis=False)
+        return identify(services, folder=folder, take_over=take_over, ask_redis=False)
 
 
 def check_queue(store: Store, queue: Presence) -> bool:
@@ -152,13 +152,13 @@ def check_service(store: Store, redis: str | None) -> bool:
     """The same of what Redis says."""
     if redis is None:
         return False
-    chain = services(store)
+    chain = service_ids(store)
     if redis not in chain:
         raise BusyError(_REDIS)
     return True
 
 
-def services(store: Store) -> list[str]:
+def service_ids(store: Store) -> list[str]:
     """Ids of the services that worked on a store; the last one does now."""
     keys = sorted(entry.key for entry in store.list(names.SERVICE))
     return [read_record(ServiceRecord, store, key).id for key in keys]

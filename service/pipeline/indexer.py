@@ -16,7 +16,7 @@ from service.model.names import attempt as attempt_key
 from service.model.planning import backoff
 from service.model.records import AttemptRecord
 from service.model.states import AssetKind, Stage, State
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.tally import Tally
 from service.queue.port import Event, EventKind
 from service.store.library import load_asset, load_check
@@ -38,11 +38,11 @@ _NEEDS_STORE: Final = frozenset({EventKind.FINISHED, EventKind.FAILED})
 class Indexer:
     """Applies events; tells listeners when a job's state changes."""
 
-    def __init__(self, parts: Parts) -> None:
-        self._parts = parts
+    def __init__(self, services: Services) -> None:
+        self._services = services
         self._told: OrderedDict[str, State] = OrderedDict()
         self._deferrals: dict[str, int] = {}
-        self._tally = Tally(parts.queue)
+        self._tally = Tally(services.queue)
         self._readers = ThreadPoolExecutor(_READERS, thread_name_prefix="manifests")
 
     def apply(self, events: Sequence[Event]) -> list[int]:
@@ -75,14 +75,14 @@ class Indexer:
         self._start(started)
         waiting += self._finish(events, finished)
         if left:
-            self._parts.index.live.forget_workers(left)
+            self._services.index.live.forget_workers(left)
         return sorted(waiting)
 
     def _start(self, started: dict[str, str]) -> None:
         """Tasks that workers took; those are taken off the list."""
         if started:
             with _left_out(f"the start of {len(started)} tasks"):
-                self.tell(self._parts.index.live.set_running(started))
+                self.tell(self._services.index.live.set_running(started))
             started.clear()
 
     def _finish(self, events: Sequence[Event], places: Sequence[int]) -> list[int]:
@@ -115,14 +115,14 @@ class Indexer:
         """The manifest of what was made. Many are read at once: most of the time the store is waited for."""
         try:
             assert event.stage is not None
-            return load_manifest(self._parts.store, event.stage, event.output)
+            return load_manifest(self._services.store, event.stage, event.output)
         except Exception as error:
             return error
 
     def _index(self, made: list[ShardManifest]) -> None:
         """Shards in one transaction; where the index cannot hold one of them, each by itself."""
         try:
-            states = self._parts.index.write.add_manifests(made) if made else {}
+            states = self._services.index.write.add_manifests(made) if made else {}
         except InputError:
             if len(made) == 1:
                 log.exception("shard %s is left out", made[0].shard_id)
@@ -139,7 +139,7 @@ class Indexer:
         if changed:
             now = timestamp()
             told = (Event(kind=EventKind.JOB, at=now, job_id=job, message=s.value) for job, s in changed.items())
-            self._parts.queue.publish(*told)
+            self._services.queue.publish(*told)
         for job, state in changed.items():
             log.info("job is %s", state, extra={"job": job})
             if state.is_final:
@@ -152,19 +152,19 @@ class Indexer:
 
     def made(self, manifest: ShardManifest) -> None:
         """Index a shard."""
-        self.tell(self._parts.index.write.add_manifest(manifest))
+        self.tell(self._services.index.write.add_manifest(manifest))
         self._tally.made([manifest])
 
     def checked(self, kind: AssetKind, digest: str) -> None:
         """Index a hand or object as the store has it now."""
-        asset = load_asset(self._parts.store, kind, digest)
-        self._parts.index.write.add_asset(asset, load_check(self._parts.store, kind, digest))
+        asset = load_asset(self._services.store, kind, digest)
+        self._services.index.write.add_asset(asset, load_check(self._services.store, kind, digest))
 
     def failed(self, attempt: AttemptRecord, *, at_once: bool = False) -> None:
         """Index a failed attempt; the next follows after a back-off, or at once."""
-        wait = 0.0 if at_once else backoff(self._parts.settings.retry_backoff_s, attempt.number)
+        wait = 0.0 if at_once else backoff(self._services.settings.retry_backoff_s, attempt.number)
         not_before = time.time() + wait
-        state = self._parts.index.write.add_attempt(attempt, not_before=not_before)
+        state = self._services.index.write.add_attempt(attempt, not_before=not_before)
         if state is not None:
             about = {
                 "job": attempt.job_id,
@@ -198,7 +198,7 @@ class Indexer:
             # Without a finding nobody knows whether the upload is good: its check is tried until it ends in one.
             self._defer(event)
         elif event.kind is EventKind.FAILED:
-            self.failed(read_record(AttemptRecord, self._parts.store, attempt_key(event.task_id, event.attempt)))
+            self.failed(read_record(AttemptRecord, self._services.store, attempt_key(event.task_id, event.attempt)))
         elif event.kind is EventKind.DEFERRED:
             self._tally.handed_back(event.stage or "", event.kind.value)
             self._defer(event)
@@ -210,15 +210,15 @@ class Indexer:
         if len(self._deferrals) >= _REMEMBERED_TASKS:
             self._deferrals.clear()
         count = self._deferrals[event.task_id] = self._deferrals.get(event.task_id, 0) + 1
-        wait = backoff(self._parts.settings.retry_backoff_s, count)
+        wait = backoff(self._services.settings.retry_backoff_s, count)
         self._wait_again(event, time.time() + wait, f"waits: {event.message}")
 
     def _wait_again(self, event: Event, not_before: float, message: str | None) -> None:
         if event.stage is Stage.INGEST:
             digest = event.output.partition("/")[2]
-            self._parts.index.live.set_asset_waiting([digest], queued=False, not_before=not_before, message=message)
+            self._services.index.live.set_asset_waiting([digest], queued=False, not_before=not_before, message=message)
         else:
-            self.tell(self._parts.index.live.set_waiting([event.task_id], not_before=not_before, message=message))
+            self.tell(self._services.index.live.set_waiting([event.task_id], not_before=not_before, message=message))
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from service.index.damage import Damage
 from service.index.notes import ScanNote
 from service.model.clock import age_of, timestamp
 from service.model.errors import GraspdError
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.integrity import FOLDERS, examine, is_checked, is_on_its_way
 
 log = logging.getLogger(__name__)
@@ -43,8 +43,8 @@ class Interrupted(Exception):
 class Turn:
     """The right to read through the store: one has it at a time, a `store verify` before the controller."""
 
-    def __init__(self, parts: Parts, *, is_controller: bool, clock: Callable[[], float] = time.monotonic) -> None:
-        self._parts, self._is_controller, self._clock = parts, is_controller, clock
+    def __init__(self, services: Services, *, is_controller: bool, clock: Callable[[], float] = time.monotonic) -> None:
+        self._services, self._is_controller, self._clock = services, is_controller, clock
         self._holder = uuid4().hex
         self._said = -_TURN_S
 
@@ -52,7 +52,7 @@ class Turn:
         """Take the turn, or keep it; asks the index every few seconds."""
         now = self._clock()
         if now - self._said >= _TURN_S:
-            if not self._parts.index.notes.take_scan_turn(
+            if not self._services.index.notes.take_scan_turn(
                 self._holder, is_controller=self._is_controller, lasts_s=3 * _TURN_S
             ):
                 return False
@@ -64,17 +64,19 @@ class Turn:
         self.is_mine()
 
     def end(self) -> None:
-        self._parts.index.notes.end_scan_turn(self._holder)
+        self._services.index.notes.end_scan_turn(self._holder)
         self._said = -_TURN_S
 
 
 class IntegrityScan:
     """Reads through the store and notes in the index what is damaged, or no longer is."""
 
-    def __init__(self, parts: Parts, stop: threading.Event, *, clock: Callable[[], float] = time.monotonic) -> None:
-        self._parts, self._stop, self._clock = parts, stop, clock
-        self._rate = parts.settings.integrity_scan_mb_per_s * 2**20
-        self._turn = Turn(parts, is_controller=True, clock=clock)
+    def __init__(
+        self, services: Services, stop: threading.Event, *, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._services, self._stop, self._clock = services, stop, clock
+        self._rate = services.settings.integrity_scan_mb_per_s * 2**20
+        self._turn = Turn(services, is_controller=True, clock=clock)
         self._paid = clock()
         self._looked = clock()
 
@@ -107,7 +109,7 @@ class IntegrityScan:
             UnavailableError: a part is away; call again.
         """
         self._look_again_in_time(None)
-        note = self._parts.index.notes.scan_note()
+        note = self._services.index.notes.scan_note()
         if note.folder >= len(FOLDERS):
             if (age_of(note.started) or 0.0) < ROUND_S:
                 return False
@@ -122,38 +124,38 @@ class IntegrityScan:
         note = replace(note, folder=note.folder + over, after="" if over else keys[-1])
         if note.folder == len(FOLDERS):
             note = replace(note, ended=timestamp())
-        self._parts.index.notes.set_scan_note(note)
+        self._services.index.notes.set_scan_note(note)
         return True
 
     def _look_again_in_time(self, reached: ScanNote | None) -> None:
         if self._clock() - self._looked > _AGAIN_S:
             if reached is not None:
-                self._parts.index.notes.set_scan_note(reached)
+                self._services.index.notes.set_scan_note(reached)
             self.look_again()
 
     def look_again(self) -> None:
         """Examine anew what is known to be damaged; forget what is well, and what was removed since."""
         self._looked = self._clock()
-        _, known = self._parts.index.damage.known(limit=_KNOWN)
+        _, known = self._services.index.damage.known(limit=_KNOWN)
         well = [one.key for one in known if self._is_well(one)]
         if well:
-            self._parts.index.damage.mark([], intact=well)
+            self._services.index.damage.mark([], intact=well)
 
     def _is_well(self, one: Damage) -> bool:
         stem, dot, _ = one.key.rpartition(".")
         keys = [f"{stem}.json", f"{stem}.h5"] if one.shard and dot else [one.key]
-        return all(examine(self._parts.store, key, read=self._pace) is None for key in keys)
+        return all(examine(self._services.store, key, read=self._pace) is None for key in keys)
 
     def _look(self, key: str) -> None:
         self._pace(_LEAST)
-        if (wrong := examine(self._parts.store, key, read=self._pace)) is None:
+        if (wrong := examine(self._services.store, key, read=self._pace)) is None:
             return
-        if not is_on_its_way(self._parts.store, wrong):
+        if not is_on_its_way(self._services.store, wrong):
             log.warning("%s: %s", wrong.key, wrong.what)
-            self._parts.index.damage.mark([wrong])
+            self._services.index.damage.mark([wrong])
 
     def _keys(self, folder: str, after: str) -> list[str]:
-        listed = self._parts.store.list(folder, offset=after or None)
+        listed = self._services.store.list(folder, offset=after or None)
         return heapq.nsmallest(_KEYS, (entry.key for entry in listed))
 
     def _pace(self, size: int) -> None:

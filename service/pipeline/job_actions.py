@@ -23,7 +23,7 @@ from service.model.planning import lane_of, message_of
 from service.model.projects import EVERYTHING, Reach
 from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane, State
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.fidelity_choice import Resolver
 from service.pipeline.ranges import TaskRanges
 from service.pipeline.recording import recording
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 HELD_S: Final = 10.0
 
 
-def submit(parts: Parts, request: JobRequest, *, lane: Lane | None = None) -> tuple[JobView, bool]:
+def submit(services: Services, request: JobRequest, *, lane: Lane | None = None) -> tuple[JobView, bool]:
     """Record a job and queue its first tasks. The same request on the same hand and object is the same job.
 
     Args:
@@ -51,11 +51,11 @@ def submit(parts: Parts, request: JobRequest, *, lane: Lane | None = None) -> tu
     Raises:
         what `prepare` raises; nothing was recorded then.
     """
-    return enter(parts, prepare(parts, request, lane=lane))
+    return enter(services, prepare(services, request, lane=lane))
 
 
 def prepare(
-    parts: Parts, request: JobRequest, *, lane: Lane | None = None, owner: str = "", reach: Reach = EVERYTHING
+    services: Services, request: JobRequest, *, lane: Lane | None = None, owner: str = "", reach: Reach = EVERYTHING
 ) -> JobRecord:
     """The job that a request stands for, of a hand and an object that may be used.
 
@@ -70,14 +70,14 @@ def prepare(
         ConflictError: the check of one of them is still running.
         QueueUnavailable, StoreUnavailable, IndexUnavailable: a part is away.
     """
-    hand = usable(parts, AssetKind.HAND, request.hand, reach)
-    obj = usable(parts, AssetKind.OBJECT, request.object, reach)
-    request, beside = with_neighbours(parts, request, reach)
-    request = with_network(parts, request, [hand], reach)
+    hand = usable(services, AssetKind.HAND, request.hand, reach)
+    obj = usable(services, AssetKind.OBJECT, request.object, reach)
+    request, beside = with_neighbours(services, request, reach)
+    request = with_network(services, request, [hand], reach)
     check_scene(request, obj, beside)
-    parts.queue.ping()
+    services.queue.ping()
     named = request.model_copy(update={"hand": hand.name, "object": obj.name})
-    request, choice = Resolver(parts.store).choose(named)
+    request, choice = Resolver(services.store).choose(named)
     record = JobRecord(
         id=job_id(request, hand.digest, obj.digest, reach.project),
         request=request,
@@ -90,10 +90,10 @@ def prepare(
         project=reach.project,
         choice=choice,
     )
-    return TaskRanges(parts, reach=reach).sized(record)
+    return TaskRanges(services, reach=reach).sized(record)
 
 
-def enter(parts: Parts, record: JobRecord, *, keeps_assets: bool = False) -> tuple[JobView, bool]:
+def enter(services: Services, record: JobRecord, *, keeps_assets: bool = False) -> tuple[JobView, bool]:
     """Keep a planned job and queue its first tasks. The controller enters those that are too many for one turn.
 
     Args:
@@ -108,22 +108,22 @@ def enter(parts: Parts, record: JobRecord, *, keeps_assets: bool = False) -> tup
     """
     key = names.job_record(record.id)
     # The dataset wants its jobs whatever breaks off, and its planner holds the turn for no store.
-    new = keeps_assets and put_record(parts.store, key, record)
-    with recording(parts, [key] if new else []) as (connection, put):
+    new = keeps_assets and put_record(services.store, key, record)
+    with recording(services, [key] if new else []) as (connection, put):
         new = new or (not keeps_assets and put(key, record))
-        refuse_pending(parts.store, "job", record.id)
+        refuse_pending(services.store, "job", record.id)
         if not new:
-            if not parts.store.exists(key):
+            if not services.store.exists(key):
                 raise ConflictError(f"job {record.id} was deleted just now; submit it again")
-            record = read_record(JobRecord, parts.store, key)
-        if not keeps_assets and (missing := parts.index.assets.missing(record.assets, within=connection)):
+            record = read_record(JobRecord, services.store, key)
+        if not keeps_assets and (missing := services.index.assets.missing(record.assets, within=connection)):
             raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
-        parts.index.write.enter_job(record, within=connection)
-    _start(parts, record.id)
-    return parts.index.jobs.get(record.id), new
+        services.index.write.enter_job(record, within=connection)
+    _start(services, record.id)
+    return services.index.jobs.get(record.id), new
 
 
-def cancel(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
+def cancel(services: Services, job_id: str, *, cause: str = "") -> JobView:
     """Stop a job: waiting tasks never start, running ones stop at the next launch. Finished shards stay.
 
     Args:
@@ -133,19 +133,19 @@ def cancel(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
         NotFoundError: unknown job.
         ConflictError: the job is already finished.
     """
-    _refuse_ended(parts, job_id)
-    with _changing(parts, job_id) as add:
-        _refuse_ended(parts, job_id)
-        in_queue = parts.index.feed.unfinished_tasks(job_id)
+    _refuse_ended(services, job_id)
+    with _changing(services, job_id) as add:
+        _refuse_ended(services, job_id)
+        in_queue = services.index.feed.unfinished_tasks(job_id)
         add("cancelled", cause=cause)
     try:
-        parts.queue.discard(in_queue)
+        services.queue.discard(in_queue)
     except UnavailableError as error:
         log.warning("job %s is cancelled; its tasks in the queue follow when it answers: %s", job_id, error)
-    return _told(parts, job_id)
+    return _told(services, job_id)
 
 
-def retry(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
+def retry(services: Services, job_id: str, *, cause: str = "") -> JobView:
     """Queue the failed and cancelled tasks of a job again, with fresh attempts.
 
     Args:
@@ -155,15 +155,15 @@ def retry(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
         NotFoundError: unknown job.
         ConflictError: the job neither failed nor was cancelled.
     """
-    _refuse_unfailed(parts, job_id)
-    with _changing(parts, job_id) as add:
-        _refuse_unfailed(parts, job_id)
-        add("retried", parts.index.feed.failed_tasks(job_id), cause=cause)
-    _start(parts, job_id)
-    return _told(parts, job_id)
+    _refuse_unfailed(services, job_id)
+    with _changing(services, job_id) as add:
+        _refuse_unfailed(services, job_id)
+        add("retried", services.index.feed.failed_tasks(job_id), cause=cause)
+    _start(services, job_id)
+    return _told(services, job_id)
 
 
-def queue_tasks(parts: Parts, ready: Sequence[ReadyTask], *, routes: Routes, again: bool = False) -> set[str]:
+def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Routes, again: bool = False) -> set[str]:
     """Put tasks into the queue and mark them in the index; what no worker can do waits, and its job says why.
 
     The mark comes first: a task marked but not queued is found missing and queued by the controller; one queued but not
@@ -178,7 +178,10 @@ def queue_tasks(parts: Parts, ready: Sequence[ReadyTask], *, routes: Routes, aga
     to_queue: dict[tuple[Lane, bool], list[TaskMessage]] = defaultdict(list)
     held: dict[str, list[str]] = defaultdict(list)
     for task in ready:
-        attempts = {"attempt": task.last_attempt + 1, "max_attempt": task.retried_upto + parts.settings.task_attempts}
+        attempts = {
+            "attempt": task.last_attempt + 1,
+            "max_attempt": task.retried_upto + services.settings.task_attempts,
+        }
         message = message_of(task.job, task.task, **attempts)
         place = routes.place(need_of(message))
         if place.held:
@@ -186,62 +189,62 @@ def queue_tasks(parts: Parts, ready: Sequence[ReadyTask], *, routes: Routes, aga
         else:
             to_queue[task.lane, place.apart].append(message)
     for why, tasks in held.items():
-        parts.index.live.set_waiting(tasks, not_before=time.time() + HELD_S, message=why)
+        services.index.live.set_waiting(tasks, not_before=time.time() + HELD_S, message=why)
     if to_queue:
-        parts.index.live.set_queued([message.task_id for messages in to_queue.values() for message in messages])
+        services.index.live.set_queued([message.task_id for messages in to_queue.values() for message in messages])
     for (lane, apart), messages in sorted(to_queue.items()):
-        parts.queue.enqueue(messages, lane, again=again, apart=apart)
+        services.queue.enqueue(messages, lane, again=again, apart=apart)
     return set(held)
 
 
-def _start(parts: Parts, job_id: str) -> None:
+def _start(services: Services, job_id: str) -> None:
     """Queue as much of a job as the queue's window holds; the controller feeds the rest, or all if Redis is away."""
     try:
-        room = parts.settings.queue_window - sum(parts.queue.depths().values())
+        room = services.settings.queue_window - sum(services.queue.depths().values())
         if room > 0:
-            routes = Routes(parts.queue.workers())
-            queue_tasks(parts, parts.index.feed.ready_of_job(job_id, limit=room), routes=routes)
-        _told(parts, job_id)
+            routes = Routes(services.queue.workers())
+            queue_tasks(services, services.index.feed.ready_of_job(job_id, limit=room), routes=routes)
+        _told(services, job_id)
     except UnavailableError as error:
         log.warning("job %s is recorded; its tasks are queued when the queue answers: %s", job_id, error)
 
 
 @contextmanager
-def _changing(parts: Parts, job_id: str) -> Iterator[Callable[..., None]]:
+def _changing(services: Services, job_id: str) -> Iterator[Callable[..., None]]:
     """A turn in which an event may be added to those of a job: of two at once the later one knows of both.
 
     What there was before is read beforehand: the store may be slow, and others wait for the turn.
     """
-    before = job_events(parts.store, job_id)
-    with recording(parts) as (connection, put):
+    before = job_events(services.store, job_id)
+    with recording(services) as (connection, put):
 
         def add(
             what: Literal["cancelled", "retried"], retried: dict[str, int] | None = None, *, cause: str = ""
         ) -> None:
-            event = add_job_event(parts.store, job_id, what, retried, cause=cause, put=put)
+            event = add_job_event(services.store, job_id, what, retried, cause=cause, put=put)
             is_next = event.number == max((one.number for one in before), default=0) + 1
-            events = [*before, event] if is_next else job_events(parts.store, job_id)
-            parts.index.write.set_job_events(job_id, events, within=connection)
+            events = [*before, event] if is_next else job_events(services.store, job_id)
+            services.index.write.set_job_events(job_id, events, within=connection)
 
         yield add
 
 
-def _refuse_ended(parts: Parts, job_id: str) -> None:
-    job = parts.index.jobs.get(job_id)
+def _refuse_ended(services: Services, job_id: str) -> None:
+    job = services.index.jobs.get(job_id)
     if job.state.is_final:
         raise ConflictError(f"job {job_id} has already {_ended(job.state)}; there is nothing to cancel")
 
 
-def _refuse_unfailed(parts: Parts, job_id: str) -> None:
-    job = parts.index.jobs.get(job_id)
+def _refuse_unfailed(services: Services, job_id: str) -> None:
+    job = services.index.jobs.get(job_id)
     if job.state not in (State.FAILED, State.CANCELLED):
         raise ConflictError(f"job {job_id} is {job.state}; only a failed or cancelled job can be retried")
 
 
-def _told(parts: Parts, job_id: str) -> JobView:
-    job = parts.index.jobs.get(job_id)
+def _told(services: Services, job_id: str) -> JobView:
+    job = services.index.jobs.get(job_id)
     try:
-        parts.queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id=job_id, message=job.state.value))
+        services.queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id=job_id, message=job.state.value))
     except UnavailableError as error:
         log.warning("nobody was told that job %s is %s: %s", job_id, job.state, error)
     return job

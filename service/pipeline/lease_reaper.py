@@ -14,7 +14,7 @@ from service.model.messages import IngestMessage, TaskMessage
 from service.model.planning import ingest_id
 from service.model.records import AttemptRecord
 from service.model.states import AssetKind, Stage
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.indexer import Indexer
 from service.queue.port import Holder, Lease
 from service.store.manifests import load_manifest
@@ -30,8 +30,8 @@ LOST_AFTER_S: Final = 3.0
 class LeaseReaper:
     """Watches leases by whether they change, on this process's own monotonic clock: set clocks do not matter."""
 
-    def __init__(self, parts: Parts, indexer: Indexer, *, clock: Callable[[], float] = time.monotonic) -> None:
-        self._parts = parts
+    def __init__(self, services: Services, indexer: Indexer, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._services = services
         self._indexer = indexer
         self._clock = clock
         self._beats: dict[str, tuple[str, float]] = {}
@@ -41,7 +41,7 @@ class LeaseReaper:
     def reap(self, leases: Collection[Lease]) -> list[Lease]:
         """Take the tasks from workers that gave no sign of life for a lease; returns those leases."""
         now = self._clock()
-        lease_s = self._parts.settings.lease_s
+        lease_s = self._services.settings.lease_s
         # Time in which nobody looked, because Redis was away or this process was stopped, is no worker's silence.
         looked, self._looked = min(now - self._looked, lease_s / 3), now
         beats: dict[str, tuple[str, float]] = {}
@@ -52,14 +52,14 @@ class LeaseReaper:
             if silence <= lease_s:
                 beats[lease.key] = (lease.beat, silence)
             else:
-                self._lose(lease, self._parts.queue.holder(lease))
+                self._lose(lease, self._services.queue.holder(lease))
                 lost.append(lease)
         self._beats = beats
         return lost
 
     def find_missing(self, present: Collection[str]) -> list[str]:
         """Ids of tasks that the index believes in the queue, but that are neither there nor with a worker."""
-        tasks, checks = self._parts.index.feed.believed_queued()
+        tasks, checks = self._services.index.feed.believed_queued()
         believed = tasks | {ingest_id(kind, digest) for kind, digest in checks}
         now = self._clock()
         self._missing = {task: self._missing.get(task, now) for task in believed - set(present)}
@@ -74,14 +74,14 @@ class LeaseReaper:
     def _recover(self, missing: list[str]) -> None:
         """Make good a lost event from the store; what the store knows nothing of is queued again."""
         again = []
-        for made in take_apart(self._parts.store) if missing else ():  # of a worker of 0.2, in a rolling upgrade
+        for made in take_apart(self._services.store) if missing else ():  # of a worker of 0.2, in a rolling upgrade
             self._indexer.made(made)
-        for task, (stage, shard) in self._parts.index.feed.outputs(missing).items():
+        for task, (stage, shard) in self._services.index.feed.outputs(missing).items():
             if self._find(task, Stage(stage), shard):
                 continue
-            known = self._parts.index.jobs.task(task).attempt
+            known = self._services.index.jobs.task(task).attempt
             try:
-                recorded = [a for a in task_attempts(self._parts.store, task) if a.number >= known]
+                recorded = [a for a in task_attempts(self._services.store, task) if a.number >= known]
             except DamagedError as error:
                 self._fail(task, Stage(stage), error)
                 continue
@@ -91,7 +91,7 @@ class LeaseReaper:
                 again.append(task)
         if again:
             log.warning("%d tasks were lost from the queue and are queued again", len(again))
-            self._indexer.tell(self._parts.index.live.set_waiting(again))
+            self._indexer.tell(self._services.index.live.set_waiting(again))
 
     def _find(self, task_id: str, stage: Stage, shard: str) -> bool:
         """Index a shard that is there; one whose manifest is damaged fails its task, since it cannot be made again.
@@ -100,7 +100,7 @@ class LeaseReaper:
             whether it is there.
         """
         try:
-            self._indexer.made(load_manifest(self._parts.store, stage, shard))
+            self._indexer.made(load_manifest(self._services.store, stage, shard))
         except NotFoundError:
             return False
         except DamagedError as error:
@@ -109,7 +109,7 @@ class LeaseReaper:
 
     def _fail(self, task_id: str, stage: Stage, error: DamagedError) -> None:
         """End a task that a damaged record stands in the way of."""
-        task = self._parts.index.jobs.task(task_id)
+        task = self._services.index.jobs.task(task_id)
         attempt = AttemptRecord(
             task_id=task_id,
             job_id=task.job_id,
@@ -121,17 +121,17 @@ class LeaseReaper:
             ended=timestamp(),
             last=True,
         )
-        put_record(self._parts.store, names.attempt(task_id, attempt.number), attempt)
+        put_record(self._services.store, names.attempt(task_id, attempt.number), attempt)
         self._indexer.failed(attempt)
 
     def _recover_check(self, kind: AssetKind, digest: str) -> None:
-        if self._parts.store.exists(names.asset_check(kind, digest)):
+        if self._services.store.exists(names.asset_check(kind, digest)):
             try:
                 self._indexer.checked(kind, digest)
             except DamagedError as error:
                 log.warning("%s", error)
         else:
-            self._parts.index.live.set_asset_waiting([digest], queued=False)
+            self._services.index.live.set_asset_waiting([digest], queued=False)
 
     def _lose(self, lease: Lease, holder: Holder) -> None:
         message = holder.message
@@ -146,7 +146,7 @@ class LeaseReaper:
         except Exception:  # anybody who writes to Redis can forge a lease: it must not hold up the others
             log.exception("the lease of task %s is left out", lease.task_id)
         # Only now: if the store was away, the next round finds the lease again.
-        self._parts.queue.release(lease)
+        self._services.queue.release(lease)
 
     def _lose_task(self, worker: str, message: TaskMessage) -> None:
         if self._find(message.task_id, message.stage, message.output):
@@ -157,15 +157,15 @@ class LeaseReaper:
             stage=message.stage,
             number=message.attempt,
             kind="WorkerLost",
-            reason=f"worker {worker} was lost: no sign of life for {self._parts.settings.lease_s:g} s",
+            reason=f"worker {worker} was lost: no sign of life for {self._services.settings.lease_s:g} s",
             worker=worker,
             ended=timestamp(),
             last=message.attempt >= message.max_attempt,
         )
         key = names.attempt(message.task_id, message.attempt)
-        if not put_record(self._parts.store, key, attempt):
+        if not put_record(self._services.store, key, attempt):
             try:
-                attempt = read_record(AttemptRecord, self._parts.store, key)
+                attempt = read_record(AttemptRecord, self._services.store, key)
             except DamagedError as error:
                 self._fail(message.task_id, message.stage, error)
                 return
@@ -178,7 +178,7 @@ class LeaseReaper:
                 f"checking this {message.kind.value} ended its worker {message.attempt} times; delete it to try again"
             )
             found = {"verdict": "refuse", "message": reason, "repairs": [], "facts": {}}
-            put_document(self._parts.store, names.asset_check(message.kind, message.digest), found)
+            put_document(self._services.store, names.asset_check(message.kind, message.digest), found)
             self._indexer.checked(message.kind, message.digest)
         else:
-            self._parts.index.live.add_asset_attempt(message.digest, message.attempt, not_before=0.0)
+            self._services.index.live.add_asset_attempt(message.digest, message.attempt, not_before=0.0)

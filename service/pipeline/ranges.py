@@ -14,7 +14,7 @@ from service.model.records import MOST_BATCHES, JobRecord
 from service.model.states import Lane, Stage
 from service.model.version import SCHEMA_OF_RANGES
 from service.model.worker_beat import WorkerBeat
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.rates import Rates, tries
 
 #: Finished tasks that tell how long a batch takes.
@@ -28,9 +28,11 @@ _KNOWN_S: Final = 10.0
 class TaskRanges:
     """Chooses the ranges of jobs as they are planned."""
 
-    def __init__(self, parts: Parts, *, reach: Reach = EVERYTHING, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, services: Services, *, reach: Reach = EVERYTHING, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         """`reach`: whose measurements count."""
-        self._parts, self._reach, self._clock = parts, reach, clock
+        self._services, self._reach, self._clock = services, reach, clock
         self._read_again = -math.inf
         self._workers: list[WorkerBeat] = []
         self._costs: list[BatchCost] = []
@@ -45,13 +47,13 @@ class TaskRanges:
         Raises:
             QueueUnavailable, IndexUnavailable: a part is away.
         """
-        batches, wanted_s = batches_of(job.request.grasps), self._parts.settings.task_s
+        batches, wanted_s = batches_of(job.request.grasps), self._services.settings.task_s
         # Pictures of a batch are a file of megabytes already.
         if batches == 1 or job.request.views or not wanted_s:
             return job
         if self._clock() >= self._read_again:
-            self._workers = self._parts.queue.workers()
-            self._costs = self._parts.index.costs.of_batches(Stage.SYNTHESIZE, limit=_LOOKED_AT, reach=self._reach)
+            self._workers = self._services.queue.workers()
+            self._costs = self._services.index.costs.of_batches(Stage.SYNTHESIZE, limit=_LOOKED_AT, reach=self._reach)
             self._read_again = self._clock() + _KNOWN_S
         able = [worker for worker in self._workers if Stage.SYNTHESIZE in worker.stages]
         if any(worker.ability.schemas[1] < SCHEMA_OF_RANGES for worker in able):

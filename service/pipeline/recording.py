@@ -10,14 +10,14 @@ from pydantic import BaseModel
 from sqlalchemy import Connection
 
 from service.model.errors import StoreUnavailable
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.records import Put, put_record
 
 log = logging.getLogger(__name__)
 
 
 @contextmanager
-def recording(parts: Parts, made: Sequence[str] = ()) -> Iterator[tuple[Connection, Put]]:
+def recording(services: Services, made: Sequence[str] = ()) -> Iterator[tuple[Connection, Put]]:
     """A turn of the index's writers, and how records are put in it. They go again where the turn breaks off.
 
     Nobody else writes meanwhile: what was looked at before a record is put still holds when the rows are there.
@@ -31,19 +31,19 @@ def recording(parts: Parts, made: Sequence[str] = ()) -> Iterator[tuple[Connecti
     keys = list(made)
 
     def put(key: str, record: BaseModel) -> bool:
-        is_new = put_record(parts.store, key, record)
+        is_new = put_record(services.store, key, record)
         keys.extend([key] if is_new else [])
         return is_new
 
-    with parts.index.database.writing() as connection:
+    with services.index.database.writing() as connection:
         try:
             yield connection, put
-            parts.index.notes.count_change(within=connection)
+            services.index.notes.count_change(within=connection)
             connection.commit()
         except Exception:
             for key in keys:
                 try:
-                    parts.store.delete(key)
+                    services.store.delete(key)
                 except StoreUnavailable as error:
                     log.error("%s stays in the store though its request was refused: %s", key, error)
             raise

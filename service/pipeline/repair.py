@@ -15,7 +15,7 @@ from service.model.planning import PlannedTask, message_of, plan
 from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane, Stage
 from service.model.version import STAGE_REVISIONS
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, STAGES, is_on_its_way
 from service.store.library import builtin_assets, load_asset, publish_builtins
 from service.store.records import read_record, task_attempts
@@ -23,7 +23,7 @@ from service.store.records import read_record, task_attempts
 _OF_ASSET: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(.+)")
 
 
-def repair(parts: Parts, found: Sequence[Damage]) -> tuple[list[Damage], list[Damage]]:
+def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], list[Damage]]:
     """Move what is damaged aside, below `damaged/`, and queue what can be made again.
 
     A worker puts a shard that was made again only where it has the checksum that its manifest says.
@@ -37,7 +37,7 @@ def repair(parts: Parts, found: Sequence[Damage]) -> tuple[list[Damage], list[Da
     harmed = {one.shard for one in found if one.shard}
     repaired, left = [], []
     for one in found:
-        why = _mend(parts, one, harmed)
+        why = _mend(services, one, harmed)
         if why:
             left.append(Damage(one.key, f"{one.what}; {why}", one.shard))
         else:
@@ -45,84 +45,84 @@ def repair(parts: Parts, found: Sequence[Damage]) -> tuple[list[Damage], list[Da
     return repaired, left
 
 
-def _mend(parts: Parts, one: Damage, harmed: set[str]) -> str:
+def _mend(services: Services, one: Damage, harmed: set[str]) -> str:
     """Repair one thing; why it cannot be, or nothing."""
     if one.what == FOREIGN:
-        parts.store.set_aside(one.key)
+        services.store.set_aside(one.key)
         return ""
     if match := _OF_ASSET.fullmatch(one.key):
-        return _asset(parts, one.key, AssetKind(match[1]), match[2], match[3])
+        return _asset(services, one.key, AssetKind(match[1]), match[2], match[3])
     if not one.shard:
         return "put a copy in its place"
     stage = STAGES[one.key.split("/")[1]]
-    if is_on_its_way(parts.store, one):
+    if is_on_its_way(services.store, one):
         return "its manifest may be on its way; run it again in a minute"
-    planned = _planned(parts, stage, one.shard)
+    planned = _planned(services, stage, one.shard)
     if isinstance(planned, str):
         if one.what == NO_MANIFEST:
-            parts.store.set_aside(one.key)
+            services.store.set_aside(one.key)
             return ""
         return planned
     job, task = planned
     if harmed & set(task.inputs):
         return "its input is made again first; run it again when that is done"
     if one.what != MISSING:
-        _clear(parts, one, stage)
-    _queue(parts, job, task)
+        _clear(services, one, stage)
+    _queue(services, job, task)
     return ""
 
 
-def _asset(parts: Parts, key: str, kind: AssetKind, digest: str, file: str) -> str:
+def _asset(services: Services, key: str, kind: AssetKind, digest: str, file: str) -> str:
     """Make room for what follows from a hand or an object; a new check makes the rest, and the next task what it needs.
 
     What comes with graspd is put again from the program.
     """
     if (kind, digest) in {(one.kind, one.digest) for one in builtin_assets()}:
-        parts.store.set_aside(key)
-        publish_builtins(parts.store)
+        services.store.set_aside(key)
+        publish_builtins(services.store)
     elif file == "files.zip":
         return "upload the same files again, or put a copy in its place"
     elif file == "asset.json":
         return "put a copy in its place"
     else:
-        parts.store.set_aside(key)
-    if file in ("model.glb", "check.json") and not parts.store.exists(key):
-        parts.store.set_aside(names.asset_check(kind, digest))
+        services.store.set_aside(key)
+    if file in ("model.glb", "check.json") and not services.store.exists(key):
+        services.store.set_aside(names.asset_check(kind, digest))
         with contextlib.suppress(NotFoundError, DamagedError):
-            parts.index.write.add_asset(load_asset(parts.store, kind, digest), None)
-            parts.index.live.set_asset_waiting([digest], queued=False)
+            services.index.write.add_asset(load_asset(services.store, kind, digest), None)
+            services.index.live.set_asset_waiting([digest], queued=False)
     return ""
 
 
-def _queue(parts: Parts, job: JobRecord, task: PlannedTask) -> None:
-    number = len(task_attempts(parts.store, task.id)) + 1
+def _queue(services: Services, job: JobRecord, task: PlannedTask) -> None:
+    number = len(task_attempts(services.store, task.id)) + 1
     message = message_of(job, task, attempt=number, max_attempt=number)
-    parts.queue.enqueue([message], Lane.BULK, again=True)
+    services.queue.enqueue([message], Lane.BULK, again=True)
 
 
-def _clear(parts: Parts, one: Damage, stage: Stage) -> None:
+def _clear(services: Services, one: Damage, stage: Stage) -> None:
     """Make room for what is made again; a file that only lacks a manifest stays if the index knows its checksum."""
     file, manifest = names.shard_file(stage, one.shard), names.shard_manifest(stage, one.shard)
     if one.what == BAD_MANIFEST:
-        parts.store.set_aside(manifest)
-    if one.what not in (BAD_MANIFEST, NO_MANIFEST) or not _known_to_index(parts, one.shard, file):
-        parts.store.set_aside(file)
+        services.store.set_aside(manifest)
+    if one.what not in (BAD_MANIFEST, NO_MANIFEST) or not _known_to_index(services, one.shard, file):
+        services.store.set_aside(file)
 
 
-def _known_to_index(parts: Parts, shard: str, file: str) -> bool:
+def _known_to_index(services: Services, shard: str, file: str) -> bool:
     try:
-        return parts.index.shards.get(shard).sha256 == hashlib.sha256(parts.store.get(file)).hexdigest()
+        return services.index.shards.get(shard).sha256 == hashlib.sha256(services.store.get(file)).hexdigest()
     except NotFoundError:
         return False
 
 
-def _planned(parts: Parts, stage: Stage, shard: str) -> tuple[JobRecord, PlannedTask] | str:
+def _planned(services: Services, stage: Stage, shard: str) -> tuple[JobRecord, PlannedTask] | str:
     """The task that makes a shard; or why there is none."""
-    job = parts.index.shards.job_of(shard)
+    job = services.index.shards.job_of(shard)
     if job is None:
         return "no job makes it, so it cannot be made again; put a copy in its place"
     try:
-        record = read_record(JobRecord, parts.store, names.job_record(job))
+        record = read_record(JobRecord, services.store, names.job_record(job))
     except (NotFoundError, DamagedError) as error:
         return f"the job that makes it cannot be read: {error}"
     if (made := record.revisions.get(stage)) != STAGE_REVISIONS[stage]:

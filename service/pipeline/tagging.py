@@ -8,7 +8,7 @@ from service.model import names
 from service.model.clock import timestamp
 from service.model.errors import ConflictError, LimitError, NotFoundError
 from service.model.tags import MOST_TAGGED, Grasp, Tag, by_shard, tag_id
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.recording import recording
 from service.store.deletions import Deletion, removed_folder
 from service.store.records import put_record
@@ -18,7 +18,7 @@ from service.store.tags import drop_older, newest_version, put_version
 Permit = Callable[[Tag | None], None]
 
 
-def give(parts: Parts, name: str, grasps: Collection[Grasp], *, project: str, owner: str, permit: Permit) -> int:
+def give(services: Services, name: str, grasps: Collection[Grasp], *, project: str, owner: str, permit: Permit) -> int:
     """Give a tag to grasps; it is made if it is not there. How many did not have it before.
 
     Raises:
@@ -33,33 +33,33 @@ def give(parts: Parts, name: str, grasps: Collection[Grasp], *, project: str, ow
 
     now = timestamp()
     fresh = Tag(id=tag_id(name, project), name=name, number=1, created=now, changed=now, owner=owner, project=project)
-    before, after = _change(parts, fresh.id, added, permit, fresh=fresh)
+    before, after = _change(services, fresh.id, added, permit, fresh=fresh)
     return len(after.members) - len(before.members)
 
 
-def take_off(parts: Parts, tag: str, grasps: Collection[Grasp], *, permit: Permit) -> int:
+def take_off(services: Services, tag: str, grasps: Collection[Grasp], *, permit: Permit) -> int:
     """Take a tag, by its id, off grasps. How many had it."""
     before, after = _change(
-        parts, tag, lambda one: one.model_copy(update={"grasps": by_shard(one.members - set(grasps))}), permit
+        services, tag, lambda one: one.model_copy(update={"grasps": by_shard(one.members - set(grasps))}), permit
     )
     return len(before.members) - len(after.members)
 
 
-def remove(parts: Parts, tag: str, *, permit: Permit, owner: str = "") -> None:
+def remove(services: Services, tag: str, *, permit: Permit, owner: str = "") -> None:
     """Take a tag away, by its id; the grasps stay, and which they were is kept for the grace time."""
 
     def gone(one: Tag) -> Tag:
         said = {"name": one.name, "submitter": one.owner, "project": one.project}
         deletion = Deletion(what="tag", id=one.id, at=timestamp(), owner=owner, **said)
         folder = removed_folder(deletion)
-        put_record(parts.store, f"{folder}/{names.tag_version(one.id, one.number)}", one)
-        put_record(parts.store, f"{folder}/deletion.json", deletion)
+        put_record(services.store, f"{folder}/{names.tag_version(one.id, one.number)}", one)
+        put_record(services.store, f"{folder}/deletion.json", deletion)
         return one.model_copy(update={"grasps": {}, "gone": True})
 
-    _change(parts, tag, gone, permit)
+    _change(services, tag, gone, permit)
 
 
-def bring_back(parts: Parts, tag: Tag) -> None:
+def bring_back(services: Services, tag: Tag) -> None:
     """A tag that was taken away, with its grasps.
 
     Raises:
@@ -70,15 +70,15 @@ def bring_back(parts: Parts, tag: Tag) -> None:
         if known is not None:
             raise ConflictError(f"there is a tag {tag.name!r} again; delete that first")
 
-    _change(parts, tag.id, lambda one: one, permit, fresh=tag)
+    _change(services, tag.id, lambda one: one, permit, fresh=tag)
 
 
 def _change(
-    parts: Parts, tag: str, change: Callable[[Tag], Tag], permit: Permit, *, fresh: Tag | None = None
+    services: Services, tag: str, change: Callable[[Tag], Tag], permit: Permit, *, fresh: Tag | None = None
 ) -> tuple[Tag, Tag]:
     """The tag before and after. Who writes has the index's turn, so that of two changes at once each sees the other."""
-    with recording(parts) as (connection, put):
-        found = newest_version(parts.store, tag)
+    with recording(services) as (connection, put):
+        found = newest_version(services.store, tag)
         known = None if found is None or found.gone else found
         if known is None and fresh is None:
             raise NotFoundError(f"there is no tag {tag!r}")
@@ -89,9 +89,9 @@ def _change(
         is_changed = known is None or after.members != before.members or after.gone
         if is_changed:
             put_version(put, after)
-            parts.index.tags.put(after, within=connection)
+            services.index.tags.put(after, within=connection)
     if is_changed:
         # Not before the rows are there for good, and not while another one reads the last version.
-        with parts.index.database.writing():
-            drop_older(parts.store, after)
+        with services.index.database.writing():
+            drop_older(services.store, after)
     return before, after

@@ -11,12 +11,12 @@ from service.model.domain import JobOptions
 from service.model.errors import ConflictError, InputError
 from service.model.projects import EVERYTHING, Reach
 from service.model.states import AssetKind
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 
 Options = TypeVar("Options", bound=JobOptions)
 
 
-def usable(parts: Parts, kind: AssetKind, name: str, reach: Reach = EVERYTHING) -> AssetView:
+def usable(services: Services, kind: AssetKind, name: str, reach: Reach = EVERYTHING) -> AssetView:
     """A hand, object or network by name or digest that jobs may use.
 
     Raises:
@@ -24,7 +24,7 @@ def usable(parts: Parts, kind: AssetKind, name: str, reach: Reach = EVERYTHING) 
         InputError: it was refused when it was checked.
         ConflictError: its check is still running.
     """
-    asset = parts.index.assets.get(kind, name, reach=reach)
+    asset = services.index.assets.get(kind, name, reach=reach)
     if asset.verdict == "refuse":
         raise InputError(f"{kind.value} {name!r} was refused: {asset.message}")
     if asset.verdict is None:
@@ -33,7 +33,9 @@ def usable(parts: Parts, kind: AssetKind, name: str, reach: Reach = EVERYTHING) 
     return asset
 
 
-def with_neighbours(parts: Parts, options: Options, reach: Reach = EVERYTHING) -> tuple[Options, Sequence[AssetView]]:
+def with_neighbours(
+    services: Services, options: Options, reach: Reach = EVERYTHING
+) -> tuple[Options, Sequence[AssetView]]:
     """Options whose neighbours have the digests of the very files that the names stand for, and these neighbours.
 
     A digest that the request says itself, as one that was read from a job does, is kept.
@@ -41,7 +43,7 @@ def with_neighbours(parts: Parts, options: Options, reach: Reach = EVERYTHING) -
     Raises:
         what `usable` raises; InputError where a name and a digest are of two objects.
     """
-    beside = [usable(parts, AssetKind.OBJECT, one.digest or one.object, reach) for one in options.beside]
+    beside = [usable(services, AssetKind.OBJECT, one.digest or one.object, reach) for one in options.beside]
     for one, asset in zip(options.beside, beside, strict=True):
         if one.object not in (asset.name, asset.digest):
             raise InputError(f"the neighbour {one.object!r} has a digest that is of {asset.name!r}; leave it out")
@@ -53,7 +55,7 @@ def with_neighbours(parts: Parts, options: Options, reach: Reach = EVERYTHING) -
 
 
 def with_network(
-    parts: Parts, options: Options, hands: Sequence[AssetView | Member], reach: Reach = EVERYTHING
+    services: Services, options: Options, hands: Sequence[AssetView | Member], reach: Reach = EVERYTHING
 ) -> Options:
     """Options that say by its digest which network they set out from; as they are where their method takes none.
 
@@ -65,7 +67,7 @@ def with_network(
     """
     if not options.network:
         return options
-    network = usable(parts, AssetKind.NETWORK, options.network, reach)
+    network = usable(services, AssetKind.NETWORK, options.network, reach)
     own = str(network.facts.get("hand_digest", ""))
     if other := next((hand for hand in hands if hand.digest != own), None):
         raise InputError(

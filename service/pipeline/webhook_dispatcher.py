@@ -21,7 +21,7 @@ from service.index.outbox import Due
 from service.index.views import EndView
 from service.model.errors import UnavailableError
 from service.model.webhooks import SIGNATURE, secret_of, signature
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.http_client import Answer, Networks, networks, post
 
 log = logging.getLogger(__name__)
@@ -42,13 +42,13 @@ class WebhookDispatcher:
         send: sends a body to an address; as `http_client.post`.
     """
 
-    def __init__(self, parts: Parts, stop: threading.Event, *, send: Post = post) -> None:
-        self._parts = parts
+    def __init__(self, services: Services, stop: threading.Event, *, send: Post = post) -> None:
+        self._services = services
         self._stop = stop
         self._send = send
-        secret = parts.settings.webhook_secret
+        secret = services.settings.webhook_secret
         self._master = secret.get_secret_value() if secret else ""
-        self._allowed: Networks = networks(parts.settings.webhook_networks or "")
+        self._allowed: Networks = networks(services.settings.webhook_networks or "")
         self._forget_again = -math.inf
         self._lock = threading.Lock()
         self._under_way: dict[str, Due] = {}
@@ -83,7 +83,7 @@ class WebhookDispatcher:
 
     def start_deliveries(self, *, now: float | None = None) -> list[Future[None]]:
         """Make deliveries of what is new, and begin those that are due and have room."""
-        out = self._parts.index.outbox
+        out = self._services.index.outbox
         if time.monotonic() > self._forget_again:
             out.forget_old()
             self._forget_again = time.monotonic() + _FORGET_EVERY_S
@@ -113,12 +113,12 @@ class WebhookDispatcher:
 
     def tell_datasets(self) -> None:
         """Put datasets that ended into the feed."""
-        untold = dict(self._parts.index.outbox.untold_datasets())
-        for name in untold.keys() - self._parts.index.datasets.unfinished(untold):
-            dataset = self._parts.index.datasets.get(name)
+        untold = dict(self._services.index.outbox.untold_datasets())
+        for name in untold.keys() - self._services.index.datasets.unfinished(untold):
+            dataset = self._services.index.datasets.get(name)
             row = {"kind": "dataset", "subject": name, "state": dataset.state.value}
             row |= {"project": dataset.project, "owner": dataset.owner}
-            self._parts.index.outbox.tell_dataset(name, untold[name], row)
+            self._services.index.outbox.tell_dataset(name, untold[name], row)
 
     def _try(self, due: Due) -> None:
         is_settled = False
@@ -146,7 +146,7 @@ class WebhookDispatcher:
         }
         answer = self._send(due.hook.url, body, headers, allowed=self._allowed)
         self._last[due.hook.id] = (time.monotonic(), not answer.is_taken)
-        self._parts.index.outbox.settle(
+        self._services.index.outbox.settle(
             due, status=answer.status, detail=answer.detail, done=answer.is_taken, final=answer.is_final
         )
 

@@ -91,7 +91,7 @@ def controller(
 
 def _run_controller(settings: Settings, stop: threading.Event) -> None:
     """Lead, or stand by; from the start again where another led meanwhile."""
-    from service.pipeline.backends import Parts
+    from service.pipeline.backends import Services
     from service.pipeline.controller import Controller
     from service.pipeline.leading import Leadership
     from service.queue.rq_queue import open_queue
@@ -105,11 +105,11 @@ def _run_controller(settings: Settings, stop: threading.Event) -> None:
         while leadership.wait(stop):
             with leadership.held(stop) as over:
                 # What an earlier controller took in and did not finish comes again to a fresh one.
-                parts = Parts.open(settings)
+                services = Services.open(settings)
                 try:
-                    Controller(parts).run(over)
+                    Controller(services).run(over)
                 finally:
-                    parts.close()
+                    services.close()
     finally:
         queue.close()
 
@@ -120,21 +120,21 @@ def _identify(settings: Settings, stop: threading.Event, alive: HeartbeatFile) -
     Raises:
         BusyError: one of them is another service's.
     """
-    from service.pipeline.backends import Parts
+    from service.pipeline.backends import Services
     from service.pipeline.identity import identify
 
-    parts = Parts.open(settings, patience=0)
+    services = Services.open(settings, patience=0)
     try:
         while not stop.is_set():
             alive.touch()
             try:
-                identify(parts)
+                identify(services)
                 return
             except QueueUnavailable as error:
                 log.warning("%s", error)
             stop.wait(settings.lease_s / 3)
     finally:
-        parts.close()
+        services.close()
 
 
 @index_app.command(epilog="graspd admin index rebuild --check")
@@ -152,16 +152,16 @@ def rebuild(
     """
     from service.index.rebuild import differences
     from service.index.rebuild import rebuild as fill
-    from service.pipeline.backends import Parts
+    from service.pipeline.backends import Services
     from service.pipeline.identity import identify_if_redis_answers
     from service.pipeline.integrity import scan
     from service.store.packs import take_apart
 
-    parts = Parts.open(load_settings(data_dir=data_dir), patience=0, make=False, anew=not check)
-    store, index = parts.store, parts.index
+    services = Services.open(load_settings(data_dir=data_dir), patience=0, make=False, anew=not check)
+    store, index = services.store, services.index
 
     def make() -> dict[str, int]:
-        identify_if_redis_answers(parts, take_over=True)
+        identify_if_redis_answers(services, take_over=True)
         for _ in take_apart(store):
             pass
         return fill(index, store)
@@ -182,7 +182,7 @@ def rebuild(
         for line in found:
             typer.echo(line)
         typer.echo("the index is what the store says" if not found else f"{len(found)} differences", err=True)
-    parts.close()
+    services.close()
     if check and found:
         raise typer.Exit(1)
 

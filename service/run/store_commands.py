@@ -34,29 +34,29 @@ def verify(
 
     The controller's integrity scan pauses meanwhile; a second call is refused.
     """
-    from service.pipeline.backends import Parts
+    from service.pipeline.backends import Services
     from service.pipeline.identity import identify_if_redis_answers
     from service.pipeline.integrity import MISSING, scan
     from service.pipeline.integrity_scan import Turn
     from service.pipeline.repair import repair as mend
 
-    parts = Parts.open(load_settings(data_dir=data_dir), make=False)
+    services = Services.open(load_settings(data_dir=data_dir), make=False)
     if repair:
-        identify_if_redis_answers(parts)
-    turn = Turn(parts, is_controller=False)
+        identify_if_redis_answers(services)
+    turn = Turn(services, is_controller=False)
     try:
         if not turn.is_mine():
             raise ConflictError("another `graspd admin store verify` reads this store; wait until it is done")
         shards, found, unsealed = 0, [], list[str]()
-        for key, wrong in scan(parts.store, read=lambda size: turn.keep(), unsealed=unsealed.append):
+        for key, wrong in scan(services.store, read=lambda size: turn.keep(), unsealed=unsealed.append):
             turn.keep()
             shards += key.startswith(f"{names.SHARDS}/") and key.endswith(".json")
             found += [wrong] if wrong is not None else []
-        parts.index.damage.replace(found)
-        repaired, left = mend(parts, found) if repair else ([], found)
+        services.index.damage.replace(found)
+        repaired, left = mend(services, found) if repair else ([], found)
     finally:
         turn.end()
-        parts.close()
+        services.close()
     if json:
         damaged = [{"shard": one.shard or one.key, "what": one.what, "key": one.key} for one in found]
         emit(

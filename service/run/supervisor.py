@@ -19,7 +19,7 @@ import httpx
 from pydantic import SecretStr
 
 from service.model.errors import BusyError, GraspdError, InputError, UnavailableError
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.identity import identify_if_redis_answers, recorded
 from service.pipeline.leading import PART
 from service.queue.address import redis_url
@@ -212,14 +212,14 @@ class Supervisor:
         open_store(self.settings.resolved_store_url)
         before = recorded(folder)
         try:
-            parts = Parts.open(self.settings, patience=0)
+            services = Services.open(self.settings, patience=0)
         except UnavailableError as error:
             log.warning("%s", error)
             return
         try:
-            mine = identify_if_redis_answers(parts, folder=folder)
+            mine = identify_if_redis_answers(services, folder=folder)
         finally:
-            parts.close()
+            services.close()
         if self._wanted.redis_url is None and before not in (None, mine):
             set_log_aside(self.settings, "it belongs to the service that ran here before")
 

@@ -13,7 +13,7 @@ from starlette.testclient import TestClient
 
 from api.app import create_app
 from service.index.index import Index
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 from service.store.store import open_store
 from tests.api.factories import add_builtins
@@ -32,7 +32,7 @@ def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data folder with the built-in hands and objects in store and index; each test gets a copy."""
     folder = tmp_path_factory.mktemp("furnished") / "data"
     made = Settings(data_dir=folder)
-    opened = Parts(made, open_store(made.resolved_store_url), empty_index(made.resolved_index_url), MemoryQueue())
+    opened = Services(made, open_store(made.resolved_store_url), empty_index(made.resolved_index_url), MemoryQueue())
     add_builtins(opened)
     opened.close()
     return folder
@@ -58,16 +58,18 @@ def settings(tmp_path: Path) -> Settings:
 
 
 @pytest.fixture
-def parts(settings: Settings, furnished: Path) -> Iterator[Parts]:
+def services(settings: Settings, furnished: Path) -> Iterator[Services]:
     shutil.copytree(furnished, settings.data_dir, dirs_exist_ok=True)
-    opened = Parts(settings, open_store(settings.resolved_store_url), Index(settings.resolved_index_url), MemoryQueue())
+    opened = Services(
+        settings, open_store(settings.resolved_store_url), Index(settings.resolved_index_url), MemoryQueue()
+    )
     yield opened
     opened.close()
 
 
 @pytest.fixture
-def app(settings: Settings, parts: Parts) -> FastAPI:
-    return create_app(settings, parts)
+def app(settings: Settings, services: Services) -> FastAPI:
+    return create_app(settings, services)
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from service.model.robust import Axis
 from service.model.states import AssetKind, Lane, Stage
 from service.model.transforms import pose_to_matrix
 from service.model.worker_beat import WorkerBeat
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.attributes import Attribute
 from service.store.library import publish_builtins
 from service.store.manifests import ShardManifest, manifest_of, publish_shard
@@ -28,17 +28,17 @@ JOINTS = 16
 Arrays = dict[str, NDArray[np.generic]]
 
 
-def add_builtins(parts: Parts) -> None:
+def add_builtins(services: Services) -> None:
     """The built-in hands and objects, as `graspd up` publishes them."""
-    for asset in publish_builtins(parts.store):
-        parts.index.write.add_asset(asset, {"verdict": "accept", "message": "", "repairs": [], "facts": {}})
+    for asset in publish_builtins(services.store):
+        services.index.write.add_asset(asset, {"verdict": "accept", "message": "", "repairs": [], "facts": {}})
 
 
-def add_job(parts: Parts, **fields: object) -> JobRecord:
+def add_job(services: Services, **fields: object) -> JobRecord:
     """A job that waits."""
     request = JobRequest.model_validate({"hand": "allegro", "object": "mug", "grasps": 32} | fields)
-    hand = parts.index.assets.get(AssetKind.HAND, request.hand).digest
-    object_ = parts.index.assets.get(AssetKind.OBJECT, request.object).digest
+    hand = services.index.assets.get(AssetKind.HAND, request.hand).digest
+    object_ = services.index.assets.get(AssetKind.OBJECT, request.object).digest
     record = JobRecord(
         id=job_id(request, hand, object_),
         request=request,
@@ -47,12 +47,12 @@ def add_job(parts: Parts, **fields: object) -> JobRecord:
         lane=Lane.INTERACTIVE,
         created=timestamp(),
     )
-    put_record(parts.store, names.job_record(record.id), record)
-    parts.index.write.add_job(record)
+    put_record(services.store, names.job_record(record.id), record)
+    services.index.write.add_job(record)
     return record
 
 
-def finish(parts: Parts, record: JobRecord, task: PlannedTask) -> ShardManifest:
+def finish(services: Services, record: JobRecord, task: PlannedTask) -> ShardManifest:
     """A task's shard, with columns of the right shapes and random values, as a worker publishes it."""
     random = np.random.default_rng(task.batch)
     arrays = _ARRAYS[task.stage](random, task.count, record.request)
@@ -63,11 +63,11 @@ def finish(parts: Parts, record: JobRecord, task: PlannedTask) -> ShardManifest:
         attributes["base_shard" if reads_base else "scene_shard"] = task.inputs[0]
     if task.stage is Stage.SYNTHESIZE:
         attributes["joint_names"] = [f"joint_{i}" for i in range(JOINTS)]
-    return publish(parts, record, task, arrays, attributes)
+    return publish(services, record, task, arrays, attributes)
 
 
 def publish(
-    parts: Parts, record: JobRecord, task: PlannedTask, arrays: Arrays, attributes: dict[str, Attribute]
+    services: Services, record: JobRecord, task: PlannedTask, arrays: Arrays, attributes: dict[str, Attribute]
 ) -> ShardManifest:
     """A task's shard of these columns, in the store and in the index."""
     kind = names.SHARD_KINDS[task.stage]
@@ -76,27 +76,27 @@ def publish(
     manifest = manifest_of(
         message, data, arrays, attributes, check_columns(kind, arrays), device="cpu", seconds=12.5, worker="worker-1"
     )
-    publish_shard(parts.store, manifest, data)
-    parts.index.write.add_manifest(manifest)
+    publish_shard(services.store, manifest, data)
+    services.index.write.add_manifest(manifest)
     return manifest
 
 
-def finish_with(parts: Parts, file: Path, **fields: object) -> ShardManifest:
+def finish_with(services: Services, file: Path, **fields: object) -> ShardManifest:
     """A job whose grasps are those of a base shard that `graspd synth` wrote of a built-in hand and object."""
     shard = read_shard(file, kind="base")
     said = {name: str(shard.attributes[name]) for name in ("hand", "object")}
-    record = add_job(parts, **said, grasps=len(shard["quality/valid"]), **fields)
+    record = add_job(services, **said, grasps=len(shard["quality/valid"]), **fields)
     task = next(task for task in plan(record) if task.stage is Stage.SYNTHESIZE)
     attributes = shard.attributes | {"shard_id": task.output, "batch": task.batch}
-    return publish(parts, record, task, shard.arrays, attributes)
+    return publish(services, record, task, shard.arrays, attributes)
 
 
-def finish_all(parts: Parts, record: JobRecord) -> list[ShardManifest]:
+def finish_all(services: Services, record: JobRecord) -> list[ShardManifest]:
     """Every task of a job, done."""
-    return [finish(parts, record, task) for task in plan(record)]
+    return [finish(services, record, task) for task in plan(record)]
 
 
-def fail(parts: Parts, record: JobRecord, reason: str) -> None:
+def fail(services: Services, record: JobRecord, reason: str) -> None:
     """The first task of a job, failed for the last time."""
     task = next(plan(record))
     now = timestamp()
@@ -113,11 +113,11 @@ def fail(parts: Parts, record: JobRecord, reason: str) -> None:
         ended=now,
         last=True,
     )
-    put_record(parts.store, names.attempt(task.id, 1), attempt)
-    parts.index.write.add_attempt(attempt)
+    put_record(services.store, names.attempt(task.id, 1), attempt)
+    services.index.write.add_attempt(attempt)
 
 
-def add_worker(parts: Parts, name: str = "worker-1", state: str = "idle") -> None:
+def add_worker(services: Services, name: str = "worker-1", state: str = "idle") -> None:
     """A worker that lives."""
     now = timestamp()
     beat = WorkerBeat(
@@ -133,7 +133,7 @@ def add_worker(parts: Parts, name: str = "worker-1", state: str = "idle") -> Non
         started=now,
         seen=now,
     )
-    parts.index.live.set_workers([beat], forget_before="2000-01-01T00:00:00Z")
+    services.index.live.set_workers([beat], forget_before="2000-01-01T00:00:00Z")
 
 
 def poses(random: np.random.Generator, count: int) -> NDArray[np.float64]:

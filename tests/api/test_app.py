@@ -9,15 +9,15 @@ from pydantic import TypeAdapter
 from starlette.testclient import TestClient
 
 from api.app import create_app
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 
 
 @pytest.mark.parametrize("path", ["/v1/jobs", "/v1/datasets", "/", "/healthz"])
 def test_the_first_request_builds_no_route(
-    settings: Settings, parts: Parts, path: str, monkeypatch: pytest.MonkeyPatch
+    settings: Settings, services: Services, path: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    app = create_app(settings, parts)
+    app = create_app(settings, services)
 
     def built_late(self: TypeAdapter[Any], *arguments: Any, **named: Any) -> None:
         raise AssertionError("a field of a route is built while a request waits")

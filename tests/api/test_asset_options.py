@@ -12,7 +12,7 @@ from starlette.testclient import TestClient
 from api.uploads import files_of_upload
 from service.model.messages import IngestMessage
 from service.model.states import AssetKind
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.asset_options import hand_options, object_options
 from service.store.assets import builtin_files
 from service.store.library import load_asset, load_asset_files, load_check
@@ -20,14 +20,16 @@ from worker.stages import ingest
 from worker.stages.context import TaskContext
 
 
-def check(http: TestClient, parts: Parts, kind: AssetKind, file: tuple[str, bytes], options: dict[str, Any]) -> Any:
+def check(
+    http: TestClient, services: Services, kind: AssetKind, file: tuple[str, bytes], options: dict[str, Any]
+) -> Any:
     """Upload over HTTP and let the worker's stage check what the store then holds."""
     answer = http.post(f"/v1/{kind.value}s", files={"file": file}, data={"options": json.dumps(options)})
     assert answer.status_code == 202, answer.text
     digest = answer.json()["digest"]
     message = IngestMessage(schema_=1, task_id="i", kind=kind, name=answer.json()["name"], digest=digest)
-    ingest.run(message, TaskContext(parts.store))
-    return load_check(parts.store, kind, digest)
+    ingest.run(message, TaskContext(services.store))
+    return load_check(services.store, kind, digest)
 
 
 def stl(*meshes: trimesh.Trimesh) -> bytes:
@@ -59,9 +61,9 @@ TWO = stl(BALL, trimesh.creation.box((0.01, 0.01, 0.01)).apply_translation((0.1,
     ids=["units", "scale", "largest", "open", "none"],
 )
 def test_an_option_of_an_object_decides_its_check(
-    http: TestClient, parts: Parts, data: bytes, options: dict[str, Any], verdict: str, volume: float | None
+    http: TestClient, services: Services, data: bytes, options: dict[str, Any], verdict: str, volume: float | None
 ) -> None:
-    found = check(http, parts, AssetKind.OBJECT, ("thing.stl", data), object_options(**options))
+    found = check(http, services, AssetKind.OBJECT, ("thing.stl", data), object_options(**options))
     assert found["verdict"] == verdict, found["message"]
     facts = found["facts"]
     if volume is not None:
@@ -73,7 +75,7 @@ def test_an_option_of_an_object_decides_its_check(
         assert facts["mass_kg"] == options["mass"]
 
 
-def test_the_options_of_a_hand_decide_its_check(http: TestClient, parts: Parts) -> None:
+def test_the_options_of_a_hand_decide_its_check(http: TestClient, services: Services) -> None:
     urdf = builtin_files(AssetKind.HAND, "allegro")["allegro.urdf"]
     options = hand_options(
         palm="palm",
@@ -82,7 +84,7 @@ def test_the_options_of_a_hand_decide_its_check(http: TestClient, parts: Parts) 
         fix=["thumb_rotation=1.0"],
         drop=["ring_proximal_link"],
     )
-    facts = check(http, parts, AssetKind.HAND, ("mine.urdf", urdf), options)["facts"]
+    facts = check(http, services, AssetKind.HAND, ("mine.urdf", urdf), options)["facts"]
     assert facts["palm_approach"] == [0.0, 0.0, 1.0]
     assert facts["preshape"]["index_proximal"] == 0.5 and facts["preshape"]["middle_proximal"] == 0.6
     assert "thumb_rotation" not in facts["dofs"]
@@ -102,17 +104,17 @@ def test_options_that_are_no_json_object_are_refused(http: TestClient, options: 
     assert answer.status_code == 422 and "JSON object" in answer.json()["detail"]
 
 
-def test_what_was_refused_gets_in_under_its_name_with_the_mend(http: TestClient, parts: Parts) -> None:
+def test_what_was_refused_gets_in_under_its_name_with_the_mend(http: TestClient, services: Services) -> None:
     file = ("open_shell.stl", shell())
     first = http.post("/v1/objects", files={"file": file}).json()
-    asset = load_asset(parts.store, AssetKind.OBJECT, first["digest"])
-    parts.index.write.add_asset(asset, check(http, parts, AssetKind.OBJECT, file, {}))
+    asset = load_asset(services.store, AssetKind.OBJECT, first["digest"])
+    services.index.write.add_asset(asset, check(http, services, AssetKind.OBJECT, file, {}))
     second = http.post("/v1/objects", files={"file": file}, data={"options": '{"allow_open": true}'})
     assert second.status_code == 202, second.text
     assert http.get("/v1/objects/open_shell").json()["digest"] == second.json()["digest"] != first["digest"]
 
 
-def test_the_other_keys_stay_as_uploaded(http: TestClient, parts: Parts) -> None:
+def test_the_other_keys_stay_as_uploaded(http: TestClient, services: Services) -> None:
     answer = http.post("/v1/objects", files={"file": ("b.stl", b"solid b\nendsolid b")}).json()
-    files = load_asset_files(parts.store, AssetKind.OBJECT, answer["digest"])
+    files = load_asset_files(services.store, AssetKind.OBJECT, answer["digest"])
     assert json.loads(files["asset.json"]) == {"file": "b.stl"}

@@ -18,7 +18,7 @@ from api.access.keys import KeyFile, Scope
 from api.app import create_app
 from api.catalog import events
 from api.server import TimedProtocol, bind, configuration
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 from tests.api.factories import add_job
 from tests.waiting import PATIENCE_S, until
@@ -152,13 +152,13 @@ def test_head_of_a_stream_that_never_ends_does(app: FastAPI, connect: Connect) -
 @pytest.mark.parametrize("end", ["revoked", "a first key"])
 @pytest.mark.parametrize("what", ["job", "service"])
 def test_a_stream_of_events_ends_with_its_key(
-    app: FastAPI, parts: Parts, settings: Settings, what: str, end: str
+    app: FastAPI, services: Services, settings: Settings, what: str, end: str
 ) -> None:
     keys: KeyFile = app.state.keys
     headers = []
     if end == "revoked":
         headers = [(b"authorization", f"Bearer {keys.add('me', Scope.READ)}".encode())]
-    job = add_job(parts).id
+    job = add_job(services).id
 
     async def nothing() -> dict[str, Any]:
         await asyncio.sleep(2 * PATIENCE_S)
@@ -183,11 +183,11 @@ def test_a_stream_of_events_ends_with_its_key(
 
 
 @pytest.fixture
-def closed(settings: Settings, parts: Parts) -> tuple[FastAPI, dict[Scope, str]]:
+def closed(settings: Settings, services: Services) -> tuple[FastAPI, dict[Scope, str]]:
     """The application of a service that has keys, and a key of each scope."""
     keys = KeyFile(settings.resolved_keys_file)
     made = {scope: keys.add(scope.value, scope) for scope in Scope}
-    return create_app(settings, parts), made
+    return create_app(settings, services), made
 
 
 def upload(length: int, *more: bytes, path: bytes = b"/v1/objects") -> bytes:

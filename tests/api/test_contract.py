@@ -29,7 +29,7 @@ from schemathesis.specs.openapi.checks import (
 )
 
 from api.app import create_app
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.queue.connection import connect
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings
@@ -64,17 +64,19 @@ def document(tmp_path_factory: pytest.TempPathFactory, redis_server: str) -> Ite
     )
     queue = RqQueue(connect(redis_server))
     queue.connection.flushdb()
-    parts = Parts(settings, open_store(settings.resolved_store_url), empty_index(settings.resolved_index_url), queue)
-    add_builtins(parts)
-    done = add_job(parts, scenes=1, views=1)
-    finish_all(parts, done)
-    fail(parts, add_job(parts, seed=1), "it broke")
-    waiting = add_job(parts, seed=2)
-    add_worker(parts)
-    parts.index.notes.set_complete()
-    shard = parts.index.shards.page(job=done.id).items[0].id
+    services = Services(
+        settings, open_store(settings.resolved_store_url), empty_index(settings.resolved_index_url), queue
+    )
+    add_builtins(services)
+    done = add_job(services, scenes=1, views=1)
+    finish_all(services, done)
+    fail(services, add_job(services, seed=1), "it broke")
+    waiting = add_job(services, seed=2)
+    add_worker(services)
+    services.index.notes.set_complete()
+    shard = services.index.shards.page(job=done.id).items[0].id
     known = {"job_id": [done.id, waiting.id], "shard_id": [shard], "name": ["allegro", "mug"]}
-    schema = schemathesis.openapi.from_asgi("/openapi.json", _addressed(create_app(settings, parts)))
+    schema = schemathesis.openapi.from_asgi("/openapi.json", _addressed(create_app(settings, services)))
 
     @schema.hook
     def map_path_parameters(context: Any, path_parameters: dict[str, Any]) -> dict[str, Any]:
@@ -95,7 +97,7 @@ def document(tmp_path_factory: pytest.TempPathFactory, redis_server: str) -> Ite
         return query
 
     yield schema
-    parts.close()
+    services.close()
 
 
 def _cursor(key: Any) -> str:

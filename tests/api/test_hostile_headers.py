@@ -15,7 +15,7 @@ import pytest
 
 from api.access.keys import KeyFile, Scope
 from api.app import create_app
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 from tests.api.factories import add_job, finish_all
 
@@ -150,15 +150,15 @@ _METHODS = ("GET", "GET", "GET", "POST", "HEAD", "DELETE", "PUT", "OPTIONS", "PA
 
 
 @pytest.fixture
-def applications(settings: Settings, parts: Parts) -> Iterator[tuple[list[Any], str, list[str]]]:
-    """An open service and one with keys over the same parts; a live key; and the paths, with a job and its shard."""
-    record = add_job(parts)
-    finish_all(parts, record)
-    shard = parts.index.shards.page(job=record.id).items[0].id
+def applications(settings: Settings, services: Services) -> Iterator[tuple[list[Any], str, list[str]]]:
+    """An open service and one with keys over the same services; a live key; and the paths, with a job and its shard."""
+    record = add_job(services)
+    finish_all(services, record)
+    shard = services.index.shards.page(job=record.id).items[0].id
     paths = [path.format(job=record.id, shard=shard) for path in _PATHS]
     closed = settings.model_copy(update={"keys_file": settings.data_dir / "other-keys.json"})
     key = KeyFile(closed.resolved_keys_file).add("k", Scope.ADMIN)
-    yield [create_app(settings, parts), create_app(closed, parts)], key, paths
+    yield [create_app(settings, services), create_app(closed, services)], key, paths
 
 
 async def ask(app: Any, method: str, path: str, headers: list[tuple[bytes, bytes]], body: bytes) -> int:

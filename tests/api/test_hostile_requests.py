@@ -19,7 +19,7 @@ from pydantic import SecretStr
 from api.access.keys import KeyFile, Scope
 from api.app import create_app
 from api.server import bind, configuration
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from tests.api.factories import add_job, finish_all
@@ -223,18 +223,18 @@ Ask = Callable[[bytes], int]
 
 
 @pytest.fixture
-def ask(settings: Settings, parts: Parts, redis_server: str, rq_queue: RqQueue) -> Iterator[Ask]:
+def ask(settings: Settings, services: Services, redis_server: str, rq_queue: RqQueue) -> Iterator[Ask]:
     """Sends bytes to an open service or to one with keys, and gives the status of the answer; 0: there is none."""
-    record = add_job(parts)
-    finish_all(parts, record)
-    shard = parts.index.shards.page(job=record.id).items[0].id
+    record = add_job(services)
+    finish_all(services, record)
+    shard = services.index.shards.page(job=record.id).items[0].id
     limits = dict.fromkeys(("requests_per_minute", "address_requests_per_minute", "concurrency"), 0)
     base = settings.model_copy(update={"redis_url": SecretStr(redis_server), **limits})
     closed = base.model_copy(update={"keys_file": settings.data_dir / "other-keys.json"})
     key = KeyFile(closed.resolved_keys_file).add("k", Scope.ADMIN).encode()
     running = []
     for one in (base, closed):
-        app = create_app(one, Parts(one, parts.store, parts.index, parts.queue))
+        app = create_app(one, Services(one, services.store, services.index, services.queue))
         server, listener = uvicorn.Server(configuration(app, one)), bind("127.0.0.1", 0)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()

@@ -21,7 +21,7 @@ from api.middleware.body_limit import MAX_BODY_BYTES
 from service.index.queries import cursors
 from service.model.errors import QuotaError
 from service.model.states import AssetKind
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 from service.store.library import load_asset, load_check
 from tests.api.factories import add_job, finish_all
@@ -70,12 +70,12 @@ def test_a_row_that_no_shard_has_is_no_500(http: TestClient, row: str) -> None:
     assert http.get(f"/v1/grasps/{'0' * 32}/{row}").status_code in (404, 422)
 
 
-def test_a_range_of_4400_digits_is_no_range(http: TestClient, parts: Parts) -> None:
-    shard = finish_all(parts, add_job(parts))[0].shard_id
+def test_a_range_of_4400_digits_is_no_range(http: TestClient, services: Services) -> None:
+    shard = finish_all(services, add_job(services))[0].shard_id
     path = f"/v1/shards/{shard}/file"
     for nasty in (f"bytes=-{'9' * 4400}", f"bytes={'9' * 4400}-", f"bytes=0-{'9' * 4400}"):
         answer = http.get(path, headers={"Range": nasty})
-        assert (answer.status_code, len(answer.content)) == (200, parts.store.size(f"shards/base/{shard}.h5"))
+        assert (answer.status_code, len(answer.content)) == (200, services.store.size(f"shards/base/{shard}.h5"))
 
 
 def test_a_length_of_4400_digits_is_too_large(http: TestClient) -> None:
@@ -156,14 +156,14 @@ def test_facts_of_an_upload_cannot_make_the_list_long(http: TestClient) -> None:
     assert len(http.get("/v1/objects").content) < 100_000
 
 
-def test_long_findings_of_a_check_do_not_make_the_list_long(http: TestClient, parts: Parts) -> None:
+def test_long_findings_of_a_check_do_not_make_the_list_long(http: TestClient, services: Services) -> None:
     http.post("/v1/objects", files={"file": ("box.stl", STL)})
     digest = http.get("/v1/objects/box").json()["digest"]
     found = {"verdict": "repair", "message": "m" * 10**6, "repairs": ["r" * 10**5] * 100}
     found["facts"] = {"faces": 7, "names": ["n" * 1000] * 1000}
-    parts.store.put(f"assets/object/{digest}/check.json", json.dumps(found).encode())
+    services.store.put(f"assets/object/{digest}/check.json", json.dumps(found).encode())
     kind = AssetKind.OBJECT
-    parts.index.write.add_asset(load_asset(parts.store, kind, digest), load_check(parts.store, kind, digest))
+    services.index.write.add_asset(load_asset(services.store, kind, digest), load_check(services.store, kind, digest))
     answer = http.get("/v1/objects/box")
     assert len(answer.content) < 300_000
     assert answer.json()["facts"] == {"faces": 7}

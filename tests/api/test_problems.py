@@ -10,7 +10,7 @@ from fastapi import FastAPI
 from starlette.testclient import TestClient
 
 from service.model.errors import IndexUnavailable, QueueUnavailable, StoreUnavailable
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
 
@@ -100,12 +100,18 @@ def test_a_body_that_grows_over_the_limit_is_refused_while_it_arrives(http: Test
     ],
 )
 def test_a_part_that_is_away_is_503_and_worth_another_try(
-    http: TestClient, parts: Parts, monkeypatch: pytest.MonkeyPatch, part: str, method: str, error: Exception, slug: str
+    http: TestClient,
+    services: Services,
+    monkeypatch: pytest.MonkeyPatch,
+    part: str,
+    method: str,
+    error: Exception,
+    slug: str,
 ) -> None:
     def away(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(type(attrgetter(part)(parts)), method, away)
+    monkeypatch.setattr(type(attrgetter(part)(services)), method, away)
     answer = http.post("/v1/jobs", json=JOB)
     assert problem(answer, 503, slug)["detail"] == str(error)
     assert int(answer.headers["retry-after"]) > 0

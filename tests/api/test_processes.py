@@ -15,7 +15,7 @@ import httpx
 import pytest
 
 from api.access.keys import KeyFile, KeyLimits, Scope
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.queue.address import redis_url
 from service.queue.connection import connect
 from service.queue.rq_queue import RqQueue
@@ -45,9 +45,9 @@ class Twins:
         wait_for_redis(queue)
         queue.close()
         assert redis.poll() is None
-        parts = Parts.open(self.settings)
-        add_builtins(parts)
-        parts.close()
+        services = Services.open(self.settings)
+        add_builtins(services)
+        services.close()
         command = [sys.executable, "-m", "graspd", "api", "--port", "0"]
         processes = [self._run(command, stderr=subprocess.PIPE) for _ in range(2)]
         self.urls = [_address(process) for process in processes]
@@ -146,8 +146,8 @@ def followed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, d
     wanted = Settings(data_dir=tmp_path_factory.mktemp("followed"), port=0, controller_interval_s=0.2)
     with Supervisor(wanted, worker_command=(sys.executable, "-m", "tests.fakes")) as supervisor:
         supervisor.wait_ready(PATIENCE_S)
-        parts = Parts.open(supervisor.settings)
-        add_assets(parts)
+        services = Services.open(supervisor.settings)
+        add_assets(services)
         with httpx.Client(base_url=supervisor.api_url, trust_env=False, timeout=60) as http:
             body = {"hand": "gripper", "object": "ball", "grasps": 64, "scenes": 1}
             job = http.post("/v1/jobs", json=body, headers={"X-Request-Id": "follow-me"}).json()
@@ -155,7 +155,7 @@ def followed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, d
             told = 'graspd_jobs_ended_total{state="succeeded"}'
             until(lambda: told in http.get("/metrics").text, "the controller passes its sums on every two seconds")
             yield supervisor.settings.data_dir / "logs", job, lambda: http.get("/metrics").text
-        parts.close()
+        services.close()
 
 
 def lines_of(logs: Path, process: str, **about: str) -> list[dict[str, Any]]:

@@ -15,7 +15,7 @@ from service.model import names
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
 from service.model.states import Stage
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.records import read_record
 from tests.fakes import fake_stages
 from worker.process.runner import Runner
@@ -33,15 +33,15 @@ def spans() -> Iterator[InMemorySpanExporter]:
 
 
 def test_a_task_is_in_the_trace_of_the_request_that_submitted_it(
-    spans: InMemorySpanExporter, http: TestClient, parts: Parts
+    spans: InMemorySpanExporter, http: TestClient, services: Services
 ) -> None:
     body = {"hand": "allegro", "object": "mug", "grasps": 32}
     made = http.post("/v1/jobs", json=body, headers={"traceparent": _PARENT}).json()
-    record = read_record(JobRecord, parts.store, names.job_record(made["id"]))
+    record = read_record(JobRecord, services.store, names.job_record(made["id"]))
     task = next(task for task in plan(record) if task.stage is Stage.SYNTHESIZE)
     message = message_of(record, task, attempt=1, max_attempt=3)
     runner = Runner(fake_stages(), worker="w", publish=lambda event: None)
-    runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(parts.store))
+    runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(services.store))
     found = {span.name: span for span in spans.get_finished_spans()}
     request, work = found["HTTP POST"], found["task synthesize"]
     assert f"{request.context.trace_id:032x}" == "a" * 32

@@ -14,7 +14,7 @@ from api.uploads import files_of_upload
 from service.model.digests import digest_files
 from service.model.errors import InputError
 from service.model.states import AssetKind
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.assets import pack
 from service.store.library import load_asset_files, publish_asset
 
@@ -31,17 +31,17 @@ def folder_of(count: int, size: int) -> bytes:
     return buffer.getvalue()
 
 
-def test_a_zip_is_kept_without_ever_being_whole_in_memory(parts: Parts, tmp_path: Path) -> None:
+def test_a_zip_is_kept_without_ever_being_whole_in_memory(services: Services, tmp_path: Path) -> None:
     with (tmp_path / "upload.zip").open("w+b") as file:
         file.write(folder_of(3, 8 * MIB))
         tracemalloc.start()
         files = files_of_upload(AssetKind.OBJECT, "thing.zip", file, limit_bytes=32 * MIB)
-        asset = publish_asset(parts.store, AssetKind.OBJECT, "thing", files)
+        asset = publish_asset(services.store, AssetKind.OBJECT, "thing", files)
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
     # Two pieces of 1 MiB on their way into the store, of 24 MiB.
     assert peak < 3 * MIB
-    assert len(load_asset_files(parts.store, AssetKind.OBJECT, asset.digest)) == 5
+    assert len(load_asset_files(services.store, AssetKind.OBJECT, asset.digest)) == 5
 
 
 def test_a_zip_on_disk_and_its_files_in_memory_are_the_same_asset() -> None:

@@ -17,10 +17,10 @@ from fastapi import FastAPI
 from api.server import bind
 from service.run.supervisor import Supervisor
 from service.settings import Settings
-from tests.api.conftest import app, furnished, parts, settings
+from tests.api.conftest import app, furnished, services, settings
 from tests.waiting import PATIENCE_S, until_a_worker_is_idle
 
-__all__ = ["app", "furnished", "parts", "settings"]
+__all__ = ["app", "furnished", "services", "settings"]
 
 #: SwiftShader draws WebGL without a GPU; the rest keeps the browser from calling home.
 ARGUMENTS = (

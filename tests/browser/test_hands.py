@@ -10,7 +10,7 @@ import pytest
 
 from service.model.messages import IngestMessage
 from service.model.states import AssetKind
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store import library
 from tests.browser.test_flows import colours
 from tests.worker.hands.urdfs import joint, link, robot
@@ -42,13 +42,13 @@ CLAW = robot(
 )
 
 
-def checked(parts: Parts, name: str) -> None:
+def checked(services: Services, name: str) -> None:
     """What a worker and the controller make of an upload."""
-    asset = parts.index.assets.get(AssetKind.HAND, name)
+    asset = services.index.assets.get(AssetKind.HAND, name)
     message = IngestMessage(schema_=1, task_id="i", kind=AssetKind.HAND, name=asset.name, digest=asset.digest)
-    ingest.run(message, TaskContext(parts.store))
-    found = library.load_check(parts.store, AssetKind.HAND, asset.digest)
-    parts.index.write.add_asset(library.load_asset(parts.store, AssetKind.HAND, asset.digest), found)
+    ingest.run(message, TaskContext(services.store))
+    found = library.load_check(services.store, AssetKind.HAND, asset.digest)
+    services.index.write.add_asset(library.load_asset(services.store, AssetKind.HAND, asset.digest), found)
 
 
 def drawn(page: Any) -> bytes:
@@ -57,7 +57,7 @@ def drawn(page: Any) -> bytes:
 
 
 def test_a_wrong_guess_is_seen_corrected_and_kept_as_a_hand_that_jobs_can_use(
-    page: Any, parts: Parts, address: str
+    page: Any, services: Services, address: str
 ) -> None:
     file = ("claw.urdf", CLAW)
     httpx.post(f"{address}/v1/hands", files={"file": file}, trust_env=False, timeout=60).raise_for_status()
@@ -66,7 +66,7 @@ def test_a_wrong_guess_is_seen_corrected_and_kept_as_a_hand_that_jobs_can_use(
     page.goto("/hands")
     page.click("text=claw")
     assert page.inner_text("#shown") == "A worker looks at it: what it finds is shown here."
-    checked(parts, "claw")
+    checked(services, "claw")
     page.wait_for_selector(".viewer[data-state=ready]")
     assert colours(page.locator(".viewer canvas")) > 50
     assert page.is_checked("[name='closing.0'][value='-1']"), "towards the other fingers, whatever its limits"
@@ -103,11 +103,11 @@ def test_a_wrong_guess_is_seen_corrected_and_kept_as_a_hand_that_jobs_can_use(
     page.click("text=Save as a hand of its own")
     page.wait_for_url(lambda url: "/hands/" in url and not url.endswith("claw"))
     assert page.inner_text("h1") == "claw-right"
-    checked(parts, "claw-right")
+    checked(services, "claw-right")
     page.wait_for_selector(".viewer[data-state=ready]")
 
-    asset = parts.index.assets.get(AssetKind.HAND, "claw-right")
-    files = library.load_asset_files(parts.store, AssetKind.HAND, asset.digest)
+    asset = services.index.assets.get(AssetKind.HAND, "claw-right")
+    files = library.load_asset_files(services.store, AssetKind.HAND, asset.digest)
     hand = load_hand(files, name="claw-right", digest="")
     assert hand.closing.tolist() == [1, 1, 1] and hand.preshape.tolist() == pytest.approx([0.05, 0.5, 1.5], abs=0.01)
     assert [hand.body_names[tip] for tip in hand.fingertips] == ["a", "b"]

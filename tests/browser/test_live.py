@@ -14,7 +14,7 @@ from service.model import names
 from service.model.planning import plan
 from service.model.records import JobRecord
 from service.pipeline import deletion, tagging
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
 from service.store.records import read_record
@@ -52,22 +52,22 @@ CHART = {
 
 
 @pytest.fixture
-def places(parts: Parts) -> list[str]:
+def places(services: Services) -> list[str]:
     """Addresses of every page, over a service in which something of everything has happened."""
     # A list of few grasps has what one of many has, and is looked at sooner.
-    record = add_job(parts, grasps=6, scenes=1, views=2, stereo=True)
-    shard = finish_all(parts, record)[0].shard_id
-    fail(parts, add_job(parts, seed=9), "a reason " * 30)
-    waiting = add_job(parts, seed=10)
-    add_worker(parts, "worker-1", "idle")
+    record = add_job(services, grasps=6, scenes=1, views=2, stereo=True)
+    shard = finish_all(services, record)[0].shard_id
+    fail(services, add_job(services, seed=9), "a reason " * 30)
+    waiting = add_job(services, seed=10)
+    add_worker(services, "worker-1", "idle")
     wanted = DatasetRequest.model_validate({"name": "kitchen", "hands": ["allegro"], "objects": ["mug", "block"]})
-    actions.create(parts, wanted)
-    parts.store.put("charts/20261121T120000Z.json", json.dumps(CHART).encode())
-    publish(parts.store, "stability", a_record())
-    tagging.give(parts, "good ones", [(shard, 0), (shard, 1)], project="", owner="", permit=lambda _: None)
-    gone = add_job(parts, seed=11)
-    fail(parts, gone, "a reason")
-    deletion.delete_job(parts, gone.id)
+    actions.create(services, wanted)
+    services.store.put("charts/20261121T120000Z.json", json.dumps(CHART).encode())
+    publish(services.store, "stability", a_record())
+    tagging.give(services, "good ones", [(shard, 0), (shard, 1)], project="", owner="", permit=lambda _: None)
+    gone = add_job(services, seed=11)
+    fail(services, gone, "a reason")
+    deletion.delete_job(services, gone.id)
     return [
         "/",
         "/datasets",
@@ -94,32 +94,32 @@ def places(parts: Parts) -> list[str]:
     ]
 
 
-def test_a_job_page_follows_its_job_without_a_reload(page: Any, parts: Parts) -> None:
-    record = add_job(parts, scenes=1, views=1)
+def test_a_job_page_follows_its_job_without_a_reload(page: Any, services: Services) -> None:
+    record = add_job(services, scenes=1, views=1)
     tasks = list(plan(record))
     page.goto(f"/jobs/{record.id}")
     page.evaluate("window.stayed = true")
     page.wait_for_selector("#head .queued")
-    finish(parts, record, tasks[0])
+    finish(services, record, tasks[0])
     page.wait_for_selector("#best .grasp")
     for task in tasks[1:]:
-        finish(parts, record, task)
+        finish(services, record, task)
     page.wait_for_selector("#head .succeeded")
     page.wait_for_selector("#views img")
     assert page.evaluate("window.stayed") is True
 
 
-def test_the_home_page_shows_a_job_that_comes_later(page: Any, parts: Parts) -> None:
+def test_the_home_page_shows_a_job_that_comes_later(page: Any, services: Services) -> None:
     page.goto("/")
     page.wait_for_selector("text=No job yet")
-    record = add_job(parts)
+    record = add_job(services)
     page.wait_for_selector(f'a[href="/jobs/{record.id}"]')
 
 
-def test_chosen_cells_stay_chosen_while_the_matrix_moves(page: Any, parts: Parts) -> None:
+def test_chosen_cells_stay_chosen_while_the_matrix_moves(page: Any, services: Services) -> None:
     page.goto("/datasets")
     page.check("input[value='allegro|mug']")
-    finish_all(parts, add_job(parts))
+    finish_all(services, add_job(services))
     page.wait_for_selector("td.succeeded")
     assert page.is_checked("input[value='allegro|mug']")
     assert page.inner_text("[data-chosen]") == "1 cell chosen"
@@ -134,8 +134,8 @@ def test_a_press_on_a_head_takes_the_column_and_submits_its_cells(page: Any) -> 
     assert page.locator("td.queued").count() == 3
 
 
-def test_a_filter_takes_effect_at_once_and_stands_in_the_address(page: Any, parts: Parts) -> None:
-    finish_all(parts, add_job(parts, grasps=96))
+def test_a_filter_takes_effect_at_once_and_stands_in_the_address(page: Any, services: Services) -> None:
+    finish_all(services, add_job(services, grasps=96))
     page.goto("/grasps?view=table")
     page.evaluate("window.stayed = true")
     page.select_option("#valid", "false")
@@ -145,9 +145,9 @@ def test_a_filter_takes_effect_at_once_and_stands_in_the_address(page: Any, part
     assert page.evaluate("window.stayed") is True
 
 
-def test_a_press_on_a_bar_shows_the_grasps_in_it(page: Any, parts: Parts) -> None:
-    record = add_job(parts)
-    finish_all(parts, record)
+def test_a_press_on_a_bar_shows_the_grasps_in_it(page: Any, services: Services) -> None:
+    record = add_job(services)
+    finish_all(services, record)
     page.goto(f"/jobs/{record.id}")
     bar = page.locator("svg.hist a").first
     count = int(bar.get_attribute("aria-label").split()[0])
@@ -160,28 +160,28 @@ def a_look_later(page: Any) -> None:
     page.clock.fast_forward(1000 * int(page.get_attribute("body", "data-poll")))
 
 
-def test_a_chart_that_is_published_appears(page: Any, parts: Parts) -> None:
+def test_a_chart_that_is_published_appears(page: Any, services: Services) -> None:
     page.clock.install()
     page.goto("/chart")
     page.wait_for_selector("text=Nothing is measured yet")
-    parts.store.put("charts/20261121T120000Z.json", json.dumps(CHART).encode())
+    services.store.put("charts/20261121T120000Z.json", json.dumps(CHART).encode())
     a_look_later(page)
     page.wait_for_selector(".trade circle")
 
 
-def test_maps_that_are_published_appear_and_say_what_a_cell_is(page: Any, parts: Parts) -> None:
+def test_maps_that_are_published_appear_and_say_what_a_cell_is(page: Any, services: Services) -> None:
     page.clock.install()
     page.goto("/stability")
     page.wait_for_selector("text=Nothing is measured yet")
-    publish(parts.store, "stability", a_record())
+    publish(services.store, "stability", a_record())
     a_look_later(page)
     page.wait_for_selector(".cells td.broken")
     page.locator("#stiffness .cells td.broken").first.hover()
     assert "penalty: stiffness [N/m] 1e4, time step [s] 0.01: broken; note 4" in page.inner_text("#stiffness .reading")
 
 
-def test_the_bound_of_theory_lies_over_its_cells_at_every_width(page: Any, parts: Parts) -> None:
-    publish(parts.store, "stability", a_record())
+def test_the_bound_of_theory_lies_over_its_cells_at_every_width(page: Any, services: Services) -> None:
+    publish(services.store, "stability", a_record())
     for width in (390, 1440):
         page.set_viewport_size({"width": width, "height": 800})
         page.goto("/stability")
@@ -269,13 +269,15 @@ def test_every_page_reads_without_javascript(address: str, page: Any, places: li
     assert "hands sink in" in of("/stability")
 
 
-def test_a_dataset_is_deleted_by_its_name_and_comes_back(page: Any, parts: Parts) -> None:
+def test_a_dataset_is_deleted_by_its_name_and_comes_back(page: Any, services: Services) -> None:
     """One press asks; what protects it is said; the press after that can be taken back."""
     wanted = DatasetRequest.model_validate({"name": "kitchen", "hands": ["allegro"], "objects": ["mug"]})
-    actions.create(parts, wanted)
-    plan_all(parts)
-    finish_all(parts, read_record(JobRecord, parts.store, names.job_record(parts.index.jobs.page().items[0].id)))
-    actions.snapshot(parts, "kitchen")
+    actions.create(services, wanted)
+    plan_all(services)
+    finish_all(
+        services, read_record(JobRecord, services.store, names.job_record(services.index.jobs.page().items[0].id))
+    )
+    actions.snapshot(services, "kitchen")
     page.goto("/datasets/kitchen")
     page.click("button:has-text('Delete')")
     dialog = page.get_by_role("dialog")
@@ -289,11 +291,11 @@ def test_a_dataset_is_deleted_by_its_name_and_comes_back(page: Any, parts: Parts
     dialog.get_by_role("checkbox").check()
     dialog.get_by_role("button", name="Delete").click()
     page.wait_for_selector("text=The dataset kitchen is deleted.")
-    assert parts.index.datasets.page().items == []
+    assert services.index.datasets.page().items == []
     page.click("button:has-text('Undo')")
     page.wait_for_url("**/datasets/kitchen")
     assert "Snapshots" in page.inner_text("main")
-    assert parts.index.datasets.get("kitchen").grasps == 32
+    assert services.index.datasets.get("kitchen").grasps == 32
 
 
 def test_an_error_is_a_page_of_its_own(page: Any) -> None:
@@ -303,8 +305,8 @@ def test_an_error_is_a_page_of_its_own(page: Any) -> None:
     assert "Back to the overview" in answer.text()
 
 
-def test_grasps_are_chosen_by_keyboard_tagged_found_by_their_tag_and_taken_home(page: Any, parts: Parts) -> None:
-    finish_all(parts, add_job(parts))
+def test_grasps_are_chosen_by_keyboard_tagged_found_by_their_tag_and_taken_home(page: Any, services: Services) -> None:
+    finish_all(services, add_job(services))
     page.goto("/grasps?view=table")
     assert page.is_disabled("button:has-text('Export')")
     boxes = page.locator("input[name=grasp]")

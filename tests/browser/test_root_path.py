@@ -15,7 +15,7 @@ from fastapi import FastAPI
 from api.app import create_app
 from api.server import bind
 from service.model.states import AssetKind
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 from service.store.assets import builtin_files
 from tests.api.factories import add_job, finish_all
@@ -71,8 +71,8 @@ def serving(app: Any) -> Iterator[str]:
 
 
 @pytest.fixture
-def app(settings: Settings, parts: Parts) -> FastAPI:
-    return create_app(settings.model_copy(update={"api_root_path": PREFIX}), parts)
+def app(settings: Settings, services: Services) -> FastAPI:
+    return create_app(settings.model_copy(update={"api_root_path": PREFIX}), services)
 
 
 @pytest.fixture
@@ -83,13 +83,13 @@ def address(app: FastAPI) -> Iterator[str]:
 
 
 @pytest.mark.slow
-def test_every_part_of_the_dashboard_works_below_the_path(page: Any, parts: Parts, address: str) -> None:
-    job = add_job(parts, grasps=6, scenes=1, views=1)
+def test_every_part_of_the_dashboard_works_below_the_path(page: Any, services: Services, address: str) -> None:
+    job = add_job(services, grasps=6, scenes=1, views=1)
     page.goto(f"{address}/")
     page.click(f"a[href='{PREFIX}/jobs/{job.id}'] >> nth=0")
     page.wait_for_selector("#head .queued")
     page.evaluate("window.stayed = true")
-    finish_all(parts, job)
+    finish_all(services, job)
     page.wait_for_selector("#head .succeeded")
     page.wait_for_selector("#best canvas[data-state=ready]")
     page.wait_for_selector("#views img")

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from tests.api.factories import finish_with
 from tests.waiting import until
 from worker.commands.synth import app as synth
@@ -31,8 +31,10 @@ def bin_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_one_slider_leads_from_the_standoff_to_the_lift_in_the_scene(page: Any, parts: Parts, bin_file: Path) -> None:
-    shard = finish_with(parts, bin_file).shard_id
+def test_one_slider_leads_from_the_standoff_to_the_lift_in_the_scene(
+    page: Any, services: Services, bin_file: Path
+) -> None:
+    shard = finish_with(services, bin_file).shard_id
     # A small canvas is drawn quickly without a GPU.
     page.set_viewport_size({"width": 700, "height": 700})
     page.goto(f"/grasps/{shard}/0")

@@ -12,7 +12,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from api.app import create_app
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 from service.store.store import open_store
 from tests.api.factories import add_builtins, add_job, finish_all
@@ -28,13 +28,13 @@ def front_door(folder: Path, url: str, endpoint: str | None) -> Iterator[tuple[T
     """An API on the S3 store; a shard's address and SHA-256."""
     settings = Settings(data_dir=folder, store_url=url, store_public_endpoint=endpoint)
     store = open_store(url, public_endpoint=endpoint)
-    parts = Parts(settings, store, empty_index(settings.resolved_index_url), MemoryQueue())
-    add_builtins(parts)
-    shard = finish_all(parts, add_job(parts))[0]
-    client = TestClient(create_app(settings, parts), base_url="http://127.0.0.1:8000")
+    services = Services(settings, store, empty_index(settings.resolved_index_url), MemoryQueue())
+    add_builtins(services)
+    shard = finish_all(services, add_job(services))[0]
+    client = TestClient(create_app(settings, services), base_url="http://127.0.0.1:8000")
     with client:
         yield client, f"/v1/shards/{shard.shard_id}/file", shard.sha256
-    parts.close()
+    services.close()
 
 
 def test_the_store_hands_files_out_where_users_reach_it(tmp_path: Path, s3_url: str, s3_server: S3Server) -> None:

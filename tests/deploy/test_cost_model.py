@@ -10,11 +10,11 @@ import pytest
 
 from benchmarks.cost_model import Measured, Prices, Work, estimate, main, sizes, table
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.store import open_store
 from tests.conftest import REPOSITORY
 from tests.fakes import request
-from tests.service.conftest import parts  # noqa: F401
+from tests.service.conftest import services  # noqa: F401
 from tests.service.index.test_index import run_all
 
 PAGE = (REPOSITORY / "docs" / "scaling.md").read_text()
@@ -82,11 +82,11 @@ def test_the_inputs_on_the_page_are_those_of_the_model() -> None:
     assert f"tasks / time × {inputs.redis_ops_per_task:.0f} + workers × {inputs.redis_ops_worker:.0f}" in PAGE
 
 
-def test_sizes_are_measured_on_a_data_folder(parts: Parts, tmp_path: Path) -> None:  # noqa: F811
+def test_sizes_are_measured_on_a_data_folder(services: Services, tmp_path: Path) -> None:  # noqa: F811
     store = open_store((tmp_path / "store").as_uri())
-    kept = Parts(parts.settings, store, parts.index, parts.queue)
-    for entry in [*parts.store.list("assets")]:
-        store.put(entry.key, parts.store.get(entry.key))
+    kept = Services(services.settings, store, services.index, services.queue)
+    for entry in [*services.store.list("assets")]:
+        store.put(entry.key, services.store.get(entry.key))
     run_all(kept, job_actions.submit(kept, request(grasps=64))[0].id)
     shards = list((tmp_path / "store" / "shards" / "base").glob("*.h5"))
     assert sizes(tmp_path)["base_bytes_per_grasp"] == sum(shard.stat().st_size for shard in shards) / 64

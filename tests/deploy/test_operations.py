@@ -12,7 +12,7 @@ from service.index.index import Index
 from service.index.rebuild import differences, rebuild
 from service.model.states import State
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.identity import identify
 from service.settings import Settings
 from service.store.library import publish_builtins
@@ -25,17 +25,17 @@ from tests.service.index.test_index import run_all
 
 
 @pytest.fixture
-def kept(tmp_path: Path) -> Iterator[Parts]:
+def kept(tmp_path: Path) -> Iterator[Services]:
     """A data folder with a finished job and one that has not begun."""
     settings = Settings(data_dir=tmp_path / "data")
     index = Index(settings.resolved_index_url)
-    parts = Parts(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
-    identify(parts)
-    add_assets(parts)
-    publish_builtins(parts.store)
-    run_all(parts, job_actions.submit(parts, request(grasps=64, scenes=1))[0].id)
-    job_actions.submit(parts, request(grasps=32, seed=5))
-    yield parts
+    services = Services(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
+    identify(services)
+    add_assets(services)
+    publish_builtins(services.store)
+    run_all(services, job_actions.submit(services, request(grasps=64, scenes=1))[0].id)
+    job_actions.submit(services, request(grasps=32, seed=5))
+    yield services
     index.close()
 
 
@@ -43,7 +43,7 @@ def names_of(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_back_up_restored_elsewhere_gives_the_same_index(kept: Parts, tmp_path: Path) -> None:
+def test_a_back_up_restored_elsewhere_gives_the_same_index(kept: Services, tmp_path: Path) -> None:
     data, fresh = kept.settings.data_dir, tmp_path / "new"
     (data / "keys.json").write_text("{}")
     (data / "store" / "shards" / "half-written.h5#123").write_bytes(b"half")
@@ -63,12 +63,12 @@ def test_a_back_up_restored_elsewhere_gives_the_same_index(kept: Parts, tmp_path
         restored.close()
 
 
-def test_a_back_up_works_where_no_key_was_ever_made(kept: Parts, tmp_path: Path) -> None:
+def test_a_back_up_works_where_no_key_was_ever_made(kept: Services, tmp_path: Path) -> None:
     done = page.run("back-up", tmp_path, {"GRASPD_DATA_DIR": str(kept.settings.data_dir)})
     assert done.returncode == 0, done.stderr
 
 
-def test_a_damaged_copy_is_noticed(kept: Parts, tmp_path: Path) -> None:
+def test_a_damaged_copy_is_noticed(kept: Services, tmp_path: Path) -> None:
     where = {"GRASPD_DATA_DIR": str(kept.settings.data_dir), "NEW_DATA_DIR": str(tmp_path / "new")}
     assert page.run("back-up", tmp_path, where).returncode == 0
     assert page.run("restore", tmp_path, where).returncode == 0
@@ -81,7 +81,7 @@ def test_a_damaged_copy_is_noticed(kept: Parts, tmp_path: Path) -> None:
         restored.close()
 
 
-def test_an_empty_index_is_filled_from_the_store(kept: Parts) -> None:
+def test_an_empty_index_is_filled_from_the_store(kept: Services) -> None:
     before = {job.id: job.state for job in kept.index.jobs.page(limit=10).items}
     empty = Index(f"sqlite:///{kept.settings.data_dir / 'older.sqlite'}")
     try:

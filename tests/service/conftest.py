@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from service.model.errors import QueueUnavailable
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.queue.address import redis_url
 from service.queue.connection import connect
 from service.queue.rq_queue import RqQueue
@@ -80,12 +80,12 @@ def index_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
 
 
 @pytest.fixture
-def parts(tmp_path: Path) -> Iterator[Parts]:
+def services(tmp_path: Path) -> Iterator[Services]:
     """A service without processes: memory store, SQLite index, memory queue, a hand `gripper` and an object `ball`;
     each batch is a task."""
     settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0, task_s=0.0)
     index = empty_index(settings.resolved_index_url)
-    made = Parts(settings, open_store("memory://"), index, MemoryQueue())
+    made = Services(settings, open_store("memory://"), index, MemoryQueue())
     add_assets(made)
     yield made
     made.close()

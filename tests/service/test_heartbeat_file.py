@@ -12,7 +12,7 @@ import pytest
 
 from service.heartbeat_file import HeartbeatFile
 from service.model.errors import QueueUnavailable
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.controller import Controller
 from tests.deploy.test_kubernetes import AGE_OF_THE_FILE
 from tests.waiting import until
@@ -38,17 +38,17 @@ def test_the_check_follows_the_age_of_the_file(tmp_path: Path) -> None:
 
 
 def test_a_controller_lives_also_while_redis_is_away(
-    parts: Parts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    services: Services, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def away(*_: object) -> None:
         raise QueueUnavailable("Redis does not answer")
 
     file = tmp_path / "alive"
-    settings = parts.settings.model_copy(update={"heartbeat_file": file, "integrity_scan_mb_per_s": 0.0})
-    monkeypatch.setattr(parts.queue, "depths", away)
+    settings = services.settings.model_copy(update={"heartbeat_file": file, "integrity_scan_mb_per_s": 0.0})
+    monkeypatch.setattr(services.queue, "depths", away)
     stop = threading.Event()
     thread = threading.Thread(
-        target=Controller(Parts(settings, parts.store, parts.index, parts.queue)).run, args=(stop,)
+        target=Controller(Services(settings, services.store, services.index, services.queue)).run, args=(stop,)
     )
     thread.start()
     try:

@@ -15,7 +15,7 @@ import pytest
 from service.index.views import JobView
 from service.model.domain import JobRequest
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.run.supervisor import Supervisor
 from service.settings import Settings
 from tests.fakes import add_assets
@@ -24,18 +24,18 @@ from tests.waiting import PATIENCE_S, until
 
 
 class System:
-    """A running service and the parts of it that a test looks at."""
+    """A running service and the services of it that a test looks at."""
 
     def __init__(self, supervisor: Supervisor, hold: Path, *, fakes: bool = True) -> None:
         """While there is a file `hold`, fake workers end no task."""
         self.supervisor = supervisor
         self.hold = hold
-        self.parts = Parts.open(supervisor.settings)
+        self.services = Services.open(supervisor.settings)
         if fakes:
-            add_assets(self.parts)
+            add_assets(self.services)
 
     def submit(self, wanted: JobRequest) -> str:
-        return job_actions.submit(self.parts, wanted)[0].id
+        return job_actions.submit(self.services, wanted)[0].id
 
     def until(self, met: Callable[[], Any], what: str, *, seconds: float = PATIENCE_S) -> None:
         """Until a condition is met; a failure shows the logs."""
@@ -43,9 +43,9 @@ class System:
 
     def finish(self, *jobs: str, seconds: float = PATIENCE_S) -> list[JobView]:
         """The jobs once all are at their end."""
-        is_done = lambda job: self.parts.index.jobs.get(job).state.is_final  # noqa: E731
+        is_done = lambda job: self.services.index.jobs.get(job).state.is_final  # noqa: E731
         self.until(lambda: all(map(is_done, jobs)), f"{len(jobs)} jobs done", seconds=seconds)
-        return [self.parts.index.jobs.get(job) for job in jobs]
+        return [self.services.index.jobs.get(job) for job in jobs]
 
     def kill(self, name: str) -> int:
         """kill -9 a child; returns its pid."""
@@ -94,7 +94,7 @@ def starting(folder: Path, patch: pytest.MonkeyPatch) -> Iterator[Started]:
 
     yield make
     for system in running:
-        system.parts.close()
+        system.services.close()
         system.supervisor.stop()
 
 

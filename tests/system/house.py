@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from service.model.states import State
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.queue.address import redis_url
 from service.queue.rq_queue import RqQueue
 from service.run.embedded import server_command
@@ -36,10 +36,10 @@ class House:
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self.start("redis", *server_command(self.settings))
         empty_index(self.settings.resolved_index_url).close()
-        self.parts = Parts.open(self.settings)
-        assert isinstance(self.parts.queue, RqQueue)
-        wait_for_redis(self.parts.queue)
-        add_assets(self.parts)
+        self.services = Services.open(self.settings)
+        assert isinstance(self.services.queue, RqQueue)
+        wait_for_redis(self.services.queue)
+        add_assets(self.services)
 
     def start(self, name: str, *command: str, **more: str) -> None:
         environment = {
@@ -69,13 +69,13 @@ class House:
         until(met, what, logs=self._said)
 
     def done(self, job: str) -> int:
-        return len(self.parts.index.jobs.tasks(job=job, state=State.SUCCEEDED, limit=100).items)
+        return len(self.services.index.jobs.tasks(job=job, state=State.SUCCEEDED, limit=100).items)
 
     def _said(self) -> str:
         return "\n".join(f"--- {file.name}\n{file.read_text()[-1500:]}" for file in sorted(self._logs.iterdir()))
 
     def close(self) -> None:
-        self.parts.close()
+        self.services.close()
         for name in reversed(self.processes):
             process = self.processes[name]
             process.send_signal(signal.SIGCONT)

@@ -43,7 +43,7 @@ RECOVERY_S = 10.0
 
 def running_on(system: System, job: str) -> str | None:
     """Name of the worker that runs the job's first unfinished task."""
-    tasks = system.parts.index.jobs.tasks(job=job, state=State.RUNNING).items
+    tasks = system.services.index.jobs.tasks(job=job, state=State.RUNNING).items
     return tasks[0].worker if tasks else None
 
 
@@ -56,21 +56,21 @@ def test_a_task_whose_worker_is_killed_runs_again_and_its_result_appears_once(sy
     killed = system.kill("worker-0")
     system.until(lambda: not alive(killed), "it is dead")
     system.hold.unlink()
-    system.until(lambda: system.parts.index.jobs.attempts(job=job), "the worker is found lost")
+    system.until(lambda: system.services.index.jobs.attempts(job=job), "the worker is found lost")
     (done,) = system.finish(job)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 32)
     assert untouched.state is State.SUCCEEDED
-    (attempt,) = system.parts.index.jobs.attempts(job=job)
+    (attempt,) = system.services.index.jobs.attempts(job=job)
     assert attempt.kind == "WorkerLost"
-    settings = system.parts.settings
+    settings = system.services.settings
     assert f"no sign of life for {settings.lease_s:g} s" in attempt.reason
     assert settings.lease_s + settings.controller_interval_s + settings.retry_backoff_s < RECOVERY_S
-    assert len(system.parts.index.grasps.page(GraspFilter(job=job), limit=200).items) == 32
-    (base,) = system.parts.index.shards.page(job=job, kind="base").items
-    kept = read_shard(system.parts.store.get(base.key))["grasp/joint_positions"]
-    undisturbed = fake_synthesize(message_for(seed=2), TaskContext(system.parts.store))
+    assert len(system.services.index.grasps.page(GraspFilter(job=job), limit=200).items) == 32
+    (base,) = system.services.index.shards.page(job=job, kind="base").items
+    kept = read_shard(system.services.store.get(base.key))["grasp/joint_positions"]
+    undisturbed = fake_synthesize(message_for(seed=2), TaskContext(system.services.store))
     np.testing.assert_array_equal(kept, undisturbed.arrays["grasp/joint_positions"])
-    assert differences(system.parts.index, system.parts.store) == []
+    assert differences(system.services.index, system.services.store) == []
 
 
 @pytest.fixture(scope="module")
@@ -89,24 +89,24 @@ def test_redis_killed_in_the_middle_comes_back_with_its_tasks(two_workers: Syste
     system.hold.unlink()
     done = system.finish(*jobs)
     assert {job.state for job in done} == {State.SUCCEEDED}
-    listed = [system.parts.index.grasps.page(GraspFilter(job=job), limit=200).items for job in jobs]
+    listed = [system.services.index.grasps.page(GraspFilter(job=job), limit=200).items for job in jobs]
     assert [len(grasps) for grasps in listed] == [96] * 3
-    assert differences(system.parts.index, system.parts.store) == []
+    assert differences(system.services.index, system.services.store) == []
 
 
 def test_five_jobs_for_two_workers_finish_and_a_rebuild_changes_no_row(two_workers: System) -> None:
     system = two_workers
     # One that still checks its engine takes no tasks, and the other might do them all.
-    system.until(lambda: [beat.state for beat in system.parts.queue.workers()] == ["idle"] * 2, "both can work")
+    system.until(lambda: [beat.state for beat in system.services.queue.workers()] == ["idle"] * 2, "both can work")
     jobs = [system.submit(wanted(grasps=70, scenes=2, seed=seed)) for seed in range(10, 15)]
     done = system.finish(*jobs)
     assert {(job.state, job.grasps) for job in done} == {(State.SUCCEEDED, 70)}
-    workers = {shard.worker for job in jobs for shard in system.parts.index.shards.page(job=job, limit=200).items}
+    workers = {shard.worker for job in jobs for shard in system.services.index.shards.page(job=job, limit=200).items}
     assert len(workers) == 2, "both took part"
-    assert differences(system.parts.index, system.parts.store) == []
-    before = [system.parts.index.jobs.get(job) for job in jobs]
-    rebuild(system.parts.index, system.parts.store)
-    assert [system.parts.index.jobs.get(job) for job in jobs] == before
+    assert differences(system.services.index, system.services.store) == []
+    before = [system.services.index.jobs.get(job) for job in jobs]
+    rebuild(system.services.index, system.services.store)
+    assert [system.services.index.jobs.get(job) for job in jobs] == before
 
 
 @pytest.mark.slow
@@ -117,18 +117,18 @@ def test_a_job_that_kills_its_worker_fails_and_the_others_go_on(start: Start) ->
     bad, good = system.finish(poisoned, healthy)
     assert good.state is State.SUCCEEDED
     assert (bad.state, bad.stages[0].succeeded, bad.stages[0].failed) == (State.FAILED, 1, 1)
-    attempts = system.parts.index.jobs.attempts(job=poisoned)
+    attempts = system.services.index.jobs.attempts(job=poisoned)
     assert [(a.number, a.kind, a.last) for a in attempts] == [(2, "WorkerLost", True), (1, "WorkerLost", False)]
-    assert differences(system.parts.index, system.parts.store) == []
+    assert differences(system.services.index, system.services.store) == []
 
 
 def test_a_running_job_is_cancelled_long_before_its_task_would_end(system: System) -> None:
     system.hold.touch()
     job = system.submit(wanted(seed=6))
     system.until(lambda: running_on(system, job), "the task runs")
-    assert job_actions.cancel(system.parts, job).state is State.CANCELLED
-    system.until(lambda: not system.parts.queue.leases(), "the worker let go")
-    assert system.parts.index.jobs.attempts(job=job) == []
+    assert job_actions.cancel(system.services, job).state is State.CANCELLED
+    system.until(lambda: not system.services.queue.leases(), "the worker let go")
+    assert system.services.index.jobs.attempts(job=job) == []
     again = system.submit(wanted(grasps=1, seed=7))
     system.until(lambda: running_on(system, again), "the worker takes the next task")
     system.hold.unlink()
@@ -145,8 +145,8 @@ def test_a_worker_told_to_stop_hands_its_task_back_at_once(system: System) -> No
     system.hold.unlink()
     (done,) = system.finish(job)
     assert done.state is State.SUCCEEDED
-    assert system.parts.index.jobs.tasks(job=job).items[0].worker != first, "another worker ran it"
-    assert system.parts.index.jobs.attempts(job=job) == [], (
+    assert system.services.index.jobs.tasks(job=job).items[0].worker != first, "another worker ran it"
+    assert system.services.index.jobs.attempts(job=job) == [], (
         "nobody waited for the lease to run out, it costs no attempt"
     )
 
@@ -161,14 +161,14 @@ def test_a_task_that_takes_too_long_is_stopped_with_that_reason(start: Start) ->
 
 def test_forged_entries_run_nothing_and_stop_nobody(system: System, tmp_path: Path) -> None:
     witness = tmp_path / "witness"
-    assert isinstance(system.parts.queue, RqQueue)
-    plain = Queue("interactive-synthesize", connection=system.parts.queue.connection, serializer=JSONSerializer)
+    assert isinstance(system.services.queue, RqQueue)
+    plain = Queue("interactive-synthesize", connection=system.services.queue.connection, serializer=JSONSerializer)
     plain.enqueue_call("os.system", args=(f"touch {witness}",))
     plain.enqueue_call("subprocess.check_output", args=(["touch", str(witness)],))
     plain.enqueue_call(TASK_FUNCTION, args=({"schema": 1, "task_id": "../../x", "stage": "synthesize"},))
     plain.enqueue_call(TASK_FUNCTION, args=(["not", "a", "message"],))
     broken = plain.enqueue_call(TASK_FUNCTION, args=({},))
-    system.parts.queue.connection.hset(f"rq:job:{broken.id}", "data", b"\xff\xfe rubbish")
+    system.services.queue.connection.hset(f"rq:job:{broken.id}", "data", b"\xff\xfe rubbish")
     worker = system.supervisor.pids["worker-0"]
     (done,) = system.finish(system.submit(wanted(seed=4)))
     assert done.state is State.SUCCEEDED
@@ -180,7 +180,7 @@ def test_a_second_up_on_the_same_data_is_refused_and_says_by_whom(system: System
     second = Supervisor(Settings(data_dir=system.supervisor.settings.data_dir, port=0), api=False)
     with pytest.raises(BusyError, match=f"in use by process {os.getpid()}"):
         second.start()
-    assert system.parts.queue.ping() >= 0, "the first goes on"
+    assert system.services.queue.ping() >= 0, "the first goes on"
 
 
 def test_any_child_that_is_killed_is_started_again(system: System) -> None:
@@ -264,9 +264,9 @@ def test_random_kills_lose_nothing_and_repeat_nothing(
     assert killed >= {"redis", "api", "controller", "worker-0"}
     done = system.finish(*jobs, seconds=PATIENCE_S + batches)
     assert {job.state for job in done} == {State.SUCCEEDED}
-    manifests = [e.key for e in system.parts.store.list(names.SHARDS) if e.key.endswith(".json")]
+    manifests = [e.key for e in system.services.store.list(names.SHARDS) if e.key.endswith(".json")]
     assert len(manifests) == batches
-    assert system.parts.index.overview.stats().grasps == 32 * batches
-    system.until(lambda: not differences(system.parts.index, system.parts.store), "index and store agree")
+    assert system.services.index.overview.stats().grasps == 32 * batches
+    system.until(lambda: not differences(system.services.index, system.services.store), "index and store agree")
     system.supervisor.stop()
     assert not [pid for pid in everyone if alive(pid)]

@@ -29,13 +29,13 @@ def test_a_controller_that_is_killed_or_stands_still_gives_way_and_nothing_is_lo
     house.until(lambda: house.says("first", "this controller leads"), "the first leads")
     house.controller("second")
     house.until(lambda: house.says("second", "another controller leads"), "the second waits")
-    early = job_actions.submit(house.parts, request(seed=1))[0].id
+    early = job_actions.submit(house.services, request(seed=1))[0].id
     house.start("worker", sys.executable, "-m", "tests.fakes", FAKE_SECONDS="0.2")
     house.until(lambda: house.done(early) == 1, "the first keeps")
 
     house.hold.touch()
-    job = job_actions.submit(house.parts, request(grasps=32 * 24))[0].id
-    house.until(lambda: house.parts.index.jobs.tasks(job=job, state=State.RUNNING).items, "the worker has a task")
+    job = job_actions.submit(house.services, request(grasps=32 * 24))[0].id
+    house.until(lambda: house.services.index.jobs.tasks(job=job, state=State.RUNNING).items, "the worker has a task")
     house.processes["first"].kill()
     house.processes["first"].wait()
     house.until(lambda: house.says("second", "this controller leads"), "the second takes over")
@@ -52,12 +52,12 @@ def test_a_controller_that_is_killed_or_stands_still_gives_way_and_nothing_is_lo
     house.until(lambda: house.says("second", "another leads now"), "the second notices")
     house.hold.unlink()
 
-    house.until(lambda: house.parts.index.jobs.get(job).state.is_final, "the job is done")
-    tasks = house.parts.index.jobs.tasks(job=job, limit=100).items
+    house.until(lambda: house.services.index.jobs.get(job).state.is_final, "the job is done")
+    tasks = house.services.index.jobs.tasks(job=job, limit=100).items
     assert {task.state for task in tasks} == {State.SUCCEEDED}
     assert [task.attempt for task in tasks] == [1] * 24, "no task was taken from its worker"
     assert house.says("worker", "synthesize took") == 1 + 24, "none was done twice"
-    house.until(lambda: differences(house.parts.index, house.parts.store) == [], "the index is the store")
+    house.until(lambda: differences(house.services.index, house.services.store) == [], "the index is the store")
 
     # A controller that ends in order gives its lease back: the next one need not wait for it to run out.
     house.processes["third"].terminate()

@@ -45,10 +45,10 @@ def test_on_a_busy_machine_no_worker_is_lost_though_its_tasks_let_nothing_else_r
     """Each task holds the interpreter lock for two leases, as a kernel that compiles does."""
     system = start(workers=2, environment={"FAKE_LOCK_S": "4"}, lease_s=2.0, task_attempts=1)
     # That they start is no part of it, and would take the tests beside this one their processors for long.
-    system.until(lambda: [beat.state for beat in system.parts.queue.workers()] == ["idle"] * 2, "both can work")
+    system.until(lambda: [beat.state for beat in system.services.queue.workers()] == ["idle"] * 2, "both can work")
     with load():
         job = system.submit(request(grasps=32 * 2))
         (done,) = system.finish(job, seconds=_LONGEST_S / 2)
-    assert system.parts.index.jobs.attempts() == []
+    assert system.services.index.jobs.attempts() == []
     assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 2)
-    assert "lost" not in {worker.state for worker in system.parts.index.overview.workers()}
+    assert "lost" not in {worker.state for worker in system.services.index.overview.workers()}

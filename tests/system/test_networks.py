@@ -39,11 +39,11 @@ def test_a_job_with_an_uploaded_network_gives_the_grasps_of_synth_with_the_file(
         assert answer.status_code == 202, answer.text
     (done,) = system.finish(answer.json()["id"])
     assert (done.state, done.reason, done.grasps) == (State.SUCCEEDED, None, 3)
-    (shard,) = system.parts.index.shards.page(job=done.id, kind="base").items
-    made = read_shard(system.parts.store.get(shard.key))
+    (shard,) = system.services.index.shards.page(job=done.id, kind="base").items
+    made = read_shard(system.services.store.get(shard.key))
     options = of_this_machine("learned", {"network": str(file), "starts": 2})
     request = JobOptions(**LEARNED, options=options)
     alone = synthesized("barrett", "block", request, place=request.place, scenes=2, device="cpu")
     for name in ("grasp/hand_pose", "grasp/joint_positions", "scene/object_pose", "quality/valid"):
         np.testing.assert_array_equal(made[name], alone.arrays[name], err_msg=name)
-    assert differences(system.parts.index, system.parts.store) == []
+    assert differences(system.services.index, system.services.store) == []

@@ -37,14 +37,14 @@ def own_postgres(postgres_server: PostgresServer) -> Iterator[PostgresServer]:
 
 
 def messages(system: System, job: str) -> list[str]:
-    return [task.message or "" for task in system.parts.index.jobs.tasks(job=job, limit=200).items]
+    return [task.message or "" for task in system.services.index.jobs.tasks(job=job, limit=200).items]
 
 
 def finish_and_compare(system: System, job: str, grasps: int) -> None:
     (done,) = system.finish(job)
     assert (done.state, done.grasps) == (State.SUCCEEDED, grasps)
-    assert system.parts.index.jobs.attempts(job=job) == [], "it costs no attempt"
-    system.until(lambda: not differences(system.parts.index, system.parts.store), "index and store agree")
+    assert system.services.index.jobs.attempts(job=job) == [], "it costs no attempt"
+    system.until(lambda: not differences(system.services.index, system.services.store), "index and store agree")
 
 
 @pytest.mark.s3
@@ -53,11 +53,11 @@ def test_a_store_killed_in_the_middle_is_waited_for(start: Start, own_s3: S3Serv
     system.finish(system.submit(request(seed=1)))
     system.hold.touch()
     job = system.submit(request(grasps=32 * 20))
-    system.until(lambda: system.parts.index.jobs.get(job).state is State.RUNNING, "a task of it runs")
+    system.until(lambda: system.services.index.jobs.get(job).state is State.RUNNING, "a task of it runs")
     own_s3.kill()
     system.hold.unlink()
     system.until(lambda: any(m.startswith("waits: the store") for m in messages(system, job)), "tasks say so")
-    assert not system.parts.index.jobs.get(job).state.is_final
+    assert not system.services.index.jobs.get(job).state.is_final
     own_s3.start()
     finish_and_compare(system, job, 32 * 20)
 
@@ -68,11 +68,11 @@ def test_an_index_killed_in_the_middle_is_caught_up_with(start: Start, own_postg
     system.finish(system.submit(request(seed=1)))
     system.hold.touch()
     job = system.submit(request(grasps=32 * 20))
-    system.until(lambda: len(system.parts.queue.waiting()) >= 4, "more waits than the one that runs")
+    system.until(lambda: len(system.services.queue.waiting()) >= 4, "more waits than the one that runs")
     own_postgres.kill()
-    made = len(list(system.parts.store.list("shards")))
+    made = len(list(system.services.store.list("shards")))
     system.hold.unlink()
-    system.until(lambda: len(list(system.parts.store.list("shards"))) > made + 4, "workers go on without it")
+    system.until(lambda: len(list(system.services.store.list("shards"))) > made + 4, "workers go on without it")
     own_postgres.start()
     finish_and_compare(system, job, 32 * 20)
 
@@ -95,6 +95,6 @@ def test_a_full_disk_is_waited_for_until_there_is_room(start: Start, small_disk:
     says = "No space left on device"
     system.until(lambda: any(says in message for message in messages(system, job)), "a task says so")
     time.sleep(1.0)  # some more tries
-    assert not system.parts.index.jobs.get(job).state.is_final
+    assert not system.services.index.jobs.get(job).state.is_final
     subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
     finish_and_compare(system, job, 32 * 100)

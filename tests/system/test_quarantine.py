@@ -37,7 +37,7 @@ def test_a_worker_whose_engine_breaks_hands_its_tasks_back_and_returns_when_it_i
     broken.unlink()
     done = system.finish(*jobs)
     assert {job.state for job in done} == {State.SUCCEEDED}
-    assert system.parts.index.jobs.attempts() == [], "it cost no attempt"
+    assert system.services.index.jobs.attempts() == [], "it cost no attempt"
 
 
 def test_a_worker_that_cannot_load_its_engine_takes_no_task(start: Callable[..., System], tmp_path: Path) -> None:
@@ -46,8 +46,8 @@ def test_a_worker_that_cannot_load_its_engine_takes_no_task(start: Callable[...,
     broken.touch()
     first = system.kill("worker-0")
     job = system.submit(request())
-    states = lambda: {worker.state for worker in system.parts.index.overview.workers()}  # noqa: E731
+    states = lambda: {worker.state for worker in system.services.index.overview.workers()}  # noqa: E731
     system.until(lambda: "quarantined" in states(), "its successor is in quarantine")
     assert system.supervisor.pids["worker-0"] != first
-    assert system.parts.index.jobs.get(job).state is State.QUEUED
-    assert system.parts.index.jobs.attempts() == []
+    assert system.services.index.jobs.get(job).state is State.QUEUED
+    assert system.services.index.jobs.attempts() == []

@@ -24,25 +24,25 @@ Start = Callable[..., System]
 
 def submitted(system: System, grasps: int, *, span: int) -> str:
     """A job in bulk whose tasks have so many batches."""
-    record = job_actions.prepare(system.parts, wanted(grasps=grasps), lane=Lane.BULK)
-    return job_actions.enter(system.parts, record.model_copy(update={"span": span}))[0].id
+    record = job_actions.prepare(system.services, wanted(grasps=grasps), lane=Lane.BULK)
+    return job_actions.enter(system.services, record.model_copy(update={"span": span}))[0].id
 
 
 def test_the_range_of_a_killed_worker_is_made_again_and_its_result_appears_once(start: Start) -> None:
     system = start(lease_s=2.0)
     system.hold.touch()
     job = submitted(system, 32 * 5, span=3)
-    running = system.parts.index.jobs.tasks
+    running = system.services.index.jobs.tasks
     system.until(lambda: len(running(job=job, state=State.RUNNING).items) == 1, "the worker holds a range")
     killed = system.kill("worker-0")
     system.until(lambda: not alive(killed), "it is dead")
     system.hold.unlink()
     (done,) = system.finish(job)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 160)
-    (attempt,) = system.parts.index.jobs.attempts(job=job)
+    (attempt,) = system.services.index.jobs.attempts(job=job)
     assert attempt.kind == "WorkerLost" and f"-{killed}-" in attempt.worker
-    record = read_record(JobRecord, system.parts.store, names.job_record(job))
-    made = [load_shard(system.parts.store, Stage.SYNTHESIZE, task.output) for task in plan(record)]
+    record = read_record(JobRecord, system.services.store, names.job_record(job))
+    made = [load_shard(system.services.store, Stage.SYNTHESIZE, task.output) for task in plan(record)]
     assert [(shard.attributes["batch"], shard.attributes["batch_rows"]) for shard in made] == [
         (0, "[32, 32, 32]"),
         (3, "[32, 32]"),
@@ -57,9 +57,9 @@ def test_a_worker_killed_between_shard_and_event_has_its_task_done_all_the_same(
     job = submitted(system, 96, span=3)
     (done,) = system.finish(job)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 96)
-    keys = sorted(entry.key for entry in system.parts.store.list("shards"))
+    keys = sorted(entry.key for entry in system.services.store.list("shards"))
     assert keys == [f"shards/base/{killed.read_text()}.{ending}" for ending in ("h5", "json")]
-    assert not system.parts.index.jobs.attempts(job=job), "no attempt was used up"
+    assert not system.services.index.jobs.attempts(job=job), "no attempt was used up"
 
 
 @pytest.mark.slow
@@ -68,10 +68,10 @@ def test_a_range_that_kills_its_worker_takes_no_other_one_down(start: Start) -> 
     job = submitted(system, 32 * 6, span=2)
     (done,) = system.finish(job)
     assert done.state is State.FAILED
-    tasks = sorted(system.parts.index.jobs.tasks(job=job).items, key=lambda task: task.batch)
+    tasks = sorted(system.services.index.jobs.tasks(job=job).items, key=lambda task: task.batch)
     assert [(task.batch, task.state) for task in tasks] == [
         (0, State.SUCCEEDED),
         (2, State.FAILED),
         (4, State.SUCCEEDED),
     ]
-    assert [attempt.task_id for attempt in system.parts.index.jobs.attempts(job=job)] == [tasks[1].id] * 3
+    assert [attempt.task_id for attempt in system.services.index.jobs.attempts(job=job)] == [tasks[1].id] * 3

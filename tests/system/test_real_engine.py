@@ -24,7 +24,7 @@ pytestmark = pytest.mark.chaos
 @pytest.mark.parametrize("scene", [pytest.param("free", marks=pytest.mark.slow), "table"])
 def test_a_worker_killed_in_mid_synthesis_leaves_the_same_grasps(start: Callable[..., System], scene: str) -> None:
     system = start(fakes=False, lease_s=2.0, retry_backoff_s=0.1)
-    index = system.parts.index
+    index = system.services.index
     system.until(
         lambda: {a.name for kind in AssetKind for a in index.assets.page(kind=kind).items} >= {"barrett", "block"},
         "the built-in assets are published",
@@ -46,7 +46,7 @@ def test_a_worker_killed_in_mid_synthesis_leaves_the_same_grasps(start: Callable
             break
     assert [attempt.kind for attempt in attempts] == ["WorkerLost"]
     (shard,) = index.shards.page(job=job, kind="base").items
-    kept = read_shard(system.parts.store.get(shard.key))
+    kept = read_shard(system.services.store.get(shard.key))
     block = object_from_path("block", face_error_m=request.knobs.face_error_m)
     scenes = None
     if request.in_scene:
@@ -55,4 +55,4 @@ def test_a_worker_killed_in_mid_synthesis_leaves_the_same_grasps(start: Callable
     undisturbed = certified_grasps(hand_from_path("barrett"), block, request, count=24, scenes=scenes).grasps
     np.testing.assert_array_equal(kept["grasp/hand_pose"], undisturbed.grasp.hand_pose)
     np.testing.assert_array_equal(kept["grasp/joint_positions"], undisturbed.grasp.joint_positions)
-    assert differences(index, system.parts.store) == []
+    assert differences(index, system.services.store) == []

@@ -15,7 +15,7 @@ from redis.exceptions import AuthenticationError
 
 from service.model.states import State
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.queue.address import redis_url
 from service.run.joining import joining
 from service.run.supervisor import Supervisor
@@ -69,13 +69,13 @@ def test_preemption_a_lost_node_and_a_time_limit_lose_nothing(tmp_path: Path, sl
         hold = tmp_path / "hold"
         system = System(supervisor, hold)
         assert stat.S_IMODE((shared / "join.env").stat().st_mode) == 0o600
-        job = job_actions.submit(system.parts, request(grasps=32 * 16))[0].id
+        job = job_actions.submit(system.services, request(grasps=32 * 16))[0].id
         hold.touch()
         slow = environment(
             shared, GRASPD=str(fakes), FAKE_SECONDS="0.2", FAKE_HOLD=str(hold), GRASPD_LEASE_S="2", IDLE_S="2"
         )
         first, second, third = slurm.sbatch(SLURM / "worker.sbatch", slow, array=3)
-        busy = lambda: len(system.parts.index.jobs.tasks(job=job, state=State.RUNNING).items)  # noqa: E731
+        busy = lambda: len(system.services.index.jobs.tasks(job=job, state=State.RUNNING).items)  # noqa: E731
         system.until(lambda: busy() == 3, f"three busy workers\n{slurm.logs()}")
         slurm.preempt(second, grace_s=PATIENCE_S)
         assert slurm.reach_time_limit(first, notice_s=PATIENCE_S), slurm.logs()
@@ -83,7 +83,7 @@ def test_preemption_a_lost_node_and_a_time_limit_lose_nothing(tmp_path: Path, sl
         hold.unlink()
         (done,) = system.finish(job)
         assert done.state is State.SUCCEEDED
-        tasks = system.parts.index.jobs.tasks(job=job, limit=100).items
+        tasks = system.services.index.jobs.tasks(job=job, limit=100).items
         assert len(tasks) == 16
         # Who is told hands the task back at once; only the node that was lost used up an attempt.
         assert sum(task.attempt > 1 for task in tasks) <= 1, [task.attempt for task in tasks]
@@ -92,7 +92,7 @@ def test_preemption_a_lost_node_and_a_time_limit_lose_nothing(tmp_path: Path, sl
         for element in (first, second, third):
             assert element.wait(PATIENCE_S) == 0, slurm.logs()
             assert element.restarts == 1
-        system.parts.close()
+        system.services.close()
     finally:
         supervisor.stop()
     assert not (shared / "join.env").exists(), "it goes with its service"
@@ -141,9 +141,9 @@ def joined(shared: Path) -> str | None:
 
 
 def add_assets_to(shared: Path) -> None:
-    parts = Parts.open(Settings(data_dir=shared / "elsewhere", store_url=(shared / "store").as_uri()))
-    add_assets(parts)
-    parts.close()
+    services = Services.open(Settings(data_dir=shared / "elsewhere", store_url=(shared / "store").as_uri()))
+    add_assets(services)
+    services.close()
 
 
 def submitted(shared: Path, slurm: FakeSlurm) -> str:

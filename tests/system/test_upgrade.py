@@ -56,14 +56,14 @@ def test_each_version_of_worker_takes_what_it_can_and_the_controller_holds_back_
     def submit(seed: int, *, revision: int) -> str:
         with monkeypatch.context() as patch:
             patch.setitem(STAGE_REVISIONS, "synthesize", revision)
-            return job_actions.submit(house.parts, request(grasps=96, seed=seed))[0].id
+            return job_actions.submit(house.services, request(grasps=96, seed=seed))[0].id
 
     def state(job: str) -> State:
-        return house.parts.index.jobs.get(job).state
+        return house.services.index.jobs.get(job).state
 
     older_worker(house, tmp_path / "previous")
     # While there is no worker, those of this version are expected.
-    house.until(house.parts.queue.workers, "the older worker says that it is there")
+    house.until(house.services.queue.workers, "the older worker says that it is there")
     before = submit(1, revision=OLD)
     house.start(
         "controller", sys.executable, "-c", MAKES.format(NEW) + "from graspd.cli import main; main()", "controller"
@@ -75,7 +75,7 @@ def test_each_version_of_worker_takes_what_it_can_and_the_controller_holds_back_
         lambda: house.says("controller", "held back, no worker that is here can do it"), "the controller says so"
     )
     assert state(after) is State.QUEUED
-    tasks = house.parts.index.jobs.tasks(job=after, limit=10).items
+    tasks = house.services.index.jobs.tasks(job=after, limit=10).items
     assert [task.attempt for task in tasks] == [1] * 3
     assert all("held back" in str(task.message) for task in tasks)
 
@@ -85,6 +85,6 @@ def test_each_version_of_worker_takes_what_it_can_and_the_controller_holds_back_
     house.until(lambda: state(late) is State.SUCCEEDED, "the older one still does what is left for it")
 
     for job, worker in ((before, "older"), (after, "next"), (late, "older")):
-        tasks = house.parts.index.jobs.tasks(job=job, limit=10).items
+        tasks = house.services.index.jobs.tasks(job=job, limit=10).items
         assert [task.attempt for task in tasks] == [1] * 3, "no attempt failed"
         assert all(f"-{house.processes[worker].pid}-" in str(task.worker) for task in tasks)

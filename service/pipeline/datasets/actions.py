@@ -17,7 +17,7 @@ from service.model.errors import ConflictError, InputError, LimitError, NotFound
 from service.model.projects import EVERYTHING, Reach
 from service.model.scene_options import NamedNeighbour, SceneDocument
 from service.model.states import AssetKind, State
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets.spec import MAX_CELLS, DatasetRequest, Matrix, describe
 from service.pipeline.fidelity_choice import Resolver
 from service.pipeline.recording import recording
@@ -28,7 +28,7 @@ from service.store.records import Put, read_record
 
 
 def create(
-    parts: Parts, request: DatasetRequest, *, owner: str = "", reach: Reach = EVERYTHING
+    services: Services, request: DatasetRequest, *, owner: str = "", reach: Reach = EVERYTHING
 ) -> tuple[DatasetView, bool]:
     """Record a dataset; the controller plans its jobs. The same hands, objects and options again are the same dataset.
 
@@ -47,36 +47,36 @@ def create(
         LimitError: more than `MAX_CELLS` cells.
         QueueUnavailable, StoreUnavailable, IndexUnavailable: nothing was recorded.
     """
-    hands, objects = members(parts, request, reach)
-    shared, beside = with_neighbours(parts, request.shared, reach)
-    shared = with_network(parts, shared, hands, reach)
-    parts.queue.ping()
+    hands, objects = members(services, request, reach)
+    shared, beside = with_neighbours(services, request.shared, reach)
+    shared = with_network(services, shared, hands, reach)
+    services.queue.ping()
     key = names.dataset_record(request.name)
     # One that is there stays what it is: a later chart changes none of its fidelities.
     found = None
-    if not parts.store.exists(key):
-        found = describe(request.name, hands, objects, shared, Resolver(parts.store).choose, owner, reach.project)
+    if not services.store.exists(key):
+        found = describe(request.name, hands, objects, shared, Resolver(services.store).choose, owner, reach.project)
     wanted = [(AssetKind.HAND, one.digest) for one in hands]
     wanted += [(AssetKind.OBJECT, one.digest) for one in objects]
     wanted += [(AssetKind.OBJECT, one.digest) for one in beside]
     wanted += [(AssetKind.NETWORK, shared.network)] if shared.network else []
-    with recording(parts) as (connection, put):
+    with recording(services) as (connection, put):
         new = found is not None and put(key, found)
-        record = found if found is not None and new else _present(parts, request.name)
+        record = found if found is not None and new else _present(services, request.name)
         if record.project != reach.project:
             # Nothing else of it is said: names are of the whole service.
             raise ConflictError(f"the name {record.name!r} is taken; take another name")
         # Not by the digest: a newer graspd knows more options, whose defaults an older one meant as well.
         if not new and (other := _difference(record, hands, objects, shared)):
             raise ConflictError(f"there is another dataset named {record.name!r} ({other}); take another name")
-        refuse_pending(parts.store, "dataset", record.name)
-        if missing := parts.index.assets.missing(wanted, within=connection):
+        refuse_pending(services.store, "dataset", record.name)
+        if missing := services.index.assets.missing(wanted, within=connection):
             raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
-        parts.index.write_dataset.add(record, within=connection)
-    return parts.index.datasets.get(record.name), new
+        services.index.write_dataset.add(record, within=connection)
+    return services.index.datasets.get(record.name), new
 
 
-def cancel(parts: Parts, name: str) -> DatasetView:
+def cancel(services: Services, name: str) -> DatasetView:
     """Stop a dataset: what is not planned never is, and its unfinished jobs are cancelled. Finished shards stay.
 
     A job that another dataset waits for as well goes on, and so does one that another key submitted.
@@ -85,30 +85,30 @@ def cancel(parts: Parts, name: str) -> DatasetView:
         NotFoundError: unknown dataset.
         ConflictError: it is finished or cancelled already.
     """
-    with recording(parts) as (connection, put):
-        dataset = parts.index.datasets.get(name)
+    with recording(services) as (connection, put):
+        dataset = services.index.datasets.get(name)
         if dataset.cancelled or dataset.state.is_final:
             raise ConflictError(f"dataset {name!r} is {dataset.state} already; there is nothing to cancel")
-        _add_event(parts, name, "cancelled", connection, put)
-    return parts.index.datasets.get(name)
+        _add_event(services, name, "cancelled", connection, put)
+    return services.index.datasets.get(name)
 
 
-def retry(parts: Parts, name: str) -> DatasetView:
+def retry(services: Services, name: str) -> DatasetView:
     """Start the failed and cancelled cells of a dataset again, with fresh attempts; what is made is not made twice.
 
     Raises:
         NotFoundError: unknown dataset.
         ConflictError: no cell failed or was cancelled.
     """
-    with recording(parts) as (connection, put):
-        dataset = parts.index.datasets.get(name)
+    with recording(services) as (connection, put):
+        dataset = services.index.datasets.get(name)
         if not dataset.cancelled and not dataset.states[State.FAILED] and not dataset.states[State.CANCELLED]:
             raise ConflictError(f"dataset {name!r} is {dataset.state}, and no cell failed; there is nothing to retry")
-        _add_event(parts, name, "retried", connection, put)
-    return parts.index.datasets.get(name)
+        _add_event(services, name, "retried", connection, put)
+    return services.index.datasets.get(name)
 
 
-def snapshot(parts: Parts, name: str) -> tuple[Snapshot, bool]:
+def snapshot(services: Services, name: str) -> tuple[Snapshot, bool]:
     """Write down which shards a dataset holds now. The same shards again are the same snapshot.
 
     Returns:
@@ -118,8 +118,8 @@ def snapshot(parts: Parts, name: str) -> tuple[Snapshot, bool]:
         NotFoundError: unknown dataset.
         ConflictError: the dataset has no shard yet.
     """
-    dataset = parts.index.datasets.get(name)
-    held = tuple(parts.index.datasets.shards(name))
+    dataset = services.index.datasets.get(name)
+    held = tuple(services.index.datasets.shards(name))
     if not held:
         raise ConflictError(f"dataset {name!r} has no shard yet; wait until a cell is done")
     base = [shard for shard in held if shard.kind == "base"]
@@ -134,18 +134,18 @@ def snapshot(parts: Parts, name: str) -> tuple[Snapshot, bool]:
         created=timestamp(),
         shards=held,
     )
-    with recording(parts) as (connection, put):
-        if parts.index.datasets.get(name).digest != dataset.digest:
+    with recording(services) as (connection, put):
+        if services.index.datasets.get(name).digest != dataset.digest:
             raise ConflictError(f"dataset {name!r} was deleted just now, and there is another one; try again")
         new = put(names.dataset_snapshot(name, taken.digest), taken)
         if not new:
-            taken = load_snapshot(parts.store, name, taken.digest)
-        parts.index.write_dataset.add_snapshot(taken, within=connection)
+            taken = load_snapshot(services.store, name, taken.digest)
+        services.index.write_dataset.add_snapshot(taken, within=connection)
     return taken, new
 
 
 def add_object_set(
-    parts: Parts,
+    services: Services,
     name: str,
     objects: Iterable[str],
     *,
@@ -165,63 +165,65 @@ def add_object_set(
         InputError: an object was refused when it was checked, or there is none.
         ConflictError: a check is still running.
     """
-    assets = [parts.index.assets.get(AssetKind.OBJECT, one, reach=reach) for one in objects]
+    assets = [services.index.assets.get(AssetKind.OBJECT, one, reach=reach) for one in objects]
     wanted = tuple(asset.name for asset in assets)
     if not wanted:
         raise InputError(f"the set {name!r} holds no object; name some")
     # Of two that want one name at once, the later one must see the earlier one's set.
-    with recording(parts) as (connection, put):
+    with recording(services) as (connection, put):
         after, project = "", reach.project
-        if (present := parts.index.object_sets.named(name)) is not None:
+        if (present := services.index.object_sets.named(name)) is not None:
             if not reach.sees(present.project):
                 raise ConflictError(f"the name {name!r} is taken; take another name")
             if set(present.objects) == set(wanted):
                 return present
             after = present.digest
-            known = read_record(ObjectSet, parts.store, names.object_set(name, after))
+            known = read_record(ObjectSet, services.store, names.object_set(name, after))
             owner, project = known.owner, known.project
             may_follow(owner, project)
-        if missing := parts.index.assets.missing([(AssetKind.OBJECT, one.digest) for one in assets], within=connection):
+        if missing := services.index.assets.missing(
+            [(AssetKind.OBJECT, one.digest) for one in assets], within=connection
+        ):
             raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
         found = object_set_of(name, wanted, after=after, owner=owner, project=project)
         if not put(key := names.object_set(name, found.digest), found):
             # It broke off before its row was there.
-            found = read_record(ObjectSet, parts.store, key)
+            found = read_record(ObjectSet, services.store, key)
             if not reach.sees(found.project):
                 raise ConflictError(f"the name {name!r} is taken; take another name")
-        parts.index.write_dataset.add_object_set(found, within=connection)
-    return parts.index.object_sets.get(name)
+        services.index.write_dataset.add_object_set(found, within=connection)
+    return services.index.object_sets.get(name)
 
 
-def members(parts: Parts, matrix: Matrix, reach: Reach = EVERYTHING) -> tuple[list[Member], list[Member]]:
+def members(services: Services, matrix: Matrix, reach: Reach = EVERYTHING) -> tuple[list[Member], list[Member]]:
     """Hands and objects of a matrix as they are now, sets spelled out; errors as in `create`."""
     objects = dict.fromkeys(matrix.objects)
     for name in matrix.sets:
-        objects |= dict.fromkeys(parts.index.object_sets.get(name, reach=reach).objects)
+        objects |= dict.fromkeys(services.index.object_sets.get(name, reach=reach).objects)
     if len(matrix.hands) * len(objects) > MAX_CELLS:
         raise LimitError(f"{len(matrix.hands)} hands x {len(objects)} objects is over {MAX_CELLS} cells; split it")
-    hands = _members(parts, AssetKind.HAND, matrix.hands, reach)
-    return hands, _members(parts, AssetKind.OBJECT, objects, reach)
+    hands = _members(services, AssetKind.HAND, matrix.hands, reach)
+    return hands, _members(services, AssetKind.OBJECT, objects, reach)
 
 
-def _members(parts: Parts, kind: AssetKind, wanted: Iterable[str], reach: Reach) -> list[Member]:
-    assets = [usable(parts, kind, name, reach) for name in wanted]
+def _members(services: Services, kind: AssetKind, wanted: Iterable[str], reach: Reach) -> list[Member]:
+    assets = [usable(services, kind, name, reach) for name in wanted]
     found = [Member(name=asset.name, digest=asset.digest) for asset in assets]
     return list(dict.fromkeys(found))
 
 
-def _present(parts: Parts, name: str) -> DatasetRecord:
+def _present(services: Services, name: str) -> DatasetRecord:
     try:
-        return load_dataset(parts.store, name)
+        return load_dataset(services.store, name)
     except NotFoundError:
         raise ConflictError(f"dataset {name!r} was deleted just now; create it again") from None
 
 
 def _add_event(
-    parts: Parts, name: str, what: Literal["cancelled", "retried"], connection: Connection, put: Put
+    services: Services, name: str, what: Literal["cancelled", "retried"], connection: Connection, put: Put
 ) -> None:
-    add_dataset_event(parts.store, name, what, put=put)
-    parts.index.write_dataset.set_events(name, dataset_events(parts.store, name), within=connection)
+    add_dataset_event(services.store, name, what, put=put)
+    services.index.write_dataset.set_events(name, dataset_events(services.store, name), within=connection)
 
 
 def _difference(known: DatasetRecord, hands: list[Member], objects: list[Member], options: JobOptions) -> str:

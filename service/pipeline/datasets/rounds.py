@@ -16,7 +16,7 @@ from service.model.dataset_records import job_of
 from service.model.errors import ConflictError
 from service.model.states import State
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.ranges import TaskRanges
 from service.store.records import job_events
 
@@ -29,10 +29,10 @@ _CELLS_AT_ONCE: Final = 20
 class DatasetRounds:
     """Works through the datasets that have something to do, the oldest first."""
 
-    def __init__(self, parts: Parts, *, clock: Callable[[], float] = time.monotonic) -> None:
-        self._parts = parts
+    def __init__(self, services: Services, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._services = services
         self._clock = clock
-        self._ranges = TaskRanges(parts, clock=clock)
+        self._ranges = TaskRanges(services, clock=clock)
         self._positions: dict[tuple[str, int], int] = {}
 
     def advance(self, budget_s: float = BUDGET_S) -> bool:
@@ -42,7 +42,7 @@ class DatasetRounds:
             UnavailableError: a part is away; call again later.
         """
         deadline = self._clock() + budget_s
-        for work in self._parts.index.dataset_feed.in_work():
+        for work in self._services.index.dataset_feed.in_work():
             if not self._pass_on(work, deadline) or not self._plan(work, deadline):
                 return True
         return False
@@ -51,16 +51,16 @@ class DatasetRounds:
         """Make jobs of the cells that have none; whether all are made."""
         after = -1
         while not work.cancelled:
-            cells = self._parts.index.dataset_feed.cells_to_plan(work.name, after=after, limit=_CELLS_AT_ONCE)
+            cells = self._services.index.dataset_feed.cells_to_plan(work.name, after=after, limit=_CELLS_AT_ONCE)
             for cell in cells:
                 if self._clock() > deadline:
                     return False
                 job = job_of(cell, work.options, work.revisions, work.owner, work.project)
-                job_actions.enter(self._parts, self._ranges.sized(job, among=len(cells)), keeps_assets=True)
+                job_actions.enter(self._services, self._ranges.sized(job, among=len(cells)), keeps_assets=True)
                 after = cell.position
             if not cells:
                 break
-        self._parts.index.write_dataset.set_progress(work.name, planned=True)
+        self._services.index.write_dataset.set_progress(work.name, planned=True)
         return True
 
     def _pass_on(self, work: DatasetWork, deadline: float) -> bool:
@@ -70,7 +70,7 @@ class DatasetRounds:
         key = (work.name, work.events)
         states = (State.QUEUED, State.RUNNING) if work.cancelled else (State.FAILED, State.CANCELLED)
         while True:
-            found = self._parts.index.dataset_feed.cells_in_states(
+            found = self._services.index.dataset_feed.cells_in_states(
                 work.name, states, after=self._positions.get(key, -1), limit=_CELLS_AT_ONCE, unshared=work.cancelled
             )
             for position, job in found:
@@ -81,16 +81,16 @@ class DatasetRounds:
             if not found:
                 break
         self._positions.pop(key, None)
-        self._parts.index.write_dataset.set_progress(work.name, applied=work.events)
+        self._services.index.write_dataset.set_progress(work.name, applied=work.events)
         return True
 
     def _pass_to(self, job: str, work: DatasetWork) -> None:
         cause = f"{work.name}/{work.events}"
-        if any(event.cause == cause for event in job_events(self._parts.store, job)):
+        if any(event.cause == cause for event in job_events(self._services.store, job)):
             return
         act = job_actions.cancel if work.cancelled else job_actions.retry
         try:
-            act(self._parts, job, cause=cause)
+            act(self._services, job, cause=cause)
         except ConflictError as error:
             # It ended, or somebody started it, since the index was asked.
             log.info("job %s of dataset %s is left as it is: %s", job, work.name, error)

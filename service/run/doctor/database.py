@@ -15,7 +15,7 @@ from service.index.sample import IndexCondition, compare, draw, look
 from service.index.tables import shards
 from service.model.errors import IndexDamaged, InputError, QueueUnavailable, UnavailableError
 from service.model.finding import Finding, bad, good, skipped, warning
-from service.pipeline.identity import Identity, recorded, services
+from service.pipeline.identity import Identity, recorded, service_ids
 from service.queue.rq_queue import open_queue
 from service.run.doctor.machine import existing, local_store
 from service.run.doctor.redis_server import is_there
@@ -118,7 +118,7 @@ def identity(settings: Settings) -> Finding:
         except QueueUnavailable:
             if said is None:
                 return skipped(name, "there is no index here, and Redis does not answer")
-    found = Identity(services(store), said, redis, recorded(settings.data_dir.resolve()), settings.store_url is None)
+    found = Identity(service_ids(store), said, redis, recorded(settings.data_dir.resolve()), settings.store_url is None)
     if why := found.refusal(store.url):
         return bad(name, why, "see the message, and GRASPD_STORE_URL, GRASPD_INDEX_URL, GRASPD_REDIS_URL")
     if not found.chain:

@@ -15,7 +15,7 @@ from api.access.keys import KeyFile, KeyLimits, Scope
 from api.app import create_app
 from api.client.key_commands import duration
 from service.model.errors import ConflictError, InputError, NotFoundError, QueueUnavailable
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 from tests.memory_queue import MemoryQueue
 
@@ -28,9 +28,9 @@ def keys(settings: Settings) -> KeyFile:
 
 
 @pytest.fixture
-def closed(settings: Settings, parts: Parts, keys: KeyFile) -> Iterator[tuple[TestClient, dict[Scope, str]]]:
+def closed(settings: Settings, services: Services, keys: KeyFile) -> Iterator[tuple[TestClient, dict[Scope, str]]]:
     tokens = {scope: keys.add(scope.value, scope) for scope in Scope}
-    with TestClient(create_app(settings, parts), base_url="https://graspd.example") as client:
+    with TestClient(create_app(settings, services), base_url="https://graspd.example") as client:
         yield client, tokens
 
 
@@ -234,12 +234,14 @@ def test_what_is_no_length_of_time_is_said_so(text: str) -> None:
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.7", "graspd.example"])
-def test_an_address_strangers_reach_needs_a_key(settings: Settings, parts: Parts, keys: KeyFile, host: str) -> None:
+def test_an_address_strangers_reach_needs_a_key(
+    settings: Settings, services: Services, keys: KeyFile, host: str
+) -> None:
     exposed = settings.model_copy(update={"host": host})
     with pytest.raises(InputError, match="graspd keys add"):
-        create_app(exposed, parts)
+        create_app(exposed, services)
     keys.add("me", Scope.ADMIN)
-    assert create_app(exposed, parts)
+    assert create_app(exposed, services)
 
 
 @pytest.mark.parametrize(

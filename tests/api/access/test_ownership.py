@@ -15,7 +15,7 @@ from service.index.rebuild import rebuild
 from service.model import names
 from service.model.records import JobRecord
 from service.model.states import AssetKind, State
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 from service.store.network_file import to_bytes
 from service.store.records import read_record
@@ -41,8 +41,8 @@ def people(keys: KeyFile) -> dict[str, Headers]:
 
 
 @pytest.fixture
-def client(people: dict[str, Headers], settings: Settings, parts: Parts) -> Iterator[TestClient]:
-    with TestClient(create_app(settings, parts), base_url="https://graspd.example") as opened:
+def client(people: dict[str, Headers], settings: Settings, services: Services) -> Iterator[TestClient]:
+    with TestClient(create_app(settings, services), base_url="https://graspd.example") as opened:
         yield opened
 
 
@@ -62,10 +62,10 @@ def test_a_job_is_cancelled_by_its_key_or_an_admin(
 
 @pytest.mark.parametrize(("who", "status"), [("ann", 202), ("bob", 403), ("root", 202)])
 def test_a_job_is_retried_by_its_key_or_an_admin(
-    client: TestClient, people: dict[str, Headers], parts: Parts, who: str, status: int
+    client: TestClient, people: dict[str, Headers], services: Services, who: str, status: int
 ) -> None:
     job = submitted(client, people["ann"])
-    fail(parts, read_record(JobRecord, parts.store, names.job_record(job)), "it broke")
+    fail(services, read_record(JobRecord, services.store, names.job_record(job)), "it broke")
     assert client.post(f"/v1/jobs/{job}/retry", headers=people[who]).status_code == status
 
 
@@ -88,21 +88,23 @@ def test_a_dataset_is_cancelled_by_its_key_or_an_admin(
 
 
 def test_a_job_of_another_key_survives_the_end_of_a_dataset_that_has_it_too(
-    client: TestClient, people: dict[str, Headers], parts: Parts
+    client: TestClient, people: dict[str, Headers], services: Services
 ) -> None:
     job = submitted(client, people["ann"])
     client.post("/v1/datasets", json=MATRIX | {"objects": ["mug", "bottle"]}, headers=people["bob"])
-    plan_all(parts)
+    plan_all(services)
     assert client.post("/v1/datasets/d/cancel", headers=people["bob"]).status_code == 202
-    plan_all(parts)
-    states = {cell.job_id == job: cell.state for cell in parts.index.datasets.cells("d").items}
+    plan_all(services)
+    states = {cell.job_id == job: cell.state for cell in services.index.datasets.cells("d").items}
     assert states == {True: State.QUEUED, False: State.CANCELLED}
 
 
-def test_jobs_of_a_dataset_belong_to_its_key(client: TestClient, people: dict[str, Headers], parts: Parts) -> None:
+def test_jobs_of_a_dataset_belong_to_its_key(
+    client: TestClient, people: dict[str, Headers], services: Services
+) -> None:
     client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
-    plan_all(parts)
-    job = parts.index.datasets.cells("d").items[0].job_id
+    plan_all(services)
+    job = services.index.datasets.cells("d").items[0].job_id
     assert client.post(f"/v1/jobs/{job}/cancel", headers=people["bob"]).status_code == 403
     assert client.post(f"/v1/jobs/{job}/cancel", headers=people["ann"]).status_code == 202
 
@@ -114,9 +116,9 @@ def test_who_finds_a_job_that_was_there_may_not_cancel_it(client: TestClient, pe
 
 
 def test_a_job_from_before_there_were_keys_takes_an_admin(
-    client: TestClient, people: dict[str, Headers], parts: Parts
+    client: TestClient, people: dict[str, Headers], services: Services
 ) -> None:
-    old = add_job(parts, seed=7).id
+    old = add_job(services, seed=7).id
     assert client.post(f"/v1/jobs/{old}/cancel", headers=people["ann"]).status_code == 403
     assert client.post(f"/v1/jobs/{old}/cancel", headers=people["root"]).status_code == 202
 
@@ -144,7 +146,7 @@ def test_keys_of_before_there_were_ids_have_one_through_rotation(keys: KeyFile) 
 
 
 def test_owners_are_in_the_store_and_survive_a_lost_index(
-    client: TestClient, people: dict[str, Headers], parts: Parts, keys: KeyFile
+    client: TestClient, people: dict[str, Headers], services: Services, keys: KeyFile
 ) -> None:
     ann = next(key.id for key in keys.list() if key.name == "ann")
     job = submitted(client, people["ann"])
@@ -153,7 +155,7 @@ def test_owners_are_in_the_store_and_survive_a_lost_index(
     added = client.post("/v1/objects", files={"file": file}, headers=people["ann"])
     assert added.status_code == 202
     fresh = Index("sqlite://")
-    rebuild(fresh, parts.store)
+    rebuild(fresh, services.store)
     found = fresh.jobs.get(job).owner, fresh.datasets.get("d").owner, fresh.assets.get(AssetKind.OBJECT, "ball").owner
     fresh.close()
     assert found == (ann, ann, ann)
@@ -235,22 +237,22 @@ def test_a_network_is_deleted_by_its_key_or_an_admin(
 
 @pytest.mark.parametrize(("who", "status"), [("ann", 204), ("bob", 403), ("root", 204)])
 def test_a_dataset_is_deleted_by_its_key_or_an_admin(
-    client: TestClient, people: dict[str, Headers], parts: Parts, who: str, status: int
+    client: TestClient, people: dict[str, Headers], services: Services, who: str, status: int
 ) -> None:
     client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
     assert client.delete("/v1/datasets/d", headers=people["ann"]).status_code == 409, "it has not ended"
     client.post("/v1/datasets/d/cancel", headers=people["ann"])
-    plan_all(parts)
+    plan_all(services)
     assert client.delete("/v1/datasets/d", headers=people[who]).status_code == status
 
 
 @pytest.mark.parametrize(("who", "status"), [("ann", 200), ("bob", 403), ("eve", 403), ("root", 200)])
 def test_a_dataset_is_restored_by_its_key_or_an_admin(
-    client: TestClient, people: dict[str, Headers], parts: Parts, who: str, status: int
+    client: TestClient, people: dict[str, Headers], services: Services, who: str, status: int
 ) -> None:
     client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
     client.post("/v1/datasets/d/cancel", headers=people["ann"])
-    plan_all(parts)
+    plan_all(services)
     assert client.delete("/v1/datasets/d", headers=people["root"]).status_code == 204
     assert [one["name"] for one in client.get("/v1/deletions", headers=people["ann"]).json()] == ["d"]
     assert client.post("/v1/datasets/d/restore", headers=people[who]).status_code == status

@@ -15,7 +15,7 @@ from api.app import create_app
 from service.index.tables import shards
 from service.model import names
 from service.model.records import JobRecord
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from service.store.records import read_record
@@ -27,9 +27,11 @@ Ask = Callable[..., Any]
 
 
 @pytest.fixture
-def service(settings: Settings, parts: Parts, redis_server: str, rq_queue: RqQueue, noon: None) -> Iterator[TestClient]:
+def service(
+    settings: Settings, services: Services, redis_server: str, rq_queue: RqQueue, noon: None
+) -> Iterator[TestClient]:
     wanted = settings.model_copy(update={"redis_url": SecretStr(redis_server)})
-    shared = Parts(wanted, parts.store, parts.index, parts.queue)
+    shared = Services(wanted, services.store, services.index, services.queue)
     with TestClient(create_app(wanted, shared), base_url="http://127.0.0.1:8000") as client:
         yield client
 
@@ -52,11 +54,11 @@ def limit(settings: Settings, **limits: int) -> None:
     KeyFile(settings.resolved_keys_file).limit_project("red", ProjectLimits(**limits))
 
 
-def done(parts: Parts, job: str, *, seconds: float, device: str = "cuda:0", day: str = TODAY) -> None:
+def done(services: Services, job: str, *, seconds: float, device: str = "cuda:0", day: str = TODAY) -> None:
     """A job of a single task is done: on that day, in that time."""
-    (made,) = finish_all(parts, read_record(JobRecord, parts.store, names.job_record(job)))
+    (made,) = finish_all(services, read_record(JobRecord, services.store, names.job_record(job)))
     values = {"device": device, "created": f"{day}T11:00:00.000000Z", "seconds": seconds}
-    with parts.index.database.writing() as connection:
+    with services.index.database.writing() as connection:
         connection.execute(update(shards).where(shards.c.id == made.shard_id).values(**values))
 
 
@@ -67,23 +69,23 @@ def refused(answer: Any) -> str:
 
 
 def test_keys_of_a_project_share_its_grasps_in_work_and_another_project_has_its_own(
-    ask: Ask, settings: Settings, parts: Parts
+    ask: Ask, settings: Settings, services: Services
 ) -> None:
     limit(settings, grasps_in_flight=64)
     first = ask("ann", 1).json()["id"]
     assert ask("amy", 2).status_code == 202
     assert "the project 'red' has 64 grasps in work and may have 64" in refused(ask("amy", 3))
     assert ask("bob", 3).status_code == 202
-    finish_all(parts, read_record(JobRecord, parts.store, names.job_record(first)))
+    finish_all(services, read_record(JobRecord, services.store, names.job_record(first)))
     assert ask("amy", 3).status_code == 202, "one of ann's ended"
 
 
 def test_keys_of_a_project_share_the_grasps_that_it_may_ask_for_on_a_day(
-    ask: Ask, settings: Settings, parts: Parts
+    ask: Ask, settings: Settings, services: Services
 ) -> None:
     limit(settings, grasps_per_day=96)
     first = ask("ann", 1).json()["id"]
-    finish_all(parts, read_record(JobRecord, parts.store, names.job_record(first)))
+    finish_all(services, read_record(JobRecord, services.store, names.job_record(first)))
     too_many = ask("amy", 2, grasps=65)
     assert "has asked for 32 of its 96 grasps of today" in refused(too_many), "also for what is done"
     assert 12 * 3600 <= int(too_many.headers["retry-after"]) <= 12 * 3600 + 1, "until midnight, and not before"
@@ -95,26 +97,26 @@ def test_keys_of_a_project_share_the_grasps_that_it_may_ask_for_on_a_day(
 
 
 def test_a_project_that_used_up_its_gpu_seconds_of_the_day_submits_no_more(
-    ask: Ask, settings: Settings, parts: Parts
+    ask: Ask, settings: Settings, services: Services
 ) -> None:
     limit(settings, gpu_seconds_per_day=60)
     made = [ask("ann", seed).json()["id"] for seed in (1, 2)]
     waiting = ask("ann", 3).json()["id"]
 
-    done(parts, made[0], device="cpu", seconds=61.0)
-    done(parts, ask("ann", 4).json()["id"], day="2026-11-19", seconds=61.0)
+    done(services, made[0], device="cpu", seconds=61.0)
+    done(services, ask("ann", 4).json()["id"], day="2026-11-19", seconds=61.0)
     assert ask("amy", 5).status_code == 202, "neither a CPU's time nor yesterday's counts"
-    done(parts, made[1], seconds=61.0)
+    done(services, made[1], seconds=61.0)
     assert "the project 'red' has used 61 of its 60 GPU seconds of today" in refused(ask("amy", 6))
     assert ask("bob", 6).status_code == 202
-    assert not parts.index.jobs.get(waiting).state.is_final, "what was submitted before goes on"
+    assert not services.index.jobs.get(waiting).state.is_final, "what was submitted before goes on"
 
 
 def test_usage_is_told_as_a_document_and_as_a_table_of_the_own_project_alone(
-    ask: Ask, service: TestClient, settings: Settings, parts: Parts
+    ask: Ask, service: TestClient, settings: Settings, services: Services
 ) -> None:
     for name, seed in (("ann", 1), ("bob", 2)):
-        done(parts, ask(name, seed).json()["id"], seconds=2.5)
+        done(services, ask(name, seed).json()["id"], seconds=2.5)
     keys = KeyFile(settings.resolved_keys_file)
     reader, admin = keys.add("reader", Scope.READ, project="red"), keys.add("root", Scope.ADMIN)
 

@@ -26,7 +26,7 @@ from service.model.errors import InputError
 from service.model.planning import plan
 from service.model.records import JobRecord
 from service.model.states import AssetKind
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 from service.store.network_file import to_bytes
 from service.store.records import read_record
@@ -46,7 +46,9 @@ def world(tmp_path_factory: pytest.TempPathFactory, furnished: Path) -> Iterator
     """A service with a job that is done, one that failed, a dataset, a hand, objects and a set of project `red`."""
     settings = Settings(data_dir=tmp_path_factory.mktemp("projects") / "data", webhook_secret=SecretStr("s" * 16))
     shutil.copytree(furnished, settings.data_dir)
-    parts = Parts(settings, open_store(settings.resolved_store_url), Index(settings.resolved_index_url), MemoryQueue())
+    services = Services(
+        settings, open_store(settings.resolved_store_url), Index(settings.resolved_index_url), MemoryQueue()
+    )
     keys = KeyFile(settings.resolved_keys_file)
     made = {
         "ann": (Scope.SUBMIT, "red"),
@@ -60,27 +62,29 @@ def world(tmp_path_factory: pytest.TempPathFactory, furnished: Path) -> Iterator
         name: {"Authorization": f"Bearer {keys.add(name, scope, project=project)}"}
         for name, (scope, project) in made.items()
     }
-    with TestClient(create_app(settings, parts), base_url="https://graspd.example", follow_redirects=False) as client:
-        yield World(client, parts, people)
-    parts.close()
+    with TestClient(
+        create_app(settings, services), base_url="https://graspd.example", follow_redirects=False
+    ) as client:
+        yield World(client, services, people)
+    services.close()
 
 
 @dataclass
 class World:
     client: TestClient
-    parts: Parts
+    services: Services
     people: dict[str, Headers]
     said: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         ann = self.people["ann"]
         job = self.post("/v1/jobs", ann, json=JOB).json()["id"]
-        record = read_record(JobRecord, self.parts.store, names.job_record(job))
-        finish_all(self.parts, record)
+        record = read_record(JobRecord, self.services.store, names.job_record(job))
+        finish_all(self.services, record)
         shard = next(task.output for task in plan(record))
         views = [task.output for task in plan(record)][-1]
         failed = self.post("/v1/jobs", ann, json=JOB | {"seed": 78}).json()["id"]
-        fail(self.parts, read_record(JobRecord, self.parts.store, names.job_record(failed)), "red-secret broke")
+        fail(self.services, read_record(JobRecord, self.services.store, names.job_record(failed)), "red-secret broke")
         waiting = self.post("/v1/jobs", ann, json=JOB | {"seed": 79}).json()["id"]
         for kind, name in (("objects", "red-secret-ball"), ("hands", "red-secret-hand")):
             file = ("ball.stl", _BALL) if kind == "objects" else ("hand.urdf", _URDF)
@@ -98,12 +102,12 @@ class World:
         self.post("/v1/object-sets", ann, json={"name": "red-secret-set", "objects": ["red-secret-ball", "mug"]})
         matrix = {"name": "red-secret-data", "hands": ["allegro"], "objects": ["mug", "bottle"], "grasps": 32}
         self.post("/v1/datasets", ann, json=matrix | {"scenes": 1, "views": 1, "seed": 77})
-        plan_all(self.parts)
+        plan_all(self.services)
         hook = self.post("/v1/webhooks", ann, json={"url": "https://red-secret.example/"}).json()
         snapshot = self.post("/v1/datasets/red-secret-data/snapshots", ann).json()["digest"]
         tag = self.post("/v1/tags", ann, json={"name": "red-secret-tag", "grasps": [{"shard_id": shard, "row": 0}]})
         assert tag.status_code == 200, tag.text
-        add_worker(self.parts)
+        add_worker(self.services)
         self.said |= {
             "job_id": job,
             "failed": failed,
@@ -354,8 +358,8 @@ def test_what_is_shared_is_used_by_every_project_and_deleted_by_its_own(world: W
 
 
 def test_an_upload_that_brings_the_mark_of_a_project_is_not_that_projects_object(world: World) -> None:
-    made = world.parts.index.assets.get(AssetKind.OBJECT, world.said["objects_digest"])
-    stored = world.parts.store.get(names.asset_files(AssetKind.OBJECT, made.digest))
+    made = world.services.index.assets.get(AssetKind.OBJECT, world.said["objects_digest"])
+    stored = world.services.store.get(names.asset_files(AssetKind.OBJECT, made.digest))
     with zipfile.ZipFile(io.BytesIO(stored)) as archive:
         assert "graspd-project.txt" in archive.namelist()
     for said in ({}, {"shared": "true"}):
@@ -375,10 +379,10 @@ def test_a_name_that_another_project_took_is_refused_without_a_word_of_it(world:
 
 
 def test_projects_are_in_the_store_and_survive_a_lost_index(world: World) -> None:
-    told = differences(world.parts.index, world.parts.store)
+    told = differences(world.services.index, world.services.store)
     assert [line for line in told if "project" in line or "shared" in line] == []
     fresh = Index("sqlite://")
-    rebuild(fresh, world.parts.store)
+    rebuild(fresh, world.services.store)
     try:
         assert fresh.jobs.get(world.said["job_id"]).project == "red"
         assert fresh.datasets.get("red-secret-data").project == "red"

@@ -16,7 +16,7 @@ from api.access.keys import KeyFile, Scope
 from api.access.proxy import Proxy
 from api.app import create_app
 from service.model.errors import InputError, UnavailableError
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 
 SECRET = "correct horse battery staple"
@@ -40,11 +40,11 @@ def behind(settings: Settings) -> Settings:
     return settings.model_copy(update=said)
 
 
-def client(settings: Settings, parts: Parts, address: tuple[str, int]) -> TestClient:
-    return TestClient(create_app(settings, parts), base_url="https://graspd.example", client=address)
+def client(settings: Settings, services: Services, address: tuple[str, int]) -> TestClient:
+    return TestClient(create_app(settings, services), base_url="https://graspd.example", client=address)
 
 
-def test_whom_the_proxy_vouches_for_has_the_rights_of_the_group(behind: Settings, parts: Parts) -> None:
+def test_whom_the_proxy_vouches_for_has_the_rights_of_the_group(behind: Settings, services: Services) -> None:
     found = {}
     for who, groups in {"ann": "vision", "bob": "hands", "ray": "others", "root": "vision,ops"}.items():
         key = Proxy(behind).find(_scope(PROXY, headers(f"{who}@lab.example", groups)))
@@ -58,8 +58,8 @@ def test_whom_the_proxy_vouches_for_has_the_rights_of_the_group(behind: Settings
     }
 
 
-def test_people_of_a_project_find_their_jobs_and_not_those_of_another(behind: Settings, parts: Parts) -> None:
-    http = client(behind, parts, PROXY)
+def test_people_of_a_project_find_their_jobs_and_not_those_of_another(behind: Settings, services: Services) -> None:
+    http = client(behind, services, PROXY)
     job = http.post("/v1/jobs", json=JOB, headers=headers()).json()["id"]
     assert http.get(f"/v1/jobs/{job}", headers=headers("amy@lab.example")).json()["project"] == "red"
     assert http.get(f"/v1/jobs/{job}", headers=headers("bob@lab.example", "hands")).status_code == 404
@@ -83,9 +83,9 @@ def test_people_of_a_project_find_their_jobs_and_not_those_of_another(behind: Se
     ],
 )
 def test_forged_headers_open_nothing(
-    behind: Settings, parts: Parts, address: tuple[str, int], sent: dict[str, str]
+    behind: Settings, services: Services, address: tuple[str, int], sent: dict[str, str]
 ) -> None:
-    http = client(behind, parts, address)
+    http = client(behind, services, address)
     assert http.get("/v1/jobs", headers=sent).status_code == 401
     assert http.get("/v1/jobs").status_code == 401
 
@@ -93,12 +93,12 @@ def test_forged_headers_open_nothing(
 @pytest.mark.parametrize("claim", ['["x", 9999999999]', "[]", "3", "{", '{"a": 1}', '["x", "y"]', "null"])
 @pytest.mark.parametrize("path", ["/", "/v1/jobs", "/login"])
 def test_a_session_that_is_signed_with_the_empty_secret_opens_nothing(
-    behind: Settings, parts: Parts, claim: str, path: str
+    behind: Settings, services: Services, claim: str, path: str
 ) -> None:
     assert not behind.resolved_keys_file.exists()
     packed = base64.urlsafe_b64encode(claim.encode()).decode()
     cookie = f"{packed}.{hmac.new(b'', packed.encode(), 'sha256').hexdigest()}"
-    http = client(behind, parts, PROXY)
+    http = client(behind, services, PROXY)
     forged = {"Cookie": f"{SESSION_COOKIE}={cookie}"}
     answers = [http.get(path, headers=sent, follow_redirects=False) for sent in (forged, {})]
     assert answers[0].status_code == answers[1].status_code < 500
@@ -120,9 +120,9 @@ def test_headers_that_came_twice_are_not_believed(behind: Settings) -> None:
     assert Proxy(behind).find({"type": "http", "client": PROXY, "headers": users}) is None
 
 
-def test_keys_go_on_opening_beside_the_proxy(behind: Settings, parts: Parts) -> None:
+def test_keys_go_on_opening_beside_the_proxy(behind: Settings, services: Services) -> None:
     token = KeyFile(behind.resolved_keys_file).add("robot", Scope.SUBMIT, project="red")
-    http = client(behind, parts, STRANGER)
+    http = client(behind, services, STRANGER)
     assert http.get("/v1/jobs", headers={"Authorization": f"Bearer {token}"}).status_code == 200
 
 

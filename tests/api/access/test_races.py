@@ -22,7 +22,7 @@ from service.model.dataset_records import ObjectSet, object_set_of
 from service.model.errors import ConflictError, QuotaError
 from service.model.records import JobRecord
 from service.model.webhooks import MOST_HOOKS
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings
@@ -42,11 +42,11 @@ Unfinished = Callable[[Collection[str]], Collection[str]]
 
 @pytest.fixture
 def twins(
-    settings: Settings, parts: Parts, redis_server: str, rq_queue: RqQueue, noon: None
+    settings: Settings, services: Services, redis_server: str, rq_queue: RqQueue, noon: None
 ) -> Iterator[list[TestClient]]:
-    """Two applications over the same parts, keys and Redis."""
+    """Two applications over the same services, keys and Redis."""
     wanted = settings.model_copy(update={"redis_url": SecretStr(redis_server), "webhook_secret": SecretStr("s" * 16)})
-    shared = Parts(wanted, parts.store, parts.index, parts.queue)
+    shared = Services(wanted, services.store, services.index, services.queue)
     clients = [TestClient(create_app(wanted, shared), base_url="http://127.0.0.1:8000") for _ in range(2)]
     for client in clients:
         client.__enter__()
@@ -158,11 +158,11 @@ def test_a_claim_of_a_process_that_died_ends(
 
 
 def test_jobs_that_ended_make_room(
-    twins: list[TestClient], headers: dict[str, str], parts: Parts, rq_queue: RqQueue
+    twins: list[TestClient], headers: dict[str, str], services: Services, rq_queue: RqQueue
 ) -> None:
     first = twins[0].post("/v1/jobs", json=JOB | {"grasps": 20}, headers=headers).json()["id"]
     assert twins[1].post("/v1/jobs", json=JOB, headers=headers).status_code == 429
-    finish_all(parts, read_record(JobRecord, parts.store, names.job_record(first)))
+    finish_all(services, read_record(JobRecord, services.store, names.job_record(first)))
     assert twins[1].post("/v1/jobs", json=JOB, headers=headers).status_code == 202
 
 
@@ -177,7 +177,7 @@ def test_a_refused_request_leaves_its_idempotency_key_free(
 
 
 def test_of_two_objects_of_one_name_at_once_one_gets_it(
-    twins: list[TestClient], headers: dict[str, str], parts: Parts, monkeypatch: pytest.MonkeyPatch
+    twins: list[TestClient], headers: dict[str, str], services: Services, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     together = Barrier(2)
     put_file = Store.put_file
@@ -197,7 +197,7 @@ def test_of_two_objects_of_one_name_at_once_one_gets_it(
     monkeypatch.setattr(Store, "put_file", both_have_looked)
     with ThreadPoolExecutor(2) as pool:
         assert sorted(pool.map(upload, range(2))) == [202, 409]
-    stored = [library.load_asset(parts.store, *found).name for found in library.stored_assets(parts.store)]
+    stored = [library.load_asset(services.store, *found).name for found in library.stored_assets(services.store)]
     assert stored.count("ball") == 1
 
 
@@ -217,9 +217,9 @@ def codes(answers: list[Response]) -> list[int]:
     return sorted(answer.status_code for answer in answers)
 
 
-def strayed(parts: Parts) -> list[str]:
+def strayed(services: Services) -> list[str]:
     """Rows that are not what the store says, but for those of the assets, which came without a check."""
-    return [line for line in differences(parts.index, parts.store) if not line.startswith("assets ")]
+    return [line for line in differences(services.index, services.store) if not line.startswith("assets ")]
 
 
 @pytest.fixture
@@ -231,7 +231,7 @@ def projects(settings: Settings) -> list[dict[str, str]]:
 
 
 def test_of_two_projects_that_want_one_name_of_a_set_at_once_one_gets_it(
-    twins: list[TestClient], projects: list[dict[str, str]], parts: Parts
+    twins: list[TestClient], projects: list[dict[str, str]], services: Services
 ) -> None:
     for number in range(ROUNDS):
         body = {"name": f"set{number}", "objects": ["mug"]}
@@ -239,11 +239,11 @@ def test_of_two_projects_that_want_one_name_of_a_set_at_once_one_gets_it(
             201,
             409,
         ]
-    assert strayed(parts) == []
+    assert strayed(services) == []
 
 
 def test_of_two_versions_of_a_set_at_once_the_later_follows_the_earlier(
-    twins: list[TestClient], headers: dict[str, str], parts: Parts
+    twins: list[TestClient], headers: dict[str, str], services: Services
 ) -> None:
     objects = (["mug"], ["block"])
     for number in range(ROUNDS):
@@ -253,20 +253,20 @@ def test_of_two_versions_of_a_set_at_once_the_later_follows_the_earlier(
             lambda http, n, name=name: http.post(SETS, json={"name": name, "objects": objects[n]}, headers=headers),
         )
         assert codes(answers) == [201, 201]
-        kept = [read_record(ObjectSet, parts.store, one.key) for one in parts.store.list(f"object_sets/{name}")]
+        kept = [read_record(ObjectSet, services.store, one.key) for one in services.store.list(f"object_sets/{name}")]
         first = next(one for one in kept if one.digest == object_set_of(name, one.objects).digest)
         later = next(one for one in kept if one is not first)
         assert later.digest == object_set_of(name, later.objects, after=first.digest).digest
 
 
 def test_of_two_datasets_of_one_name_at_once_one_gets_it(
-    twins: list[TestClient], headers: dict[str, str], parts: Parts
+    twins: list[TestClient], headers: dict[str, str], services: Services
 ) -> None:
     def create(http: TestClient, number: int) -> Response:
         return http.post("/v1/datasets", json=MATRIX | {"name": "all", "seed": number}, headers=headers)
 
     assert codes(at_once(twins, create)) == [202, 409]
-    assert strayed(parts) == []
+    assert strayed(services) == []
 
 
 def test_of_two_last_webhooks_at_once_one_is_made(twins: list[TestClient], projects: list[dict[str, str]]) -> None:
@@ -283,7 +283,7 @@ def test_of_two_last_webhooks_at_once_one_is_made(twins: list[TestClient], proje
 
 @pytest.mark.parametrize("what", ["job", "dataset"])
 def test_of_two_cancellations_at_once_one_counts(
-    twins: list[TestClient], headers: dict[str, str], parts: Parts, what: str
+    twins: list[TestClient], headers: dict[str, str], services: Services, what: str
 ) -> None:
     """Each leaves an event in the store: of two with one number a rebuild would not know which came last."""
     for number in range(4):
@@ -297,28 +297,28 @@ def test_of_two_cancellations_at_once_one_counts(
             202,
             409,
         ]
-        events = list(parts.store.list(f"{what}s/{name}/events"))
+        events = list(services.store.list(f"{what}s/{name}/events"))
         assert len(events) == 1
         answers = at_once(twins, lambda http, _, path=path: http.post(f"{path}/retry", headers=headers))
         assert codes(answers) == [202, 409]
-        assert len(list(parts.store.list(f"{what}s/{name}/events"))) == 2
+        assert len(list(services.store.list(f"{what}s/{name}/events"))) == 2
 
 
-def test_two_snapshots_at_once_are_one(twins: list[TestClient], headers: dict[str, str], parts: Parts) -> None:
+def test_two_snapshots_at_once_are_one(twins: list[TestClient], headers: dict[str, str], services: Services) -> None:
     twins[0].post("/v1/datasets", json=MATRIX | {"name": "all"}, headers=headers)
-    DatasetRounds(parts).advance()
-    job = next(parts.store.list("jobs")).key
-    finish_all(parts, read_record(JobRecord, parts.store, job))
+    DatasetRounds(services).advance()
+    job = next(services.store.list("jobs")).key
+    finish_all(services, read_record(JobRecord, services.store, job))
     answers = at_once(twins, lambda http, _: http.post("/v1/datasets/all/snapshots", headers=headers))
     assert codes(answers) == [200, 201]
     assert answers[0].json() == answers[1].json()
 
 
 def test_a_tag_given_twice_at_once_has_the_grasps_of_both(
-    twins: list[TestClient], headers: dict[str, str], parts: Parts
+    twins: list[TestClient], headers: dict[str, str], services: Services
 ) -> None:
     job = twins[0].post("/v1/jobs", json=JOB, headers=headers).json()["id"]
-    shard = finish_all(parts, read_record(JobRecord, parts.store, names.job_record(job)))[0].shard_id
+    shard = finish_all(services, read_record(JobRecord, services.store, names.job_record(job)))[0].shard_id
 
     def give(http: TestClient, number: int) -> Response:
         chosen = {"name": "good", "grasps": [{"shard_id": shard, "row": number}]}
@@ -326,7 +326,7 @@ def test_a_tag_given_twice_at_once_has_the_grasps_of_both(
 
     assert codes(at_once(twins, give)) == [200, 200]
     assert [tag["grasps"] for tag in twins[0].get("/v1/tags", headers=headers).json()] == [2]
-    assert strayed(parts) == []
+    assert strayed(services) == []
 
 
 def test_of_two_keys_of_one_name_at_once_one_is_made(settings: Settings) -> None:

@@ -7,7 +7,7 @@ from starlette.testclient import TestClient
 
 from api.app import create_app
 from service.index.rebuild import rebuild
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 from tests.api.factories import add_job
 from tests.damage import overwrite
@@ -21,25 +21,25 @@ def asked_anew(app: FastAPI) -> dict[str, object]:
         return {"status": answer.status_code, **answer.json()["parts"]["index"]}
 
 
-def test_an_index_that_lacks_what_the_store_has_is_not_ready(settings: Settings, parts: Parts) -> None:
-    record = add_job(parts)
+def test_an_index_that_lacks_what_the_store_has_is_not_ready(settings: Settings, services: Services) -> None:
+    record = add_job(services)
     fresh = empty_index(f"sqlite:///{settings.data_dir / 'fresh.sqlite'}")
-    lost = Parts(settings, parts.store, fresh, parts.queue)
+    lost = Services(settings, services.store, fresh, services.queue)
     app = create_app(settings, lost)
     fresh.write.add_job(record)
     assert (found := asked_anew(app))["status"] == 503
     assert not found["ok"]
     assert "controller" in str(found["detail"])
-    rebuild(fresh, parts.store)
+    rebuild(fresh, services.store)
     assert asked_anew(app)["status"] == 200
     fresh.close()
 
 
-def test_an_index_without_damaged_records_names_them(settings: Settings, parts: Parts) -> None:
-    key = f"jobs/{add_job(parts).id}/job.json"
-    app = create_app(settings, parts)
-    overwrite(parts.store, key, b'{"x": 1}')
-    rebuild(parts.index, parts.store)
+def test_an_index_without_damaged_records_names_them(settings: Settings, services: Services) -> None:
+    key = f"jobs/{add_job(services).id}/job.json"
+    app = create_app(settings, services)
+    overwrite(services.store, key, b'{"x": 1}')
+    rebuild(services.index, services.store)
     found = asked_anew(app)
     assert found["status"] == 200
     assert key in str(found["detail"])

@@ -7,7 +7,7 @@ from starlette.testclient import TestClient
 
 from service.model import names
 from service.model.records import JobRecord
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
 from service.store.records import read_record
@@ -16,11 +16,11 @@ from tests.planning import plan_all
 
 
 @pytest.fixture
-def jobs(http: TestClient, parts: Parts) -> dict[str, str]:
+def jobs(http: TestClient, services: Services) -> dict[str, str]:
     """One job that was judged, and a larger one on the same pair that was not."""
-    judged, unjudged = add_job(parts, want="raw"), add_job(parts, grasps=320, referee="none", want="raw")
+    judged, unjudged = add_job(services, want="raw"), add_job(services, grasps=320, referee="none", want="raw")
     for record in (judged, unjudged):
-        finish_all(parts, record)
+        finish_all(services, record)
     return {"judged": judged.id, "unjudged": unjudged.id}
 
 
@@ -41,12 +41,12 @@ def test_a_job_tells_its_yield_or_that_nobody_judged(http: TestClient, jobs: dic
     assert (told["unjudged"]["judged"], told["unjudged"]["valid_yield"]) == (0, None)
 
 
-def test_a_dataset_of_unjudged_grasps_has_no_yield(http: TestClient, parts: Parts) -> None:
+def test_a_dataset_of_unjudged_grasps_has_no_yield(http: TestClient, services: Services) -> None:
     wanted = {"name": "d", "hands": ["allegro"], "objects": ["mug"], "referee": "none"}
-    actions.create(parts, DatasetRequest.model_validate(wanted))
-    plan_all(parts)
-    (job,) = parts.index.jobs.page().items
-    finish_all(parts, read_record(JobRecord, parts.store, names.job_record(job.id)))
+    actions.create(services, DatasetRequest.model_validate(wanted))
+    plan_all(services)
+    (job,) = services.index.jobs.page().items
+    finish_all(services, read_record(JobRecord, services.store, names.job_record(job.id)))
     (cell,) = http.get("/v1/datasets/d/cells").json()["items"]
     assert (cell["tried"], cell["judged"], cell["valid_yield"]) == (32, 0, None)
     assert http.get("/v1/datasets/d").json()["valid_yield"] is None

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from api.client.dataset_reports import print_cells, print_dataset, print_estimate
 from service.model.domain import JobOptions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.cost import estimate
 from service.pipeline.datasets.spec import DatasetRequest
@@ -18,18 +18,18 @@ from tests.planning import plan_all
 
 
 @pytest.mark.parametrize("referee", ["none", "certificate"])
-def test_a_report_names_the_standing_of_what_it_counts(parts: Parts, referee: str) -> None:
+def test_a_report_names_the_standing_of_what_it_counts(services: Services, referee: str) -> None:
     given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32, "referee": referee}
     wanted = DatasetRequest.model_validate(given)
-    actions.create(parts, wanted)
-    plan_all(parts)
-    finish_all(parts, add_job(parts, referee=referee))
+    actions.create(services, wanted)
+    plan_all(services)
+    finish_all(services, add_job(services, referee=referee))
     out = io.StringIO()
     console = Console(file=out, width=200)
-    dataset = parts.index.datasets.get("k")
-    print_estimate(estimate(parts.index, wanted), console)
+    dataset = services.index.datasets.get("k")
+    print_estimate(estimate(services.index, wanted), console)
     print_dataset(dataset, console)
-    print_cells(dataset, parts.index.datasets.cells("k").items, console)
+    print_cells(dataset, services.index.datasets.cells("k").items, console)
     made = 32 if referee == "none" else dataset.valid
     word, other = ("sound", "valid") if referee == "none" else ("valid", "sound")
     assert f"grasps: {made} {word} of 32 tried" in out.getvalue()

@@ -8,25 +8,25 @@ from starlette.testclient import TestClient
 from api.catalog.comparison import Comparisons, Pair
 from api.catalog.datasets import Datasets
 from service.index.filters import GraspFilter
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
 from tests.api.factories import add_job, finish_all
 from tests.planning import plan_all
 
 
-def _two(parts: Parts) -> None:
+def _two(services: Services) -> None:
     """`rough` is done, one cell of draft grasps; `fine` has another object besides and no grasp yet."""
     rough = {"name": "rough", "hands": ["allegro"], "objects": ["mug"], "grasps": 32, "fidelity": "draft"}
     fine = {"name": "fine", "hands": ["allegro"], "objects": ["mug", "block"], "grasps": 32}
     for given in (rough, fine):
-        actions.create(parts, DatasetRequest.model_validate(given))
-    plan_all(parts)
-    finish_all(parts, add_job(parts, fidelity="draft"))
+        actions.create(services, DatasetRequest.model_validate(given))
+    plan_all(services)
+    finish_all(services, add_job(services, fidelity="draft"))
 
 
-def test_the_page_shows_what_differs_and_every_cell(http: TestClient, parts: Parts) -> None:
-    _two(parts)
+def test_the_page_shows_what_differs_and_every_cell(http: TestClient, services: Services) -> None:
+    _two(services)
     page = " ".join(http.get("/compare", params={"one": "rough", "other": "fine"}).text.split())
     assert "Fidelity</th><td" in page and ">draft</td>" in page and ">standard</td>" in page
     assert "Objects of its own</th>" in page and ">block</td>" in page
@@ -35,32 +35,32 @@ def test_the_page_shows_what_differs_and_every_cell(http: TestClient, parts: Par
     assert "They ask for the same" not in page
 
 
-def test_a_dataset_beside_itself_differs_in_nothing(http: TestClient, parts: Parts) -> None:
-    _two(parts)
+def test_a_dataset_beside_itself_differs_in_nothing(http: TestClient, services: Services) -> None:
+    _two(services)
     page = http.get("/compare", params={"one": "rough", "other": "rough"}).text
     assert "They ask for the same" in page
     assert "+0 points" in page
 
 
-def test_without_a_choice_the_page_offers_datasets(http: TestClient, parts: Parts) -> None:
-    _two(parts)
+def test_without_a_choice_the_page_offers_datasets(http: TestClient, services: Services) -> None:
+    _two(services)
     page = http.get("/compare").text
     assert page.count("<option>rough</option>") == page.count("<option>fine</option>") == 2
     assert "/compare?one=rough&amp;other=fine" in http.get("/datasets").text
 
 
-def test_a_dataset_that_is_not_there_is_not_found(http: TestClient, parts: Parts) -> None:
-    _two(parts)
+def test_a_dataset_that_is_not_there_is_not_found(http: TestClient, services: Services) -> None:
+    _two(services)
     assert http.get("/compare", params={"one": "rough", "other": "gone"}).status_code == 404
 
 
-def test_distributions_of_two_share_their_bins_and_count_all(parts: Parts) -> None:
-    _two(parts)
+def test_distributions_of_two_share_their_bins_and_count_all(services: Services) -> None:
+    _two(services)
     filters = [GraspFilter(dataset="rough", valid=valid) for valid in (True, False)]
-    one, other = parts.index.statistics.side_by_side(filters, ["epsilon"], bins=7)["epsilon"]
+    one, other = services.index.statistics.side_by_side(filters, ["epsilon"], bins=7)["epsilon"]
     assert one is not None and other is not None
     assert (one.low, one.high) == (other.low, other.high)
-    both = parts.index.statistics.distributions(GraspFilter(dataset="rough"), ["epsilon"], bins=7).metrics["epsilon"]
+    both = services.index.statistics.distributions(GraspFilter(dataset="rough"), ["epsilon"], bins=7).metrics["epsilon"]
     assert (one.low, one.high) == (both.low, both.high)
     assert [a + b for a, b in zip(one.counts, other.counts, strict=True)] == both.counts
 
@@ -69,13 +69,13 @@ def test_a_cell_that_only_one_has_makes_no_difference() -> None:
     assert Pair("hand", "object", None, None).gain is None
 
 
-def test_more_cells_than_anybody_reads_are_left_out(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
-    _two(parts)
+def test_more_cells_than_anybody_reads_are_left_out(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
+    _two(services)
     monkeypatch.setattr("api.catalog.comparison.MOST_CELLS", 1)
-    datasets = Datasets(parts, None)  # type: ignore[arg-type]
-    assert Comparisons(parts, datasets).of("rough", "fine").pairs == []
+    datasets = Datasets(services, None)  # type: ignore[arg-type]
+    assert Comparisons(services, datasets).of("rough", "fine").pairs == []
 
 
-def test_datasets_without_a_grasp_say_so(http: TestClient, parts: Parts) -> None:
-    actions.create(parts, DatasetRequest.model_validate({"name": "k", "hands": ["allegro"], "objects": ["mug"]}))
+def test_datasets_without_a_grasp_say_so(http: TestClient, services: Services) -> None:
+    actions.create(services, DatasetRequest.model_validate({"name": "k", "hands": ["allegro"], "objects": ["mug"]}))
     assert "No grasp yet" in http.get("/compare", params={"one": "k", "other": "k"}).text

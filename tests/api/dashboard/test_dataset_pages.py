@@ -8,7 +8,7 @@ from starlette.testclient import TestClient
 from api.dashboard.figures.matrix import of_service
 from service.index.views import MatrixCell
 from service.model.states import State
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
 from tests.api.factories import add_job, fail, finish_all
@@ -43,25 +43,25 @@ def test_pairs_without_work_have_a_cell_to_choose() -> None:
     assert all(shown is not None for _, cells in grid.rows for shown in cells)
 
 
-def test_chosen_pairs_are_submitted(http: TestClient, parts: Parts) -> None:
+def test_chosen_pairs_are_submitted(http: TestClient, services: Services) -> None:
     form = {"action": "submit", "cell": ["allegro|mug", "shadow|block"], "grasps": "64", "fidelity": "draft"}
     answer = http.post("/datasets/cells", data=form)
     assert "2 jobs submitted." in answer.text
-    made = parts.index.jobs.page().items
+    made = services.index.jobs.page().items
     assert {(job.request.hand, job.request.object, job.request.grasps) for job in made} == {
         ("allegro", "mug", 64),
         ("shadow", "block", 64),
     }
 
 
-def test_chosen_pairs_are_cancelled_and_retried(http: TestClient, parts: Parts) -> None:
-    waiting, failed = add_job(parts), add_job(parts, object="block")
-    fail(parts, failed, "lost")
+def test_chosen_pairs_are_cancelled_and_retried(http: TestClient, services: Services) -> None:
+    waiting, failed = add_job(services), add_job(services, object="block")
+    fail(services, failed, "lost")
     pairs = ["allegro|mug", "allegro|block"]
     assert "1 job cancelled." in http.post("/datasets/cells", data={"action": "cancel", "cell": pairs}).text
-    assert parts.index.jobs.get(waiting.id).state is State.CANCELLED
+    assert services.index.jobs.get(waiting.id).state is State.CANCELLED
     assert "2 jobs retried." in http.post("/datasets/cells", data={"action": "retry", "cell": pairs}).text
-    assert parts.index.jobs.get(failed.id).state is State.QUEUED
+    assert services.index.jobs.get(failed.id).state is State.QUEUED
 
 
 @pytest.mark.parametrize(
@@ -73,24 +73,24 @@ def test_an_action_that_cannot_be_done_says_why(http: TestClient, form: dict[str
     assert "That cannot be done" in answer.text
 
 
-def test_a_dataset_is_made_watched_retried_and_frozen(http: TestClient, parts: Parts) -> None:
+def test_a_dataset_is_made_watched_retried_and_frozen(http: TestClient, services: Services) -> None:
     form = {"name": "kitchen", "grasps": "32", "fidelity": "draft", "hands": ["allegro"], "objects": ["mug", "block"]}
     page = http.post("/datasets", data=form).text
     assert "kitchen" in page
     assert page.count('class="cell queued') == 2
-    plan_all(parts)
+    plan_all(services)
     assert (
         "1 job cancelled"
         in http.post(
             "/datasets/kitchen/cells",
-            data={"action": "cancel", "cell": [parts.index.datasets.cells("kitchen").items[0].job_id]},
+            data={"action": "cancel", "cell": [services.index.datasets.cells("kitchen").items[0].job_id]},
         ).text
     )
     assert http.post("/datasets/kitchen/retry").status_code == 200
-    finish_all(parts, add_job(parts, fidelity="draft"))
+    finish_all(services, add_job(services, fidelity="draft"))
     answer = http.post("/datasets/kitchen/snapshot")
     assert "The snapshot is taken" in answer.text
-    assert len(parts.index.datasets.snapshots("kitchen").items) == 1
+    assert len(services.index.datasets.snapshots("kitchen").items) == 1
 
 
 def test_a_dataset_without_a_hand_is_explained_and_what_was_typed_stays(http: TestClient) -> None:
@@ -101,29 +101,29 @@ def test_a_dataset_without_a_hand_is_explained_and_what_was_typed_stays(http: Te
     assert 'value="7"' in answer.text
 
 
-def test_a_dataset_is_made_in_scenes_with_neighbours(http: TestClient, parts: Parts) -> None:
+def test_a_dataset_is_made_in_scenes_with_neighbours(http: TestClient, services: Services) -> None:
     form = {"name": "clutter", "grasps": "32", "hands": ["allegro"], "objects": ["mug"], "neighbours": "block, bottle"}
     page = http.post("/datasets", data=form | {"scene": "table"}).text
     assert "on a table beside block, bottle" in page
-    assert [one.object for one in parts.index.datasets.get("clutter").options.beside] == ["block", "bottle"]
+    assert [one.object for one in services.index.datasets.get("clutter").options.beside] == ["block", "bottle"]
     wrong = http.post("/datasets", data=form | {"name": "afloat"})
     assert wrong.status_code == 422 and "neighbours stand in a scene" in wrong.text
     assert 'value="block, bottle"' in wrong.text
 
 
-def test_a_dataset_says_how_near_fingertips_come_to_supports(http: TestClient, parts: Parts) -> None:
+def test_a_dataset_says_how_near_fingertips_come_to_supports(http: TestClient, services: Services) -> None:
     form = {"name": "flat", "hands": ["barrett"], "objects": ["block"], "scene": "table", "touch": "-0.5"}
     assert http.post("/datasets", data=form).status_code == 200
-    assert parts.index.datasets.get("flat").options.touch == -0.5
+    assert services.index.datasets.get("flat").options.touch == -0.5
     wrong = http.post("/datasets", data=form | {"name": "too-deep", "touch": "-3"})
     assert (
         wrong.status_code == 422 and 'name="touch" type="number" min="-1" max="2" step="any" value="-3"' in wrong.text
     )
 
 
-def test_cells_of_one_state_are_a_list(http: TestClient, parts: Parts) -> None:
+def test_cells_of_one_state_are_a_list(http: TestClient, services: Services) -> None:
     wanted = DatasetRequest.model_validate({"name": "k", "hands": ["allegro"], "objects": ["mug", "block"]})
-    actions.create(parts, wanted)
+    actions.create(services, wanted)
     assert http.get("/datasets/k", params={"state": "queued"}).text.count('name="cell"') == 2
     assert "No cell is failed" in http.get("/datasets/k", params={"state": "failed"}).text
 
@@ -136,12 +136,12 @@ def test_cells_of_one_state_are_a_list(http: TestClient, parts: Parts) -> None:
     ],
 )
 def test_grasps_that_nobody_judged_are_counted_and_not_called_valid(
-    http: TestClient, parts: Parts, options: dict[str, str], shown: str
+    http: TestClient, services: Services, options: dict[str, str], shown: str
 ) -> None:
     given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
-    actions.create(parts, DatasetRequest.model_validate(given | options))
-    plan_all(parts)
-    finish_all(parts, add_job(parts, **options))
+    actions.create(services, DatasetRequest.model_validate(given | options))
+    plan_all(services)
+    finish_all(services, add_job(services, **options))
     http.post("/datasets/k/snapshot")
     word = shown.partition(" ")[2]
     matrix_page, list_page = http.get("/datasets/k").text, http.get("/datasets/k", params={"state": "succeeded"}).text
@@ -154,36 +154,36 @@ def test_grasps_that_nobody_judged_are_counted_and_not_called_valid(
 
 @pytest.mark.parametrize(("scene", "place"), [("free", ""), ("bin", " in a bin")])
 def test_the_share_of_a_cell_says_in_which_scene_its_grasps_are_valid(
-    http: TestClient, parts: Parts, scene: str, place: str
+    http: TestClient, services: Services, scene: str, place: str
 ) -> None:
     given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32, "scene": scene}
-    actions.create(parts, DatasetRequest.model_validate(given))
-    plan_all(parts)
-    finish_all(parts, add_job(parts, scene=scene))
-    valid = parts.index.datasets.get("k").valid
+    actions.create(services, DatasetRequest.model_validate(given))
+    plan_all(services)
+    finish_all(services, add_job(services, scene=scene))
+    valid = services.index.datasets.get("k").valid
     page = " ".join(http.get("/datasets/k").text.split())
     assert f"32 grasps each{place} ·" in page
     assert f">{valid} valid{place}<" in page
     assert ("Valid grasps in scenes" in page) == bool(place)
 
 
-def test_a_dataset_and_a_job_ask_for_robust_grasps(http: TestClient, parts: Parts) -> None:
+def test_a_dataset_and_a_job_ask_for_robust_grasps(http: TestClient, services: Services) -> None:
     form = {"name": "sure", "grasps": "32", "robust": "0.9", "hands": ["allegro"], "objects": ["mug"]}
     assert "sure" in http.post("/datasets", data=form).text
-    assert parts.index.datasets.get("sure").options.robust == 0.9
+    assert services.index.datasets.get("sure").options.robust == 0.9
     http.post("/submit", data={"hand": "allegro", "object": "mug", "robust": "0.75"})
-    assert parts.index.jobs.page().items[0].request.robust == 0.75
+    assert services.index.jobs.page().items[0].request.robust == 0.75
     refused = http.post("/submit", data={"hand": "allegro", "object": "mug", "robust": "0.75", "referee": "none"})
     assert refused.status_code == 422 and "choose a referee" in refused.text
 
 
-def test_a_dataset_and_a_job_ask_for_a_payload_and_a_shake(http: TestClient, parts: Parts) -> None:
+def test_a_dataset_and_a_job_ask_for_a_payload_and_a_shake(http: TestClient, services: Services) -> None:
     asked = {"min_payload": "0.5", "shake": "true", "scene": "table"}
     form = {"name": "heavy", "grasps": "32", "hands": ["allegro"], "objects": ["mug"], **asked}
     assert "heavy" in http.post("/datasets", data=form).text
     http.post("/submit", data={"hand": "allegro", "object": "mug", **asked})
-    job = parts.index.jobs.page().items[0].request
-    for options in (parts.index.datasets.get("heavy").options, job):
+    job = services.index.jobs.page().items[0].request
+    for options in (services.index.datasets.get("heavy").options, job):
         assert (options.min_payload, options.shake) == (0.5, True)
     refused = http.post("/submit", data={"hand": "allegro", "object": "mug", "shake": "true"})
     assert refused.status_code == 422 and "lifted out of a scene" in refused.text

@@ -14,7 +14,7 @@ from api.dashboard import form_uploads
 from service.index.views import AssetView
 from service.model import names
 from service.model.states import AssetKind
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.library import load_asset, load_asset_files
 from tests.api.dashboard.test_pages import FORM
 
@@ -27,25 +27,25 @@ def no_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(form_uploads, "_CHECK_WAIT_S", 0.0)
 
 
-def check(parts: Parts, asset: AssetView, verdict: str, facts: dict[str, Any] | None = None) -> None:
+def check(services: Services, asset: AssetView, verdict: str, facts: dict[str, Any] | None = None) -> None:
     """What a worker would find."""
     found = {"verdict": verdict, "message": "a thing of 60 m", "repairs": [], "facts": facts or {}}
-    parts.store.put(names.asset_check(AssetKind.OBJECT, asset.digest), json.dumps(found).encode())
-    parts.index.write.add_asset(load_asset(parts.store, AssetKind.OBJECT, asset.digest), found)
+    services.store.put(names.asset_check(AssetKind.OBJECT, asset.digest), json.dumps(found).encode())
+    services.index.write.add_asset(load_asset(services.store, AssetKind.OBJECT, asset.digest), found)
 
 
 def uploaded(
-    http: TestClient, parts: Parts, verdict: str, facts: dict[str, Any] | None = None, **options: str
+    http: TestClient, services: Services, verdict: str, facts: dict[str, Any] | None = None, **options: str
 ) -> AssetView:
     data = {"options": json.dumps(options)} if options else {}
     asset = AssetView.model_validate(http.post("/v1/objects", files={"file": MESH}, data=data).json())
-    check(parts, asset, verdict, facts)
+    check(services, asset, verdict, facts)
     return asset
 
 
-def jobs(parts: Parts) -> list[str]:
+def jobs(services: Services) -> list[str]:
     """Objects of the jobs there are."""
-    return [job.request.object for job in parts.index.jobs.page(limit=10).items]
+    return [job.request.object for job in services.index.jobs.page(limit=10).items]
 
 
 def fields_of(page: str) -> dict[str, str]:
@@ -58,76 +58,76 @@ def fields_of(page: str) -> dict[str, str]:
     return FORM | picked | hidden
 
 
-def test_a_refused_file_is_what_the_form_goes_on_to_show(http: TestClient, parts: Parts) -> None:
-    uploaded(http, parts, "refuse")
+def test_a_refused_file_is_what_the_form_goes_on_to_show(http: TestClient, services: Services) -> None:
+    uploaded(http, services, "refuse")
     answer = http.post("/submit", data=FORM, files={"file": MESH})
     assert answer.status_code == 422
     assert "a thing of 60 m" in answer.text
     assert fields_of(answer.text)["object"] == ""
     assert "your file part (refused)" in answer.text
     assert 'data-model="/v1/objects/mug/model"' not in answer.text
-    assert jobs(parts) == []
+    assert jobs(services) == []
 
 
-def test_pressing_again_does_not_run_another_object(http: TestClient, parts: Parts) -> None:
-    uploaded(http, parts, "refuse")
+def test_pressing_again_does_not_run_another_object(http: TestClient, services: Services) -> None:
+    uploaded(http, services, "refuse")
     page = http.post("/submit", data=FORM, files={"file": MESH}).text
     again = http.post("/submit", data=fields_of(page))
     assert again.status_code == 422 and "a thing of 60 m" in again.text
-    assert jobs(parts) == []
+    assert jobs(services) == []
 
 
 def test_a_refused_file_is_checked_again_in_other_units_without_being_sent_again(
-    http: TestClient, parts: Parts
+    http: TestClient, services: Services
 ) -> None:
-    first = uploaded(http, parts, "refuse")
+    first = uploaded(http, services, "refuse")
     page = http.post("/submit", data=FORM, files={"file": MESH}).text
     waiting = http.post("/submit", data=fields_of(page) | {"units": "mm"})
     assert waiting.status_code == 409 and "still being checked" in waiting.text
-    meant = parts.index.assets.get(AssetKind.OBJECT, "part")
-    check(parts, meant, "accept")
+    meant = services.index.assets.get(AssetKind.OBJECT, "part")
+    check(services, meant, "accept")
     assert http.post("/submit", data=fields_of(waiting.text), follow_redirects=False).status_code == 303
-    assert jobs(parts) == ["part"]
+    assert jobs(services) == ["part"]
     assert meant.digest != first.digest
-    assert json.loads(load_asset_files(parts.store, AssetKind.OBJECT, meant.digest)["asset.json"]) == {
+    assert json.loads(load_asset_files(services.store, AssetKind.OBJECT, meant.digest)["asset.json"]) == {
         "file": "part.stl",
         "units": "mm",
     }
 
 
-def test_units_stay_chosen_on_a_page_in_error(http: TestClient, parts: Parts) -> None:
-    uploaded(http, parts, "refuse", units="mm")
+def test_units_stay_chosen_on_a_page_in_error(http: TestClient, services: Services) -> None:
+    uploaded(http, services, "refuse", units="mm")
     page = http.post("/submit", data=FORM | {"units": "mm"}, files={"file": MESH}).text
     assert fields_of(page)["units"] == "mm"
 
 
-def test_a_known_object_can_be_chosen_instead_of_the_refused_file(http: TestClient, parts: Parts) -> None:
-    uploaded(http, parts, "refuse")
+def test_a_known_object_can_be_chosen_instead_of_the_refused_file(http: TestClient, services: Services) -> None:
+    uploaded(http, services, "refuse")
     page = http.post("/submit", data=FORM, files={"file": MESH}).text
     answer = http.post("/submit", data=fields_of(page) | {"object": "block"}, follow_redirects=False)
     assert answer.status_code == 303
-    assert jobs(parts) == ["block"]
+    assert jobs(services) == ["block"]
 
 
-def test_a_file_that_cannot_be_kept_is_asked_for_again(http: TestClient, parts: Parts) -> None:
+def test_a_file_that_cannot_be_kept_is_asked_for_again(http: TestClient, services: Services) -> None:
     page = http.post("/submit", data=FORM, files={"file": ("notes.txt", b"hello")})
     assert "notes.txt holds no object file" in page.text
     again = http.post("/submit", data=fields_of(page.text))
     assert again.status_code == 422 and "choose a known object, or a file" in again.text
-    assert jobs(parts) == []
+    assert jobs(services) == []
 
 
-def test_a_mistake_in_another_field_keeps_the_file(http: TestClient, parts: Parts) -> None:
-    uploaded(http, parts, "accept")
+def test_a_mistake_in_another_field_keeps_the_file(http: TestClient, services: Services) -> None:
+    uploaded(http, services, "accept")
     page = http.post("/submit", data=FORM | {"grasps": "0"}, files={"file": MESH})
     assert page.status_code == 422
     assert fields_of(page.text)["object"] == "part"
 
 
-def test_a_form_that_names_no_object_gets_none(http: TestClient, parts: Parts) -> None:
+def test_a_form_that_names_no_object_gets_none(http: TestClient, services: Services) -> None:
     answer = http.post("/submit", data={key: value for key, value in FORM.items() if key != "object"})
     assert answer.status_code == 422 and "choose a known object, or a file" in answer.text
-    assert jobs(parts) == []
+    assert jobs(services) == []
 
 
 def test_an_object_that_is_not_known_is_not_shown_as_the_first_of_those_that_are(http: TestClient) -> None:
@@ -136,10 +136,10 @@ def test_an_object_that_is_not_known_is_not_shown_as_the_first_of_those_that_are
     assert "lost (not known here)" in page
 
 
-def test_what_a_form_holds_must_be_there(http: TestClient, parts: Parts) -> None:
+def test_what_a_form_holds_must_be_there(http: TestClient, services: Services) -> None:
     answer = http.post("/submit", data=FORM | {"object": "", "object_held": "0" * 32})
     assert answer.status_code == 422
-    assert jobs(parts) == []
+    assert jobs(services) == []
 
 
 #: What the check of a mesh in millimetres tells beside its message.
@@ -157,8 +157,8 @@ def fixes_of(page: str) -> dict[str, str]:
     return {words: unescape(value) for value, words in found}
 
 
-def test_a_refusal_is_told_in_words_with_buttons(http: TestClient, parts: Parts) -> None:
-    asset = uploaded(http, parts, "refuse", TOO_LARGE)
+def test_a_refusal_is_told_in_words_with_buttons(http: TestClient, services: Services) -> None:
+    asset = uploaded(http, services, "refuse", TOO_LARGE)
     whole = http.post("/submit", data=FORM, files={"file": MESH}).text
     part = http.get(f"/submit/refusals/object/{asset.digest}").text
     for page in (whole, part):
@@ -179,23 +179,23 @@ def test_a_refusal_is_told_in_words_with_buttons(http: TestClient, parts: Parts)
     ],
 )
 def test_the_button_of_a_fix_checks_the_file_again_and_submits_nothing(
-    http: TestClient, parts: Parts, words: str, field: dict[str, str], said: dict[str, Any]
+    http: TestClient, services: Services, words: str, field: dict[str, str], said: dict[str, Any]
 ) -> None:
-    uploaded(http, parts, "refuse", TOO_LARGE)
+    uploaded(http, services, "refuse", TOO_LARGE)
     page = http.post("/submit", data=FORM, files={"file": MESH}).text
     again = http.post("/submit", data=fields_of(page) | field | {"object_fix": fixes_of(page)[words]})
-    assert again.status_code == 200 and jobs(parts) == []
+    assert again.status_code == 200 and jobs(services) == []
     assert fields_of(again.text)["object"] == "part"
-    meant = parts.index.assets.get(AssetKind.OBJECT, "part")
-    assert json.loads(load_asset_files(parts.store, AssetKind.OBJECT, meant.digest)["asset.json"]) == {
+    meant = services.index.assets.get(AssetKind.OBJECT, "part")
+    assert json.loads(load_asset_files(services.store, AssetKind.OBJECT, meant.digest)["asset.json"]) == {
         "file": "part.stl",
         **said,
     }
 
 
 @pytest.mark.parametrize("typed", ["", "wide"])
-def test_a_fix_without_its_number_asks_for_it(http: TestClient, parts: Parts, typed: str) -> None:
-    uploaded(http, parts, "refuse", TOO_LARGE)
+def test_a_fix_without_its_number_asks_for_it(http: TestClient, services: Services, typed: str) -> None:
+    uploaded(http, services, "refuse", TOO_LARGE)
     page = http.post("/submit", data=FORM, files={"file": MESH}).text
     fix = fixes_of(page)["Scale it to this size"]
     again = http.post("/submit", data=fields_of(page) | {"object_scale_to": typed, "object_fix": fix})
@@ -214,22 +214,22 @@ def test_a_fix_without_its_number_asks_for_it(http: TestClient, parts: Parts, ty
     ],
 )
 def test_each_suggested_option_is_a_button(
-    http: TestClient, parts: Parts, suggested: dict[str, Any], words: str
+    http: TestClient, services: Services, suggested: dict[str, Any], words: str
 ) -> None:
-    asset = uploaded(http, parts, "refuse", {"problem": "it is none", "options_suggested": [suggested]})
+    asset = uploaded(http, services, "refuse", {"problem": "it is none", "options_suggested": [suggested]})
     page = http.get(f"/submit/refusals/object/{asset.digest}").text
     assert {said: json.loads(value) for said, value in fixes_of(page).items()} == {words: suggested}
 
 
-def test_facts_that_an_upload_says_of_itself_break_no_page(http: TestClient, parts: Parts) -> None:
+def test_facts_that_an_upload_says_of_itself_break_no_page(http: TestClient, services: Services) -> None:
     odd = {"units_suggested": "mm", "options_suggested": [3, {}, {"a": 1}, {"root": "<b>"}], "lengths_m": [1]}
-    asset = uploaded(http, parts, "refuse", odd)
+    asset = uploaded(http, services, "refuse", odd)
     page = http.get(f"/submit/refusals/object/{asset.digest}").text
     assert list(fixes_of(page)) == ["Begin the hand at &lt;b&gt;"]
 
 
-def test_what_was_refused_can_be_chosen_nowhere(http: TestClient, parts: Parts) -> None:
-    uploaded(http, parts, "refuse")
+def test_what_was_refused_can_be_chosen_nowhere(http: TestClient, services: Services) -> None:
+    uploaded(http, services, "refuse")
     for page in ("/submit", "/datasets", "/grasps"):
         assert not re.search(r">\s*part\b", http.get(page).text), page
     assert "part" not in {one["name"] for one in http.get("/v1/objects").json()["items"]}
@@ -238,15 +238,15 @@ def test_what_was_refused_can_be_chosen_nowhere(http: TestClient, parts: Parts) 
     assert "part" not in http.get("/v1/objects/nothing").json()["detail"]
 
 
-def test_a_name_of_something_refused_is_free(http: TestClient, parts: Parts) -> None:
-    refused = uploaded(http, parts, "refuse")
+def test_a_name_of_something_refused_is_free(http: TestClient, services: Services) -> None:
+    refused = uploaded(http, services, "refuse")
     answer = http.post("/v1/objects", files={"file": ("part.stl", b"solid another\nendsolid\n")})
     assert answer.status_code == 202 and answer.json()["digest"] != refused.digest
     assert http.get("/v1/objects/part").json()["digest"] == answer.json()["digest"]
 
 
-def test_a_file_of_other_content_and_the_same_name_is_another_object(http: TestClient, parts: Parts) -> None:
-    first = uploaded(http, parts, "accept")
+def test_a_file_of_other_content_and_the_same_name_is_another_object(http: TestClient, services: Services) -> None:
+    first = uploaded(http, services, "accept")
     other = {"file": ("part.stl", b"solid another\nendsolid\n")}
     assert http.post("/v1/objects", files=other).status_code == 409
     second = http.post("/v1/objects", files=other, data={"rename": "true"}).json()
@@ -255,8 +255,8 @@ def test_a_file_of_other_content_and_the_same_name_is_another_object(http: TestC
     assert (again["name"], again["digest"]) == ("part", first.digest)
 
 
-def test_a_refused_file_is_found_again_though_its_name_stands_for_another(http: TestClient, parts: Parts) -> None:
-    refused = uploaded(http, parts, "refuse")
+def test_a_refused_file_is_found_again_though_its_name_stands_for_another(http: TestClient, services: Services) -> None:
+    refused = uploaded(http, services, "refuse")
     good = http.post("/v1/objects", files={"file": ("part.stl", b"solid another\nendsolid\n")}).json()
     for sent in ({}, {"name": "other"}):
         again = http.post("/v1/objects", files={"file": MESH}, data=sent)

@@ -12,15 +12,15 @@ from starlette.testclient import TestClient
 
 from api.catalog.grasp_files import OUTCOMES, judged_by
 from service.model.robust import MEANINGS, Axis
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.shards import Shard, read_shard
 from tests.api.factories import JOINTS, add_job, finish_all
 from worker.quality.referee.protocol import JudgedBy, Outcome
 
 
-def test_a_grasp_is_the_row_of_its_shard(http: TestClient, parts: Parts) -> None:
-    manifest = finish_all(parts, add_job(parts))[0]
-    shard = read_shard(parts.store.get(manifest.key))
+def test_a_grasp_is_the_row_of_its_shard(http: TestClient, services: Services) -> None:
+    manifest = finish_all(services, add_job(services))[0]
+    shard = read_shard(services.store.get(manifest.key))
     document = http.get(f"/v1/grasps/{manifest.shard_id}/5").json()
     np.testing.assert_allclose(document["postures"]["squeeze"]["hand_pose"], shard["squeeze/hand_pose"][5])
     np.testing.assert_allclose(document["sweep"]["epsilon"], shard["quality/epsilon"][5])
@@ -29,16 +29,16 @@ def test_a_grasp_is_the_row_of_its_shard(http: TestClient, parts: Parts) -> None
 
 
 @pytest.mark.parametrize("row", [32, -1])
-def test_a_grasp_that_is_not_there_is_named(http: TestClient, parts: Parts, row: int) -> None:
-    shard = finish_all(parts, add_job(parts))[0].shard_id
+def test_a_grasp_that_is_not_there_is_named(http: TestClient, services: Services, row: int) -> None:
+    shard = finish_all(services, add_job(services))[0].shard_id
     answer = http.get(f"/v1/grasps/{shard}/{row}")
     assert answer.status_code == 404
     assert f"there is no grasp {row}" in answer.json()["detail"]
 
 
-def test_a_grasp_whose_file_is_gone_is_a_clear_error(http: TestClient, parts: Parts) -> None:
-    manifest = finish_all(parts, add_job(parts))[0]
-    (parts.settings.data_dir / "store" / manifest.key).unlink()
+def test_a_grasp_whose_file_is_gone_is_a_clear_error(http: TestClient, services: Services) -> None:
+    manifest = finish_all(services, add_job(services))[0]
+    (services.settings.data_dir / "store" / manifest.key).unlink()
     answer = http.get(f"/grasps/{manifest.shard_id}/0", headers={"Accept": "text/html"})
     assert answer.status_code == 500
     assert manifest.key in answer.text
@@ -55,9 +55,9 @@ def test_a_verdict_says_whose_it_is() -> None:
     assert told == [["mujoco", "mujoco_warp"], ["mujoco", "mujoco"], [None, None]]
 
 
-def test_the_page_of_a_grasp_tells_quality_and_where_it_is_kept(http: TestClient, parts: Parts) -> None:
-    record = add_job(parts)
-    shard = finish_all(parts, record)[0].shard_id
+def test_the_page_of_a_grasp_tells_quality_and_where_it_is_kept(http: TestClient, services: Services) -> None:
+    record = add_job(services)
+    shard = finish_all(services, record)[0].shard_id
     page = http.get(f"/grasps/{shard}/3").text
     assert f'href="/v1/shards/{shard}/file"' in page
     assert f'href="/jobs/{record.id}"' in page
@@ -78,9 +78,9 @@ def test_models_are_served_as_gltf_and_kept_under_their_digest(http: TestClient,
 
 
 @pytest.mark.parametrize("channel", ["depth", "segmentation"])
-def test_depth_and_segmentation_are_pictures_too(http: TestClient, parts: Parts, channel: str) -> None:
-    record = add_job(parts, scenes=1, views=1, width=64, height=48)
-    shard = finish_all(parts, record)[-1].shard_id
+def test_depth_and_segmentation_are_pictures_too(http: TestClient, services: Services, channel: str) -> None:
+    record = add_job(services, scenes=1, views=1, width=64, height=48)
+    shard = finish_all(services, record)[-1].shard_id
     answer = http.get(f"/shards/{shard}/pictures/0.png", params={"channel": channel, "width": 32})
     assert Image.open(io.BytesIO(answer.content)).size == (32, 24)
 
@@ -91,18 +91,18 @@ def test_an_unknown_channel_is_refused(http: TestClient) -> None:
 
 @pytest.mark.parametrize(("bounds", "kept"), [({"max_epsilon": 0.3}, True), ({"min_contact_area_cm2": 900}, False)])
 def test_metrics_are_bounded_from_both_sides(
-    http: TestClient, parts: Parts, bounds: dict[str, float], kept: bool
+    http: TestClient, services: Services, bounds: dict[str, float], kept: bool
 ) -> None:
-    finish_all(parts, add_job(parts))
+    finish_all(services, add_job(services))
     items = http.get("/v1/grasps", params={**bounds, "limit": 200}).json()["items"]
     assert bool(items) == kept
     assert all(item["epsilon"] <= bounds.get("max_epsilon", 99) for item in items)
 
 
-def test_grasps_of_a_scene_job_say_where_they_are_for(http: TestClient, parts: Parts) -> None:
-    free, table = add_job(parts), add_job(parts, scene="table", scenes=1)
+def test_grasps_of_a_scene_job_say_where_they_are_for(http: TestClient, services: Services) -> None:
+    free, table = add_job(services), add_job(services, scene="table", scenes=1)
     for record in (free, table):
-        finish_all(parts, record)
+        finish_all(services, record)
     page = http.get("/grasps", params={"scene": "any", "valid": "true"}).text
     assert '<span class="note">table</span>' in page and 'aria-current="true">valid in a scene' in page
     assert '<span class="note">table</span>' not in http.get("/grasps", params={"scene": "free"}).text
@@ -111,9 +111,11 @@ def test_grasps_of_a_scene_job_say_where_they_are_for(http: TestClient, parts: P
     assert "Valid in their scenes" not in http.get(f"/jobs/{free.id}").text
 
 
-def test_robust_grasps_are_found_by_their_share_and_by_what_they_fail_of_first(http: TestClient, parts: Parts) -> None:
-    manifest = finish_all(parts, add_job(parts, robust_models=8))[0]
-    shard = read_shard(parts.store.get(manifest.key))
+def test_robust_grasps_are_found_by_their_share_and_by_what_they_fail_of_first(
+    http: TestClient, services: Services
+) -> None:
+    manifest = finish_all(services, add_job(services, robust_models=8))[0]
+    shard = read_shard(services.store.get(manifest.key))
     share, weakest = shard["quality/robust_share"], shard["quality/robust_weakest"]
     row = int(np.flatnonzero((share < 0.9) & (weakest > 0))[0])
     document = http.get(f"/v1/grasps/{manifest.shard_id}/{row}").json()
@@ -132,16 +134,16 @@ def test_robust_grasps_are_found_by_their_share_and_by_what_they_fail_of_first(h
     assert 'name="min_robust_share"' in listed and "Fails first along" in listed
 
 
-def test_grasps_that_were_judged_in_no_other_model_say_nothing_of_it(http: TestClient, parts: Parts) -> None:
-    manifest = finish_all(parts, add_job(parts))[0]
+def test_grasps_that_were_judged_in_no_other_model_say_nothing_of_it(http: TestClient, services: Services) -> None:
+    manifest = finish_all(services, add_job(services))[0]
     document = http.get(f"/v1/grasps/{manifest.shard_id}/0").json()
     assert (document["robust_share"], document["robust_weakest"]) == (None, None)
     assert "Models survived" not in http.get(f"/grasps/{manifest.shard_id}/0").text
 
 
-def test_forms_tag_chosen_grasps_and_lead_back_to_the_list(http: TestClient, parts: Parts) -> None:
-    record = add_job(parts)
-    shard = finish_all(parts, record)[0].shard_id
+def test_forms_tag_chosen_grasps_and_lead_back_to_the_list(http: TestClient, services: Services) -> None:
+    record = add_job(services)
+    shard = finish_all(services, record)[0].shard_id
 
     def does(action: str, **fields: object) -> str:
         answer = http.post(f"/grasps/{action}", data={"tag": "good", **fields}, follow_redirects=False)
@@ -164,8 +166,8 @@ def test_forms_tag_chosen_grasps_and_lead_back_to_the_list(http: TestClient, par
     assert "<script>" not in http.get("/grasps?did=tagged&done=1&named=<script>").text
 
 
-def test_the_list_takes_the_language_of_the_command_line(http: TestClient, parts: Parts) -> None:
-    finish_all(parts, add_job(parts))
+def test_the_list_takes_the_language_of_the_command_line(http: TestClient, services: Services) -> None:
+    finish_all(services, add_job(services))
     page = http.get("/grasps", params={"where": "epsilon > 0.2 and valid"})
     assert page.status_code == 200 and 'value="epsilon &gt; 0.2 and valid"' in page.text
     wrong = http.get("/grasps", params={"where": "epsilon >"})

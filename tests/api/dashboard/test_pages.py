@@ -17,7 +17,7 @@ from service.model.errors import IndexUnavailable, QueueUnavailable
 from service.model.fidelity import OFFERED
 from service.model.planning import plan
 from service.model.states import State
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
 from tests.memory_queue import MemoryQueue
 
@@ -32,10 +32,10 @@ def test_an_empty_service_says_what_to_do(http: TestClient) -> None:
 
 @pytest.mark.parametrize("path", ["/", "/workers"])
 def test_damage_of_the_store_is_shown_with_its_mend_and_only_while_there_is_some(
-    http: TestClient, parts: Parts, path: str
+    http: TestClient, services: Services, path: str
 ) -> None:
     assert "graspd admin store verify" not in http.get(path).text
-    parts.index.damage.mark([Damage(f"shards/base/{n}.h5", "its <file> is gone", f"{n}") for n in range(7)])
+    services.index.damage.mark([Damage(f"shards/base/{n}.h5", "its <file> is gone", f"{n}") for n in range(7)])
     page = http.get(path).text
     assert "7 objects of the store are damaged or missing" in page
     assert "graspd admin store verify --repair" in page
@@ -43,15 +43,15 @@ def test_damage_of_the_store_is_shown_with_its_mend_and_only_while_there_is_some
         assert "shards/base/0.h5" in page
         assert "its &lt;file&gt; is gone" in page
         assert "and 2 more" in page
-    parts.index.damage.replace([])
+    services.index.damage.replace([])
     assert "damaged or missing" not in http.get(path).text
 
 
-def test_home_shows_jobs_workers_and_failures(http: TestClient, parts: Parts) -> None:
-    record = add_job(parts, seed=1)
-    finish_all(parts, record)
-    fail(parts, add_job(parts, seed=2), "the mesh has 12 open edges")
-    add_worker(parts, "worker-7", "busy")
+def test_home_shows_jobs_workers_and_failures(http: TestClient, services: Services) -> None:
+    record = add_job(services, seed=1)
+    finish_all(services, record)
+    fail(services, add_job(services, seed=2), "the mesh has 12 open edges")
+    add_worker(services, "worker-7", "busy")
     page = http.get("/").text
     assert f'href="/jobs/{record.id}"' in page
     assert "worker-7" in page
@@ -59,15 +59,15 @@ def test_home_shows_jobs_workers_and_failures(http: TestClient, parts: Parts) ->
 
 
 @pytest.mark.parametrize("state", list(State))
-def test_home_filters_by_state(http: TestClient, parts: Parts, state: State) -> None:
-    add_job(parts)
+def test_home_filters_by_state(http: TestClient, services: Services, state: State) -> None:
+    add_job(services)
     page = http.get("/", params={"state": state.value}).text
     assert ("allegro" in page) == (state is State.QUEUED)
 
 
-def test_a_finished_job_shows_quality_views_files_and_code(http: TestClient, parts: Parts) -> None:
-    record = add_job(parts, scenes=1, views=2, stereo=True)
-    manifests = finish_all(parts, record)
+def test_a_finished_job_shows_quality_views_files_and_code(http: TestClient, services: Services) -> None:
+    record = add_job(services, scenes=1, views=2, stereo=True)
+    manifests = finish_all(services, record)
     page = http.get(f"/jobs/{record.id}").text
     assert page.count("<img ") == 4 * 3  # colour, depth, segmentation
     assert all(f"/v1/shards/{manifest.shard_id}/file" in page for manifest in manifests)
@@ -75,30 +75,30 @@ def test_a_finished_job_shows_quality_views_files_and_code(http: TestClient, par
     assert "h5py" in page
 
 
-def test_a_waiting_job_has_a_page_with_a_way_to_cancel(http: TestClient, parts: Parts) -> None:
-    record = add_job(parts, scenes=1, views=1)
+def test_a_waiting_job_has_a_page_with_a_way_to_cancel(http: TestClient, services: Services) -> None:
+    record = add_job(services, scenes=1, views=1)
     page = http.get(f"/jobs/{record.id}").text
     assert f'action="/jobs/{record.id}/cancel"' in page
     assert f'data-events="/v1/jobs/{record.id}/events"' in page
 
 
-def test_a_running_job_has_a_page(http: TestClient, parts: Parts) -> None:
-    record = add_job(parts, grasps=96, scenes=1)
-    finish(parts, record, next(plan(record)))
+def test_a_running_job_has_a_page(http: TestClient, services: Services) -> None:
+    record = add_job(services, grasps=96, scenes=1)
+    finish(services, record, next(plan(record)))
     assert "1 of 3" in http.get(f"/jobs/{record.id}").text
 
 
-def test_a_failed_job_says_why_and_offers_a_retry(http: TestClient, parts: Parts) -> None:
-    record = add_job(parts)
-    fail(parts, record, "<b>not</b> watertight")
+def test_a_failed_job_says_why_and_offers_a_retry(http: TestClient, services: Services) -> None:
+    record = add_job(services)
+    fail(services, record, "<b>not</b> watertight")
     page = http.get(f"/jobs/{record.id}").text
     assert "&lt;b&gt;not&lt;/b&gt; watertight" in page
     assert f'action="/jobs/{record.id}/retry"' in page
 
 
-def test_a_thumbnail_is_the_picture_of_the_shard(http: TestClient, parts: Parts) -> None:
-    record = add_job(parts, scenes=1, views=1, width=64, height=48)
-    shard = finish_all(parts, record)[-1].shard_id
+def test_a_thumbnail_is_the_picture_of_the_shard(http: TestClient, services: Services) -> None:
+    record = add_job(services, scenes=1, views=1, width=64, height=48)
+    shard = finish_all(services, record)[-1].shard_id
     answer = http.get(f"/shards/{shard}/pictures/0.png")
     picture = Image.open(io.BytesIO(answer.content))
     assert (answer.headers["content-type"], picture.size) == ("image/png", (64, 48))
@@ -106,13 +106,13 @@ def test_a_thumbnail_is_the_picture_of_the_shard(http: TestClient, parts: Parts)
     assert http.get(f"/shards/{shard}/pictures/9.png").status_code == 404
 
 
-def test_a_shard_without_pictures_has_no_thumbnail(http: TestClient, parts: Parts) -> None:
-    shard = finish_all(parts, add_job(parts))[0].shard_id
+def test_a_shard_without_pictures_has_no_thumbnail(http: TestClient, services: Services) -> None:
+    shard = finish_all(services, add_job(services))[0].shard_id
     assert http.get(f"/shards/{shard}/pictures/0.png").status_code == 404
 
 
-def test_the_table_of_grasps_keeps_its_filters_on_the_next_page(http: TestClient, parts: Parts) -> None:
-    finish_all(parts, add_job(parts, grasps=128))
+def test_the_table_of_grasps_keeps_its_filters_on_the_next_page(http: TestClient, services: Services) -> None:
+    finish_all(services, add_job(services, grasps=128))
     page = http.get("/grasps", params={"valid": "true", "sort": "penetration_depth_mm", "order": "asc"}).text
     link = re.search(r'href="([^"]*)" rel="next"|rel="next" href="([^"]*)"', page)
     assert link is not None
@@ -121,8 +121,8 @@ def test_the_table_of_grasps_keeps_its_filters_on_the_next_page(http: TestClient
     assert http.get(address).text.count('<li class="card grasp">') > 2
 
 
-def test_a_filter_that_fits_nothing_says_so(http: TestClient, parts: Parts) -> None:
-    finish_all(parts, add_job(parts))
+def test_a_filter_that_fits_nothing_says_so(http: TestClient, services: Services) -> None:
+    finish_all(services, add_job(services))
     assert "No grasp fits these filters" in http.get("/grasps", params={"min_epsilon": 99}).text
 
 
@@ -157,8 +157,8 @@ def test_a_form_with_a_bad_file_shows_the_reason(http: TestClient) -> None:
     assert "notes.txt holds no object file" in answer.text
 
 
-def test_the_buttons_cancel_and_retry_a_job(http: TestClient, parts: Parts) -> None:
-    record = add_job(parts)
+def test_the_buttons_cancel_and_retry_a_job(http: TestClient, services: Services) -> None:
+    record = add_job(services)
     for action, state in (("cancel", "cancelled"), ("retry", "queued")):
         answer = http.post(f"/jobs/{record.id}/{action}", follow_redirects=False)
         assert (answer.status_code, answer.headers["location"]) == (303, f"/jobs/{record.id}")
@@ -181,9 +181,11 @@ def test_what_the_pages_need_is_served(http: TestClient, path: str) -> None:
     assert http.get(path).status_code == 200
 
 
-def test_pages_are_read_on_while_redis_is_away(http: TestClient, parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
-    record = add_job(parts)
-    finish_all(parts, record)
+def test_pages_are_read_on_while_redis_is_away(
+    http: TestClient, services: Services, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record = add_job(services)
+    finish_all(services, record)
 
     def away(*_: object) -> float:
         raise QueueUnavailable("Redis does not answer at unix:///redis.sock")

@@ -9,7 +9,7 @@ from starlette.testclient import TestClient
 
 from api.dashboard.figures.stability import PITCH, draw
 from service.model.stability import MapCell, Outcome, Stability, StabilityMap
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.study_records import publish
 
 
@@ -84,9 +84,9 @@ def test_the_bar_of_what_is_within_reach_is_whole() -> None:
     ]
 
 
-def test_the_page_shows_the_maps_that_were_published_last(http: TestClient, parts: Parts) -> None:
-    publish(parts.store, "stability", a_record("2026-11-21T13:00:00.000Z"))
-    publish(parts.store, "stability", a_record(measure="an older measure"))
+def test_the_page_shows_the_maps_that_were_published_last(http: TestClient, services: Services) -> None:
+    publish(services.store, "stability", a_record("2026-11-21T13:00:00.000Z"))
+    publish(services.store, "stability", a_record(measure="an older measure"))
     page = http.get("/stability").text
     assert "A map of stiffness" in page
     assert "an older measure" not in page
@@ -106,15 +106,15 @@ def test_the_page_shows_the_maps_that_were_published_last(http: TestClient, part
         "graspd stability",
     ],
 )
-def test_beneath_a_map_stands_what_it_means(http: TestClient, parts: Parts, words: str) -> None:
-    publish(parts.store, "stability", a_record())
+def test_beneath_a_map_stands_what_it_means(http: TestClient, services: Services, words: str) -> None:
+    publish(services.store, "stability", a_record())
     assert words in http.get("/stability").text
 
 
 @pytest.mark.parametrize("stored", [None, b"{}", b"no json"])
 def test_without_maps_the_page_says_which_command_makes_them(
-    http: TestClient, parts: Parts, stored: bytes | None
+    http: TestClient, services: Services, stored: bytes | None
 ) -> None:
     if stored is not None:
-        parts.store.put("stability/20260101.json", stored)
+        services.store.put("stability/20260101.json", stored)
     assert "graspd stability --quick --publish" in http.get("/stability").text

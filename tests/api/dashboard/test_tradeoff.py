@@ -15,7 +15,7 @@ from starlette.testclient import TestClient
 from api.dashboard.figures.tradeoff import HEIGHT, WIDTH, Measured, draw, pareto
 from service.model.charts import FILTERED, IN_SCENE
 from service.model.scene_spec import SceneSpec
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.study_records import publish
 
 
@@ -95,10 +95,10 @@ def test_no_label_lies_on_another_or_leaves_the_chart(shares: tuple[int, ...]) -
         assert left >= 0 and right <= WIDTH and top >= 0 and bottom <= HEIGHT
 
 
-def test_the_page_draws_free_charts_and_those_in_scenes_apart(http: TestClient, parts: Parts) -> None:
-    publish(parts.store, "charts", {"created": "2026-11-21T10:00:00.000Z", "runs": RUNS})
+def test_the_page_draws_free_charts_and_those_in_scenes_apart(http: TestClient, services: Services) -> None:
+    publish(services.store, "charts", {"created": "2026-11-21T10:00:00.000Z", "runs": RUNS})
     for kind in ("table", "bin"):
-        publish(parts.store, f"scene_charts/{kind}", scenes_of(kind, lifted("standard", 18), lifted("fine", 19)))
+        publish(services.store, f"scene_charts/{kind}", scenes_of(kind, lifted("standard", 18), lifted("fine", 19)))
     page = http.get("/chart", params={"lifts": "lift_hard"}).text
     titles = ["Around free objects", "In a bin", "On a table"]
     assert [page.index(title) for title in titles] == sorted(page.index(title) for title in titles)
@@ -106,15 +106,15 @@ def test_the_page_draws_free_charts_and_those_in_scenes_apart(http: TestClient, 
     assert page.count("Lifted at half the friction [%]</text>") == 2
 
 
-def test_a_chart_in_scenes_is_drawn_where_there_is_no_other(http: TestClient, parts: Parts) -> None:
-    publish(parts.store, "scene_charts/table", scenes_of("table", lifted("standard", 18)))
+def test_a_chart_in_scenes_is_drawn_where_there_is_no_other(http: TestClient, services: Services) -> None:
+    publish(services.store, "scene_charts/table", scenes_of("table", lifted("standard", 18)))
     page = http.get("/chart", params={"lifts": "magic"}).text
     assert "Around free objects" not in page and "Lifted, of all tries [%]</text>" in page
 
 
-def test_the_page_shows_the_chart_that_was_published_last(http: TestClient, parts: Parts) -> None:
+def test_the_page_shows_the_chart_that_was_published_last(http: TestClient, services: Services) -> None:
     for name, fidelity in (("20260101", "old"), ("20260202", "new")):
-        parts.store.put(f"charts/{name}.json", json.dumps({"runs": [run(fidelity, 2.0, 0.5)]}).encode())
+        services.store.put(f"charts/{name}.json", json.dumps({"runs": [run(fidelity, 2.0, 0.5)]}).encode())
     page = http.get("/chart").text
     assert ">new<" in page
     assert ">old<" not in page
@@ -122,8 +122,8 @@ def test_the_page_shows_the_chart_that_was_published_last(http: TestClient, part
 
 @pytest.mark.parametrize("stored", [None, b"{}", b"no json"])
 def test_without_a_chart_the_page_says_which_command_makes_one(
-    http: TestClient, parts: Parts, stored: bytes | None
+    http: TestClient, services: Services, stored: bytes | None
 ) -> None:
     if stored is not None:
-        parts.store.put("charts/20260101.json", stored)
+        services.store.put("charts/20260101.json", stored)
     assert "graspd chart" in http.get("/chart").text

@@ -17,7 +17,7 @@ from api.middleware.body_limit import BodyLimit
 from api.middleware.rates import Allowance, Rates
 from service.model import names
 from service.model.records import JobRecord
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from service.store.records import read_record
@@ -36,13 +36,13 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def twins(settings: Settings, parts: Parts, redis_server: str, rq_queue: RqQueue, noon: None) -> Iterator[Twins]:
-    """Two applications over the same parts, keys and Redis."""
+def twins(settings: Settings, services: Services, redis_server: str, rq_queue: RqQueue, noon: None) -> Iterator[Twins]:
+    """Two applications over the same services, keys and Redis."""
     open_clients: list[TestClient] = []
 
     def make(**changes: Any) -> tuple[TestClient, TestClient]:
         wanted = settings.model_copy(update={"redis_url": SecretStr(redis_server), **changes})
-        shared = Parts(wanted, parts.store, parts.index, parts.queue)
+        shared = Services(wanted, services.store, services.index, services.queue)
         for _ in range(2):
             client = TestClient(create_app(wanted, shared), base_url="http://127.0.0.1:8000")
             client.__enter__()
@@ -114,9 +114,9 @@ def test_an_open_service_counts_nothing(twins: Twins) -> None:
     assert {client.get("/v1/stats").status_code for _ in range(4)} == {200}
 
 
-def test_without_redis_the_limits_let_everybody_in(settings: Settings, parts: Parts, keys: KeyFile) -> None:
+def test_without_redis_the_limits_let_everybody_in(settings: Settings, services: Services, keys: KeyFile) -> None:
     headers = bearer(keys.add("me", Scope.READ, limits=KeyLimits(requests_per_minute=1)))
-    with TestClient(create_app(settings, parts), base_url="http://127.0.0.1:8000") as client:
+    with TestClient(create_app(settings, services), base_url="http://127.0.0.1:8000") as client:
         assert [client.get("/v1/stats", headers=headers).status_code for _ in range(2)] == [200, 200]
 
 
@@ -185,17 +185,17 @@ def test_a_refused_submission_costs_nothing(twins: Twins, keys: KeyFile) -> None
     assert client.post("/v1/jobs", json=JOB, headers=headers).status_code == 202
 
 
-def test_grasps_in_flight_come_free_as_jobs_end(twins: Twins, keys: KeyFile, parts: Parts) -> None:
+def test_grasps_in_flight_come_free_as_jobs_end(twins: Twins, keys: KeyFile, services: Services) -> None:
     headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(grasps_in_flight=64)))
     client, _ = twins()
     first = client.post("/v1/jobs", json=JOB, headers=headers).json()["id"]
     assert client.post("/v1/jobs", json=JOB | {"seed": 1, "grasps": 33}, headers=headers).status_code == 429
-    finish_all(parts, read_record(JobRecord, parts.store, names.job_record(first)))
+    finish_all(services, read_record(JobRecord, services.store, names.job_record(first)))
     assert client.post("/v1/jobs", json=JOB | {"seed": 1, "grasps": 33}, headers=headers).status_code == 202
 
 
 def test_a_dataset_counts_with_the_grasps_of_all_its_cells_until_it_ends(
-    twins: Twins, keys: KeyFile, parts: Parts
+    twins: Twins, keys: KeyFile, services: Services
 ) -> None:
     headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(grasps_in_flight=64)))
     client, _ = twins()
@@ -206,7 +206,7 @@ def test_a_dataset_counts_with_the_grasps_of_all_its_cells_until_it_ends(
         assert client.post("/v1/datasets", json=matrix, headers=headers).status_code == 202
     assert client.post("/v1/jobs", json=JOB | {"seed": 1}, headers=headers).status_code == 429
     assert client.post("/v1/datasets/d/cancel", headers=headers).status_code == 202
-    plan_all(parts)
+    plan_all(services)
     assert client.post("/v1/jobs", json=JOB | {"seed": 1}, headers=headers).status_code == 202
     assert client.post("/v1/datasets/d/retry", headers=headers).status_code == 429
 

@@ -16,7 +16,7 @@ from api.app import create_app
 from api.client.client import Client
 from api.middleware.root_path import RootPath, with_prefix
 from service.model.errors import InputError
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 from tests.api.conftest import BASE_URL
 from tests.api.factories import add_job, finish_all
@@ -31,9 +31,9 @@ def below(settings: Settings) -> Settings:
 
 
 @pytest.fixture(params=[PREFIX, ""], ids=["kept", "stripped"])
-def http(request: pytest.FixtureRequest, below: Settings, parts: Parts) -> Iterator[TestClient]:
+def http(request: pytest.FixtureRequest, below: Settings, services: Services) -> Iterator[TestClient]:
     """A client behind a proxy that passes the prefix on, and one behind a proxy that takes it off."""
-    app = create_app(below, parts)
+    app = create_app(below, services)
 
     async def proxy(scope: Any, receive: Any, send: Any) -> None:
         if scope["type"] == "http":
@@ -51,9 +51,9 @@ def addresses(page: str) -> set[str]:
     return set(re.findall(r'\s(?:href|src|action|formaction|hx-get|data-[a-z]+)="(/[^"#]*)', page))
 
 
-def test_every_address_of_a_page_is_below_the_prefix_and_there(http: TestClient, parts: Parts) -> None:
-    job = add_job(parts, scenes=1, views=1)
-    finish_all(parts, job)
+def test_every_address_of_a_page_is_below_the_prefix_and_there(http: TestClient, services: Services) -> None:
+    job = add_job(services, scenes=1, views=1)
+    finish_all(services, job)
     seen: set[str] = set()
     left = {f"{PREFIX}/", f"{PREFIX}/jobs/{job.id}", f"{PREFIX}/login", f"{PREFIX}/none"}
     while left and len(seen) < 150:
@@ -87,8 +87,8 @@ def test_the_api_tells_where_it_is(http: TestClient) -> None:
     assert http.get(problem["type"]).status_code == 200
 
 
-def test_the_client_works_below_a_prefix(http: TestClient, parts: Parts, tmp_path: Any) -> None:
-    finish_all(parts, job := add_job(parts))
+def test_the_client_works_below_a_prefix(http: TestClient, services: Services, tmp_path: Any) -> None:
+    finish_all(services, job := add_job(services))
 
     def forward(request: httpx.Request) -> httpx.Response:
         answer = http.request(request.method, str(request.url))
@@ -99,9 +99,9 @@ def test_the_client_works_below_a_prefix(http: TestClient, parts: Parts, tmp_pat
         assert client.download(shard, tmp_path / "x.h5").stat().st_size > 0
 
 
-def test_a_snippet_names_the_address_that_the_visitor_sees(http: TestClient, parts: Parts) -> None:
-    job = add_job(parts)
-    finish_all(parts, job)
+def test_a_snippet_names_the_address_that_the_visitor_sees(http: TestClient, services: Services) -> None:
+    job = add_job(services)
+    finish_all(services, job)
     assert f"{BASE_URL}{PREFIX}/v1/shards/" in http.get(f"{PREFIX}/jobs/{job.id}").text
 
 
@@ -138,6 +138,6 @@ def test_what_is_no_path_is_refused(said: str) -> None:
 
 
 @pytest.mark.parametrize("said", ["/v1", "/jobs", "/static/x", "/metrics"])
-def test_a_path_of_the_service_itself_is_refused(settings: Settings, parts: Parts, said: str) -> None:
+def test_a_path_of_the_service_itself_is_refused(settings: Settings, services: Services, said: str) -> None:
     with pytest.raises(InputError, match="GRASPD_API_ROOT_PATH"):
-        create_app(settings.model_copy(update={"api_root_path": said}), parts)
+        create_app(settings.model_copy(update={"api_root_path": said}), services)

@@ -11,7 +11,7 @@ from starlette.testclient import TestClient
 from api.uploads import files_of_upload, name_of_upload
 from service.model.errors import InputError, LimitError
 from service.model.states import AssetKind
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 from service.store.asset_summary import summary
 from service.store.library import load_asset, load_asset_files
@@ -32,24 +32,24 @@ def test_the_built_in_hands_and_objects_are_listed(http: TestClient) -> None:
     assert "mug" in {asset["name"] for asset in http.get("/v1/objects").json()["items"]}
 
 
-def test_an_upload_is_kept_whole_and_waits_for_its_check(http: TestClient, parts: Parts) -> None:
+def test_an_upload_is_kept_whole_and_waits_for_its_check(http: TestClient, services: Services) -> None:
     answer = http.post("/v1/objects", files={"file": ("My box (2).stl", STL)})
     assert answer.status_code == 202
     asset = http.get(answer.headers["location"]).json()
     assert (asset["name"], asset["verdict"]) == ("My-box-2", None)
-    assert load_asset_files(parts.store, AssetKind.OBJECT, asset["digest"])["My box (2).stl"] == STL
-    assert [check.name for check in parts.index.feed.ready_checks(now=1e12, limit=9)] == ["My-box-2"]
+    assert load_asset_files(services.store, AssetKind.OBJECT, asset["digest"])["My box (2).stl"] == STL
+    assert [check.name for check in services.index.feed.ready_checks(now=1e12, limit=9)] == ["My-box-2"]
 
 
-def test_a_self_test_is_asked_for_with_the_hand_and_shown_with_its_facts(http: TestClient, parts: Parts) -> None:
+def test_a_self_test_is_asked_for_with_the_hand_and_shown_with_its_facts(http: TestClient, services: Services) -> None:
     asked = {"name": "mine", "self_test": "true"}
     answer = http.post("/v1/hands", files={"file": ("mine.urdf", b"<robot name='mine'/>")}, data=asked)
     assert answer.status_code == 202
-    record = load_asset(parts.store, AssetKind.HAND, answer.json()["digest"])
+    record = load_asset(services.store, AssetKind.HAND, answer.json()["digest"])
     assert record.self_test
     tried = {"gsr": 0.9, "n": 64, "width_m": 0.04, "by_object": {"box": 0.9}, "says": "ready: 90 % hold"}
     found = {"verdict": "accept", "message": "", "repairs": [], "facts": {"self_test": tried}}
-    parts.index.write.add_asset(record, found)
+    services.index.write.add_asset(record, found)
     shown = http.get("/v1/hands/mine").json()
     assert shown["facts"]["self_test"] == tried
     assert "self-test          ready: 90 % hold" in summary(AssetKind.HAND, shown["facts"])

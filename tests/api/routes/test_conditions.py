@@ -7,18 +7,18 @@ from fastapi import FastAPI
 from httpx import Response
 from starlette.testclient import TestClient
 
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from tests.api.factories import add_job, finish_all
 
 
 @pytest.fixture
-def file(http: TestClient, parts: Parts) -> str:
+def file(http: TestClient, services: Services) -> str:
     """Address of a shard's file."""
-    return f"/v1/shards/{finish_all(parts, add_job(parts))[0].shard_id}/file"
+    return f"/v1/shards/{finish_all(services, add_job(services))[0].shard_id}/file"
 
 
 @pytest.fixture
-def model(parts: Parts) -> str:
+def model(services: Services) -> str:
     return "/v1/hands/allegro/model"
 
 

@@ -9,7 +9,7 @@ from starlette.testclient import TestClient
 
 from service.model import names
 from service.model.records import JobRecord
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.records import read_record
 from service.store.study_records import publish
 from tests.api.factories import finish_all
@@ -26,11 +26,11 @@ def kitchen(http: TestClient) -> dict[str, Any]:
     return answer.json()
 
 
-def finish_cells(parts: Parts, http: TestClient, count: int) -> None:
+def finish_cells(services: Services, http: TestClient, count: int) -> None:
     """Do all tasks of the first cells."""
-    plan_all(parts)
+    plan_all(services)
     for cell in http.get("/v1/datasets/kitchen/cells").json()["items"][:count]:
-        finish_all(parts, read_record(JobRecord, parts.store, names.job_record(cell["job_id"])))
+        finish_all(services, read_record(JobRecord, services.store, names.job_record(cell["job_id"])))
 
 
 def test_a_new_dataset_is_accepted_with_its_place(http: TestClient) -> None:
@@ -44,41 +44,41 @@ def test_a_new_dataset_is_accepted_with_its_place(http: TestClient) -> None:
 
 
 def test_a_dataset_that_is_done_is_found_again_with_200(
-    http: TestClient, parts: Parts, kitchen: dict[str, Any]
+    http: TestClient, services: Services, kitchen: dict[str, Any]
 ) -> None:
-    finish_cells(parts, http, 4)
+    finish_cells(services, http, 4)
     again = http.post("/v1/datasets", json=WANTED)
     assert again.status_code == 200 and again.json()["state"] == "succeeded"
 
 
-def test_options_of_the_method_reach_the_jobs_of_the_cells(http: TestClient, parts: Parts) -> None:
+def test_options_of_the_method_reach_the_jobs_of_the_cells(http: TestClient, services: Services) -> None:
     answer = http.post("/v1/datasets", json=WANTED | {"method": "graspit", "options": {"keep": 20}})
     assert answer.json()["options"]["options"] == {"keep": 20}
-    plan_all(parts)
+    plan_all(services)
     cell = http.get("/v1/datasets/kitchen/cells").json()["items"][0]
     assert http.get(f"/v1/jobs/{cell['job_id']}").json()["request"]["options"] == {"keep": 20}
     assert "graspit keep=20" in http.get("/datasets/kitchen").text
 
 
-def test_with_auto_each_cell_says_which_fidelity_it_got(http: TestClient, parts: Parts) -> None:
+def test_with_auto_each_cell_says_which_fidelity_it_got(http: TestClient, services: Services) -> None:
     wanted = WANTED | {"fidelity": "auto", "target": "gsr>=0.6"}
     for path, body in (("/v1/datasets", wanted), ("/v1/datasets/estimate", {**wanted, "name": None})):
         body = {key: value for key, value in body.items() if value is not None}
         answer = http.post(path, json=body)
         assert answer.status_code == 422 and "graspd chart --publish" in answer.text
-    publish(parts.store, "charts", CHART)
+    publish(services.store, "charts", CHART)
     assert http.post("/v1/datasets", json=wanted).status_code == 202
     cells = http.get("/v1/datasets/kitchen/cells").json()["items"]
     assert {(cell["hand"], cell["fidelity"]) for cell in cells} == {("allegro", "standard"), ("barrett", "draft")}
     assert "auto (gsr&gt;=0.6)" in http.get("/datasets/kitchen").text
 
 
-def test_with_auto_cells_in_scenes_are_chosen_by_the_chart_of_such_scenes(http: TestClient, parts: Parts) -> None:
+def test_with_auto_cells_in_scenes_are_chosen_by_the_chart_of_such_scenes(http: TestClient, services: Services) -> None:
     wanted = WANTED | {"scene": "table", "views": 0, "fidelity": "auto", "target": "lift>=0.8"}
-    publish(parts.store, "charts", CHART)
+    publish(services.store, "charts", CHART)
     answer = http.post("/v1/datasets", json=wanted)
     assert answer.status_code == 422 and "graspd chart --scene table --publish" in answer.text
-    key = publish(parts.store, "scene_charts/table", scene_chart())
+    key = publish(services.store, "scene_charts/table", scene_chart())
     assert http.post("/v1/datasets", json=wanted).status_code == 202
     cells = http.get("/v1/datasets/kitchen/cells").json()["items"]
     assert [(cell["hand"], cell["object"], cell["fidelity"], cell["choice"]["measured_on"]) for cell in cells] == [
@@ -90,8 +90,10 @@ def test_with_auto_cells_in_scenes_are_chosen_by_the_chart_of_such_scenes(http: 
     assert {cell["choice"]["chart"] for cell in cells} == {key}
 
 
-def test_cells_come_in_pages_with_a_link_to_the_next(http: TestClient, parts: Parts, kitchen: dict[str, Any]) -> None:
-    finish_cells(parts, http, 1)
+def test_cells_come_in_pages_with_a_link_to_the_next(
+    http: TestClient, services: Services, kitchen: dict[str, Any]
+) -> None:
+    finish_cells(services, http, 1)
     first = http.get("/v1/datasets/kitchen/cells", params={"limit": 3})
     address = first.headers["Link"].partition(">")[0].lstrip("<")
     cells = first.json()["items"] + http.get(address).json()["items"]
@@ -139,21 +141,23 @@ def test_an_estimate_records_nothing(http: TestClient) -> None:
     assert http.get("/v1/datasets").json()["items"] == []
 
 
-def test_cancel_and_retry_are_accepted_once(http: TestClient, parts: Parts, kitchen: dict[str, Any]) -> None:
-    plan_all(parts)
+def test_cancel_and_retry_are_accepted_once(http: TestClient, services: Services, kitchen: dict[str, Any]) -> None:
+    plan_all(services)
     assert http.post("/v1/datasets/kitchen/retry").status_code == 409
     assert http.post("/v1/datasets/kitchen/cancel").status_code == 202
     assert http.post("/v1/datasets/kitchen/cancel").status_code == 409
-    plan_all(parts)
+    plan_all(services)
     assert http.get("/v1/datasets/kitchen").json()["state"] == "cancelled"
     assert http.post("/v1/datasets/kitchen/retry").status_code == 202
-    plan_all(parts)
+    plan_all(services)
     assert http.get("/v1/datasets/kitchen").json()["state"] == "queued"
 
 
-def test_a_snapshot_is_made_once_and_names_checksums(http: TestClient, parts: Parts, kitchen: dict[str, Any]) -> None:
+def test_a_snapshot_is_made_once_and_names_checksums(
+    http: TestClient, services: Services, kitchen: dict[str, Any]
+) -> None:
     assert http.post("/v1/datasets/kitchen/snapshots").status_code == 409
-    finish_cells(parts, http, 2)
+    finish_cells(services, http, 2)
     taken = http.post("/v1/datasets/kitchen/snapshots")
     assert taken.status_code == 201 and taken.json()["shards"] == 4 and not taken.json()["complete"]
     assert http.post("/v1/datasets/kitchen/snapshots").status_code == 200

@@ -13,7 +13,7 @@ from api.access.keys import KeyFile, Scope
 from api.app import create_app
 from service.model import names
 from service.model.states import AssetKind
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 from service.store.assets import builtin_files
 from service.store.hand_corrections import MAX_ENTRIES
@@ -32,19 +32,21 @@ def corrected(http: TestClient, body: dict[str, Any], hand: str = "barrett") -> 
     return http.post(f"/v1/hands/{hand}/corrections", json=body)
 
 
-def test_a_corrected_hand_is_another_one_of_the_same_files_that_says_it_all(http: TestClient, parts: Parts) -> None:
+def test_a_corrected_hand_is_another_one_of_the_same_files_that_says_it_all(
+    http: TestClient, services: Services
+) -> None:
     answer = corrected(http, {"closing": {"finger_1_spread": 1}, "preshape": {"finger_2_medial": -0.3}})
     assert answer.status_code == 202, answer.text
     made = http.get(answer.headers["location"]).json()
     assert (made["name"], made["verdict"]) == ("barrett-2", None)
-    kept = load_asset_files(parts.store, AssetKind.HAND, made["digest"])
+    kept = load_asset_files(services.store, AssetKind.HAND, made["digest"])
     said = json.loads(kept.pop("asset.json"))
     assert kept == {name: data for name, data in FILES.items() if name != "asset.json"}
     assert said["closing"]["finger_1_spread"] == 1 and said["closing"]["finger_2_medial"] == -1
     # The joint that closes another way has its pre-shape guessed anew.
     assert "finger_1_spread" not in said["preshape"] and said["preshape"]["finger_2_medial"] == -0.3
     assert said["root"] == said["palm"]["link"] == "palm" and len(said["fingertips"]) == 3
-    assert [check.name for check in parts.index.feed.ready_checks(now=1e12, limit=9)] == ["barrett-2"]
+    assert [check.name for check in services.index.feed.ready_checks(now=1e12, limit=9)] == ["barrett-2"]
 
 
 def test_the_same_corrections_are_the_same_hand_and_others_get_the_next_number(http: TestClient) -> None:
@@ -101,12 +103,12 @@ def test_an_unknown_hand_is_not_found_and_one_without_a_model_waits(http: TestCl
     assert corrected(http, SAID, hand="new").status_code == 404
 
 
-def test_a_model_of_an_older_version_says_the_mend(http: TestClient, parts: Parts) -> None:
+def test_a_model_of_an_older_version_says_the_mend(http: TestClient, services: Services) -> None:
     made = http.post("/v1/hands", files={"file": ("old.urdf", b"<robot/>")}).json()
-    for model in (b"glTF", b"glTF" + bytes(40), parts.store.get(names.asset_model(AssetKind.OBJECT, mug(http)))):
+    for model in (b"glTF", b"glTF" + bytes(40), services.store.get(names.asset_model(AssetKind.OBJECT, mug(http)))):
         key = names.asset_model(AssetKind.HAND, made["digest"])
-        parts.store.delete(key)
-        parts.store.put(key, model)
+        services.store.delete(key)
+        services.store.put(key, model)
         answer = corrected(http, SAID, hand="old")
         assert answer.status_code == 409 and "graspd hands check --write" in answer.json()["detail"]
         assert "older version" in http.get("/hands/old").text
@@ -116,10 +118,12 @@ def mug(http: TestClient) -> str:
     return str(http.get("/v1/objects/mug").json()["digest"])
 
 
-def test_who_may_only_read_corrects_nothing_and_who_corrects_owns_the_hand(settings: Settings, parts: Parts) -> None:
+def test_who_may_only_read_corrects_nothing_and_who_corrects_owns_the_hand(
+    settings: Settings, services: Services
+) -> None:
     keys = KeyFile(settings.resolved_keys_file)
     tokens = {scope: keys.add(scope.value, scope) for scope in (Scope.READ, Scope.SUBMIT)}
-    app: FastAPI = create_app(settings, parts)
+    app: FastAPI = create_app(settings, services)
     with TestClient(app, base_url=BASE_URL, raise_server_exceptions=False) as http:
         body = {"closing": {"finger_1_spread": 1}}
         path = "/v1/hands/barrett/corrections"
@@ -129,7 +133,7 @@ def test_who_may_only_read_corrects_nothing_and_who_corrects_owns_the_hand(setti
         assert http.post("/hands/barrett", data={"closing.0": "1"}, headers=reader).status_code == 403
         assert "Save as a hand" not in http.get("/hands/barrett", headers=reader).text
         made = http.post(path, json=body, headers=writer).json()
-        assert load_asset(parts.store, AssetKind.HAND, made["digest"]).owner == made["owner"] != ""
+        assert load_asset(services.store, AssetKind.HAND, made["digest"]).owner == made["owner"] != ""
 
 
 def test_the_page_has_a_field_for_all_that_was_guessed_and_works_without_scripts(http: TestClient) -> None:

@@ -12,7 +12,7 @@ from api.client.client import events_of
 from service.model.clock import timestamp
 from service.model.diversity import GraspType
 from service.model.planning import plan
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.study_records import publish
 from tests.api.factories import add_job, fail, finish, finish_all
 from tests.service.pipeline.test_fidelity_choice import scene_chart
@@ -41,11 +41,11 @@ def test_the_same_request_is_the_same_job(http: TestClient) -> None:
     assert len(http.get("/v1/jobs").json()["items"]) == 1
 
 
-def test_a_job_in_a_scene_with_auto_says_how_its_fidelity_was_chosen(http: TestClient, parts: Parts) -> None:
+def test_a_job_in_a_scene_with_auto_says_how_its_fidelity_was_chosen(http: TestClient, services: Services) -> None:
     wanted = {**JOB, "views": 0, "scene": "table", "fidelity": "auto", "target": "lift>=0.8"}
     refused = http.post("/v1/jobs", json=wanted)
     assert refused.status_code == 422 and "graspd chart --scene table --publish" in refused.text
-    key = publish(parts.store, "scene_charts/table", scene_chart())
+    key = publish(services.store, "scene_charts/table", scene_chart())
     refused = http.post("/v1/jobs", json=wanted | {"target": "gsr>=0.6"})
     assert refused.status_code == 422 and "lift, lift_letter, lift_hard, robust" in refused.text
     answer = http.post("/v1/jobs", json=wanted)
@@ -58,9 +58,9 @@ def test_a_job_in_a_scene_with_auto_says_how_its_fidelity_was_chosen(http: TestC
 
 
 def test_a_job_that_is_there_by_its_fidelity_tells_who_asks_with_a_target_how_it_was_chosen(
-    http: TestClient, parts: Parts
+    http: TestClient, services: Services
 ) -> None:
-    publish(parts.store, "scene_charts/table", scene_chart())
+    publish(services.store, "scene_charts/table", scene_chart())
     wanted = {**JOB, "views": 0, "scene": "table"}
     named = http.post("/v1/jobs", json=wanted | {"fidelity": "fine"}).json()
     chosen = http.post("/v1/jobs", json=wanted | {"fidelity": "auto", "target": "lift>=0.9"}).json()
@@ -68,16 +68,16 @@ def test_a_job_that_is_there_by_its_fidelity_tells_who_asks_with_a_target_how_it
     assert chosen["choice"]["reached"] == 0.95
 
 
-def test_a_job_that_is_done_is_found_again_with_200(http: TestClient, parts: Parts) -> None:
-    record = add_job(parts, grasps=32)
-    finish_all(parts, record)
+def test_a_job_that_is_done_is_found_again_with_200(http: TestClient, services: Services) -> None:
+    record = add_job(services, grasps=32)
+    finish_all(services, record)
     answer = http.post("/v1/jobs", json={"hand": "allegro", "object": "mug", "grasps": 32})
     assert (answer.status_code, answer.json()["id"]) == (200, record.id)
 
 
-def test_a_finished_job_says_its_counts_means_and_shards(http: TestClient, parts: Parts) -> None:
-    record = add_job(parts, grasps=40, scenes=2, views=3, stereo=True)
-    manifests = finish_all(parts, record)
+def test_a_finished_job_says_its_counts_means_and_shards(http: TestClient, services: Services) -> None:
+    record = add_job(services, grasps=40, scenes=2, views=3, stereo=True)
+    manifests = finish_all(services, record)
     job = http.get(f"/v1/jobs/{record.id}").json()
     grasps = [grasp for manifest in manifests for grasp in manifest.grasps]
     valid = [grasp for grasp in grasps if grasp.valid]
@@ -86,9 +86,9 @@ def test_a_finished_job_says_its_counts_means_and_shards(http: TestClient, parts
     assert {shard["id"] for shard in job["shards"]} == {manifest.shard_id for manifest in manifests}
 
 
-def test_a_finished_job_says_how_different_its_grasps_are(http: TestClient, parts: Parts) -> None:
-    record = add_job(parts, grasps=40)
-    manifests = finish_all(parts, record)
+def test_a_finished_job_says_how_different_its_grasps_are(http: TestClient, services: Services) -> None:
+    record = add_job(services, grasps=40)
+    manifests = finish_all(services, record)
     found = http.get(f"/v1/jobs/{record.id}").json()["diversity"]
     valid = [grasp for manifest in manifests for grasp in manifest.grasps if grasp.valid]
     types = Counter(GraspType(grasp.grasp_type).name.lower() for grasp in valid)
@@ -101,26 +101,26 @@ def test_a_finished_job_says_how_different_its_grasps_are(http: TestClient, part
     assert len(page["items"]) == types["power"] and {one["grasp_type"] for one in page["items"]} == {1}
 
 
-def test_a_half_done_job_says_how_far_each_stage_is(http: TestClient, parts: Parts) -> None:
-    record = add_job(parts, grasps=64, scenes=1)
+def test_a_half_done_job_says_how_far_each_stage_is(http: TestClient, services: Services) -> None:
+    record = add_job(services, grasps=64, scenes=1)
     tasks = list(plan(record))
-    finish(parts, record, tasks[0])
+    finish(services, record, tasks[0])
     job = http.get(f"/v1/jobs/{record.id}").json()
     assert {stage["stage"]: stage["progress"] for stage in job["stages"]} == {"synthesize": 0.5, "scene": 0.0}
     assert job["progress"] == 0.25
     assert job["stages"][0]["eta_s"] == pytest.approx(12.5)
 
 
-def test_a_failed_job_keeps_its_reason_and_its_attempts(http: TestClient, parts: Parts) -> None:
-    record = add_job(parts)
-    fail(parts, record, "the mesh is not watertight")
+def test_a_failed_job_keeps_its_reason_and_its_attempts(http: TestClient, services: Services) -> None:
+    record = add_job(services)
+    fail(services, record, "the mesh is not watertight")
     job = http.get(f"/v1/jobs/{record.id}").json()
     assert (job["state"], job["reason"]) == ("failed", "the mesh is not watertight")
     assert [(attempt["number"], attempt["last"]) for attempt in job["attempts"]] == [(1, True)]
 
 
-def test_pages_of_jobs_meet_without_gap_or_overlap(http: TestClient, parts: Parts) -> None:
-    ids = [add_job(parts, seed=seed).id for seed in range(5)]
+def test_pages_of_jobs_meet_without_gap_or_overlap(http: TestClient, services: Services) -> None:
+    ids = [add_job(services, seed=seed).id for seed in range(5)]
     seen, path = [], "/v1/jobs?limit=2"
     while path:
         answer = http.get(path)
@@ -129,10 +129,10 @@ def test_pages_of_jobs_meet_without_gap_or_overlap(http: TestClient, parts: Part
     assert seen == ids[::-1]
 
 
-def test_jobs_are_filtered_by_state(http: TestClient, parts: Parts) -> None:
-    done = add_job(parts, seed=1)
-    finish_all(parts, done)
-    add_job(parts, seed=2)
+def test_jobs_are_filtered_by_state(http: TestClient, services: Services) -> None:
+    done = add_job(services, seed=1)
+    finish_all(services, done)
+    add_job(services, seed=2)
     assert [job["id"] for job in http.get("/v1/jobs?state=succeeded").json()["items"]] == [done.id]
 
 
@@ -143,9 +143,9 @@ def test_a_cancelled_job_is_cancelled_and_can_be_retried(http: TestClient) -> No
     assert http.post(f"/v1/jobs/{job}/retry").json()["state"] == "queued"
 
 
-def test_events_of_a_finished_job_say_its_end(http: TestClient, parts: Parts) -> None:
-    record = add_job(parts)
-    finish_all(parts, record)
+def test_events_of_a_finished_job_say_its_end(http: TestClient, services: Services) -> None:
+    record = add_job(services)
+    finish_all(services, record)
     with http.stream("GET", f"/v1/jobs/{record.id}/events") as answer:
         assert answer.headers["content-type"].startswith("text/event-stream")
         events = list(events_of(answer))
@@ -159,16 +159,16 @@ def test_events_of_an_unknown_job_are_a_problem_not_a_stream(http: TestClient) -
     assert answer.headers["content-type"] == "application/problem+json"
 
 
-def test_time_that_another_job_spent_is_not_counted_twice(http: TestClient, parts: Parts) -> None:
-    first = add_job(parts, seed=7)
-    made = finish_all(parts, first)
+def test_time_that_another_job_spent_is_not_counted_twice(http: TestClient, services: Services) -> None:
+    first = add_job(services, seed=7)
+    made = finish_all(services, first)
     until(lambda: timestamp() > made[0].created, "the clock moves on")
-    second = add_job(parts, seed=7, grasps=64)
+    second = add_job(services, seed=7, grasps=64)
     (stage,) = http.get(f"/v1/jobs/{second.id}").json()["stages"]
     assert (stage["succeeded"], stage["reused"], stage["seconds"]) == (1, 1, 0.0)
-    finish(parts, second, list(plan(second))[1])
+    finish(services, second, list(plan(second))[1])
     (stage,) = http.get(f"/v1/jobs/{second.id}").json()["stages"]
     assert (stage["succeeded"], stage["reused"], stage["seconds"]) == (2, 1, 12.5)
     assert http.get(f"/v1/jobs/{first.id}").json()["stages"][0]["seconds"] == 12.5
     assert "12 s, 1 reused" in http.get(f"/jobs/{second.id}").text
-    assert "none, reused" in http.get(f"/jobs/{add_job(parts, seed=7, scenes=1).id}").text
+    assert "none, reused" in http.get(f"/jobs/{add_job(services, seed=7, scenes=1).id}").text

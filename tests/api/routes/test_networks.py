@@ -15,7 +15,7 @@ from service.model import names
 from service.model.errors import LimitError
 from service.model.records import JobRecord
 from service.model.states import AssetKind
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store import network_file
 from service.store.library import load_asset_files
 from service.store.network_check import NETWORK_FILE
@@ -36,7 +36,7 @@ def upload(http: TestClient, data: bytes, filename: str = "net.npz", **said: str
     return http.post("/v1/networks", files={"file": (filename, data)}, data=said)
 
 
-def test_an_upload_can_be_used_at_once_and_says_whose_grasps_it_proposes(http: TestClient, parts: Parts) -> None:
+def test_an_upload_can_be_used_at_once_and_says_whose_grasps_it_proposes(http: TestClient, services: Services) -> None:
     data = of_hand(http)
     answer = upload(http, data)
     assert answer.status_code == 201, answer.text
@@ -45,9 +45,9 @@ def test_an_upload_can_be_used_at_once_and_says_whose_grasps_it_proposes(http: T
     barrett = http.get("/v1/hands/barrett").json()["digest"]
     assert (shown["facts"]["hand"], shown["facts"]["hand_digest"]) == ("barrett", barrett)
     assert shown["facts"]["about"] == "drawn by chance" and shown["created"] and shown["size_bytes"] > len(data)
-    assert load_asset_files(parts.store, AssetKind.NETWORK, shown["digest"])[NETWORK_FILE] == data
+    assert load_asset_files(services.store, AssetKind.NETWORK, shown["digest"])[NETWORK_FILE] == data
     assert [one["name"] for one in http.get("/v1/networks").json()["items"]] == ["net"]
-    assert list(parts.index.feed.ready_checks(now=1e12, limit=9)) == [], "no worker is asked"
+    assert list(services.index.feed.ready_checks(now=1e12, limit=9)) == [], "no worker is asked"
 
 
 def test_the_same_file_is_the_same_network_whatever_it_was_called(http: TestClient) -> None:
@@ -59,13 +59,13 @@ def test_the_same_file_is_the_same_network_whatever_it_was_called(http: TestClie
 
 
 @pytest.mark.parametrize("what", HOSTILE)
-def test_what_is_no_network_is_refused_in_a_line_and_not_kept(http: TestClient, parts: Parts, what: str) -> None:
+def test_what_is_no_network_is_refused_in_a_line_and_not_kept(http: TestClient, services: Services, what: str) -> None:
     with np.load(io.BytesIO(to_bytes(random_network()))) as stored:
         data = HOSTILE[what][0]({name: stored[name] for name in stored.files})
     answer = upload(http, data)
     assert answer.status_code == 422 and "\n" not in answer.json()["detail"], answer.text
     assert http.get("/v1/networks").json()["items"] == []
-    assert list(parts.store.list(f"{names.ASSETS}/network")) == []
+    assert list(services.store.list(f"{names.ASSETS}/network")) == []
 
 
 @pytest.mark.parametrize(
@@ -99,11 +99,11 @@ def test_a_network_has_no_model_to_show(http: TestClient) -> None:
     assert http.get("/v1/networks/net/model").status_code == 404
 
 
-def test_a_job_names_a_network_and_keeps_its_digest(http: TestClient, parts: Parts) -> None:
+def test_a_job_names_a_network_and_keeps_its_digest(http: TestClient, services: Services) -> None:
     digest = upload(http, of_hand(http)).json()["digest"]
     answer = http.post("/v1/jobs", json=JOB)
     assert answer.status_code == 202, answer.text
-    record = read_record(JobRecord, parts.store, names.job_record(answer.json()["id"]))
+    record = read_record(JobRecord, services.store, names.job_record(answer.json()["id"]))
     assert record.request.network == digest
     refused = http.delete("/v1/networks/net")
     assert refused.status_code == 409 and record.id in refused.json()["detail"]

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from tests.api.factories import add_job, finish_all
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
@@ -124,9 +124,9 @@ def test_a_document_holds_neighbours_with_their_poses(http: TestClient) -> None:
         assert "block stands in support 0" in answer.json()["detail"]
 
 
-def test_grasps_are_filtered_by_the_kind_of_their_scene(http: TestClient, parts: Parts) -> None:
+def test_grasps_are_filtered_by_the_kind_of_their_scene(http: TestClient, services: Services) -> None:
     for fields in ({}, {"scene": "table", "scenes": 2}):
-        finish_all(parts, add_job(parts, **fields))
+        finish_all(services, add_job(services, **fields))
     for kind, counts in (("free", {"free"}), ("table", {"table"}), ("any", {"table"}), ("bin", set())):
         found = http.get("/v1/grasps", params={"scene": kind, "limit": 100}).json()["items"]
         assert {grasp["scene_kind"] for grasp in found} == counts

@@ -11,16 +11,16 @@ from starlette.testclient import TestClient
 
 from api.dashboard.pictures import Pictures
 from api.routes.shards import parse_range
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.store import Store
 from tests.api.factories import add_job, finish_all
 from tests.damage import cut, flip, remove
 
 
 @pytest.fixture
-def shard(http: TestClient, parts: Parts) -> str:
-    record = add_job(parts)
-    return finish_all(parts, record)[0].shard_id
+def shard(http: TestClient, services: Services) -> str:
+    record = add_job(services)
+    return finish_all(services, record)[0].shard_id
 
 
 def test_a_downloaded_shard_opens_as_hdf5(http: TestClient, shard: str) -> None:
@@ -58,9 +58,9 @@ def test_a_range_that_is_not_a_single_byte_range_sends_the_whole(header: str | N
 
 
 def test_a_store_that_signs_hands_the_file_out_itself(
-    http: TestClient, parts: Parts, shard: str, monkeypatch: pytest.MonkeyPatch
+    http: TestClient, services: Services, shard: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(type(parts.store), "sign", lambda *_, **__: "https://bucket.example/signed")
+    monkeypatch.setattr(type(services.store), "sign", lambda *_, **__: "https://bucket.example/signed")
     answer = http.get(f"/v1/shards/{shard}/file", follow_redirects=False)
     assert (answer.status_code, answer.headers["location"]) == (307, "https://bucket.example/signed")
 
@@ -95,9 +95,9 @@ def test_pages_of_grasps_meet_without_gap_or_overlap(http: TestClient, shard: st
 @pytest.mark.parametrize("harm", [flip, cut, remove])
 @pytest.mark.parametrize("path", ["/v1/shards/{}/file", "/v1/grasps/{}/0"])
 def test_a_damaged_shard_is_refused_with_its_name(
-    http: TestClient, parts: Parts, shard: str, harm: Callable[[Store, str], None], path: str
+    http: TestClient, services: Services, shard: str, harm: Callable[[Store, str], None], path: str
 ) -> None:
-    harm(parts.store, f"shards/base/{shard}.h5")
+    harm(services.store, f"shards/base/{shard}.h5")
     answer = http.get(path.format(shard), headers={"Range": "bytes=0-9"})
     assert (answer.status_code, answer.json()["type"]) == (500, "/problems/damaged-shard")
     assert shard in answer.json()["detail"]
@@ -105,11 +105,11 @@ def test_a_damaged_shard_is_refused_with_its_name(
     assert "immutable" not in answer.headers.get("cache-control", "")
 
 
-def test_a_picture_of_a_damaged_shard_is_refused(http: TestClient, parts: Parts) -> None:
-    views = finish_all(parts, add_job(parts, scenes=1, views=2, width=24, height=16))[-1]
+def test_a_picture_of_a_damaged_shard_is_refused(http: TestClient, services: Services) -> None:
+    views = finish_all(services, add_job(services, scenes=1, views=2, width=24, height=16))[-1]
     assert http.get(f"/shards/{views.shard_id}/pictures/0.png").status_code == 200
-    flip(parts.store, views.key)
-    http.app.state.pictures = Pictures(parts.store)  # type: ignore[attr-defined]
+    flip(services.store, views.key)
+    http.app.state.pictures = Pictures(services.store)  # type: ignore[attr-defined]
     answer = http.get(f"/shards/{views.shard_id}/pictures/0.png")
     assert answer.status_code == 500
     assert views.key in answer.text

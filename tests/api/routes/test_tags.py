@@ -18,7 +18,7 @@ from api.app import create_app
 from service.index.rebuild import differences, rebuild
 from service.model import names
 from service.model.tags import MOST_TAGGED
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.readers.where import parse
 from service.store.manifests import ShardManifest
 from service.store.shards import Shard, read_shard
@@ -29,9 +29,9 @@ Grasps = list[dict[str, Any]]
 
 
 @pytest.fixture
-def made(parts: Parts) -> ShardManifest:
+def made(services: Services) -> ShardManifest:
     """A base shard of 32 grasps."""
-    return finish_all(parts, add_job(parts))[0]
+    return finish_all(services, add_job(services))[0]
 
 
 def named(shard: str, *rows: int) -> Grasps:
@@ -50,8 +50,8 @@ def rows_of(http: TestClient, **query: Any) -> list[int]:
     return sorted(grasp["row"] for grasp in answer.json()["items"])
 
 
-def shard_of(parts: Parts, made: ShardManifest) -> Shard:
-    return read_shard(parts.store.get(made.key))
+def shard_of(services: Services, made: ShardManifest) -> Shard:
+    return read_shard(services.store.get(made.key))
 
 
 def test_a_tag_is_given_listed_filtered_by_and_taken_off(http: TestClient, made: ShardManifest) -> None:
@@ -68,10 +68,10 @@ def test_a_tag_is_given_listed_filtered_by_and_taken_off(http: TestClient, made:
     assert rows_of(http) == list(range(32))
 
 
-def test_all_that_pass_a_filter_are_tagged(http: TestClient, made: ShardManifest, parts: Parts) -> None:
+def test_all_that_pass_a_filter_are_tagged(http: TestClient, made: ShardManifest, services: Services) -> None:
     give(http, "deep", filter={"where": "penetration_depth_mm > 0.8", "valid": True})
-    deep = shard_of(parts, made)["quality/penetration_depth_mm"] > 0.8
-    valid = shard_of(parts, made)["quality/valid"] == 1
+    deep = shard_of(services, made)["quality/penetration_depth_mm"] > 0.8
+    valid = shard_of(services, made)["quality/valid"] == 1
     assert rows_of(http, tag="deep") == np.flatnonzero(deep & valid).tolist()
 
 
@@ -87,9 +87,9 @@ def test_all_that_pass_a_filter_are_tagged(http: TestClient, made: ShardManifest
     ],
 )
 def test_the_index_chooses_what_the_shards_choose(
-    http: TestClient, made: ShardManifest, parts: Parts, expression: str
+    http: TestClient, made: ShardManifest, services: Services, expression: str
 ) -> None:
-    shard = shard_of(parts, made)
+    shard = shard_of(services, made)
     rows = np.flatnonzero(parse(expression)(shard.arrays, shard.attributes)).tolist()
     assert rows_of(http, where=expression) == rows
 
@@ -111,26 +111,26 @@ def test_an_expression_that_cannot_be_used_is_said_in_a_line(http: TestClient, e
 
 
 def test_tags_survive_a_rebuild_and_are_what_the_store_says(
-    http: TestClient, made: ShardManifest, parts: Parts
+    http: TestClient, made: ShardManifest, services: Services
 ) -> None:
     give(http, "good", grasps=named(made.shard_id, 1, 2, 3))
     give(http, "gone", grasps=named(made.shard_id, 4))
     http.post("/v1/tags/good/remove", json={"grasps": named(made.shard_id, 2)})
     http.delete("/v1/tags/gone")
-    assert [line for line in differences(parts.index, parts.store) if line.startswith("tag")] == []
-    assert [entry.key.rpartition("/")[2] for entry in parts.store.list(names.TAGS)] == ["000002.json"]
-    rebuild(parts.index, parts.store)
+    assert [line for line in differences(services.index, services.store) if line.startswith("tag")] == []
+    assert [entry.key.rpartition("/")[2] for entry in services.store.list(names.TAGS)] == ["000002.json"]
+    rebuild(services.index, services.store)
     assert rows_of(http, tag="good") == [1, 3]
     assert [tag["name"] for tag in http.get("/v1/tags").json()] == ["good"]
 
 
 def test_a_tag_is_made_anew_after_its_end_even_if_that_broke_off(
-    http: TestClient, made: ShardManifest, parts: Parts, monkeypatch: pytest.MonkeyPatch
+    http: TestClient, made: ShardManifest, services: Services, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     give(http, "good", grasps=named(made.shard_id, 1))
     monkeypatch.setattr("service.pipeline.tagging.drop_older", lambda *_: None)
     http.delete("/v1/tags/good")
-    rebuild(parts.index, parts.store)
+    rebuild(services.index, services.store)
     assert http.get("/v1/tags").json() == []
     assert give(http, "good", grasps=named(made.shard_id, 7))["tag"]["grasps"] == 1
     assert rows_of(http, tag="good") == [7]
@@ -159,8 +159,10 @@ def test_what_is_not_there_or_too_much_gets_no_tag(
     assert "the most" in refused(413, grasps=named(made.shard_id, 1))
 
 
-def test_a_project_has_tags_of_its_own_and_a_key_changes_only_what_is_its(parts: Parts, made: ShardManifest) -> None:
-    keys = KeyFile(parts.settings.resolved_keys_file)
+def test_a_project_has_tags_of_its_own_and_a_key_changes_only_what_is_its(
+    services: Services, made: ShardManifest
+) -> None:
+    keys = KeyFile(services.settings.resolved_keys_file)
     people = {
         name: {"Authorization": f"Bearer {keys.add(name, scope, project=project)}"}
         for name, scope, project in [
@@ -172,7 +174,7 @@ def test_a_project_has_tags_of_its_own_and_a_key_changes_only_what_is_its(parts:
         ]
     }
     body = {"name": "good", "grasps": named(made.shard_id, 1)}
-    with TestClient(create_app(parts.settings, parts), base_url="https://graspd.example") as http:
+    with TestClient(create_app(services.settings, services), base_url="https://graspd.example") as http:
 
         def does(who: str, method: str, path: str, **content: Any) -> int:
             return http.request(method, path, headers=people[who], **content).status_code
@@ -189,7 +191,7 @@ def test_a_project_has_tags_of_its_own_and_a_key_changes_only_what_is_its(parts:
 
 
 def test_a_tag_is_taken_home_as_rows_and_as_shards_of_its_grasps_alone(
-    http: TestClient, made: ShardManifest, parts: Parts
+    http: TestClient, made: ShardManifest, services: Services
 ) -> None:
     give(http, "good", grasps=named(made.shard_id, 2, 30))
     give(http, "best", grasps=named(made.shard_id, 2))
@@ -208,29 +210,29 @@ def test_a_tag_is_taken_home_as_rows_and_as_shards_of_its_grasps_alone(
         assert packed.namelist() == ["allegro/mug/base-00000.h5", "subset.json"]
         part = read_shard(packed.read("allegro/mug/base-00000.h5"), kind="base")
         assert json.loads(packed.read("subset.json"))["kept"] == 2
-    whole = shard_of(parts, made)
+    whole = shard_of(services, made)
     np.testing.assert_array_equal(part["grasp/hand_pose"], whole["grasp/hand_pose"][[2, 30]])
     np.testing.assert_array_equal(part["quality/thresholds_m"], whole["quality/thresholds_m"])
     assert http.get("/v1/grasps/export?tag=good&format=zip").content == answer.content
 
 
 def test_a_zip_of_nothing_of_too_much_or_of_a_damaged_shard_is_refused(
-    http: TestClient, made: ShardManifest, parts: Parts, monkeypatch: pytest.MonkeyPatch
+    http: TestClient, made: ShardManifest, services: Services, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     address = "/v1/grasps/export?format=zip"
     assert http.get(address + "&min_epsilon=1000").status_code == 422
-    (parts.settings.data_dir / "store" / made.key).write_bytes(b"other bytes")
+    (services.settings.data_dir / "store" / made.key).write_bytes(b"other bytes")
     answer = http.get(address)
     assert answer.status_code == 500 and made.key in answer.json()["detail"]
     monkeypatch.setattr("api.catalog.grasp_exports.MOST_SHARDS", 0)
     assert http.get(address).status_code == 413
 
 
-def test_grasps_of_a_dataset_are_those_of_its_cells(http: TestClient, made: ShardManifest, parts: Parts) -> None:
+def test_grasps_of_a_dataset_are_those_of_its_cells(http: TestClient, made: ShardManifest, services: Services) -> None:
     matrix = {"name": "d", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
     http.post("/v1/datasets", json=matrix)
-    plan_all(parts)
-    finish_all(parts, add_job(parts, seed=5))
+    plan_all(services)
+    finish_all(services, add_job(services, seed=5))
     assert rows_of(http, dataset="d") == list(range(32)) != rows_of(http)
     assert http.get("/v1/grasps?dataset=none").status_code == 404
 

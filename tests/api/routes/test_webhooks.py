@@ -20,7 +20,7 @@ from service.index.index import Index
 from service.index.outbox import note_ends
 from service.index.rebuild import rebuild
 from service.model.webhooks import MOST_HOOKS, WAITS_S, Webhook
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.http_client import Answer
 from service.pipeline.webhook_dispatcher import AT_ONCE, SLOW_AT_ONCE, WebhookDispatcher
 from service.settings import Settings
@@ -41,11 +41,11 @@ def settings(settings: Settings) -> Settings:
 class Ear:
     """Stands for the address: notes what is sent there, and answers as it is told."""
 
-    def __init__(self, parts: Parts) -> None:
-        self.parts = parts
+    def __init__(self, services: Services) -> None:
+        self.services = services
         self.heard: list[tuple[str, bytes, dict[str, str]]] = []
         self.answer = Answer(200)
-        self.dispatcher = WebhookDispatcher(parts, threading.Event(), send=self.send)
+        self.dispatcher = WebhookDispatcher(services, threading.Event(), send=self.send)
 
     def send(self, url: str, body: bytes, headers: dict[str, str], **_: Any) -> Answer:
         self.heard.append((url, body, headers))
@@ -57,8 +57,8 @@ class Ear:
 
 
 @pytest.fixture
-def ear(parts: Parts) -> Ear:
-    return Ear(parts)
+def ear(services: Services) -> Ear:
+    return Ear(services)
 
 
 def add(http: TestClient, **said: Any) -> dict[str, Any]:
@@ -67,14 +67,14 @@ def add(http: TestClient, **said: Any) -> dict[str, Any]:
     return dict(answer.json())
 
 
-def end_a_job(parts: Parts, **fields: Any) -> str:
-    record = add_job(parts, **fields)
-    finish_all(parts, record)
+def end_a_job(services: Services, **fields: Any) -> str:
+    record = add_job(services, **fields)
+    finish_all(services, record)
     return record.id
 
 
-def test_the_feed_tells_of_each_end_once_and_in_order(http: TestClient, parts: Parts) -> None:
-    jobs = [end_a_job(parts, seed=seed) for seed in (1, 2)]
+def test_the_feed_tells_of_each_end_once_and_in_order(http: TestClient, services: Services) -> None:
+    jobs = [end_a_job(services, seed=seed) for seed in (1, 2)]
     page = http.get("/v1/events").json()
     assert [(one["subject"], one["state"]) for one in page["items"]] == [(job, "succeeded") for job in jobs]
     assert http.get(f"/v1/events?since={page['next']}").json() == {"items": [], "next": page["next"]}
@@ -90,20 +90,20 @@ def test_a_job_that_is_retried_and_cancelled_again_ends_twice(http: TestClient) 
     assert [one["state"] for one in http.get("/v1/events").json()["items"]] == ["cancelled", "cancelled"]
 
 
-def test_a_dataset_that_ended_is_told_once(http: TestClient, parts: Parts, ear: Ear) -> None:
+def test_a_dataset_that_ended_is_told_once(http: TestClient, services: Services, ear: Ear) -> None:
     http.post("/v1/datasets", json={"name": "d", "hands": ["allegro"], "objects": ["mug"], "grasps": 32})
     ear.round()
     http.post("/v1/datasets/d/cancel")
-    plan_all(parts)
+    plan_all(services)
     ear.round()
     ear.round()
     told = [one for one in http.get("/v1/events").json()["items"] if one["kind"] == "dataset"]
     assert [(one["subject"], one["state"]) for one in told] == [("d", "cancelled")]
 
 
-def test_what_is_sent_is_signed_with_the_time(http: TestClient, parts: Parts, ear: Ear) -> None:
+def test_what_is_sent_is_signed_with_the_time(http: TestClient, services: Services, ear: Ear) -> None:
     hook = add(http)
-    job = end_a_job(parts)
+    job = end_a_job(services)
     assert ear.round() == 1
     url, body, headers = ear.heard[0]
     said = dict(part.split("=") for part in headers["X-Graspd-Signature"].split(","))
@@ -114,10 +114,10 @@ def test_what_is_sent_is_signed_with_the_time(http: TestClient, parts: Parts, ea
 
 
 def test_what_is_not_taken_is_tried_again_with_longer_waits_and_then_given_up(
-    http: TestClient, parts: Parts, ear: Ear
+    http: TestClient, services: Services, ear: Ear
 ) -> None:
     hook = add(http)
-    end_a_job(parts)
+    end_a_job(services)
     ear.answer = Answer(500, "answered 500")
     assert ear.round() == 1 and ear.round() == 0
     for wait in WAITS_S:
@@ -129,35 +129,37 @@ def test_what_is_not_taken_is_tried_again_with_longer_waits_and_then_given_up(
     assert len({headers["X-Graspd-Delivery"] for _, _, headers in ear.heard}) == 1
 
 
-def test_a_webhook_is_told_of_the_ends_it_asked_for_from_then_on(http: TestClient, parts: Parts, ear: Ear) -> None:
-    end_a_job(parts, seed=1)
+def test_a_webhook_is_told_of_the_ends_it_asked_for_from_then_on(
+    http: TestClient, services: Services, ear: Ear
+) -> None:
+    end_a_job(services, seed=1)
     add(http, states=["failed"])
-    end_a_job(parts, seed=2)
+    end_a_job(services, seed=2)
     assert ear.round() == 0
 
 
-def test_one_that_is_deleted_is_told_nothing(http: TestClient, parts: Parts, ear: Ear) -> None:
+def test_one_that_is_deleted_is_told_nothing(http: TestClient, services: Services, ear: Ear) -> None:
     hook = add(http)
-    end_a_job(parts)
+    end_a_job(services)
     assert http.delete(f"/v1/webhooks/{hook['id']}").status_code == 204
     assert ear.round() == 0 and http.get("/v1/webhooks").json() == []
 
 
 def test_webhooks_are_in_the_store_and_tell_nothing_old_after_a_rebuild(
-    http: TestClient, parts: Parts, ear: Ear
+    http: TestClient, services: Services, ear: Ear
 ) -> None:
     hook = add(http)
-    end_a_job(parts)
+    end_a_job(services)
     ear.round()
     fresh = Index("sqlite://")
     try:
-        rebuild(fresh, parts.store)
+        rebuild(fresh, services.store)
         assert [one.id for one in fresh.outbox.hooks()] == [hook["id"]]
         fresh.outbox.plan()
         assert fresh.outbox.due(time.time()) == []
     finally:
         fresh.close()
-    rebuild(parts.index, parts.store)
+    rebuild(services.index, services.store)
     ear.round()
     assert len(ear.heard) == 1
 
@@ -173,29 +175,29 @@ def test_what_is_no_address_is_refused(http: TestClient, url: str) -> None:
     assert http.post("/v1/webhooks", json={"url": url}).status_code in (400, 422)
 
 
-def test_without_a_secret_of_the_operators_there_are_none(parts: Parts) -> None:
-    bare = parts.settings.model_copy(update={"webhook_secret": None})
-    app = create_app(bare, Parts(bare, parts.store, parts.index, parts.queue))
+def test_without_a_secret_of_the_operators_there_are_none(services: Services) -> None:
+    bare = services.settings.model_copy(update={"webhook_secret": None})
+    app = create_app(bare, Services(bare, services.store, services.index, services.queue))
     with TestClient(app, base_url="http://127.0.0.1:8000") as http:
         assert http.post("/v1/webhooks", json={"url": ADDRESS}).status_code == 409
 
 
 @pytest.fixture
-def two(settings: Settings, parts: Parts) -> Iterator[tuple[TestClient, dict[str, dict[str, str]]]]:
+def two(settings: Settings, services: Services) -> Iterator[tuple[TestClient, dict[str, dict[str, str]]]]:
     keys = KeyFile(settings.resolved_keys_file)
     people = {
         name: {"Authorization": f"Bearer {keys.add(name, Scope.SUBMIT, project=project)}"}
         for name, project in {"ann": "red", "bob": "blue"}.items()
     }
-    with TestClient(create_app(settings, parts), base_url="https://graspd.example") as client:
+    with TestClient(create_app(settings, services), base_url="https://graspd.example") as client:
         yield client, people
 
 
 def test_a_project_is_told_of_its_own_ends_alone(
-    two: tuple[TestClient, dict[str, dict[str, str]]], parts: Parts
+    two: tuple[TestClient, dict[str, dict[str, str]]], services: Services
 ) -> None:
     client, people = two
-    ear = Ear(parts)
+    ear = Ear(services)
     hook = client.post("/v1/webhooks", json={"url": ADDRESS}, headers=people["bob"]).json()
     for who in people:
         job = client.post("/v1/jobs", json=JOB, headers=people[who]).json()["id"]
@@ -208,7 +210,7 @@ def test_a_project_is_told_of_its_own_ends_alone(
     assert client.delete(address, headers=people["ann"]).status_code == 404
 
 
-def hooks(parts: Parts, count: int, project: str, host: str) -> None:
+def hooks(services: Services, count: int, project: str, host: str) -> None:
     for number in range(count):
         hook = Webhook(
             id=f"{project}{number:031}",
@@ -217,11 +219,11 @@ def hooks(parts: Parts, count: int, project: str, host: str) -> None:
             created=f"2026-01-01T00:00:{number % 60:02}Z",
             project=project,
         )
-        parts.index.outbox.add(hook)
+        services.index.outbox.add(hook)
 
 
-def end_jobs_of(parts: Parts, projects: str, seq: str = "") -> None:
-    with parts.index.database.writing() as connection:
+def end_jobs_of(services: Services, projects: str, seq: str = "") -> None:
+    with services.index.database.writing() as connection:
         rows = [
             {"kind": "job", "subject": f"{p}{seq}", "state": "succeeded", "project": p, "owner": ""} for p in projects
         ]
@@ -231,8 +233,8 @@ def end_jobs_of(parts: Parts, projects: str, seq: str = "") -> None:
 class Silent(Ear):
     """Addresses of `dead` do not answer until they are let go."""
 
-    def __init__(self, parts: Parts) -> None:
-        super().__init__(parts)
+    def __init__(self, services: Services) -> None:
+        super().__init__(services)
         self.asked: list[str] = []
         self.let_go = threading.Event()
         self.good = threading.Event()
@@ -248,31 +250,33 @@ class Silent(Ear):
 
 
 @pytest.mark.parametrize(("dead", "theirs"), [(20, "a"), (20, "b"), (3 * AT_ONCE, "a")])
-def test_silent_addresses_keep_no_other_waiting(parts: Parts, dead: int, theirs: str) -> None:
-    ear = Silent(parts)
-    hooks(parts, dead, theirs, "dead")
-    hooks(parts, 1, "b", "good") if theirs != "b" else parts.index.outbox.add(
+def test_silent_addresses_keep_no_other_waiting(services: Services, dead: int, theirs: str) -> None:
+    ear = Silent(services)
+    hooks(services, dead, theirs, "dead")
+    hooks(services, 1, "b", "good") if theirs != "b" else services.index.outbox.add(
         Webhook(id="c" * 32, url="https://good/", states=("succeeded",), created="2026-02-01T00:00:00Z", project="b")
     )
-    end_jobs_of(parts, "ab")
+    end_jobs_of(services, "ab")
     try:
         ear.dispatcher.start_deliveries()
         assert ear.good.wait(30)
         # What is silent is not asked again while it is asked.
-        end_jobs_of(parts, "ab", "again")
+        end_jobs_of(services, "ab", "again")
         ear.dispatcher.start_deliveries()
         assert len(set(ear.asked)) == len(ear.asked)
     finally:
         ear.let_go.set()
 
 
-def test_a_burst_of_ends_is_told_without_a_pause_between_them(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_burst_of_ends_is_told_without_a_pause_between_them(
+    services: Services, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("service.pipeline.webhook_dispatcher._PAUSE_S", PATIENCE_S)
-    ear, stop = Ear(parts), threading.Event()
-    ear.dispatcher = WebhookDispatcher(parts, stop, send=ear.send)
-    hooks(parts, 1, "a", "good")
+    ear, stop = Ear(services), threading.Event()
+    ear.dispatcher = WebhookDispatcher(services, stop, send=ear.send)
+    hooks(services, 1, "a", "good")
     for number in range(20):
-        end_jobs_of(parts, "a", str(number))
+        end_jobs_of(services, "a", str(number))
     ear.dispatcher.deliver()
     thread = threading.Thread(target=ear.dispatcher.run)
     thread.start()
@@ -284,23 +288,23 @@ def test_a_burst_of_ends_is_told_without_a_pause_between_them(parts: Parts, monk
         thread.join()
 
 
-def test_an_address_that_failed_rests_with_all_that_waits_for_it(parts: Parts, ear: Ear) -> None:
-    hooks(parts, 1, "a", "busy")
+def test_an_address_that_failed_rests_with_all_that_waits_for_it(services: Services, ear: Ear) -> None:
+    hooks(services, 1, "a", "busy")
     ear.answer = Answer(503, "answered 503")
     for number in range(3):
-        end_jobs_of(parts, "a", str(number))
+        end_jobs_of(services, "a", str(number))
     assert ear.round() == 1 and ear.round() == 0
-    end_jobs_of(parts, "a", "new")
+    end_jobs_of(services, "a", "new")
     assert ear.round() == 0
     ear.answer = Answer(200)
     assert [ear.round(WAITS_S[0] + 1), ear.round(), ear.round(), ear.round(), ear.round()] == [1, 1, 1, 1, 0]
     assert [json.loads(body)["subject"] for _, body, _ in ear.heard] == ["a0", "a0", "a1", "a2", "anew"]
 
 
-def test_addresses_that_failed_leave_half_of_the_room_to_the_others(parts: Parts) -> None:
-    ear = Silent(parts)
-    hooks(parts, AT_ONCE, "a", "dead")
-    end_jobs_of(parts, "a")
+def test_addresses_that_failed_leave_half_of_the_room_to_the_others(services: Services) -> None:
+    ear = Silent(services)
+    hooks(services, AT_ONCE, "a", "dead")
+    end_jobs_of(services, "a")
     ear.let_go.set()
     assert ear.dispatcher.deliver() == AT_ONCE
     ear.let_go.clear()
@@ -311,10 +315,10 @@ def test_addresses_that_failed_leave_half_of_the_room_to_the_others(parts: Parts
         ear.let_go.set()
 
 
-def test_an_address_that_may_not_be_reached_is_given_up_at_once(parts: Parts, ear: Ear) -> None:
-    hooks(parts, 1, "a", "inside")
-    end_jobs_of(parts, "a", "1")
-    end_jobs_of(parts, "a", "2")
+def test_an_address_that_may_not_be_reached_is_given_up_at_once(services: Services, ear: Ear) -> None:
+    hooks(services, 1, "a", "inside")
+    end_jobs_of(services, "a", "1")
+    end_jobs_of(services, "a", "2")
     ear.answer = Answer(None, "the address is not one of the public internet", is_final=True)
     assert ear.round() == 1 and ear.round(10 * WAITS_S[-1]) == 0
-    assert {one.state for one in parts.index.outbox.log(f"a{0:031}")} == {"failed"}
+    assert {one.state for one in services.index.outbox.log(f"a{0:031}")} == {"failed"}

@@ -19,7 +19,7 @@ from service.model.planning import plan
 from service.model.records import AttemptRecord, JobRecord
 from service.model.states import AssetKind, State
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.controller import Controller
 from service.run.commands import app
 from service.settings import Settings
@@ -36,11 +36,11 @@ DAMAGED = b'{"x": 1}'
 
 
 @pytest.fixture
-def parts(tmp_path: Path) -> Iterator[Parts]:
+def services(tmp_path: Path) -> Iterator[Services]:
     """A service on files with some jobs."""
     settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0)
     index = empty_index(settings.resolved_index_url)
-    made = Parts(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
+    made = Services(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
     add_assets(made)
     for seed in range(GOOD):
         job_actions.submit(made, request(seed=seed))
@@ -48,63 +48,65 @@ def parts(tmp_path: Path) -> Iterator[Parts]:
     made.close()
 
 
-def lost(parts: Parts) -> Parts:
+def lost(services: Services) -> Services:
     """The same service with an index that knows nothing."""
-    index = empty_index(f"sqlite:///{parts.settings.data_dir / 'fresh.sqlite'}")
-    return Parts(parts.settings, parts.store, index, MemoryQueue())
+    index = empty_index(f"sqlite:///{services.settings.data_dir / 'fresh.sqlite'}")
+    return Services(services.settings, services.store, index, MemoryQueue())
 
 
 def shown(index: Index) -> int:
     return len(index.jobs.page(limit=99).items)
 
 
-def a_job(parts: Parts) -> str:
-    return parts.index.jobs.page().items[0].id
+def a_job(services: Services) -> str:
+    return services.index.jobs.page().items[0].id
 
 
-def of_job(parts: Parts) -> str:
-    return names.job_record(a_job(parts))
+def of_job(services: Services) -> str:
+    return names.job_record(a_job(services))
 
 
-def of_manifest(parts: Parts) -> str:
-    return names.shard_manifest(*made_one(parts))
+def of_manifest(services: Services) -> str:
+    return names.shard_manifest(*made_one(services))
 
 
-def made_one(parts: Parts) -> tuple[object, str]:  # type: ignore[type-arg]
-    made = make_shard(parts.store, message_for(seed=99))
+def made_one(services: Services) -> tuple[object, str]:  # type: ignore[type-arg]
+    made = make_shard(services.store, message_for(seed=99))
     return made.stage, made.shard_id
 
 
-def of_attempt(parts: Parts) -> str:
-    task = next(plan(read_record(JobRecord, parts.store, of_job(parts))))
+def of_attempt(services: Services) -> str:
+    task = next(plan(read_record(JobRecord, services.store, of_job(services))))
     key = names.attempt(task.id, 1)
     fields = {"stage": task.stage, "number": 1, "kind": "K", "reason": "r", "worker": "w", "ended": "", "last": False}
-    put_record(parts.store, key, AttemptRecord(task_id=task.id, job_id=a_job(parts), **fields))
+    put_record(services.store, key, AttemptRecord(task_id=task.id, job_id=a_job(services), **fields))
     return key
 
 
-def of_event(parts: Parts) -> str:
-    return names.job_event(a_job(parts), add_job_event(parts.store, a_job(parts), "cancelled").number, "cancelled")
+def of_event(services: Services) -> str:
+    return names.job_event(
+        a_job(services), add_job_event(services.store, a_job(services), "cancelled").number, "cancelled"
+    )
 
 
-def of_asset(parts: Parts) -> str:
-    return names.asset_record(*next(a for a in stored_assets(parts.store) if a[0] is AssetKind.OBJECT))
+def of_asset(services: Services) -> str:
+    return names.asset_record(*next(a for a in stored_assets(services.store) if a[0] is AssetKind.OBJECT))
 
 
-def of_check(parts: Parts) -> str:
-    return names.asset_check(*next(a for a in stored_assets(parts.store) if a[0] is AssetKind.OBJECT))
+def of_check(services: Services) -> str:
+    return names.asset_check(*next(a for a in stored_assets(services.store) if a[0] is AssetKind.OBJECT))
 
 
-def of_dataset(parts: Parts) -> str:
-    return put(parts, names.dataset_record("kitchen"))
+def of_dataset(services: Services) -> str:
+    return put(services, names.dataset_record("kitchen"))
 
 
-def of_snapshot(parts: Parts) -> str:
-    return put(parts, names.dataset_snapshot("kitchen", "a" * 32))
+def of_snapshot(services: Services) -> str:
+    return put(services, names.dataset_snapshot("kitchen", "a" * 32))
 
 
-def put(parts: Parts, key: str) -> str:
-    parts.store.put(key, b"{}")
+def put(services: Services, key: str) -> str:
+    services.store.put(key, b"{}")
     return key
 
 
@@ -112,10 +114,12 @@ RECORDS = [of_job, of_manifest, of_attempt, of_event, of_asset, of_check, of_dat
 
 
 @pytest.mark.parametrize("record", RECORDS)
-def test_a_damaged_record_is_left_out_of_a_lost_index_and_named(parts: Parts, record: Callable[[Parts], str]) -> None:
-    key = record(parts)
-    overwrite(parts.store, key, DAMAGED)
-    fresh = lost(parts)
+def test_a_damaged_record_is_left_out_of_a_lost_index_and_named(
+    services: Services, record: Callable[[Services], str]
+) -> None:
+    key = record(services)
+    overwrite(services.store, key, DAMAGED)
+    fresh = lost(services)
     Controller(fresh).round()
     assert shown(fresh.index) == GOOD - (record is of_job)
     made = fresh.index.notes.completeness()
@@ -124,13 +128,13 @@ def test_a_damaged_record_is_left_out_of_a_lost_index_and_named(parts: Parts, re
     fresh.index.close()
 
 
-def test_a_record_that_was_mended_is_there_again(parts: Parts) -> None:
-    key = of_job(parts)
-    whole = parts.store.get(key)
-    overwrite(parts.store, key, DAMAGED)
-    fresh = lost(parts)
+def test_a_record_that_was_mended_is_there_again(services: Services) -> None:
+    key = of_job(services)
+    whole = services.store.get(key)
+    overwrite(services.store, key, DAMAGED)
+    fresh = lost(services)
     Controller(fresh).round()
-    overwrite(parts.store, key, whole)
+    overwrite(services.store, key, whole)
     Controller(fresh).round()
     assert shown(fresh.index) == GOOD
     assert (made := fresh.index.notes.completeness()) is not None
@@ -138,9 +142,9 @@ def test_a_record_that_was_mended_is_there_again(parts: Parts) -> None:
     fresh.index.close()
 
 
-def test_one_new_job_does_not_make_a_lost_index_whole(parts: Parts) -> None:
-    fresh = lost(parts)
-    fresh.index.write.add_job(read_record(JobRecord, parts.store, of_job(parts)))
+def test_one_new_job_does_not_make_a_lost_index_whole(services: Services) -> None:
+    fresh = lost(services)
+    fresh.index.write.add_job(read_record(JobRecord, services.store, of_job(services)))
     assert fresh.index.notes.completeness() is None
     Controller(fresh).round()
     assert shown(fresh.index) == GOOD
@@ -148,18 +152,18 @@ def test_one_new_job_does_not_make_a_lost_index_whole(parts: Parts) -> None:
     fresh.index.close()
 
 
-def test_a_damaged_attempt_fails_its_task_and_stops_no_round(parts: Parts) -> None:
+def test_a_damaged_attempt_fails_its_task_and_stops_no_round(services: Services) -> None:
     clock = Clock()
-    controller = Controller(parts, clock=clock)
+    controller = Controller(services, clock=clock)
     controller.round()
-    overwrite(parts.store, of_attempt(parts), DAMAGED)
-    delivery = parts.queue.take("w")  # type: ignore[attr-defined]
-    parts.queue._held.clear()  # type: ignore[attr-defined]
+    overwrite(services.store, of_attempt(services), DAMAGED)
+    delivery = services.queue.take("w")  # type: ignore[attr-defined]
+    services.queue._held.clear()  # type: ignore[attr-defined]
     for _ in range(6):
         clock.now += 1.0
         controller.round()
     assert delivery is not None
-    assert sum(job.state is State.FAILED for job in parts.index.jobs.page().items) <= 1
+    assert sum(job.state is State.FAILED for job in services.index.jobs.page().items) <= 1
 
 
 class Clock:
@@ -180,18 +184,18 @@ def remove_only_the_file(folder: Path) -> None:
 
 @pytest.mark.parametrize("remove", [remove_file, remove_only_the_file])
 def test_an_index_removed_under_its_readers_is_made_again_for_all_of_them(
-    parts: Parts, remove: Callable[[Path], None]
+    services: Services, remove: Callable[[Path], None]
 ) -> None:
-    controller = Controller(parts)
+    controller = Controller(services)
     controller.round()
-    other = Index(parts.settings.resolved_index_url)
+    other = Index(services.settings.resolved_index_url)
     assert shown(other) == GOOD
-    remove(parts.settings.data_dir)
+    remove(services.settings.data_dir)
     controller.round()
-    assert shown(other) == shown(parts.index) == GOOD
-    job_actions.submit(Parts(parts.settings, parts.store, other, parts.queue), request(seed=50))
-    assert shown(parts.index) == GOOD + 1
-    assert differences(parts.index, parts.store) == []
+    assert shown(other) == shown(services.index) == GOOD
+    job_actions.submit(Services(services.settings, services.store, other, services.queue), request(seed=50))
+    assert shown(services.index) == GOOD + 1
+    assert differences(services.index, services.store) == []
     other.close()
 
 
@@ -220,35 +224,35 @@ HARMS = [scribble_over_the_log, scribble_over_the_file, scribble_over_its_tables
 
 
 @pytest.mark.parametrize("harm", HARMS)
-def test_a_damaged_file_gives_way_to_a_rebuilt_one(parts: Parts, harm: Callable[[Path], None]) -> None:
-    rebuild(parts.index, parts.store)
-    harm(parts.settings.data_dir)
-    command = ["index", "rebuild", "--json", "--data-dir", str(parts.settings.data_dir)]
+def test_a_damaged_file_gives_way_to_a_rebuilt_one(services: Services, harm: Callable[[Path], None]) -> None:
+    rebuild(services.index, services.store)
+    harm(services.settings.data_dir)
+    command = ["index", "rebuild", "--json", "--data-dir", str(services.settings.data_dir)]
     told = CliRunner().invoke(app, command)
     assert told.exit_code == 0, told.output
     assert json.loads(told.stdout.splitlines()[-1])["jobs"] == GOOD
-    assert shown(parts.index) == GOOD, "who had it open sees the new one"
+    assert shown(services.index) == GOOD, "who had it open sees the new one"
     assert CliRunner().invoke(app, [*command, "--check"]).exit_code == 0
 
 
 @pytest.mark.parametrize("harm", HARMS)
-def test_a_controller_outlives_a_damaged_index(parts: Parts, harm: Callable[[Path], None]) -> None:
-    controller = Controller(parts)
+def test_a_controller_outlives_a_damaged_index(services: Services, harm: Callable[[Path], None]) -> None:
+    controller = Controller(services)
     controller.round()
-    harm(parts.settings.data_dir)
+    harm(services.settings.data_dir)
     for _ in range(4):
         try:
             controller.round()
         except IndexUnavailable:
             continue
-    assert shown(parts.index) == GOOD
-    assert differences(parts.index, parts.store) == []
+    assert shown(services.index) == GOOD
+    assert differences(services.index, services.store) == []
 
 
-def test_a_check_names_a_damaged_record_and_exits_with_1(parts: Parts) -> None:
-    rebuild(parts.index, parts.store)
-    key = of_job(parts)
-    overwrite(parts.store, key, DAMAGED)
-    told = CliRunner().invoke(app, ["index", "rebuild", "--check", "--data-dir", str(parts.settings.data_dir)])
+def test_a_check_names_a_damaged_record_and_exits_with_1(services: Services) -> None:
+    rebuild(services.index, services.store)
+    key = of_job(services)
+    overwrite(services.store, key, DAMAGED)
+    told = CliRunner().invoke(app, ["index", "rebuild", "--check", "--data-dir", str(services.settings.data_dir)])
     assert told.exit_code == 1
     assert key in told.output

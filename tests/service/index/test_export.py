@@ -10,18 +10,18 @@ from sqlalchemy import select
 
 from service.index.export import TABLES, export
 from service.model.errors import InputError
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from tests.service.index.test_projects import enter, make
 
 pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed; pip install 'graspd[parquet]'")
 
 
-def test_every_row_and_value_of_a_table_is_in_its_file(parts: Parts, tmp_path: Path, monkeypatch) -> None:
+def test_every_row_and_value_of_a_table_is_in_its_file(services: Services, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("service.index.export.GROUP", 7)  # several groups of rows, the last one not full
-    make(parts, enter(parts, "vision", 1, batches=2))
-    counts = export(parts.index.database, tmp_path)
+    make(services, enter(services, "vision", 1, batches=2))
+    counts = export(services.index.database, tmp_path)
     assert counts["grasps"] == 64 and counts["jobs"] == 1 and counts["shards"] == counts["tasks"] > 1
-    with parts.index.database.reading() as connection:
+    with services.index.database.reading() as connection:
         for name, table in TABLES.items():
             stored = [
                 {key: json.dumps(value) if isinstance(value, dict | list) else value for key, value in row.items()}
@@ -31,20 +31,20 @@ def test_every_row_and_value_of_a_table_is_in_its_file(parts: Parts, tmp_path: P
             assert len(stored) == counts[name]
 
 
-def test_an_empty_index_has_empty_tables_with_all_columns(parts: Parts, tmp_path: Path) -> None:
-    assert export(parts.index.database, tmp_path)["grasps"] == 0
+def test_an_empty_index_has_empty_tables_with_all_columns(services: Services, tmp_path: Path) -> None:
+    assert export(services.index.database, tmp_path)["grasps"] == 0
     assert pq.read_schema(tmp_path / "grasps.parquet").names == [c.name for c in TABLES["grasps"].columns]
     assert str(pq.read_schema(tmp_path / "grasps.parquet").field("epsilon").type) == "double"
 
 
-def test_no_table_holds_what_is_secret(parts: Parts, tmp_path: Path) -> None:
+def test_no_table_holds_what_is_secret(services: Services, tmp_path: Path) -> None:
     columns = {column.name for table in TABLES.values() for column in table.columns}
     assert not {name for name in columns if "secret" in name or "token" in name or "url" in name}
 
 
 def test_without_pyarrow_the_error_says_what_to_install(
-    parts: Parts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    services: Services, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     with pytest.raises(InputError, match=r"graspd\[parquet\]"):
-        export(parts.index.database, tmp_path)
+        export(services.index.database, tmp_path)

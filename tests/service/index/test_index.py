@@ -29,7 +29,7 @@ from service.model.states import AssetKind, Lane, Stage, State
 from service.model.turns import Turns
 from service.model.version import STAGE_REVISIONS
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 from service.store.records import put_record, read_record
 from service.store.store import Store, open_store
@@ -47,25 +47,27 @@ def index(index_url: str) -> Iterator[Index]:
 
 
 @pytest.fixture
-def parts(tmp_path: Path, index: Index, index_url: str) -> Parts:
+def services(tmp_path: Path, index: Index, index_url: str) -> Services:
     """A service without processes on an index of each kind: a hand `gripper` and an object `ball`."""
     settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0, task_s=0.0, index_url=SecretStr(index_url))
-    made = Parts(settings, open_store("memory://"), index, MemoryQueue())
+    made = Services(settings, open_store("memory://"), index, MemoryQueue())
     add_assets(made)
     return made
 
 
-def run_all(parts: Parts, job: str, *, batches: int | None = None, stages: int | None = None) -> None:
+def run_all(services: Services, job: str, *, batches: int | None = None, stages: int | None = None) -> None:
     """Do the first tasks of a job and index them."""
-    record = read_record(JobRecord, parts.store, names.job_record(job))
+    record = read_record(JobRecord, services.store, names.job_record(job))
     for task in plan(record):
         if (batches is None or task.batch < batches) and (stages is None or task.stage is Stage.SYNTHESIZE):
-            parts.index.write.add_manifest(make_shard(parts.store, message_of(record, task, attempt=1, max_attempt=3)))
+            services.index.write.add_manifest(
+                make_shard(services.store, message_of(record, task, attempt=1, max_attempt=3))
+            )
 
 
-def fail(parts: Parts, job: str, batch: int, number: int, *, last: bool) -> None:
+def fail(services: Services, job: str, batch: int, number: int, *, last: bool) -> None:
     """A failed attempt of the first stage of a batch, in the store and in the index."""
-    task = parts.index.jobs.tasks(job=job).items[batch]
+    task = services.index.jobs.tasks(job=job).items[batch]
     attempt = AttemptRecord(
         task_id=task.id,
         job_id=job,
@@ -77,28 +79,28 @@ def fail(parts: Parts, job: str, batch: int, number: int, *, last: bool) -> None
         ended=timestamp(),
         last=last,
     )
-    put_record(parts.store, names.attempt(task.id, number), attempt)
-    parts.index.write.add_attempt(attempt)
+    put_record(services.store, names.attempt(task.id, number), attempt)
+    services.index.write.add_attempt(attempt)
 
 
-def test_opening_an_index_again_changes_nothing(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request())
-    again = Index(parts.settings.resolved_index_url)
-    assert again.jobs.get(job.id) == parts.index.jobs.get(job.id)
+def test_opening_an_index_again_changes_nothing(services: Services) -> None:
+    job, _ = job_actions.submit(services, request())
+    again = Index(services.settings.resolved_index_url)
+    assert again.jobs.get(job.id) == services.index.jobs.get(job.id)
     again.close()
 
 
-def test_sqlite_lets_readers_read_while_one_writes(parts: Parts) -> None:
-    with parts.index.database.writing() as connection:
+def test_sqlite_lets_readers_read_while_one_writes(services: Services) -> None:
+    with services.index.database.writing() as connection:
         connection.execute(update(tables.assets).values(message="half done"))
-        assert {a.message for a in parts.index.assets.page(AssetKind.HAND).items} == {"fine"}
+        assert {a.message for a in services.index.assets.page(AssetKind.HAND).items} == {"fine"}
 
 
-def test_a_write_that_breaks_off_leaves_nothing(parts: Parts) -> None:
-    with pytest.raises(RuntimeError), parts.index.database.writing() as connection:
+def test_a_write_that_breaks_off_leaves_nothing(services: Services) -> None:
+    with pytest.raises(RuntimeError), services.index.database.writing() as connection:
         connection.execute(delete(tables.assets))
         raise RuntimeError
-    assert parts.index.assets.get(AssetKind.HAND, "gripper").name == "gripper"
+    assert services.index.assets.get(AssetKind.HAND, "gripper").name == "gripper"
 
 
 def test_a_database_that_cannot_be_opened_is_one_clear_line(tmp_path: Path) -> None:
@@ -108,72 +110,72 @@ def test_a_database_that_cannot_be_opened_is_one_clear_line(tmp_path: Path) -> N
         Index("nonsense://")
 
 
-def test_a_job_shows_progress_by_stage(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request(grasps=64, scenes=1))
-    task = parts.index.jobs.tasks(job=job.id).items[0]
-    parts.index.live.set_running({task.id: "w"})
-    parts.index.live.set_progress({task.id: (1.0, 4.0, "descending")})
-    shown = parts.index.jobs.get(job.id)
+def test_a_job_shows_progress_by_stage(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=64, scenes=1))
+    task = services.index.jobs.tasks(job=job.id).items[0]
+    services.index.live.set_running({task.id: "w"})
+    services.index.live.set_progress({task.id: (1.0, 4.0, "descending")})
+    shown = services.index.jobs.get(job.id)
     assert shown.state is State.RUNNING
     assert [(s.stage, s.tasks, s.running, s.done) for s in shown.stages] == [
         ("synthesize", 2, 1, 0.25),
         ("scene", 2, 0, 0),
     ]
-    run_all(parts, job.id)
-    done = parts.index.jobs.get(job.id)
+    run_all(services, job.id)
+    done = services.index.jobs.get(job.id)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 64)
-    assert done.valid == len(parts.index.grasps.page(GraspFilter(job=job.id, valid=True), limit=200).items)
+    assert done.valid == len(services.index.grasps.page(GraspFilter(job=job.id, valid=True), limit=200).items)
     assert done.finished is not None
 
 
-def test_a_job_that_found_fewer_grasps_says_what_became_of_the_others(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request(grasps=64))
-    record = read_record(JobRecord, parts.store, names.job_record(job.id))
+def test_a_job_that_found_fewer_grasps_says_what_became_of_the_others(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=64))
+    record = read_record(JobRecord, services.store, names.job_record(job.id))
     for task, lost in zip(plan(record), ({"slipped": 3, "turned": 1}, {"slipped": 4}), strict=True):
-        made = make_shard(parts.store, message_of(record, task, attempt=1, max_attempt=3))
-        parts.index.write.add_manifest(made.model_copy(update={"info": {"outcomes": lost}}))
-    done = parts.index.jobs.get(job.id)
+        made = make_shard(services.store, message_of(record, task, attempt=1, max_attempt=3))
+        services.index.write.add_manifest(made.model_copy(update={"info": {"outcomes": lost}}))
+    done = services.index.jobs.get(job.id)
     assert done.valid < 64 and done.outcomes == {"turned": 1, "slipped": 7}
     assert done.note is not None and f"found {done.valid} of 64 valid grasps" in done.note
     assert "7 slipped, 1 turned in the hand" in done.note
-    (listed,) = parts.index.jobs.page().items
+    (listed,) = services.index.jobs.page().items
     assert listed.note is not None and not listed.outcomes
 
 
-def test_jobs_come_newest_first_page_by_page(parts: Parts) -> None:
+def test_jobs_come_newest_first_page_by_page(services: Services) -> None:
     ids = []
     for seed in range(5):
-        ids.append(job_actions.submit(parts, request(seed=seed))[0].id)
+        ids.append(job_actions.submit(services, request(seed=seed))[0].id)
         time.sleep(0.002)  # timestamps have milliseconds
     seen: list[str] = []
     cursor = None
     for _ in range(3):
-        page = parts.index.jobs.page(limit=2, cursor=cursor)
+        page = services.index.jobs.page(limit=2, cursor=cursor)
         seen += [job.id for job in page.items]
         cursor = page.next
     assert seen == ids[::-1]
     assert cursor is None
 
 
-def test_jobs_are_found_by_state_hand_and_object(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request())
-    assert parts.index.jobs.page(state=State.QUEUED, hand="gripper", object="ball").items[0].id == job.id
-    assert parts.index.jobs.page(state=State.FAILED).items == []
-    assert parts.index.jobs.page(hand="other").items == []
+def test_jobs_are_found_by_state_hand_and_object(services: Services) -> None:
+    job, _ = job_actions.submit(services, request())
+    assert services.index.jobs.page(state=State.QUEUED, hand="gripper", object="ball").items[0].id == job.id
+    assert services.index.jobs.page(state=State.FAILED).items == []
+    assert services.index.jobs.page(hand="other").items == []
 
 
-def test_grasps_page_through_in_the_order_of_any_metric(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request(grasps=70))
-    run_all(parts, job.id)
+def test_grasps_page_through_in_the_order_of_any_metric(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=70))
+    run_all(services, job.id)
     metrics = ("epsilon", "penetration_depth_mm", "stability_loss")
-    with parts.index.database.writing() as connection:  # some without the metrics
+    with services.index.database.writing() as connection:  # some without the metrics
         connection.execute(update(tables.grasps).where(tables.grasps.c.row < 3).values(dict.fromkeys(metrics)))
     for by, descending in itertools.product((*metrics, "created"), (True, False)):
         sort = GraspSort(by=by, descending=descending)  # type: ignore[arg-type]
         seen: list[GraspView] = []
         cursor = None
         while True:
-            page = parts.index.grasps.page(sort=sort, limit=16, cursor=cursor)
+            page = services.index.grasps.page(sort=sort, limit=16, cursor=cursor)
             seen += page.items
             if (cursor := page.next) is None:
                 break
@@ -184,17 +186,17 @@ def test_grasps_page_through_in_the_order_of_any_metric(parts: Parts) -> None:
         assert values[: len(known)] == known, f"{sort}: those without the metric come last"
 
 
-def test_grasps_are_filtered_by_every_condition_at_once(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request(grasps=64))
-    other, _ = job_actions.submit(parts, request(seed=1))
-    run_all(parts, job.id)
-    run_all(parts, other.id)
-    everything = [g for start in (None,) for g in parts.index.grasps.page(limit=200, cursor=start).items]
+def test_grasps_are_filtered_by_every_condition_at_once(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=64))
+    other, _ = job_actions.submit(services, request(seed=1))
+    run_all(services, job.id)
+    run_all(services, other.id)
+    everything = [g for start in (None,) for g in services.index.grasps.page(limit=200, cursor=start).items]
     where = GraspFilter(
         job=job.id, hand="gripper", valid=True, at_least={"epsilon": 0.3}, at_most={"penetration_depth_mm": 2.0}
     )
-    found = parts.index.grasps.page(where, limit=200).items
-    of_job = {shard.id for shard in parts.index.shards.page(job=job.id).items}
+    found = services.index.grasps.page(where, limit=200).items
+    of_job = {shard.id for shard in services.index.shards.page(job=job.id).items}
     expected = [
         g
         for g in everything
@@ -204,62 +206,62 @@ def test_grasps_are_filtered_by_every_condition_at_once(parts: Parts) -> None:
     assert 0 < len(found) < 64
 
 
-def test_a_cursor_of_another_list_is_refused(parts: Parts) -> None:
+def test_a_cursor_of_another_list_is_refused(services: Services) -> None:
     for cursor in ("rubbish", "eyJ4IjoxfQ", "", "W10"):
         with pytest.raises(InputError, match="cursor"):
-            parts.index.jobs.page(cursor=cursor)
+            services.index.jobs.page(cursor=cursor)
 
 
-def test_unknown_ids_are_named(parts: Parts) -> None:
-    for call in (parts.index.jobs.get, parts.index.shards.get, parts.index.jobs.task):
+def test_unknown_ids_are_named(services: Services) -> None:
+    for call in (services.index.jobs.get, services.index.shards.get, services.index.jobs.task):
         with pytest.raises(NotFoundError, match="nothing-here"):
             call("nothing-here")
     with pytest.raises(NotFoundError, match="there are: gripper"):
-        parts.index.assets.get(AssetKind.HAND, "nothing-here")
+        services.index.assets.get(AssetKind.HAND, "nothing-here")
     with pytest.raises(NotFoundError, match=r"there are: gripper; did you mean gripper\?"):
-        parts.index.assets.get(AssetKind.HAND, "griper")
+        services.index.assets.get(AssetKind.HAND, "griper")
 
 
-def test_a_shard_shows_its_manifest(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request())
-    run_all(parts, job.id)
-    (shard,) = parts.index.shards.page(job=job.id).items
-    whole = parts.index.shards.get(shard.id)
+def test_a_shard_shows_its_manifest(services: Services) -> None:
+    job, _ = job_actions.submit(services, request())
+    run_all(services, job.id)
+    (shard,) = services.index.shards.page(job=job.id).items
+    whole = services.index.shards.get(shard.id)
     assert whole.manifest["request"]["hand"] == "gripper"
     assert whole.count == 32
-    assert len(parts.store.get(whole.key)) == whole.size_bytes
+    assert len(services.store.get(whole.key)) == whole.size_bytes
 
 
-def test_failures_are_grouped_by_stage_and_error(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request(grasps=64))
-    fail(parts, job.id, 0, 1, last=False)
-    fail(parts, job.id, 0, 2, last=False)
-    fail(parts, job.id, 1, 1, last=False)
-    (group,) = parts.index.overview.failures()
+def test_failures_are_grouped_by_stage_and_error(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=64))
+    fail(services, job.id, 0, 1, last=False)
+    fail(services, job.id, 0, 2, last=False)
+    fail(services, job.id, 1, 1, last=False)
+    (group,) = services.index.overview.failures()
     assert (group.stage, group.kind, group.attempts, group.tasks) == ("synthesize", "ValueError", 3, 2)
-    assert len(parts.index.jobs.attempts(job=job.id)) == 3
+    assert len(services.index.jobs.attempts(job=job.id)) == 3
 
 
-def test_the_service_in_numbers(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request(grasps=64, scenes=1))
+def test_the_service_in_numbers(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=64, scenes=1))
     before = timestamp()
-    run_all(parts, job.id, batches=1)
-    stats = parts.index.overview.stats()
+    run_all(services, job.id, batches=1)
+    stats = services.index.overview.stats()
     assert (stats.grasps, stats.shards) == (32, 2)
     assert stats.tasks[State.SUCCEEDED] == 2
     assert stats.jobs[State.RUNNING] == 1
-    (cell,) = parts.index.overview.matrix()
+    (cell,) = services.index.overview.matrix()
     assert (cell.hand, cell.object, cell.jobs, cell.grasps, cell.queued) == ("gripper", "ball", 1, 32, 2)
-    made = parts.index.overview.throughput(since=before)
+    made = services.index.overview.throughput(since=before)
     assert sum(bucket.grasps for bucket in made) == 32
 
 
-def test_the_jobs_of_a_key_are_fed_in_turn_and_each_batch_by_batch(parts: Parts) -> None:
-    window = parts.settings.model_copy(update={"queue_window": 1})
-    small = Parts(window, parts.store, parts.index, parts.queue)
+def test_the_jobs_of_a_key_are_fed_in_turn_and_each_batch_by_batch(services: Services) -> None:
+    window = services.settings.model_copy(update={"queue_window": 1})
+    small = Services(window, services.store, services.index, services.queue)
     for seed in range(2):
         job_actions.submit(small, request(grasps=320, seed=seed), lane=Lane.BULK)
-    ready = parts.index.feed.ready_tasks(Lane.BULK, Turns(), now=time.time(), limit=10)
+    ready = services.index.feed.ready_tasks(Lane.BULK, Turns(), now=time.time(), limit=10)
     assert len(ready) == 10
     for job in {task.job.id for task in ready}:
         batches = [task.task.batch for task in ready if task.job.id == job]
@@ -268,15 +270,15 @@ def test_the_jobs_of_a_key_are_fed_in_turn_and_each_batch_by_batch(parts: Parts)
     assert len({task.job.id for task in ready[:2]}) == 2
 
 
-def test_a_key_with_many_jobs_gets_no_more_turns_than_one_with_a_single_job(parts: Parts) -> None:
+def test_a_key_with_many_jobs_gets_no_more_turns_than_one_with_a_single_job(services: Services) -> None:
     for seed in range(5):
-        _submit_as(parts, "greedy", seed)
-    _submit_as(parts, "modest", 9)
+        _submit_as(services, "greedy", seed)
+    _submit_as(services, "modest", 9)
     turns = Turns()
     owners: list[str] = []
     for limit in (1, 2, 3, 10, 4):  # room as it comes up, round by round
-        ready = parts.index.feed.ready_tasks(Lane.BULK, turns, now=time.time(), limit=limit)
-        parts.index.live.set_queued([task.task.id for task in ready])
+        ready = services.index.feed.ready_tasks(Lane.BULK, turns, now=time.time(), limit=limit)
+        services.index.live.set_queued([task.task.id for task in ready])
         owners += [task.job.origin.key for task in ready if task.job.origin is not None]
     assert owners.count("greedy") == owners.count("modest") == 10
 
@@ -284,9 +286,9 @@ def test_a_key_with_many_jobs_gets_no_more_turns_than_one_with_a_single_job(part
 _PAIR = ((AssetKind.HAND, "gripper"), (AssetKind.OBJECT, "ball"))
 
 
-def _submit_as(parts: Parts, key: str, seed: int) -> None:
+def _submit_as(services: Services, key: str, seed: int) -> None:
     """A bulk job of 20 batches, none of them in the queue yet."""
-    hand, obj = (parts.index.assets.get(kind, name).digest for kind, name in _PAIR)
+    hand, obj = (services.index.assets.get(kind, name).digest for kind, name in _PAIR)
     record = JobRecord(
         id=f"{seed:032x}",
         request=request(grasps=640, seed=seed),
@@ -297,106 +299,114 @@ def _submit_as(parts: Parts, key: str, seed: int) -> None:
         created=timestamp(),
         origin=Origin(key=key),
     )
-    put_record(parts.store, names.job_record(record.id), record)
-    parts.index.write.add_job(record)
+    put_record(services.store, names.job_record(record.id), record)
+    services.index.write.add_job(record)
 
 
-def test_a_clock_set_back_does_not_strand_a_task(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request())
-    task = parts.index.jobs.tasks(job=job.id).items[0]
+def test_a_clock_set_back_does_not_strand_a_task(services: Services) -> None:
+    job, _ = job_actions.submit(services, request())
+    task = services.index.jobs.tasks(job=job.id).items[0]
     a_year = 365 * 86400
-    parts.index.live.set_waiting([task.id], not_before=time.time() + 60)
-    assert parts.index.feed.ready_tasks(Lane.INTERACTIVE, Turns(), now=time.time(), limit=9) == []
-    parts.index.live.set_waiting([task.id], not_before=time.time() + a_year)
-    assert len(parts.index.feed.ready_tasks(Lane.INTERACTIVE, Turns(), now=time.time(), limit=9)) == 1
+    services.index.live.set_waiting([task.id], not_before=time.time() + 60)
+    assert services.index.feed.ready_tasks(Lane.INTERACTIVE, Turns(), now=time.time(), limit=9) == []
+    services.index.live.set_waiting([task.id], not_before=time.time() + a_year)
+    assert len(services.index.feed.ready_tasks(Lane.INTERACTIVE, Turns(), now=time.time(), limit=9)) == 1
 
 
-def test_two_jobs_that_need_one_shard_both_profit_from_it(parts: Parts) -> None:
-    plain, _ = job_actions.submit(parts, request())
-    with_scenes, _ = job_actions.submit(parts, request(scenes=1))
-    run_all(parts, plain.id)
-    assert parts.index.jobs.get(plain.id).state is State.SUCCEEDED
-    stages = parts.index.jobs.get(with_scenes.id).stages
+def test_two_jobs_that_need_one_shard_both_profit_from_it(services: Services) -> None:
+    plain, _ = job_actions.submit(services, request())
+    with_scenes, _ = job_actions.submit(services, request(scenes=1))
+    run_all(services, plain.id)
+    assert services.index.jobs.get(plain.id).state is State.SUCCEEDED
+    stages = services.index.jobs.get(with_scenes.id).stages
     assert [stage.succeeded for stage in stages] == [1, 0]
-    later, _ = job_actions.submit(parts, request(scenes=2))
-    assert [stage.succeeded for stage in parts.index.jobs.get(later.id).stages] == [1, 0]
-    assert parts.index.overview.stats().grasps == 32, "it is one shard"
+    later, _ = job_actions.submit(services, request(scenes=2))
+    assert [stage.succeeded for stage in services.index.jobs.get(later.id).stages] == [1, 0]
+    assert services.index.overview.stats().grasps == 32, "it is one shard"
 
 
-def build_a_history(parts: Parts) -> None:
+def build_a_history(services: Services) -> None:
     """Jobs in every state: done, failed, failed and retried, cancelled, cancelled and retried, half done."""
-    done, _ = job_actions.submit(parts, request(grasps=70, scenes=1))
-    run_all(parts, done.id)
-    half, _ = job_actions.submit(parts, request(grasps=64, scenes=1, seed=1))
-    run_all(parts, half.id, batches=1, stages=1)
-    failed, _ = job_actions.submit(parts, request(seed=2, scenes=1))
-    fail(parts, failed.id, 0, 1, last=False)
-    fail(parts, failed.id, 0, 2, last=True)
-    retried, _ = job_actions.submit(parts, request(seed=3, scenes=1))
-    fail(parts, retried.id, 0, 1, last=True)
-    job_actions.retry(parts, retried.id)
-    fail(parts, retried.id, 0, 2, last=False)
-    cancelled, _ = job_actions.submit(parts, request(seed=4, grasps=64))
-    run_all(parts, cancelled.id, batches=1)
-    job_actions.cancel(parts, cancelled.id)
-    again, _ = job_actions.submit(parts, request(seed=5))
-    fail(parts, again.id, 0, 1, last=False)
-    job_actions.cancel(parts, again.id)
-    job_actions.retry(parts, again.id)
-    running, _ = job_actions.submit(parts, request(seed=6))
-    parts.index.live.set_running({parts.index.jobs.tasks(job=running.id).items[0].id: "w"})
-    shared, _ = job_actions.submit(parts, request(seed=2))
-    run_all(parts, shared.id)
+    done, _ = job_actions.submit(services, request(grasps=70, scenes=1))
+    run_all(services, done.id)
+    half, _ = job_actions.submit(services, request(grasps=64, scenes=1, seed=1))
+    run_all(services, half.id, batches=1, stages=1)
+    failed, _ = job_actions.submit(services, request(seed=2, scenes=1))
+    fail(services, failed.id, 0, 1, last=False)
+    fail(services, failed.id, 0, 2, last=True)
+    retried, _ = job_actions.submit(services, request(seed=3, scenes=1))
+    fail(services, retried.id, 0, 1, last=True)
+    job_actions.retry(services, retried.id)
+    fail(services, retried.id, 0, 2, last=False)
+    cancelled, _ = job_actions.submit(services, request(seed=4, grasps=64))
+    run_all(services, cancelled.id, batches=1)
+    job_actions.cancel(services, cancelled.id)
+    again, _ = job_actions.submit(services, request(seed=5))
+    fail(services, again.id, 0, 1, last=False)
+    job_actions.cancel(services, again.id)
+    job_actions.retry(services, again.id)
+    running, _ = job_actions.submit(services, request(seed=6))
+    services.index.live.set_running({services.index.jobs.tasks(job=running.id).items[0].id: "w"})
+    shared, _ = job_actions.submit(services, request(seed=2))
+    run_all(services, shared.id)
 
 
-def test_a_rebuild_from_the_store_gives_the_rows_that_are_there(parts: Parts) -> None:
-    build_a_history(parts)
-    states = {job.state for job in parts.index.jobs.page(limit=99).items}
+def test_a_rebuild_from_the_store_gives_the_rows_that_are_there(services: Services) -> None:
+    build_a_history(services)
+    states = {job.state for job in services.index.jobs.page(limit=99).items}
     assert states == {State.SUCCEEDED, State.RUNNING, State.QUEUED, State.CANCELLED}
-    assert differences(parts.index, parts.store) == []
-    before = parts.index.jobs.page(limit=99), parts.index.grasps.page(limit=200), parts.index.shards.page(limit=200)
-    rebuild(parts.index, parts.store)
-    assert differences(parts.index, parts.store) == []
-    after = parts.index.jobs.page(limit=99), parts.index.grasps.page(limit=200), parts.index.shards.page(limit=200)
+    assert differences(services.index, services.store) == []
+    before = (
+        services.index.jobs.page(limit=99),
+        services.index.grasps.page(limit=200),
+        services.index.shards.page(limit=200),
+    )
+    rebuild(services.index, services.store)
+    assert differences(services.index, services.store) == []
+    after = (
+        services.index.jobs.page(limit=99),
+        services.index.grasps.page(limit=200),
+        services.index.shards.page(limit=200),
+    )
     assert before[1:] == after[1:]
     assert [job.id for job in before[0].items] == [job.id for job in after[0].items]
 
 
-def test_every_kind_of_damage_to_the_index_is_seen_and_mended(parts: Parts) -> None:
-    build_a_history(parts)
-    with parts.index.database.writing() as connection:
+def test_every_kind_of_damage_to_the_index_is_seen_and_mended(services: Services) -> None:
+    build_a_history(services)
+    with services.index.database.writing() as connection:
         connection.execute(delete(tables.grasps).where(tables.grasps.c.row == 0))
         connection.execute(update(tables.shards).values(seconds=99.0))
         connection.execute(update(tables.tasks).where(tables.tasks.c.done.is_(True)).values(state="failed"))
-    found = differences(parts.index, parts.store)
+    found = differences(services.index, services.store)
     assert {line.split()[0] for line in found} >= {"grasps", "shards"}
-    rebuild(parts.index, parts.store)
-    assert differences(parts.index, parts.store) == []
+    rebuild(services.index, services.store)
+    assert differences(services.index, services.store) == []
 
 
-def test_a_rebuild_that_breaks_off_leaves_the_old_rows(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
-    build_a_history(parts)
-    jobs = len(parts.index.jobs.page(limit=99).items)
+def test_a_rebuild_that_breaks_off_leaves_the_old_rows(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
+    build_a_history(services)
+    jobs = len(services.index.jobs.page(limit=99).items)
 
     def away(_store: Store, key: str) -> bytes:
         raise StoreUnavailable("away")
 
     monkeypatch.setattr(Store, "get", away)
     with pytest.raises(StoreUnavailable):
-        rebuild(parts.index, parts.store)
-    assert len(parts.index.jobs.page(limit=99).items) == jobs
+        rebuild(services.index, services.store)
+    assert len(services.index.jobs.page(limit=99).items) == jobs
 
 
 @pytest.mark.parametrize("sorted_at_once", [0, 20_000])
 def test_a_pair_is_found_whichever_way_the_database_goes(
-    parts: Parts, monkeypatch: pytest.MonkeyPatch, sorted_at_once: int
+    services: Services, monkeypatch: pytest.MonkeyPatch, sorted_at_once: int
 ) -> None:
     monkeypatch.setattr("service.index.queries.grasp_search.SORTED_AT_ONCE", sorted_at_once)
-    job, _ = job_actions.submit(parts, request())
-    run_all(parts, job.id)
+    job, _ = job_actions.submit(services, request())
+    run_all(services, job.id)
     sort = GraspSort(by="penetration_depth_mm", descending=False)
-    assert len(parts.index.grasps.page(GraspFilter(hand="gripper", object="ball"), sort=sort).items) == 32
-    assert parts.index.grasps.page(GraspFilter(hand="gripper", object="cube"), sort=sort).items == []
+    assert len(services.index.grasps.page(GraspFilter(hand="gripper", object="ball"), sort=sort).items) == 32
+    assert services.index.grasps.page(GraspFilter(hand="gripper", object="cube"), sort=sort).items == []
 
 
 #: What is searched for, and the ways of the search: what it sorts at once, and how many rows it looks at in turn.
@@ -410,10 +420,12 @@ WAYS: list[tuple[int, tuple[int, ...]]] = [(1000, (8, 16)), (0, (8, 16)), (0, (1
 
 
 @pytest.mark.parametrize("sort", [GraspSort(), GraspSort(by="penetration_depth_mm", descending=False)])
-def test_every_way_of_searching_finds_the_same(parts: Parts, monkeypatch: pytest.MonkeyPatch, sort: GraspSort) -> None:
-    job, _ = job_actions.submit(parts, request(grasps=160))
-    run_all(parts, job.id)
-    everything = parts.index.grasps.page(sort=sort, limit=200).items
+def test_every_way_of_searching_finds_the_same(
+    services: Services, monkeypatch: pytest.MonkeyPatch, sort: GraspSort
+) -> None:
+    job, _ = job_actions.submit(services, request(grasps=160))
+    run_all(services, job.id)
+    everything = services.index.grasps.page(sort=sort, limit=200).items
     for where, (sorted_at_once, looked_at) in itertools.product(SEARCHED, WAYS):
         passing = [
             grasp
@@ -427,39 +439,39 @@ def test_every_way_of_searching_finds_the_same(parts: Parts, monkeypatch: pytest
         found: list[GraspView] = []
         cursor = None
         while True:
-            page = parts.index.grasps.page(where, sort=sort, limit=7, cursor=cursor)
+            page = services.index.grasps.page(where, sort=sort, limit=7, cursor=cursor)
             found += page.items
             if (cursor := page.next) is None:
                 break
         assert found == passing, (where, sorted_at_once, looked_at)
 
 
-def test_what_was_made_adds_up_in_intervals_of_any_length(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request(grasps=96, scenes=1))
-    run_all(parts, job.id)
+def test_what_was_made_adds_up_in_intervals_of_any_length(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=96, scenes=1))
+    run_all(services, job.id)
     hour = "2026-05-01T{:02}:{:02}:{:02}.123Z"
     times = [hour.format(7, 59, 59), hour.format(8, 0, 0), hour.format(8, 0, 44), hour.format(9, 30, 1)]
-    with parts.index.database.writing() as connection:
-        for number, shard in enumerate(parts.index.shards.page(job=job.id, limit=9).items):
+    with services.index.database.writing() as connection:
+        for number, shard in enumerate(services.index.shards.page(job=job.id, limit=9).items):
             change = update(tables.shards).where(tables.shards.c.id == shard.id)
             connection.execute(change.values(created=times[number % 4]))
     seconds = [int(datetime.fromisoformat(x).timestamp()) for x in times]
     for bucket_s in (1, 45, 60, 3600, 5400, 86400):
-        buckets = parts.index.overview.throughput(since="2026-05-01T00:00:00Z", bucket_s=bucket_s)
+        buckets = services.index.overview.throughput(since="2026-05-01T00:00:00Z", bucket_s=bucket_s)
         assert (sum(b.grasps for b in buckets), sum(b.tasks for b in buckets)) == (96, 6), bucket_s
         starts = [datetime.fromisoformat(bucket.start).timestamp() for bucket in buckets]
         assert starts == sorted({t - t % bucket_s for t in seconds}), bucket_s
 
 
-def test_writers_at_once_leave_the_rows_that_follow_from_the_store(parts: Parts, index_url: str) -> None:
+def test_writers_at_once_leave_the_rows_that_follow_from_the_store(services: Services, index_url: str) -> None:
     """The controller indexes shards while the API of another process cancels and retries their job, over and over."""
-    job, _ = job_actions.submit(parts, request(grasps=32 * 12, scenes=1))
-    record = read_record(JobRecord, parts.store, names.job_record(job.id))
+    job, _ = job_actions.submit(services, request(grasps=32 * 12, scenes=1))
+    record = read_record(JobRecord, services.store, names.job_record(job.id))
     messages = [message_of(record, task, attempt=1, max_attempt=3) for task in plan(record)]
-    other = Parts(parts.settings, parts.store, Index(index_url), parts.queue)
+    other = Services(services.settings, services.store, Index(index_url), services.queue)
     done = threading.Event()
 
-    def interfere(change: Callable[[Parts, str], object]) -> None:
+    def interfere(change: Callable[[Services, str], object]) -> None:
         while not done.is_set():
             with contextlib.suppress(ConflictError):
                 change(other, job.id)
@@ -470,24 +482,24 @@ def test_writers_at_once_leave_the_rows_that_follow_from_the_store(parts: Parts,
         thread.start()
     try:
         for message in messages:
-            parts.index.write.add_manifest(make_shard(parts.store, message))
+            services.index.write.add_manifest(make_shard(services.store, message))
     finally:
         done.set()
         for thread in threads:
             thread.join()
         other.index.close()
-    assert parts.index.overview.stats().tasks[State.SUCCEEDED] == 24
-    assert parts.index.jobs.get(job.id).state is State.SUCCEEDED
-    assert differences(parts.index, parts.store) == []
+    assert services.index.overview.stats().tasks[State.SUCCEEDED] == 24
+    assert services.index.jobs.get(job.id).state is State.SUCCEEDED
+    assert differences(services.index, services.store) == []
 
 
-def test_text_that_a_database_would_refuse_stops_nothing(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request())
-    task = parts.index.jobs.tasks(job=job.id).items[0]
+def test_text_that_a_database_would_refuse_stops_nothing(services: Services) -> None:
+    job, _ = job_actions.submit(services, request())
+    task = services.index.jobs.tasks(job=job.id).items[0]
     long = "w" * 200 + "\0"
-    parts.index.live.set_running({task.id: long})
-    parts.index.live.set_progress({task.id: (1.0, 2.0, "half\0way")})
-    assert parts.index.jobs.task(task.id).message == "halfway"
+    services.index.live.set_running({task.id: long})
+    services.index.live.set_progress({task.id: (1.0, 2.0, "half\0way")})
+    assert services.index.jobs.task(task.id).message == "halfway"
     attempt = AttemptRecord(
         task_id=task.id,
         job_id=job.id,
@@ -500,10 +512,10 @@ def test_text_that_a_database_would_refuse_stops_nothing(parts: Parts) -> None:
         ended=timestamp(),
         last=True,
     )
-    put_record(parts.store, names.attempt(task.id, 1), attempt)
-    parts.index.write.add_attempt(attempt)
-    assert parts.index.jobs.get(job.id).reason == "ab"
-    assert differences(parts.index, parts.store) == []
+    put_record(services.store, names.attempt(task.id, 1), attempt)
+    services.index.write.add_attempt(attempt)
+    assert services.index.jobs.get(job.id).reason == "ab"
+    assert differences(services.index, services.store) == []
 
 
 @pytest.mark.postgres

@@ -16,7 +16,7 @@ from service.model.clock import timestamp
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane, State
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 from service.store.records import put_record
 from service.store.store import open_store
@@ -29,23 +29,24 @@ CONTROLLERS = 4
 
 
 @pytest.fixture
-def processes(index_url: str, tmp_path: Path) -> Iterator[list[Parts]]:
+def processes(index_url: str, tmp_path: Path) -> Iterator[list[Services]]:
     """The same service as several processes have it."""
     with ExitStack() as stack:
         store = open_store("memory://")
         made = [
-            Parts(Settings(data_dir=tmp_path), store, empty_index(index_url), MemoryQueue()) for _ in range(CONTROLLERS)
+            Services(Settings(data_dir=tmp_path), store, empty_index(index_url), MemoryQueue())
+            for _ in range(CONTROLLERS)
         ]
-        for parts in made:
-            stack.callback(parts.index.close)
+        for services in made:
+            stack.callback(services.index.close)
         add_assets(made[0])
         yield made
 
 
-def enter(parts: Parts, place: int, seed: int, *, batches: int = 1) -> JobRecord:
+def enter(services: Services, place: int, seed: int, *, batches: int = 1) -> JobRecord:
     """A job whose id begins with a digit."""
     hand, obj = (
-        parts.index.assets.get(kind, name).digest
+        services.index.assets.get(kind, name).digest
         for kind, name in ((AssetKind.HAND, "gripper"), (AssetKind.OBJECT, "ball"))
     )
     record = JobRecord(
@@ -56,12 +57,12 @@ def enter(parts: Parts, place: int, seed: int, *, batches: int = 1) -> JobRecord
         lane=Lane.BULK,
         created=timestamp(),
     )
-    put_record(parts.store, names.job_record(record.id), record)
-    parts.index.write.add_job(record)
+    put_record(services.store, names.job_record(record.id), record)
+    services.index.write.add_job(record)
     return record
 
 
-def test_controllers_that_index_at_once_leave_the_rows_that_follow_from_the_store(processes: list[Parts]) -> None:
+def test_controllers_that_index_at_once_leave_the_rows_that_follow_from_the_store(processes: list[Services]) -> None:
     """Each indexes two jobs of eight; each job wants what a job of another wants as well."""
     jobs = [enter(processes[0], 2 * place, place % 4, batches=2) for place in range(8)]
     messages = {job.id: [message_of(job, task, attempt=1, max_attempt=3) for task in plan(job)] for job in jobs}
@@ -69,15 +70,15 @@ def test_controllers_that_index_at_once_leave_the_rows_that_follow_from_the_stor
     begun = threading.Barrier(CONTROLLERS)
 
     def keep(number: int) -> None:
-        parts = processes[number]
+        services = processes[number]
         tasks = [message for job in jobs[2 * number : 2 * number + 2] for message in messages[job.id]]
         tasks = tasks if number % 2 else tasks[::-1]
         begun.wait(PATIENCE_S)
         for first in range(0, len(tasks), 2):
             some = tasks[first : first + 2]
-            parts.index.live.set_queued([message.task_id for message in some])
-            parts.index.live.set_running({message.task_id: f"worker-{number}" for message in some})
-            parts.index.write.add_manifests([made[message.output] for message in some])
+            services.index.live.set_queued([message.task_id for message in some])
+            services.index.live.set_running({message.task_id: f"worker-{number}" for message in some})
+            services.index.write.add_manifests([made[message.output] for message in some])
 
     with ThreadPoolExecutor(CONTROLLERS) as pool:
         for done in [pool.submit(keep, number) for number in range(CONTROLLERS)]:

@@ -1,4 +1,4 @@
-"""The controller on the in-memory parts: lost workers, lost events, lost queue, lost index, parts that are away."""
+"""The controller on in-memory services: lost workers, lost events, lost queue, lost index, parts that are away."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from service.model.errors import ConflictError, QueueUnavailable, StoreUnavailab
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import AssetKind, Stage, State
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.controller import Controller
 from service.pipeline.lease_reaper import LOST_AFTER_S
 from service.pipeline.routes import Routes
@@ -42,10 +42,10 @@ class Clock:
 class Bench:
     """A controller and one worker, both moved step by step."""
 
-    def __init__(self, parts: Parts) -> None:
-        assert isinstance(parts.queue, MemoryQueue)
-        self.parts, self.queue, self.clock = parts, parts.queue, Clock()
-        self.controller = Controller(parts, clock=self.clock)
+    def __init__(self, services: Services) -> None:
+        assert isinstance(services.queue, MemoryQueue)
+        self.services, self.queue, self.clock = services, services.queue, Clock()
+        self.controller = Controller(services, clock=self.clock)
 
     def pass_time(self, seconds: float, *, beating: Delivery | None = None) -> None:
         """Rounds of the controller, one a second."""
@@ -66,7 +66,7 @@ class Bench:
             fake_stages() | {Stage(k): v for k, v in stages.items()}, worker="w", publish=self.queue.publish
         )
         raw = delivery.message.model_dump(mode="json", by_alias=True)
-        outcome = runner.run(raw, TaskContext(self.parts.store))
+        outcome = runner.run(raw, TaskContext(self.services.store))
         self.queue.finish(delivery)
         if outcome is not None:
             self.queue.publish(outcome)
@@ -81,8 +81,8 @@ class Bench:
 
 
 @pytest.fixture
-def bench(parts: Parts) -> Bench:
-    made = Bench(parts)
+def bench(services: Services) -> Bench:
+    made = Bench(services)
     made.controller.round()
     return made
 
@@ -92,15 +92,15 @@ def explode(message: TaskMessage, context: TaskContext) -> None:
 
 
 def test_a_job_goes_through_all_its_stages(bench: Bench) -> None:
-    job, _ = job_actions.submit(bench.parts, request(grasps=70, scenes=2))
+    job, _ = job_actions.submit(bench.services, request(grasps=70, scenes=2))
     bench.work_off()
-    done = bench.parts.index.jobs.get(job.id)
+    done = bench.services.index.jobs.get(job.id)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 70)
-    assert differences(bench.parts.index, bench.parts.store) == []
+    assert differences(bench.services.index, bench.services.store) == []
 
 
 def test_listeners_hear_how_a_job_goes(bench: Bench) -> None:
-    job, _ = job_actions.submit(bench.parts, request())
+    job, _ = job_actions.submit(bench.services, request())
     bench.work_off()
     told = [e.message for _, e in bench.queue.tail("0", limit=99, wait_s=0) if e.kind is EventKind.JOB]
     assert told == ["queued", "running", "succeeded"]
@@ -108,29 +108,29 @@ def test_listeners_hear_how_a_job_goes(bench: Bench) -> None:
 
 
 def test_a_task_of_a_lost_worker_is_queued_again_with_its_reason_kept(bench: Bench) -> None:
-    job, _ = job_actions.submit(bench.parts, request())
+    job, _ = job_actions.submit(bench.services, request())
     bench.take()
-    bench.pass_time(bench.parts.settings.lease_s + 2)
+    bench.pass_time(bench.services.settings.lease_s + 2)
     again = bench.take()
     assert again.message.attempt == 2
-    (attempt,) = bench.parts.index.jobs.attempts(job=job.id)
+    (attempt,) = bench.services.index.jobs.attempts(job=job.id)
     assert (attempt.kind, attempt.last) == ("WorkerLost", False)
     assert "no sign of life for 6 s" in attempt.reason
     bench.do(again)
     bench.pass_time(1)
-    assert bench.parts.index.jobs.get(job.id).state is State.SUCCEEDED
-    assert differences(bench.parts.index, bench.parts.store) == []
+    assert bench.services.index.jobs.get(job.id).state is State.SUCCEEDED
+    assert differences(bench.services.index, bench.services.store) == []
 
 
 def test_a_worker_that_gives_signs_of_life_keeps_its_task(bench: Bench) -> None:
-    job_actions.submit(bench.parts, request())
+    job_actions.submit(bench.services, request())
     delivery = bench.take()
     bench.pass_time(100, beating=delivery)
     assert [lease.key for lease in bench.queue.leases()] == [delivery.key]
 
 
 def test_time_in_which_the_controller_did_not_look_is_no_silence(bench: Bench) -> None:
-    job_actions.submit(bench.parts, request())
+    job_actions.submit(bench.services, request())
     bench.take()
     bench.pass_time(2)
     bench.clock.now += 3600
@@ -139,7 +139,7 @@ def test_time_in_which_the_controller_did_not_look_is_no_silence(bench: Bench) -
 
 
 def test_while_redis_takes_no_writes_nobody_is_called_silent(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    job_actions.submit(bench.parts, request())
+    job_actions.submit(bench.services, request())
     held = bench.take()
     bench.pass_time(2, beating=held)
 
@@ -148,64 +148,64 @@ def test_while_redis_takes_no_writes_nobody_is_called_silent(bench: Bench, monke
 
     with monkeypatch.context() as patch:
         patch.setattr(bench.queue, "announce", full)
-        for _ in range(10 * round(bench.parts.settings.lease_s)):
+        for _ in range(10 * round(bench.services.settings.lease_s)):
             bench.clock.now += 1.0
             with pytest.raises(QueueUnavailable):
                 bench.controller.round()
     bench.pass_time(2, beating=held)
     assert [lease.key for lease in bench.queue.leases()] == [held.key]
-    assert bench.parts.index.jobs.attempts() == []
+    assert bench.services.index.jobs.attempts() == []
 
 
 def test_a_worker_that_was_only_slow_changes_nothing_when_it_ends(bench: Bench) -> None:
-    job, _ = job_actions.submit(bench.parts, request())
+    job, _ = job_actions.submit(bench.services, request())
     slow = bench.take()
-    bench.pass_time(bench.parts.settings.lease_s + 2)
+    bench.pass_time(bench.services.settings.lease_s + 2)
     bench.do(bench.take())
     bench.pass_time(1)
-    (before,) = bench.parts.index.shards.page(job=job.id).items
+    (before,) = bench.services.index.shards.page(job=job.id).items
     bench.do(slow)
     bench.pass_time(1)
-    (after,) = bench.parts.index.shards.page(job=job.id).items
+    (after,) = bench.services.index.shards.page(job=job.id).items
     assert after == before
-    assert bench.parts.index.overview.stats().grasps == 32
+    assert bench.services.index.overview.stats().grasps == 32
 
 
 def test_a_worker_lost_after_its_manifest_was_put_costs_no_attempt(bench: Bench) -> None:
-    job, _ = job_actions.submit(bench.parts, request())
+    job, _ = job_actions.submit(bench.services, request())
     delivery = bench.take()
     assert isinstance(delivery.message, TaskMessage)
-    make_shard(bench.parts.store, delivery.message)
-    bench.pass_time(bench.parts.settings.lease_s + 2)
-    assert bench.parts.index.jobs.get(job.id).state is State.SUCCEEDED
-    assert bench.parts.index.jobs.attempts(job=job.id) == []
+    make_shard(bench.services.store, delivery.message)
+    bench.pass_time(bench.services.settings.lease_s + 2)
+    assert bench.services.index.jobs.get(job.id).state is State.SUCCEEDED
+    assert bench.services.index.jobs.attempts(job=job.id) == []
 
 
 def test_a_task_that_kills_every_worker_stops_after_its_attempts(bench: Bench) -> None:
-    job, _ = job_actions.submit(bench.parts, request(scenes=1))
-    for _ in range(bench.parts.settings.task_attempts):
+    job, _ = job_actions.submit(bench.services, request(scenes=1))
+    for _ in range(bench.services.settings.task_attempts):
         bench.take()
-        bench.pass_time(bench.parts.settings.lease_s + 2)
+        bench.pass_time(bench.services.settings.lease_s + 2)
     assert bench.queue.take("w") is None
-    failed = bench.parts.index.jobs.get(job.id)
+    failed = bench.services.index.jobs.get(job.id)
     assert failed.state is State.FAILED
     assert failed.reason is not None
     assert "was lost" in failed.reason
-    assert [a.number for a in bench.parts.index.jobs.attempts(job=job.id)] == [3, 2, 1]
-    assert differences(bench.parts.index, bench.parts.store) == []
+    assert [a.number for a in bench.services.index.jobs.attempts(job=job.id)] == [3, 2, 1]
+    assert differences(bench.services.index, bench.services.store) == []
 
 
 def test_a_failing_task_fails_its_job_alone_and_keeps_each_reason(bench: Bench) -> None:
-    bad, _ = job_actions.submit(bench.parts, request(seed=1))
+    bad, _ = job_actions.submit(bench.services, request(seed=1))
     for _ in range(3):
         bench.do(bench.take(), synthesize=explode)
         bench.pass_time(1)
-    good, _ = job_actions.submit(bench.parts, request(seed=2))
+    good, _ = job_actions.submit(bench.services, request(seed=2))
     bench.work_off()
-    assert bench.parts.index.jobs.get(bad.id).state is State.FAILED
-    assert bench.parts.index.jobs.get(bad.id).reason == "the planner lost its way"
-    assert bench.parts.index.jobs.get(good.id).state is State.SUCCEEDED
-    attempts = bench.parts.index.jobs.attempts(job=bad.id)
+    assert bench.services.index.jobs.get(bad.id).state is State.FAILED
+    assert bench.services.index.jobs.get(bad.id).reason == "the planner lost its way"
+    assert bench.services.index.jobs.get(good.id).state is State.SUCCEEDED
+    attempts = bench.services.index.jobs.attempts(job=bad.id)
     assert [(a.number, a.kind, a.last) for a in attempts] == [
         (3, "ValueError", True),
         (2, "ValueError", False),
@@ -213,13 +213,13 @@ def test_a_failing_task_fails_its_job_alone_and_keeps_each_reason(bench: Bench) 
     ]
     assert attempts[0].trace is not None
     assert "explode" in attempts[0].trace
-    assert differences(bench.parts.index, bench.parts.store) == []
+    assert differences(bench.services.index, bench.services.store) == []
 
 
 def test_a_failed_attempt_waits_before_the_next(bench: Bench) -> None:
-    patient = bench.parts.settings.model_copy(update={"retry_backoff_s": 60.0})
-    bench = Bench(Parts(patient, bench.parts.store, bench.parts.index, bench.parts.queue))
-    job_actions.submit(bench.parts, request())
+    patient = bench.services.settings.model_copy(update={"retry_backoff_s": 60.0})
+    bench = Bench(Services(patient, bench.services.store, bench.services.index, bench.services.queue))
+    job_actions.submit(bench.services, request())
     bench.do(bench.take(), synthesize=explode)
     bench.pass_time(5)
     assert bench.queue.take("w") is None
@@ -229,35 +229,35 @@ def test_a_store_that_is_away_costs_no_attempt_and_says_so(bench: Bench) -> None
     def away(message: TaskMessage, context: TaskContext) -> None:
         raise StoreUnavailable("the store is full")
 
-    job, _ = job_actions.submit(bench.parts, request())
+    job, _ = job_actions.submit(bench.services, request())
     outcome = bench.do(bench.take(), synthesize=away)
     assert outcome is not None
     assert outcome.kind is EventKind.DEFERRED
     bench.controller._index_events(0)
-    waiting = bench.parts.index.jobs.tasks(job=job.id).items[0]
+    waiting = bench.services.index.jobs.tasks(job=job.id).items[0]
     assert (waiting.state, waiting.message) == (State.QUEUED, "waits: the store is full")
     bench.work_off()
-    assert bench.parts.index.jobs.get(job.id).state is State.SUCCEEDED
-    assert bench.parts.index.jobs.attempts(job=job.id) == []
+    assert bench.services.index.jobs.get(job.id).state is State.SUCCEEDED
+    assert bench.services.index.jobs.attempts(job=job.id) == []
 
 
 def test_while_the_store_is_away_what_does_not_need_it_is_known(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     def away(*_: object, **__: object) -> None:
         raise StoreUnavailable("the store does not answer")
 
-    job, _ = job_actions.submit(bench.parts, request(grasps=64))
+    job, _ = job_actions.submit(bench.services, request(grasps=64))
     bench.do(bench.take())
     with monkeypatch.context() as patch:
-        patch.setattr(bench.parts.store, "get", away)
+        patch.setattr(bench.services.store, "get", away)
         bench.do(bench.take(), synthesize=away)
         for _ in range(3):
             with pytest.raises(StoreUnavailable, match="1 events wait for it"):
                 bench.pass_time(1)
-        states = [(task.state, task.message) for task in bench.parts.index.jobs.tasks(job=job.id).items]
+        states = [(task.state, task.message) for task in bench.services.index.jobs.tasks(job=job.id).items]
         assert states == [(State.RUNNING, None), (State.QUEUED, "waits: the store does not answer")]
     bench.work_off()
-    assert bench.parts.index.jobs.get(job.id).state is State.SUCCEEDED
-    assert bench.parts.index.jobs.attempts(job=job.id) == []
+    assert bench.services.index.jobs.get(job.id).state is State.SUCCEEDED
+    assert bench.services.index.jobs.attempts(job=job.id) == []
 
 
 def test_a_task_handed_back_at_shutdown_costs_no_attempt(bench: Bench) -> None:
@@ -265,50 +265,50 @@ def test_a_task_handed_back_at_shutdown_costs_no_attempt(bench: Bench) -> None:
         context.stop(StopReason.SHUTDOWN)
         context.check()
 
-    job, _ = job_actions.submit(bench.parts, request())
+    job, _ = job_actions.submit(bench.services, request())
     bench.do(bench.take(), synthesize=told_to_stop)
     bench.pass_time(1)
     again = bench.take()
     assert again.message.attempt == 1
-    assert bench.parts.index.jobs.get(job.id).state is State.QUEUED
+    assert bench.services.index.jobs.get(job.id).state is State.QUEUED
 
 
 def test_redis_lost_whole_loses_no_task(bench: Bench) -> None:
-    job, _ = job_actions.submit(bench.parts, request(grasps=96, scenes=1))
+    job, _ = job_actions.submit(bench.services, request(grasps=96, scenes=1))
     bench.do(bench.take())
     bench.take()
     empty = MemoryQueue()
-    bench = Bench(Parts(bench.parts.settings, bench.parts.store, bench.parts.index, empty))
+    bench = Bench(Services(bench.services.settings, bench.services.store, bench.services.index, empty))
     bench.pass_time(LOST_AFTER_S + 2)
     assert len(empty.waiting()) == 3, "two syntheses, and the scene of the shard whose event was lost"
     bench.work_off()
-    assert bench.parts.index.jobs.get(job.id).state is State.SUCCEEDED
-    assert differences(bench.parts.index, bench.parts.store) == []
+    assert bench.services.index.jobs.get(job.id).state is State.SUCCEEDED
+    assert differences(bench.services.index, bench.services.store) == []
 
 
 def test_a_lost_failure_event_is_made_good_from_the_store(bench: Bench) -> None:
-    job, _ = job_actions.submit(bench.parts, request())
+    job, _ = job_actions.submit(bench.services, request())
     delivery = bench.take()
     runner = Runner({Stage.SYNTHESIZE: explode}, worker="w", publish=lambda event: None)  # type: ignore[dict-item]
-    runner.run(delivery.message.model_dump(mode="json", by_alias=True), TaskContext(bench.parts.store))
+    runner.run(delivery.message.model_dump(mode="json", by_alias=True), TaskContext(bench.services.store))
     bench.queue.finish(delivery)
     bench.pass_time(LOST_AFTER_S + 2)
     assert bench.take().message.attempt == 2
-    assert [a.number for a in bench.parts.index.jobs.attempts(job=job.id)] == [1]
+    assert [a.number for a in bench.services.index.jobs.attempts(job=job.id)] == [1]
 
 
 def test_a_damaged_manifest_fails_its_task_and_stops_no_other(bench: Bench) -> None:
-    bad, _ = job_actions.submit(bench.parts, request(seed=1))
+    bad, _ = job_actions.submit(bench.services, request(seed=1))
     delivery = bench.take()
     assert isinstance(delivery.message, TaskMessage)
     key = names.shard_manifest(delivery.message.stage, delivery.message.output)
-    bench.parts.store.put(key, b'{"version": 1, "shard_id": torn')
+    bench.services.store.put(key, b'{"version": 1, "shard_id": torn')
     bench.do(delivery)
-    good, _ = job_actions.submit(bench.parts, request(seed=2))
+    good, _ = job_actions.submit(bench.services, request(seed=2))
     bench.work_off()
     bench.pass_time(LOST_AFTER_S + 2)
-    assert bench.parts.index.jobs.get(good.id).state is State.SUCCEEDED
-    failed = bench.parts.index.jobs.get(bad.id)
+    assert bench.services.index.jobs.get(good.id).state is State.SUCCEEDED
+    failed = bench.services.index.jobs.get(bad.id)
     assert failed.state is State.FAILED
     assert key in (failed.reason or "")
     assert "remove it and retry its job" in (failed.reason or "")
@@ -320,14 +320,14 @@ def test_tasks_that_their_job_queues_while_the_controller_looks_are_queued_once(
     """The controller has read the queue before, and the index before the job's tasks are marked there."""
     with monkeypatch.context() as late:
         late.setattr(job_actions, "queue_tasks", lambda *_, **__: set())
-        job, _ = job_actions.submit(bench.parts, request())
-    feed = type(bench.parts.index.feed)
+        job, _ = job_actions.submit(bench.services, request())
+    feed = type(bench.services.index.feed)
     ready = feed.ready_tasks
 
     def beside(index: Any, *given: Any, **named: Any) -> Any:
         seen = ready(index, *given, **named)
-        mine = bench.parts.index.feed.ready_of_job(job.id, limit=9)
-        job_actions.queue_tasks(bench.parts, mine, routes=Routes(bench.queue.workers()))
+        mine = bench.services.index.feed.ready_of_job(job.id, limit=9)
+        job_actions.queue_tasks(bench.services, mine, routes=Routes(bench.queue.workers()))
         if bench.queue.waiting():
             taken.append(bench.take())
         return seen
@@ -342,32 +342,32 @@ def test_a_check_that_is_queued_while_the_controller_looks_is_queued_once(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The controller has read the queue before, and the index before the check is marked there."""
-    asset = publish_asset(bench.parts.store, AssetKind.HAND, "upload", HAND_FILES | {"extra": b"3"})
-    bench.parts.index.write.add_asset(asset, None)
+    asset = publish_asset(bench.services.store, AssetKind.HAND, "upload", HAND_FILES | {"extra": b"3"})
+    bench.services.index.write.add_asset(asset, None)
     bench.pass_time(1)
     assert isinstance(bench.take().message, IngestMessage)
-    bench.parts.index.live.set_asset_waiting([asset.digest], queued=False)
+    bench.services.index.live.set_asset_waiting([asset.digest], queued=False)
     monkeypatch.setattr(MemoryQueue, "leases", lambda _: [])
     bench.controller._look_after_queue()
     assert bench.queue.waiting() == set(), "the worker's check waits a second time"
 
 
 def test_a_check_that_failed_is_told_and_tried_again(bench: Bench) -> None:
-    asset = publish_asset(bench.parts.store, AssetKind.HAND, "upload", HAND_FILES | {"extra": b"4"})
-    bench.parts.index.write.add_asset(asset, None)
+    asset = publish_asset(bench.services.store, AssetKind.HAND, "upload", HAND_FILES | {"extra": b"4"})
+    bench.services.index.write.add_asset(asset, None)
     bench.pass_time(1)
     bench.do(bench.take(), ingest=explode)
     bench.pass_time(1)
-    known = bench.parts.index.assets.get(AssetKind.HAND, "upload")
+    known = bench.services.index.assets.get(AssetKind.HAND, "upload")
     assert (known.verdict, known.message) == (None, "waits: the planner lost its way")
     with pytest.raises(ConflictError, match="the planner lost its way"):
-        job_actions.submit(bench.parts, request(hand="upload"))
-    assert differences(bench.parts.index, bench.parts.store) == []
+        job_actions.submit(bench.services, request(hand="upload"))
+    assert differences(bench.services.index, bench.services.store) == []
     until(lambda: bench.controller.round() or bench.queue.waiting(), "tried again")
 
 
 def test_a_task_between_queue_and_worker_is_not_taken_for_lost(bench: Bench) -> None:
-    job_actions.submit(bench.parts, request())
+    job_actions.submit(bench.services, request())
     delivery = bench.take()
     bench.queue._held.clear()
     bench.pass_time(LOST_AFTER_S - 1)
@@ -378,60 +378,60 @@ def test_a_task_between_queue_and_worker_is_not_taken_for_lost(bench: Bench) -> 
 
 
 def test_files_below_an_asset_do_not_stop_a_controller_or_a_rebuild(bench: Bench) -> None:
-    (digest, *_) = [digest for kind, digest in stored_assets(bench.parts.store) if kind is AssetKind.OBJECT]
-    bench.parts.store.put(names.object_pieces(digest, "32"), b"pieces")
+    (digest, *_) = [digest for kind, digest in stored_assets(bench.services.store) if kind is AssetKind.OBJECT]
+    bench.services.store.put(names.object_pieces(digest, "32"), b"pieces")
     bench.controller.round()
-    assert differences(bench.parts.index, bench.parts.store) == []
+    assert differences(bench.services.index, bench.services.store) == []
 
 
 def test_an_index_lost_whole_is_made_again_from_the_store(bench: Bench) -> None:
-    job, _ = job_actions.submit(bench.parts, request(grasps=64, scenes=1))
+    job, _ = job_actions.submit(bench.services, request(grasps=64, scenes=1))
     bench.do(bench.take())
     bench.pass_time(1)
-    fresh = empty_index(f"sqlite:///{bench.parts.settings.data_dir / 'fresh.sqlite'}")
-    bench = Bench(Parts(bench.parts.settings, bench.parts.store, fresh, bench.queue))
+    fresh = empty_index(f"sqlite:///{bench.services.settings.data_dir / 'fresh.sqlite'}")
+    bench = Bench(Services(bench.services.settings, bench.services.store, fresh, bench.queue))
     bench.controller.round()
     waiting = len(bench.queue.waiting())
     bench.pass_time(LOST_AFTER_S + 2)
     assert len(bench.queue.waiting()) == waiting == 2, "what was in the queue is not queued twice"
     bench.work_off()
     assert fresh.jobs.get(job.id).state is State.SUCCEEDED
-    assert differences(fresh, bench.parts.store) == []
+    assert differences(fresh, bench.services.store) == []
     fresh.close()
 
 
 def test_events_not_yet_in_the_index_come_again_to_the_next_controller(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job, _ = job_actions.submit(bench.parts, request())
+    job, _ = job_actions.submit(bench.services, request())
     bench.do(bench.take())
 
     def away(*_: object, **__: object) -> None:
         raise StoreUnavailable("away")
 
     with monkeypatch.context() as patch:
-        patch.setattr(bench.parts.store, "get", away)
+        patch.setattr(bench.services.store, "get", away)
         with pytest.raises(StoreUnavailable):
             bench.controller.round()
     bench.queue.restart_consumer()
-    bench = Bench(bench.parts)
+    bench = Bench(bench.services)
     bench.controller.round()
-    assert bench.parts.index.jobs.get(job.id).state is State.SUCCEEDED
+    assert bench.services.index.jobs.get(job.id).state is State.SUCCEEDED
 
 
 def test_forged_events_are_left_out_and_stop_nothing(bench: Bench) -> None:
-    job, _ = job_actions.submit(bench.parts, request())
+    job, _ = job_actions.submit(bench.services, request())
     for output in ("../../etc/passwd", "0" * 32, "hand/x", ""):
         for kind in (EventKind.FINISHED, EventKind.FAILED, EventKind.STARTED):
             for stage in (Stage.SYNTHESIZE, Stage.INGEST):
                 forged = {"kind": kind, "at": timestamp(), "task_id": "../x", "stage": stage, "output": output}
                 bench.queue.publish(Event.model_construct(**forged, attempt=1))
     bench.work_off()
-    assert bench.parts.index.jobs.get(job.id).state is State.SUCCEEDED
+    assert bench.services.index.jobs.get(job.id).state is State.SUCCEEDED
 
 
 def test_a_cancelled_task_that_still_runs_is_stopped(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    job, _ = job_actions.submit(bench.parts, request())
+    job, _ = job_actions.submit(bench.services, request())
     delivery = bench.take()
 
     def away(task_ids: object) -> None:
@@ -439,52 +439,52 @@ def test_a_cancelled_task_that_still_runs_is_stopped(bench: Bench, monkeypatch: 
 
     with monkeypatch.context() as patch:
         patch.setattr(bench.queue, "discard", away)
-        assert job_actions.cancel(bench.parts, job.id).state is State.CANCELLED
+        assert job_actions.cancel(bench.services, job.id).state is State.CANCELLED
     assert bench.queue.beat(delivery) == (False, False)
     bench.pass_time(1)
     assert bench.queue.beat(delivery)[0], "the controller tells it"
 
 
 def test_the_window_is_refilled_as_it_empties(bench: Bench) -> None:
-    small = bench.parts.settings.model_copy(update={"queue_window": 4})
-    bench = Bench(Parts(small, bench.parts.store, bench.parts.index, bench.parts.queue))
-    job, _ = job_actions.submit(bench.parts, request(grasps=32 * 12))
+    small = bench.services.settings.model_copy(update={"queue_window": 4})
+    bench = Bench(Services(small, bench.services.store, bench.services.index, bench.services.queue))
+    job, _ = job_actions.submit(bench.services, request(grasps=32 * 12))
     deepest = 0
     while (delivery := bench.queue.take("w")) is not None:
         deepest = max(deepest, len(bench.queue.waiting()) + 1)
         bench.do(delivery)
         bench.pass_time(1)
     assert deepest == 4
-    assert bench.parts.index.jobs.get(job.id).state is State.SUCCEEDED
+    assert bench.services.index.jobs.get(job.id).state is State.SUCCEEDED
 
 
 def test_an_upload_is_checked_and_what_was_found_is_indexed(bench: Bench) -> None:
-    asset = publish_asset(bench.parts.store, AssetKind.HAND, "upload", HAND_FILES | {"extra": b"3"})
-    bench.parts.index.write.add_asset(asset, None)
+    asset = publish_asset(bench.services.store, AssetKind.HAND, "upload", HAND_FILES | {"extra": b"3"})
+    bench.services.index.write.add_asset(asset, None)
 
     def check(message: IngestMessage, context: TaskContext) -> None:
         found = {"verdict": "repair", "message": "one hole closed", "repairs": ["hole"], "facts": {"faces": 12}}
         context.store.put(names.asset_check(message.kind, message.digest), json.dumps(found).encode())
 
     bench.work_off(ingest=check)
-    view = bench.parts.index.assets.get(AssetKind.HAND, "upload")
+    view = bench.services.index.assets.get(AssetKind.HAND, "upload")
     assert (view.verdict, view.repairs, view.facts) == ("repair", ["hole"], {"faces": 12})
-    assert differences(bench.parts.index, bench.parts.store) == []
+    assert differences(bench.services.index, bench.services.store) == []
 
 
 def test_an_upload_that_kills_every_worker_is_refused(bench: Bench) -> None:
-    asset = publish_asset(bench.parts.store, AssetKind.HAND, "bomb", HAND_FILES | {"extra": b"4"})
-    bench.parts.index.write.add_asset(asset, None)
+    asset = publish_asset(bench.services.store, AssetKind.HAND, "bomb", HAND_FILES | {"extra": b"4"})
+    bench.services.index.write.add_asset(asset, None)
     bench.pass_time(1)
-    for _ in range(bench.parts.settings.task_attempts):
+    for _ in range(bench.services.settings.task_attempts):
         bench.take()
-        bench.pass_time(bench.parts.settings.lease_s + 2)
+        bench.pass_time(bench.services.settings.lease_s + 2)
     assert bench.queue.take("w") is None
-    assert bench.parts.index.assets.get(AssetKind.HAND, "bomb").verdict == "refuse"
+    assert bench.services.index.assets.get(AssetKind.HAND, "bomb").verdict == "refuse"
 
 
 def test_the_loop_outlives_parts_that_are_away_and_ends_when_told(
-    parts: Parts, monkeypatch: pytest.MonkeyPatch
+    services: Services, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stop, rounds = threading.Event(), 0
 
@@ -495,7 +495,7 @@ def test_the_loop_outlives_parts_that_are_away_and_ends_when_told(
             stop.set()
         raise (QueueUnavailable("away"), KeyError("a bug"))[rounds % 2]
 
-    controller = Controller(parts)
+    controller = Controller(services)
     monkeypatch.setattr(controller, "round", failing)
     # What goes on beside the rounds ends by it.
     monkeypatch.setattr(stop, "wait", lambda seconds: stop.is_set())

@@ -14,7 +14,7 @@ from service.model.errors import ConflictError, NotFoundError
 from service.model.states import AssetKind, State
 from service.model.tags import tag_id
 from service.pipeline import job_actions, tagging
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.deletion import delete_asset, delete_dataset, delete_job, restore
@@ -26,196 +26,196 @@ from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import fail
 
 
-def finished(parts: Parts, **changes: Any) -> str:
+def finished(services: Services, **changes: Any) -> str:
     """A job whose shards are there."""
-    job, _ = job_actions.submit(parts, request(**changes))
-    _make_all(parts)
-    assert parts.index.jobs.get(job.id).state is State.SUCCEEDED
+    job, _ = job_actions.submit(services, request(**changes))
+    _make_all(services)
+    assert services.index.jobs.get(job.id).state is State.SUCCEEDED
     return job.id
 
 
-def _make_all(parts: Parts) -> None:
-    queue: Any = parts.queue
+def _make_all(services: Services) -> None:
+    queue: Any = services.queue
     while (delivery := queue.take("w")) is not None:
-        parts.index.write.add_manifest(make_shard(parts.store, delivery.message))
+        services.index.write.add_manifest(make_shard(services.store, delivery.message))
         queue.finish(delivery)
-        for job in parts.index.jobs.page().items:
-            job_actions._start(parts, job.id)
+        for job in services.index.jobs.page().items:
+            job_actions._start(services, job.id)
 
 
-def dataset(parts: Parts, name: str = "d", **changes: Any) -> str:
+def dataset(services: Services, name: str = "d", **changes: Any) -> str:
     """A finished dataset of one cell."""
     wanted = DatasetRequest(name=name, hands=("gripper",), objects=("ball",), **{"grasps": 32, **changes})
-    actions.create(parts, wanted)
-    plan_all(parts)
-    _make_all(parts)
-    assert parts.index.datasets.get(name).state is State.SUCCEEDED
+    actions.create(services, wanted)
+    plan_all(services)
+    _make_all(services)
+    assert services.index.datasets.get(name).state is State.SUCCEEDED
     return name
 
 
-def keys(parts: Parts, *prefixes: str) -> set[str]:
-    return {entry.key for prefix in prefixes for entry in parts.store.list(prefix)}
+def keys(services: Services, *prefixes: str) -> set[str]:
+    return {entry.key for prefix in prefixes for entry in services.store.list(prefix)}
 
 
-def graceless(parts: Parts) -> GarbageCollector:
+def graceless(services: Services) -> GarbageCollector:
     """A garbage collector to which every released shard is old."""
-    eager = parts.settings.model_copy(update={"shard_grace_s": -1.0})
-    return GarbageCollector(Parts(eager, parts.store, parts.index, parts.queue))
+    eager = services.settings.model_copy(update={"shard_grace_s": -1.0})
+    return GarbageCollector(Services(eager, services.store, services.index, services.queue))
 
 
-def test_a_deleted_job_is_gone_at_once_and_its_objects_with_the_controller(parts: Parts) -> None:
-    job = finished(parts)
-    delete_job(parts, job)
+def test_a_deleted_job_is_gone_at_once_and_its_objects_with_the_controller(services: Services) -> None:
+    job = finished(services)
+    delete_job(services, job)
     with pytest.raises(NotFoundError):
-        parts.index.jobs.get(job)
-    assert differences(parts.index, parts.store) == [], "an index made anew knows it as little"
-    assert not GarbageCollector(parts).advance()
-    assert keys(parts, "jobs", "tasks", "deletions") == set()
-    assert differences(parts.index, parts.store) == []
+        services.index.jobs.get(job)
+    assert differences(services.index, services.store) == [], "an index made anew knows it as little"
+    assert not GarbageCollector(services).advance()
+    assert keys(services, "jobs", "tasks", "deletions") == set()
+    assert differences(services.index, services.store) == []
 
 
-def test_shards_that_nobody_needs_go_after_the_grace_time(parts: Parts) -> None:
-    job = finished(parts)
-    delete_job(parts, job)
-    GarbageCollector(parts).advance()
-    assert not GarbageCollector(parts).collect()
-    assert len(keys(parts, "shards")) == 2, "there is grace"
-    assert not graceless(parts).collect(budget_s=60)
-    assert keys(parts, "shards", "released") == set()
-    assert parts.index.overview.stats().grasps == 0
-    assert differences(parts.index, parts.store) == []
+def test_shards_that_nobody_needs_go_after_the_grace_time(services: Services) -> None:
+    job = finished(services)
+    delete_job(services, job)
+    GarbageCollector(services).advance()
+    assert not GarbageCollector(services).collect()
+    assert len(keys(services, "shards")) == 2, "there is grace"
+    assert not graceless(services).collect(budget_s=60)
+    assert keys(services, "shards", "released") == set()
+    assert services.index.overview.stats().grasps == 0
+    assert differences(services.index, services.store) == []
 
 
-def test_a_shard_that_another_job_needs_stays(parts: Parts) -> None:
-    short, long = finished(parts), finished(parts, grasps=64)
-    delete_job(parts, short)
-    GarbageCollector(parts).advance()
-    assert not graceless(parts).collect(budget_s=60)
-    assert len(keys(parts, "shards")) == 4
-    assert parts.index.jobs.get(long).grasps == 64
+def test_a_shard_that_another_job_needs_stays(services: Services) -> None:
+    short, long = finished(services), finished(services, grasps=64)
+    delete_job(services, short)
+    GarbageCollector(services).advance()
+    assert not graceless(services).collect(budget_s=60)
+    assert len(keys(services, "shards")) == 4
+    assert services.index.jobs.get(long).grasps == 64
 
 
-def test_a_deleted_job_may_be_submitted_again_and_finds_its_shards(parts: Parts) -> None:
-    job = finished(parts)
-    delete_job(parts, job)
+def test_a_deleted_job_may_be_submitted_again_and_finds_its_shards(services: Services) -> None:
+    job = finished(services)
+    delete_job(services, job)
     with pytest.raises(ConflictError, match="still being removed"):
-        job_actions.submit(parts, request())
-    assert names.job_record(job) in keys(parts, "jobs")
-    GarbageCollector(parts).advance()
-    again, new = job_actions.submit(parts, request())
+        job_actions.submit(services, request())
+    assert names.job_record(job) in keys(services, "jobs")
+    GarbageCollector(services).advance()
+    again, new = job_actions.submit(services, request())
     assert (again.id, new, again.state) == (job, True, State.SUCCEEDED)
-    assert not graceless(parts).collect(budget_s=60)
-    assert len(keys(parts, "shards")) == 2, "it needs them again"
-    assert differences(parts.index, parts.store) == []
+    assert not graceless(services).collect(budget_s=60)
+    assert len(keys(services, "shards")) == 2, "it needs them again"
+    assert differences(services.index, services.store) == []
 
 
-def test_a_job_that_runs_is_in_use(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request())
+def test_a_job_that_runs_is_in_use(services: Services) -> None:
+    job, _ = job_actions.submit(services, request())
     with pytest.raises(ConflictError, match="is queued; cancel it first"):
-        delete_job(parts, job.id)
-    assert not pending(parts.store)
+        delete_job(services, job.id)
+    assert not pending(services.store)
 
 
-def test_a_job_of_a_dataset_is_in_use(parts: Parts) -> None:
-    dataset(parts)
-    (job,) = parts.index.jobs.page().items
+def test_a_job_of_a_dataset_is_in_use(services: Services) -> None:
+    dataset(services)
+    (job,) = services.index.jobs.page().items
     with pytest.raises(ConflictError, match="belongs to dataset 'd'"):
-        delete_job(parts, job.id)
+        delete_job(services, job.id)
 
 
-def test_a_deleted_dataset_takes_its_own_jobs_with_it(parts: Parts) -> None:
-    own = finished(parts, seed=7)
-    dataset(parts)
-    dataset(parts, "other", grasps=64)
-    actions.snapshot(parts, "d")
-    delete_dataset(parts, "d", with_snapshots=True)
-    assert differences(parts.index, parts.store) == []
+def test_a_deleted_dataset_takes_its_own_jobs_with_it(services: Services) -> None:
+    own = finished(services, seed=7)
+    dataset(services)
+    dataset(services, "other", grasps=64)
+    actions.snapshot(services, "d")
+    delete_dataset(services, "d", with_snapshots=True)
+    assert differences(services.index, services.store) == []
     with pytest.raises(ConflictError, match="still being removed"):
-        dataset(parts)
-    while GarbageCollector(parts).advance():
+        dataset(services)
+    while GarbageCollector(services).advance():
         pass
-    GarbageCollector(parts).advance()
-    assert {view.name for view in parts.index.datasets.page().items} == {"other"}
-    assert len(parts.index.jobs.page().items) == 2
-    assert parts.index.jobs.get(own)
-    assert keys(parts, "datasets") == {names.dataset_record("other")}
-    assert differences(parts.index, parts.store) == []
-    dataset(parts, "d", grasps=96)
+    GarbageCollector(services).advance()
+    assert {view.name for view in services.index.datasets.page().items} == {"other"}
+    assert len(services.index.jobs.page().items) == 2
+    assert services.index.jobs.get(own)
+    assert keys(services, "datasets") == {names.dataset_record("other")}
+    assert differences(services.index, services.store) == []
+    dataset(services, "d", grasps=96)
 
 
-def test_a_dataset_that_runs_is_in_use(parts: Parts) -> None:
-    actions.create(parts, DatasetRequest(name="d", hands=("gripper",), objects=("ball",)))
+def test_a_dataset_that_runs_is_in_use(services: Services) -> None:
+    actions.create(services, DatasetRequest(name="d", hands=("gripper",), objects=("ball",)))
     with pytest.raises(ConflictError, match="cancel it first"):
-        delete_dataset(parts, "d")
+        delete_dataset(services, "d")
 
 
-def test_a_dataset_that_was_just_cancelled_can_be_deleted(parts: Parts) -> None:
+def test_a_dataset_that_was_just_cancelled_can_be_deleted(services: Services) -> None:
     """Before the planner has told its jobs; those end with it."""
-    actions.create(parts, DatasetRequest(name="d", hands=("gripper",), objects=("ball",)))
-    plan_all(parts)
-    assert actions.cancel(parts, "d").state is State.CANCELLED
-    delete_dataset(parts, "d")
-    GarbageCollector(parts).advance()
-    assert not parts.index.jobs.page().items
+    actions.create(services, DatasetRequest(name="d", hands=("gripper",), objects=("ball",)))
+    plan_all(services)
+    assert actions.cancel(services, "d").state is State.CANCELLED
+    delete_dataset(services, "d")
+    GarbageCollector(services).advance()
+    assert not services.index.jobs.page().items
 
 
-def test_a_cancelled_dataset_has_ended_though_another_waits_for_its_jobs(parts: Parts) -> None:
+def test_a_cancelled_dataset_has_ended_though_another_waits_for_its_jobs(services: Services) -> None:
     for name in ("d", "other"):
-        actions.create(parts, DatasetRequest(name=name, hands=("gripper",), objects=("ball",)))
-    plan_all(parts)
-    assert actions.cancel(parts, "d").state is State.CANCELLED
-    plan_all(parts)
-    delete_dataset(parts, "d")
-    while GarbageCollector(parts).advance():
+        actions.create(services, DatasetRequest(name=name, hands=("gripper",), objects=("ball",)))
+    plan_all(services)
+    assert actions.cancel(services, "d").state is State.CANCELLED
+    plan_all(services)
+    delete_dataset(services, "d")
+    while GarbageCollector(services).advance():
         pass
-    (job,) = parts.index.jobs.page().items
+    (job,) = services.index.jobs.page().items
     assert job.state is State.QUEUED, "the other dataset waits for it"
 
 
-def test_a_hand_that_a_job_needs_is_in_use(parts: Parts) -> None:
-    job = finished(parts)
+def test_a_hand_that_a_job_needs_is_in_use(services: Services) -> None:
+    job = finished(services)
     with pytest.raises(ConflictError, match=f"needed by job {job}"):
-        delete_asset(parts, AssetKind.HAND, "gripper")
-    delete_job(parts, job)
-    delete_asset(parts, AssetKind.HAND, "gripper")
+        delete_asset(services, AssetKind.HAND, "gripper")
+    delete_job(services, job)
+    delete_asset(services, AssetKind.HAND, "gripper")
     with pytest.raises(NotFoundError):
-        job_actions.submit(parts, request())
+        job_actions.submit(services, request())
 
 
-def test_an_object_of_a_set_is_in_use(parts: Parts) -> None:
-    actions.add_object_set(parts, "kitchen", ["ball"])
+def test_an_object_of_a_set_is_in_use(services: Services) -> None:
+    actions.add_object_set(services, "kitchen", ["ball"])
     with pytest.raises(ConflictError, match="the set of objects 'kitchen'"):
-        delete_asset(parts, AssetKind.OBJECT, "ball")
+        delete_asset(services, AssetKind.OBJECT, "ball")
 
 
-def test_a_deleted_object_frees_its_name_and_its_files(parts: Parts) -> None:
-    digest = parts.index.assets.get(AssetKind.OBJECT, "ball").digest
-    delete_asset(parts, AssetKind.OBJECT, "ball")
-    assert differences(parts.index, parts.store) == []
+def test_a_deleted_object_frees_its_name_and_its_files(services: Services) -> None:
+    digest = services.index.assets.get(AssetKind.OBJECT, "ball").digest
+    delete_asset(services, AssetKind.OBJECT, "ball")
+    assert differences(services.index, services.store) == []
     with pytest.raises(ConflictError, match="still being removed"):
-        publish_asset(parts.store, AssetKind.OBJECT, "ball", OBJECT_FILES)
-    GarbageCollector(parts).advance()
-    assert keys(parts, f"assets/object/{digest}", "deletions") == set()
-    assert publish_asset(parts.store, AssetKind.OBJECT, "orb", OBJECT_FILES).name == "orb"
+        publish_asset(services.store, AssetKind.OBJECT, "ball", OBJECT_FILES)
+    GarbageCollector(services).advance()
+    assert keys(services, f"assets/object/{digest}", "deletions") == set()
+    assert publish_asset(services.store, AssetKind.OBJECT, "orb", OBJECT_FILES).name == "orb"
 
 
-def test_a_job_entered_while_its_hand_is_deleted_is_not_kept(parts: Parts) -> None:
-    record = job_actions.prepare(parts, request())
-    delete_asset(parts, AssetKind.HAND, "gripper")
+def test_a_job_entered_while_its_hand_is_deleted_is_not_kept(services: Services) -> None:
+    record = job_actions.prepare(services, request())
+    delete_asset(services, AssetKind.HAND, "gripper")
     with pytest.raises(NotFoundError, match="deleted just now"):
-        job_actions.enter(parts, record)
-    assert keys(parts, "jobs") == set()
+        job_actions.enter(services, record)
+    assert keys(services, "jobs") == set()
 
 
 @pytest.mark.parametrize("what", ["job", "dataset", "object"])
 def test_a_deletion_that_broke_off_is_carried_out_by_the_next_controller(
-    parts: Parts, what: str, monkeypatch: pytest.MonkeyPatch
+    services: Services, what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At each removal of an object in turn, and between the record and the rows."""
     acts: dict[str, tuple[Callable[[], Any], Callable[[], Any]]] = {
-        "job": (lambda: finished(parts, seed=3), lambda: delete_job(parts, next(iter(_jobs(parts))))),
-        "dataset": (lambda: dataset(parts), lambda: delete_dataset(parts, "d")),
-        "object": (lambda: None, lambda: delete_asset(parts, AssetKind.OBJECT, "ball")),
+        "job": (lambda: finished(services, seed=3), lambda: delete_job(services, next(iter(_jobs(services))))),
+        "dataset": (lambda: dataset(services), lambda: delete_dataset(services, "d")),
+        "object": (lambda: None, lambda: delete_asset(services, AssetKind.OBJECT, "ball")),
     }
     make, act = acts[what]
     make()
@@ -224,127 +224,128 @@ def test_a_deletion_that_broke_off_is_carried_out_by_the_next_controller(
         patch.setattr(Removals, remove, _break)
         with pytest.raises(KeyboardInterrupt):
             act()
-    assert pending(parts.store)
-    real, place = type(parts.store).delete, 0
-    while keys(parts, "deletions"):
+    assert pending(services.store)
+    real, place = type(services.store).delete, 0
+    while keys(services, "deletions"):
         with monkeypatch.context() as patch, pytest.raises((KeyboardInterrupt, StopIteration)):
-            patch.setattr(type(parts.store), "delete", _after(place, real))
-            if not GarbageCollector(parts).advance():
+            patch.setattr(type(services.store), "delete", _after(place, real))
+            if not GarbageCollector(services).advance():
                 raise StopIteration
         place += 1
-    assert differences(parts.index, parts.store) == []
+    assert differences(services.index, services.store) == []
     assert (
-        keys(parts, *{"job": ("jobs",), "dataset": ("datasets", "jobs"), "object": ("assets/object",)}[what]) == set()
+        keys(services, *{"job": ("jobs",), "dataset": ("datasets", "jobs"), "object": ("assets/object",)}[what])
+        == set()
     )
 
 
-def test_a_dataset_with_a_snapshot_is_deleted_only_by_a_further_word(parts: Parts) -> None:
-    dataset(parts)
-    actions.snapshot(parts, "d")
+def test_a_dataset_with_a_snapshot_is_deleted_only_by_a_further_word(services: Services) -> None:
+    dataset(services)
+    actions.snapshot(services, "d")
     with pytest.raises(ConflictError, match=r"has 1 snapshot.*--with-snapshots"):
-        delete_dataset(parts, "d")
-    assert parts.index.datasets.get("d").name == "d"
-    assert not pending(parts.store)
+        delete_dataset(services, "d")
+    assert services.index.datasets.get("d").name == "d"
+    assert not pending(services.store)
 
 
 COLLECTED = pytest.mark.parametrize("collected", [False, True], ids=["at once", "after the controller"])
 
 
-def collect_garbage(parts: Parts) -> None:
-    while GarbageCollector(parts).advance():
+def collect_garbage(services: Services) -> None:
+    while GarbageCollector(services).advance():
         pass
-    GarbageCollector(parts).advance()
+    GarbageCollector(services).advance()
 
 
 @COLLECTED
-def test_a_deleted_job_is_restored_as_it_was(parts: Parts, collected: bool) -> None:
+def test_a_deleted_job_is_restored_as_it_was(services: Services, collected: bool) -> None:
     """One that had failed, with its attempts: it is not run again."""
-    job, _ = job_actions.submit(parts, request())
-    fail(parts, job.id)
-    before = parts.index.jobs.get(job.id), parts.index.jobs.attempts(job=job.id)
-    delete_job(parts, job.id)
+    job, _ = job_actions.submit(services, request())
+    fail(services, job.id)
+    before = services.index.jobs.get(job.id), services.index.jobs.attempts(job=job.id)
+    delete_job(services, job.id)
     if collected:
-        collect_garbage(parts)
-    restore(parts, "job", job.id, permit=lambda _: None)
-    assert (parts.index.jobs.get(job.id), parts.index.jobs.attempts(job=job.id)) == before
-    assert not deletions(parts.store)
-    assert not GarbageCollector(parts).advance()
-    assert differences(parts.index, parts.store) == []
+        collect_garbage(services)
+    restore(services, "job", job.id, permit=lambda _: None)
+    assert (services.index.jobs.get(job.id), services.index.jobs.attempts(job=job.id)) == before
+    assert not deletions(services.store)
+    assert not GarbageCollector(services).advance()
+    assert differences(services.index, services.store) == []
 
 
 @COLLECTED
-def test_a_deleted_dataset_is_restored_with_its_jobs_and_snapshots(parts: Parts, collected: bool) -> None:
-    dataset(parts)
-    actions.snapshot(parts, "d")
-    before = parts.index.datasets.get("d"), parts.index.datasets.snapshots("d").items, _jobs(parts)
-    delete_dataset(parts, "d", with_snapshots=True)
+def test_a_deleted_dataset_is_restored_with_its_jobs_and_snapshots(services: Services, collected: bool) -> None:
+    dataset(services)
+    actions.snapshot(services, "d")
+    before = services.index.datasets.get("d"), services.index.datasets.snapshots("d").items, _jobs(services)
+    delete_dataset(services, "d", with_snapshots=True)
     if collected:
-        collect_garbage(parts)
-        assert _jobs(parts) == []
-    restore(parts, "dataset", "d", permit=lambda _: None)
-    collect_garbage(parts)
-    assert (parts.index.datasets.get("d"), parts.index.datasets.snapshots("d").items, _jobs(parts)) == before
-    assert not deletions(parts.store)
-    assert differences(parts.index, parts.store) == []
+        collect_garbage(services)
+        assert _jobs(services) == []
+    restore(services, "dataset", "d", permit=lambda _: None)
+    collect_garbage(services)
+    assert (services.index.datasets.get("d"), services.index.datasets.snapshots("d").items, _jobs(services)) == before
+    assert not deletions(services.store)
+    assert differences(services.index, services.store) == []
 
 
 @COLLECTED
-def test_a_deleted_object_is_restored_under_its_name(parts: Parts, collected: bool) -> None:
-    before = parts.index.assets.get(AssetKind.OBJECT, "ball")
-    delete_asset(parts, AssetKind.OBJECT, "ball")
+def test_a_deleted_object_is_restored_under_its_name(services: Services, collected: bool) -> None:
+    before = services.index.assets.get(AssetKind.OBJECT, "ball")
+    delete_asset(services, AssetKind.OBJECT, "ball")
     if collected:
-        collect_garbage(parts)
-    restore(parts, "object", "ball", permit=lambda _: None)
-    assert parts.index.assets.get(AssetKind.OBJECT, "ball") == before
-    assert differences(parts.index, parts.store) == []
+        collect_garbage(services)
+    restore(services, "object", "ball", permit=lambda _: None)
+    assert services.index.assets.get(AssetKind.OBJECT, "ball") == before
+    assert differences(services.index, services.store) == []
 
 
-def test_what_was_made_again_is_not_written_over(parts: Parts) -> None:
-    dataset(parts)
-    delete_dataset(parts, "d")
-    collect_garbage(parts)
-    dataset(parts, "d", grasps=64)
+def test_what_was_made_again_is_not_written_over(services: Services) -> None:
+    dataset(services)
+    delete_dataset(services, "d")
+    collect_garbage(services)
+    dataset(services, "d", grasps=64)
     with pytest.raises(ConflictError, match="there is a dataset 'd' again"):
-        restore(parts, "dataset", "d", permit=lambda _: None)
-    assert parts.index.datasets.get("d").asked == 64
+        restore(services, "dataset", "d", permit=lambda _: None)
+    assert services.index.datasets.get("d").asked == 64
 
 
-def test_a_job_is_not_restored_without_its_object(parts: Parts) -> None:
-    job = finished(parts)
-    delete_job(parts, job)
-    delete_asset(parts, AssetKind.OBJECT, "ball")
-    collect_garbage(parts)
+def test_a_job_is_not_restored_without_its_object(services: Services) -> None:
+    job = finished(services)
+    delete_job(services, job)
+    delete_asset(services, AssetKind.OBJECT, "ball")
+    collect_garbage(services)
     with pytest.raises(ConflictError, match="graspd objects restore first"):
-        restore(parts, "job", job, permit=lambda _: None)
-    collect_garbage(parts)
-    assert differences(parts.index, parts.store) == []
-    restore(parts, "object", "ball", permit=lambda _: None)
-    restore(parts, "job", job, permit=lambda _: None)
-    assert parts.index.jobs.get(job).state is State.SUCCEEDED
+        restore(services, "job", job, permit=lambda _: None)
+    collect_garbage(services)
+    assert differences(services.index, services.store) == []
+    restore(services, "object", "ball", permit=lambda _: None)
+    restore(services, "job", job, permit=lambda _: None)
+    assert services.index.jobs.get(job).state is State.SUCCEEDED
 
 
-def test_a_deleted_tag_is_restored_with_its_grasps(parts: Parts) -> None:
-    job = finished(parts)
-    shard = next(shard.id for shard in parts.index.shards.page(job=job).items if shard.kind == "base")
-    tagging.give(parts, "good", [(shard, 0), (shard, 3)], project="", owner="", permit=lambda _: None)
-    tagging.remove(parts, tag_id("good", ""), permit=lambda _: None)
-    restore(parts, "tag", "good", permit=lambda _: None)
-    assert [(tag.name, tag.grasps) for tag in parts.index.tags.all()] == [("good", 2)]
-    assert not deletions(parts.store)
+def test_a_deleted_tag_is_restored_with_its_grasps(services: Services) -> None:
+    job = finished(services)
+    shard = next(shard.id for shard in services.index.shards.page(job=job).items if shard.kind == "base")
+    tagging.give(services, "good", [(shard, 0), (shard, 3)], project="", owner="", permit=lambda _: None)
+    tagging.remove(services, tag_id("good", ""), permit=lambda _: None)
+    restore(services, "tag", "good", permit=lambda _: None)
+    assert [(tag.name, tag.grasps) for tag in services.index.tags.all()] == [("good", 2)]
+    assert not deletions(services.store)
 
 
-def test_after_the_grace_time_nothing_comes_back(parts: Parts) -> None:
-    job = finished(parts)
-    delete_job(parts, job)
-    collect_garbage(parts)
-    assert not graceless(parts).collect(budget_s=60)
-    assert keys(parts, "removed") == set()
+def test_after_the_grace_time_nothing_comes_back(services: Services) -> None:
+    job = finished(services)
+    delete_job(services, job)
+    collect_garbage(services)
+    assert not graceless(services).collect(budget_s=60)
+    assert keys(services, "removed") == set()
     with pytest.raises(NotFoundError, match="was deleted in the last 7 days"):
-        restore(parts, "job", job, permit=lambda _: None)
+        restore(services, "job", job, permit=lambda _: None)
 
 
-def _jobs(parts: Parts) -> list[str]:
-    return [job.id for job in parts.index.jobs.page().items]
+def _jobs(services: Services) -> list[str]:
+    return [job.id for job in services.index.jobs.page().items]
 
 
 def _break(*_: object, **__: object) -> None:

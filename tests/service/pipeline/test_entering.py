@@ -16,7 +16,7 @@ from service.model import names
 from service.model.errors import ConflictError
 from service.model.states import State
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.deletion import delete_job
 from service.pipeline.entering import Entering
 from tests.fakes import request
@@ -24,79 +24,79 @@ from tests.fakes import request
 LARGE = 32 * (2 * RANGES_AT_ONCE + 1)
 
 
-def entered(parts: Parts) -> int:
-    with parts.index.database.reading() as connection:
+def entered(services: Services) -> int:
+    with services.index.database.reading() as connection:
         return int(connection.scalar(select(func.count()).select_from(tasks)) or 0)
 
 
-def work_off(parts: Parts) -> list[tuple[str, int]]:
+def work_off(services: Services) -> list[tuple[str, int]]:
     """Enter all that is left; the job and the number of rows of each turn."""
     stop, turns = threading.Event(), list[tuple[str, int]]()
 
     class Watched(Entering):
         def enter(self, job: str) -> None:
-            before = entered(parts)
+            before = entered(services)
             super().enter(job)
-            turns.append((job, entered(parts) - before))
-            if not parts.index.write.entering():
+            turns.append((job, entered(services) - before))
+            if not services.index.write.entering():
                 stop.set()
 
-    Watched(parts, stop).run()
+    Watched(services, stop).run()
     return turns
 
 
-def test_turns_are_short_and_alternate(parts: Parts) -> None:
-    jobs = [job_actions.submit(parts, request(grasps=LARGE, seed=seed))[0].id for seed in range(2)]
-    assert entered(parts) == 2 * RANGES_AT_ONCE
-    turns = work_off(parts)
+def test_turns_are_short_and_alternate(services: Services) -> None:
+    jobs = [job_actions.submit(services, request(grasps=LARGE, seed=seed))[0].id for seed in range(2)]
+    assert entered(services) == 2 * RANGES_AT_ONCE
+    turns = work_off(services)
     assert [job for job, _ in turns] == 2 * sorted(jobs)
     assert [rows for _, rows in turns] == [RANGES_AT_ONCE, RANGES_AT_ONCE, 1, 1]
-    assert differences(parts.index, parts.store) == []
+    assert differences(services.index, services.store) == []
 
 
-def test_a_job_is_told_whole_before_it_is_entered(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request(grasps=LARGE))
+def test_a_job_is_told_whole_before_it_is_entered(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=LARGE))
     assert [(stage.tasks, stage.queued) for stage in job.stages] == [(LARGE // 32, LARGE // 32)]
 
 
-def test_a_job_that_is_being_entered_has_not_ended(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request(grasps=LARGE))
-    assert not job_actions.cancel(parts, job.id).state.is_final
+def test_a_job_that_is_being_entered_has_not_ended(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=LARGE))
+    assert not job_actions.cancel(services, job.id).state.is_final
     with pytest.raises(ConflictError):
-        delete_job(parts, job.id)
-    work_off(parts)
-    assert parts.index.jobs.get(job.id).state is State.CANCELLED
-    assert differences(parts.index, parts.store) == []
+        delete_job(services, job.id)
+    work_off(services)
+    assert services.index.jobs.get(job.id).state is State.CANCELLED
+    assert differences(services.index, services.store) == []
 
 
-def test_the_same_job_again_begins_nothing_anew(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request(grasps=LARGE))
-    work_off(parts)
-    again, new = job_actions.submit(parts, request(grasps=LARGE))
-    assert (again.id, new, parts.index.write.entering()) == (job.id, False, [])
+def test_the_same_job_again_begins_nothing_anew(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=LARGE))
+    work_off(services)
+    again, new = job_actions.submit(services, request(grasps=LARGE))
+    assert (again.id, new, services.index.write.entering()) == (job.id, False, [])
 
 
-def test_a_job_whose_record_is_gone_is_given_up(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request(grasps=LARGE))
-    parts.store.delete(names.job_record(job.id))
-    assert work_off(parts) == [(job.id, 0)]
+def test_a_job_whose_record_is_gone_is_given_up(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=LARGE))
+    services.store.delete(names.job_record(job.id))
+    assert work_off(services) == [(job.id, 0)]
 
 
 @pytest.mark.slow
-def test_five_jobs_of_a_million_grasps_delay_a_small_one_by_less_than_three_seconds(parts: Parts) -> None:
+def test_five_jobs_of_a_million_grasps_delay_a_small_one_by_less_than_three_seconds(services: Services) -> None:
     stop, waits = threading.Event(), list[float]()
-    controller = threading.Thread(target=Entering(parts, stop).run)
+    controller = threading.Thread(target=Entering(services, stop).run)
     controller.start()
     with ThreadPoolExecutor(5) as pool:
-        large = [pool.submit(job_actions.submit, parts, request(grasps=10**6, seed=seed)) for seed in range(5)]
+        large = [pool.submit(job_actions.submit, services, request(grasps=10**6, seed=seed)) for seed in range(5)]
         number = 0
-        while not all(one.done() for one in large) or parts.index.write.entering():
+        while not all(one.done() for one in large) or services.index.write.entering():
             number += 1
             start = time.monotonic()
-            job_actions.submit(parts, request(grasps=1, seed=100 + number))
+            job_actions.submit(services, request(grasps=1, seed=100 + number))
             waits.append(time.monotonic() - start)
     stop.set()
     controller.join()
     print(f"{number} small jobs beside five large ones: longest wait {max(waits):.2f} s")
-    assert entered(parts) == 5 * 31_250 + number
+    assert entered(services) == 5 * 31_250 + number
     assert max(waits) < 3

@@ -12,7 +12,7 @@ from service.model.errors import InputError
 from service.model.records import Choice, JobRecord
 from service.model.scene_spec import SceneSpec
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.fidelity_choice import cheapest, parse_target
 from service.store.records import read_record
 from service.store.store import open_store
@@ -105,17 +105,17 @@ def test_the_chart_published_last_is_the_latest(tmp_path: Path) -> None:
     assert found is not None and found["created"] == "2026-11-21T11:00:00.000Z"
 
 
-def test_a_job_with_fidelity_auto_is_stored_with_the_one_the_chart_promises(parts: Parts) -> None:
-    publish(parts.store, "charts", CHART)
-    job, _ = job_actions.submit(parts, request(fidelity="auto", target="gsr>=0.75"))
+def test_a_job_with_fidelity_auto_is_stored_with_the_one_the_chart_promises(services: Services) -> None:
+    publish(services.store, "charts", CHART)
+    job, _ = job_actions.submit(services, request(fidelity="auto", target="gsr>=0.75"))
     assert (job.request.fidelity, job.request.target) == ("standard", "")
     # It is the job that names the fidelity itself: a later chart does not change it.
-    assert job_actions.submit(parts, request(fidelity="standard"))[0].id == job.id
+    assert job_actions.submit(services, request(fidelity="standard"))[0].id == job.id
 
 
-def test_fidelity_auto_without_a_chart_says_how_to_get_one(parts: Parts) -> None:
+def test_fidelity_auto_without_a_chart_says_how_to_get_one(services: Services) -> None:
     with pytest.raises(InputError, match="graspd chart --publish"):
-        job_actions.submit(parts, request(fidelity="auto", target="gsr>=0.6"))
+        job_actions.submit(services, request(fidelity="auto", target="gsr>=0.6"))
 
 
 @pytest.mark.parametrize("changes", [{"fidelity": "auto"}, {"target": "gsr>=0.6"}, {"fidelity": "superb"}])
@@ -172,26 +172,26 @@ def test_end_to_end_speed_counts_before_the_planners_own() -> None:
     assert pick("gsr>=0.5", chart={"runs": runs}) == "fine"
 
 
-def test_a_job_in_a_scene_is_chosen_by_the_chart_of_its_kind_of_scene_and_says_so(parts: Parts) -> None:
-    publish(parts.store, "charts", CHART)
-    key = publish(parts.store, charts_of(SceneSpec(kind="table")), scene_chart())
-    publish(parts.store, charts_of(SceneSpec(kind="bin")), scene_chart("bin") | {"runs": [lifts("fine", 1, 0.99)]})
+def test_a_job_in_a_scene_is_chosen_by_the_chart_of_its_kind_of_scene_and_says_so(services: Services) -> None:
+    publish(services.store, "charts", CHART)
+    key = publish(services.store, charts_of(SceneSpec(kind="table")), scene_chart())
+    publish(services.store, charts_of(SceneSpec(kind="bin")), scene_chart("bin") | {"runs": [lifts("fine", 1, 0.99)]})
     wanted = request(fidelity="auto", target="lift>=0.84", scene="table")
-    job, _ = job_actions.submit(parts, wanted)
+    job, _ = job_actions.submit(services, wanted)
     choice = Choice(target="lift>=0.84", chart=key, measured_on="all", reached=0.875)
     assert (job.request.fidelity, job.request.target, job.choice) == ("standard", "", choice)
-    assert read_record(JobRecord, parts.store, names.job_record(job.id)).choice == choice
-    assert job_actions.submit(parts, wanted.model_copy(update={"scene": "bin"}))[0].request.fidelity == "fine"
-    assert job_actions.submit(parts, request(scene="table", seed=9))[0].choice is None
+    assert read_record(JobRecord, services.store, names.job_record(job.id)).choice == choice
+    assert job_actions.submit(services, wanted.model_copy(update={"scene": "bin"}))[0].request.fidelity == "fine"
+    assert job_actions.submit(services, request(scene="table", seed=9))[0].choice is None
 
 
-def test_a_free_chart_is_no_chart_of_scenes_and_the_other_way_round(parts: Parts) -> None:
-    publish(parts.store, charts_of(SceneSpec(kind="table")), scene_chart())
+def test_a_free_chart_is_no_chart_of_scenes_and_the_other_way_round(services: Services) -> None:
+    publish(services.store, charts_of(SceneSpec(kind="table")), scene_chart())
     with pytest.raises(InputError, match="run `graspd chart --publish` once"):
-        job_actions.submit(parts, request(fidelity="auto", target="gsr>=0.6"))
-    publish(parts.store, "charts", CHART)
+        job_actions.submit(services, request(fidelity="auto", target="gsr>=0.6"))
+    publish(services.store, "charts", CHART)
     with pytest.raises(InputError, match=r"says nothing of lifts: run `graspd chart --scene shelf --publish` once"):
-        job_actions.submit(parts, request(fidelity="auto", target="lift>=0.6", scene="shelf"))
+        job_actions.submit(services, request(fidelity="auto", target="lift>=0.6", scene="shelf"))
 
 
 def test_a_scene_file_has_charts_of_its_own_by_what_stands_there(tmp_path: Path) -> None:

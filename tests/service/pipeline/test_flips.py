@@ -20,7 +20,7 @@ from service.model.states import AssetKind, Stage
 from service.model.tags import Tag
 from service.model.webhooks import Webhook
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.identity import ServiceRecord
@@ -44,23 +44,23 @@ _ID: Final = re.compile(r"[0-9a-f]{32}|[0-9]+|T[0-9]+Z")
 
 
 @pytest.fixture
-def full(parts: Parts) -> Parts:
+def full(services: Services) -> Services:
     """A store with an object of every kind."""
-    store = parts.store
-    job, _ = job_actions.submit(parts, request(grasps=96))
+    store = services.store
+    job, _ = job_actions.submit(services, request(grasps=96))
     record = read_record(JobRecord, store, names.job_record(job.id))
     lone, first, _ = tasks_of(record)
     manifest = make_shard(store, lone)
-    parts.index.write.add_manifest(manifest)
+    services.index.write.add_manifest(manifest)
     add_job_event(store, job.id, "cancelled")
     attempt = {"task_id": first.task_id, "job_id": job.id, "stage": Stage.SYNTHESIZE, "number": 1, "kind": "Error"}
     failed = AttemptRecord(**attempt, reason="broke", worker="w", ended=timestamp(), last=False)
     put_record(store, names.attempt(first.task_id, 1), failed)
-    actions.create(parts, DatasetRequest(name="all", hands=["gripper"], objects=["ball"], grasps=96))
-    parts.index.write_dataset.set_progress("all", planned=True)
-    actions.cancel(parts, "all")
-    actions.snapshot(parts, "all")
-    actions.add_object_set(parts, "balls", ["ball"])
+    actions.create(services, DatasetRequest(name="all", hands=["gripper"], objects=["ball"], grasps=96))
+    services.index.write_dataset.set_progress("all", planned=True)
+    actions.cancel(services, "all")
+    actions.snapshot(services, "all")
+    actions.add_object_set(services, "balls", ["ball"])
     put_record(store, f"{names.DELETIONS}/job/{'e' * 32}.json", Deletion(what="job", id="e" * 32, at=timestamp()))
     put_record(store, f"{names.RELEASED}/1-{job.id}.json", Released(at=timestamp(), job=record))
     gone = Deletion(what="job", id="b" * 32, at=timestamp())
@@ -68,7 +68,7 @@ def full(parts: Parts) -> Parts:
     put_record(store, f"{removed_folder(gone)}/{names.job_record(gone.id)}", record)
     put_record(store, names.service(1), ServiceRecord(id="c" * 32, at=timestamp()))
     put_document(store, names.mark("d" * 32), {"at": timestamp()})
-    hand = parts.index.assets.get(AssetKind.HAND, "gripper").digest
+    hand = services.index.assets.get(AssetKind.HAND, "gripper").digest
     put_document(store, names.hand_expanded(hand), {"urdf": "<robot name='claw'/>"})
     hook = Webhook(id="f" * 32, url="https://example.org/", states=("succeeded",), created=timestamp())
     put_record(store, names.webhook(hook.id), hook)
@@ -77,21 +77,21 @@ def full(parts: Parts) -> Parts:
     for kind in ("charts", "scene_charts/table", "stability"):
         publish(store, kind, {"created": timestamp(), "runs": [1.0, 2.0]})
     publish_builtins(store)
-    ball = parts.index.assets.get(AssetKind.OBJECT, "ball").digest
+    ball = services.index.assets.get(AssetKind.OBJECT, "ball").digest
     file = io.BytesIO()
     np.savez(file, vertices=np.arange(30.0))
     put_sealed(store, names.object_prepared(ball, "1" * 32), file.getvalue())
     put_sealed(store, names.object_pieces(ball, "2" * 32), file.getvalue())
-    return parts
+    return services
 
 
-def keys_of_each_kind(parts: Parts) -> list[str]:
+def keys_of_each_kind(services: Services) -> list[str]:
     """The longest-named of each kind of object, by key; every kind of hand's or object's file is there."""
-    kinds = {_ID.sub("*", entry.key): entry.key for folder in FOLDERS for entry in parts.store.list(folder)}
+    kinds = {_ID.sub("*", entry.key): entry.key for folder in FOLDERS for entry in services.store.list(folder)}
     return sorted(kinds.values())
 
 
-def test_every_flipped_byte_is_found_and_named(full: Parts) -> None:
+def test_every_flipped_byte_is_found_and_named(full: Services) -> None:
     draw, missed, tried = random.Random(45), [], 0
     keys = keys_of_each_kind(full)
     for key in keys:
@@ -110,7 +110,7 @@ def test_every_flipped_byte_is_found_and_named(full: Parts) -> None:
     assert [wrong for _, wrong in scan(full.store) if wrong is not None] == []
 
 
-def test_a_damaged_manifest_is_neither_read_nor_indexed(full: Parts) -> None:
+def test_a_damaged_manifest_is_neither_read_nor_indexed(full: Services) -> None:
     manifest = next(entry.key for entry in full.store.list(names.SHARDS) if entry.key.endswith(".json"))
     data = full.store.get(manifest)
     at = data.index(b'"epsilon":0.') + len(b'"epsilon":0.')
@@ -122,60 +122,60 @@ def test_a_damaged_manifest_is_neither_read_nor_indexed(full: Parts) -> None:
     assert made is not None and made.names == (manifest,)
 
 
-def test_what_an_earlier_graspd_wrote_is_read_and_counted(parts: Parts) -> None:
+def test_what_an_earlier_graspd_wrote_is_read_and_counted(services: Services) -> None:
     found = ObjectSet(name="c" * 64, digest="a" * 32, objects=("ball",), created=timestamp())
     key, without = names.object_set(found.name, found.digest), list[str]()
-    parts.store.put(key, found.model_dump_json().encode())
-    zipped = names.asset_files(AssetKind.OBJECT, parts.index.assets.get(AssetKind.OBJECT, "ball").digest)
-    overwrite(parts.store, zipped, pack_files(OBJECT_FILES))
-    assert read_record(ObjectSet, parts.store, key) == found
-    assert [wrong for _, wrong in scan(parts.store, unsealed=without.append) if wrong is not None] == []
+    services.store.put(key, found.model_dump_json().encode())
+    zipped = names.asset_files(AssetKind.OBJECT, services.index.assets.get(AssetKind.OBJECT, "ball").digest)
+    overwrite(services.store, zipped, pack_files(OBJECT_FILES))
+    assert read_record(ObjectSet, services.store, key) == found
+    assert [wrong for _, wrong in scan(services.store, unsealed=without.append) if wrong is not None] == []
     assert {key, zipped} <= set(without)
 
 
-def test_files_of_an_earlier_upload_are_held_against_their_name(parts: Parts) -> None:
-    key = names.asset_files(AssetKind.HAND, parts.index.assets.get(AssetKind.HAND, "gripper").digest)
-    overwrite(parts.store, key, pack_files(HAND_FILES | {"hand.urdf": b"<robot name='other'/>"}))
-    wrong = examine(parts.store, key)
+def test_files_of_an_earlier_upload_are_held_against_their_name(services: Services) -> None:
+    key = names.asset_files(AssetKind.HAND, services.index.assets.get(AssetKind.HAND, "gripper").digest)
+    overwrite(services.store, key, pack_files(HAND_FILES | {"hand.urdf": b"<robot name='other'/>"}))
+    wrong = examine(services.store, key)
     assert wrong is not None and "its files are not those of its name" in wrong.what
 
 
-def test_a_damaged_upload_is_replaced_by_the_same_files(parts: Parts) -> None:
-    key = names.asset_files(AssetKind.HAND, parts.index.assets.get(AssetKind.HAND, "gripper").digest)
-    overwrite(parts.store, key, flipped(parts.store.get(key)))
-    store_files(parts.store, AssetKind.HAND, "gripper", HAND_FILES)
-    assert examine(parts.store, key) is None
+def test_a_damaged_upload_is_replaced_by_the_same_files(services: Services) -> None:
+    key = names.asset_files(AssetKind.HAND, services.index.assets.get(AssetKind.HAND, "gripper").digest)
+    overwrite(services.store, key, flipped(services.store.get(key)))
+    store_files(services.store, AssetKind.HAND, "gripper", HAND_FILES)
+    assert examine(services.store, key) is None
 
 
 @pytest.mark.parametrize("file", ["model.glb", "check.json"])
-def test_what_a_check_found_is_made_again(parts: Parts, file: str) -> None:
-    ball = parts.index.assets.get(AssetKind.OBJECT, "ball").digest
+def test_what_a_check_found_is_made_again(services: Services, file: str) -> None:
+    ball = services.index.assets.get(AssetKind.OBJECT, "ball").digest
     folder = names.asset_check(AssetKind.OBJECT, ball).rpartition("/")[0]
-    put_document(parts.store, f"{folder}/check.json", {"verdict": "accept"})
-    put_sealed(parts.store, f"{folder}/model.glb", b"glTF" + bytes(8) + b"\4\0\0\0JSON{}  ")
-    overwrite(parts.store, f"{folder}/{file}", flipped(parts.store.get(f"{folder}/{file}")))
-    found = [wrong for _, wrong in scan(parts.store) if wrong is not None]
-    repaired, left = repair(parts, found)
+    put_document(services.store, f"{folder}/check.json", {"verdict": "accept"})
+    put_sealed(services.store, f"{folder}/model.glb", b"glTF" + bytes(8) + b"\4\0\0\0JSON{}  ")
+    overwrite(services.store, f"{folder}/{file}", flipped(services.store.get(f"{folder}/{file}")))
+    found = [wrong for _, wrong in scan(services.store) if wrong is not None]
+    repaired, left = repair(services, found)
     assert [one.key for one in repaired] == [f"{folder}/{file}"]
     assert left == []
-    assert load_check(parts.store, AssetKind.OBJECT, ball) is None
-    assert [check.digest for check in parts.index.feed.ready_checks(now=1e12, limit=9)] == [ball]
+    assert load_check(services.store, AssetKind.OBJECT, ball) is None
+    assert [check.digest for check in services.index.feed.ready_checks(now=1e12, limit=9)] == [ball]
 
 
-def test_what_comes_with_graspd_is_put_again(parts: Parts) -> None:
-    publish_builtins(parts.store)
+def test_what_comes_with_graspd_is_put_again(services: Services) -> None:
+    publish_builtins(services.store)
     mug = next(asset for asset in builtin_assets() if asset.kind is AssetKind.OBJECT)
     folder = names.asset_record(mug.kind, mug.digest).rpartition("/")[0]
     for file in ("asset.json", "files.zip", "model.glb"):
-        overwrite(parts.store, f"{folder}/{file}", flipped(parts.store.get(f"{folder}/{file}")))
-    _, left = repair(parts, [wrong for _, wrong in scan(parts.store) if wrong is not None])
+        overwrite(services.store, f"{folder}/{file}", flipped(services.store.get(f"{folder}/{file}")))
+    _, left = repair(services, [wrong for _, wrong in scan(services.store) if wrong is not None])
     assert left == []
-    assert [wrong for _, wrong in scan(parts.store) if wrong is not None] == []
+    assert [wrong for _, wrong in scan(services.store) if wrong is not None] == []
 
 
-def test_charts_of_one_moment_are_all_kept(parts: Parts) -> None:
+def test_charts_of_one_moment_are_all_kept(services: Services) -> None:
     at = timestamp()
-    keys = [publish(parts.store, "charts", {"created": at, "runs": [number]}) for number in range(12)]
+    keys = [publish(services.store, "charts", {"created": at, "runs": [number]}) for number in range(12)]
     assert len(set(keys)) == 12
-    found = latest(parts.store, "charts")
+    found = latest(services.store, "charts")
     assert found is not None and found["runs"] == [11]

@@ -7,7 +7,7 @@ from service.model.clock import timestamp
 from service.model.states import Lane, Stage, State
 from service.model.worker_beat import WorkerBeat
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.controller import Controller
 from service.queue.port import Event, EventKind, Report
 from tests.fakes import make_shard, request
@@ -21,21 +21,21 @@ class Clock:
         return self.now
 
 
-def taken(parts: Parts) -> list[Delivery]:
+def taken(services: Services) -> list[Delivery]:
     """Every waiting task, in workers' hands."""
-    assert isinstance(parts.queue, MemoryQueue)
+    assert isinstance(services.queue, MemoryQueue)
     held = []
-    while (delivery := parts.queue.take(f"w{len(held)}")) is not None:
-        parts.queue.publish(_event(delivery, EventKind.STARTED))
+    while (delivery := services.queue.take(f"w{len(held)}")) is not None:
+        services.queue.publish(_event(delivery, EventKind.STARTED))
         held.append(delivery)
     return held
 
 
-def finish(parts: Parts, delivery: Delivery) -> None:
-    assert isinstance(parts.queue, MemoryQueue)
-    make_shard(parts.store, delivery.message)  # type: ignore[arg-type]
-    parts.queue.finish(delivery)
-    parts.queue.publish(_event(delivery, EventKind.FINISHED))
+def finish(services: Services, delivery: Delivery) -> None:
+    assert isinstance(services.queue, MemoryQueue)
+    make_shard(services.store, delivery.message)  # type: ignore[arg-type]
+    services.queue.finish(delivery)
+    services.queue.publish(_event(delivery, EventKind.FINISHED))
 
 
 def _event(delivery: Delivery, kind: EventKind) -> Event:
@@ -45,62 +45,64 @@ def _event(delivery: Delivery, kind: EventKind) -> Event:
                  output=output)  # fmt: skip
 
 
-def test_the_next_stage_is_queued_without_waiting_for_a_sweep(parts: Parts) -> None:
-    controller = Controller(parts, clock=Clock())
+def test_the_next_stage_is_queued_without_waiting_for_a_sweep(services: Services) -> None:
+    controller = Controller(services, clock=Clock())
     controller.round()
-    job_actions.submit(parts, request(scenes=2))
-    (first,) = taken(parts)
-    finish(parts, first)
+    job_actions.submit(services, request(scenes=2))
+    (first,) = taken(services)
+    finish(services, first)
     controller.round()
-    assert [delivery.message.stage for delivery in taken(parts)] == [Stage.SCENE]
+    assert [delivery.message.stage for delivery in taken(services)] == [Stage.SCENE]
 
 
-def test_a_task_that_runs_is_not_queued_again_between_two_sweeps(parts: Parts) -> None:
-    controller = Controller(parts, clock=Clock())
+def test_a_task_that_runs_is_not_queued_again_between_two_sweeps(services: Services) -> None:
+    controller = Controller(services, clock=Clock())
     controller.round()
-    job_actions.submit(parts, request(grasps=96), lane=Lane.BULK)
-    held = taken(parts)
-    finish(parts, held[0])
+    job_actions.submit(services, request(grasps=96), lane=Lane.BULK)
+    held = taken(services)
+    finish(services, held[0])
     controller.round()
-    assert parts.queue.waiting() == set()
+    assert services.queue.waiting() == set()
 
 
-def test_many_ends_at_once_are_one_round(parts: Parts) -> None:
-    controller = Controller(parts, clock=Clock())
+def test_many_ends_at_once_are_one_round(services: Services) -> None:
+    controller = Controller(services, clock=Clock())
     controller.round()
-    job, _ = job_actions.submit(parts, request(grasps=32 * 150), lane=Lane.BULK)
-    for delivery in taken(parts):
-        finish(parts, delivery)
+    job, _ = job_actions.submit(services, request(grasps=32 * 150), lane=Lane.BULK)
+    for delivery in taken(services):
+        finish(services, delivery)
     controller.round()
-    done = parts.index.jobs.get(job.id)
+    done = services.index.jobs.get(job.id)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 150)
 
 
-def test_how_far_a_task_is_reaches_the_index_and_goes_with_its_worker(parts: Parts) -> None:
+def test_how_far_a_task_is_reaches_the_index_and_goes_with_its_worker(services: Services) -> None:
     clock = Clock()
-    controller = Controller(parts, clock=clock)
+    controller = Controller(services, clock=clock)
     controller.round()
-    job, _ = job_actions.submit(parts, request())
-    (held,) = taken(parts)
-    parts.queue.report(held.message.task_id, Report(attempt=1, done=3.0, total=4.0, message="descending"))
+    job, _ = job_actions.submit(services, request())
+    (held,) = taken(services)
+    services.queue.report(held.message.task_id, Report(attempt=1, done=3.0, total=4.0, message="descending"))
     clock.now += 1.0
     controller.round()
-    (task,) = parts.index.jobs.tasks(job=job.id).items
+    (task,) = services.index.jobs.tasks(job=job.id).items
     assert (task.done, task.total, task.message) == (3.0, 4.0, "descending")
-    assert isinstance(parts.queue, MemoryQueue)
-    parts.queue.finish(held)  # it was killed before it said anything more
+    assert isinstance(services.queue, MemoryQueue)
+    services.queue.finish(held)  # it was killed before it said anything more
     for _ in range(2):
         clock.now += 1.0
         controller.round()
-    assert parts.queue.reports() == {}
+    assert services.queue.reports() == {}
 
 
-def test_a_fleet_larger_than_the_window_finds_work(parts: Parts) -> None:
-    small = Parts(parts.settings.model_copy(update={"queue_window": 1}), parts.store, parts.index, parts.queue)
-    assert isinstance(parts.queue, MemoryQueue)
+def test_a_fleet_larger_than_the_window_finds_work(services: Services) -> None:
+    small = Services(
+        services.settings.model_copy(update={"queue_window": 1}), services.store, services.index, services.queue
+    )
+    assert isinstance(services.queue, MemoryQueue)
     now, own = timestamp(), own_ability()
     for name in map(str, range(20)):
-        parts.queue._workers[name] = WorkerBeat(
+        services.queue._workers[name] = WorkerBeat(
             name,
             "h",
             1,
@@ -122,4 +124,4 @@ def test_a_fleet_larger_than_the_window_finds_work(parts: Parts) -> None:
     job_actions.submit(small, request(grasps=32 * 100), lane=Lane.BULK)
     clock.now += 1.0
     controller.round()
-    assert len(parts.queue.waiting()) == 40
+    assert len(services.queue.waiting()) == 40

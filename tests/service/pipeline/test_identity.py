@@ -9,9 +9,9 @@ import pytest
 
 from service.index.index import Index
 from service.model.errors import BusyError
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.controller import Controller
-from service.pipeline.identity import check_queue, identify, services
+from service.pipeline.identity import check_queue, identify, service_ids
 from service.queue.port import TaskQueue
 from service.settings import Settings
 from service.store.store import Store, open_store
@@ -19,23 +19,23 @@ from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 
 
-def service(folder: Path, *, store: Store | None = None, queue: TaskQueue | None = None, **more: str) -> Parts:
+def service(folder: Path, *, store: Store | None = None, queue: TaskQueue | None = None, **more: str) -> Services:
     """A service with an index of its own; store and Redis may be shared."""
     if store is not None:
         more["store_url"] = store.url
     settings = Settings(data_dir=folder, **more)
     index = empty_index(settings.resolved_index_url)
-    return Parts(settings, store or open_store(settings.resolved_store_url), index, queue or MemoryQueue())
+    return Services(settings, store or open_store(settings.resolved_store_url), index, queue or MemoryQueue())
 
 
 @pytest.fixture
-def first(tmp_path: Path) -> Parts:
+def first(tmp_path: Path) -> Services:
     made = service(tmp_path / "first")
     identify(made)
     return made
 
 
-def test_a_second_service_on_a_store_is_refused_with_the_ways_out(first: Parts, tmp_path: Path) -> None:
+def test_a_second_service_on_a_store_is_refused_with_the_ways_out(first: Services, tmp_path: Path) -> None:
     second = service(tmp_path / "second", store=first.store)
     for _ in range(2):
         with pytest.raises(BusyError, match=r"belongs to another graspd service.*a store of its own.*index rebuild"):
@@ -43,14 +43,14 @@ def test_a_second_service_on_a_store_is_refused_with_the_ways_out(first: Parts, 
     assert second.queue.service() is None
 
 
-def test_a_second_service_on_a_redis_is_refused_with_the_ways_out(first: Parts, tmp_path: Path) -> None:
+def test_a_second_service_on_a_redis_is_refused_with_the_ways_out(first: Services, tmp_path: Path) -> None:
     second = service(tmp_path / "second", queue=first.queue)
     for _ in range(2):
         with pytest.raises(BusyError, match=r"Redis belongs to another graspd service.*GRASPD_REDIS_URL"):
             identify(second)
 
 
-def test_a_worker_of_another_store_is_refused(first: Parts, tmp_path: Path) -> None:
+def test_a_worker_of_another_store_is_refused(first: Services, tmp_path: Path) -> None:
     second = service(tmp_path / "second")
     assert not check_queue(second.store, second.queue)
     assert check_queue(first.store, first.queue)
@@ -60,17 +60,17 @@ def test_a_worker_of_another_store_is_refused(first: Parts, tmp_path: Path) -> N
 
 def test_processes_that_begin_a_service_at_once_agree(tmp_path: Path) -> None:
     one = service(tmp_path)
-    other = Parts(one.settings, one.store, Index(one.settings.resolved_index_url), one.queue)
+    other = Services(one.settings, one.store, Index(one.settings.resolved_index_url), one.queue)
     assert identify(one) == identify(other) == one.queue.service()
-    assert len(services(one.store)) == 1
+    assert len(service_ids(one.store)) == 1
 
 
-def test_a_lost_redis_becomes_the_services_again(first: Parts) -> None:
-    emptied = Parts(first.settings, first.store, first.index, MemoryQueue())
+def test_a_lost_redis_becomes_the_services_again(first: Services) -> None:
+    emptied = Services(first.settings, first.store, first.index, MemoryQueue())
     assert identify(emptied) == emptied.queue.service() == first.queue.service()
 
 
-def test_an_index_on_another_machine_or_a_lost_one_is_the_services(first: Parts, tmp_path: Path) -> None:
+def test_an_index_on_another_machine_or_a_lost_one_is_the_services(first: Services, tmp_path: Path) -> None:
     other = service(tmp_path / "other", store=first.store, queue=first.queue)
     assert identify(other) == first.index.notes.service() == other.index.notes.service()
 
@@ -85,7 +85,7 @@ def test_a_data_folder_whose_index_and_redis_are_lost_remembers_its_service(tmp_
     assert identify(again, folder=again.settings.data_dir) == mine
 
 
-def test_a_store_in_the_data_folder_is_that_folders_own(first: Parts, tmp_path: Path) -> None:
+def test_a_store_in_the_data_folder_is_that_folders_own(first: Services, tmp_path: Path) -> None:
     """As it is after `cp -r` of the store, or where everything but the store was removed."""
     shutil.copytree(first.settings.data_dir / "store", tmp_path / "moved" / "store")
     assert identify(service(tmp_path / "moved")) == first.index.notes.service()
@@ -94,18 +94,18 @@ def test_a_store_in_the_data_folder_is_that_folders_own(first: Parts, tmp_path: 
 def test_a_first_start_that_was_killed_half_way_goes_on(tmp_path: Path) -> None:
     begun = service(tmp_path)
     begun.index.notes.name_service("begun")
-    assert identify(begun) == "begun" == services(begun.store)[-1]
+    assert identify(begun) == "begun" == service_ids(begun.store)[-1]
 
 
-def test_a_second_store_under_one_index_is_refused(first: Parts, tmp_path: Path) -> None:
+def test_a_second_store_under_one_index_is_refused(first: Services, tmp_path: Path) -> None:
     first.index.notes.set_complete()
-    second = Parts(first.settings, open_store((tmp_path / "other").as_uri()), first.index, MemoryQueue())
+    second = Services(first.settings, open_store((tmp_path / "other").as_uri()), first.index, MemoryQueue())
     with pytest.raises(BusyError, match="the index belongs to another graspd service"):
         identify(second)
-    assert not services(second.store)
+    assert not service_ids(second.store)
 
 
-def test_a_service_that_takes_over_is_the_only_one_from_then_on(first: Parts, tmp_path: Path) -> None:
+def test_a_service_that_takes_over_is_the_only_one_from_then_on(first: Services, tmp_path: Path) -> None:
     second = service(tmp_path / "second", store=first.store)
     mine = identify(second, take_over=True)
     assert identify(second) == mine == second.queue.service()
@@ -116,26 +116,26 @@ def test_a_service_that_takes_over_is_the_only_one_from_then_on(first: Parts, tm
         identify(second)
 
 
-def test_a_rebuild_of_the_services_own_index_changes_no_identity(first: Parts) -> None:
+def test_a_rebuild_of_the_services_own_index_changes_no_identity(first: Services) -> None:
     assert identify(first, take_over=True) == first.queue.service()
-    assert len(services(first.store)) == 1
+    assert len(service_ids(first.store)) == 1
 
 
-def test_a_take_over_takes_nobodys_redis(first: Parts, tmp_path: Path) -> None:
+def test_a_take_over_takes_nobodys_redis(first: Services, tmp_path: Path) -> None:
     second = service(tmp_path / "second", queue=first.queue)
     with pytest.raises(BusyError, match="Redis belongs to another"):
         identify(second, take_over=True)
 
 
-def test_an_index_of_another_store_is_refused(first: Parts, tmp_path: Path) -> None:
+def test_an_index_of_another_store_is_refused(first: Services, tmp_path: Path) -> None:
     second = service(tmp_path / "second")
     identify(second)
-    mixed = Parts(first.settings, first.store, second.index, MemoryQueue())
+    mixed = Services(first.settings, first.store, second.index, MemoryQueue())
     with pytest.raises(BusyError, match="the index belongs to another graspd service"):
         identify(mixed)
 
 
-def test_a_controller_ends_when_another_service_takes_over_its_store(first: Parts, tmp_path: Path) -> None:
+def test_a_controller_ends_when_another_service_takes_over_its_store(first: Services, tmp_path: Path) -> None:
     now = [0.0]
     controller = Controller(first, clock=lambda: now[0])
     controller.round()
@@ -145,7 +145,7 @@ def test_a_controller_ends_when_another_service_takes_over_its_store(first: Part
         controller.round()
 
 
-def test_what_is_forged_in_redis_stops_no_controller(first: Parts) -> None:
+def test_what_is_forged_in_redis_stops_no_controller(first: Services) -> None:
     first.queue.set_service("forged", instead=True)
     Controller(first).round()
     assert first.queue.service() == first.index.notes.service()

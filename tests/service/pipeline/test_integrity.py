@@ -13,7 +13,7 @@ from service.model import names
 from service.model.errors import DamagedShard
 from service.model.states import State
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.controller import Controller
 from service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, scan
 from service.pipeline.repair import repair
@@ -29,44 +29,46 @@ SHARDS = 6
 
 
 @pytest.fixture(params=["files", pytest.param("s3", marks=pytest.mark.s3)])
-def parts(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Parts]:
+def services(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Services]:
     yield from parts_on(request.param, request, tmp_path)
 
 
 @pytest.fixture
-def shards(parts: Parts) -> list[ShardManifest]:
+def shards(services: Services) -> list[ShardManifest]:
     """Finished shards, in the order of their batches."""
-    job, _ = job_actions.submit(parts, request(grasps=32 * SHARDS))
-    work_off(parts)
-    assert parts.index.jobs.get(job.id).state is State.SUCCEEDED
-    found = [load_manifest(parts.store, s.stage, s.id) for s in parts.index.shards.page(job=job.id, limit=99).items]
+    job, _ = job_actions.submit(services, request(grasps=32 * SHARDS))
+    work_off(services)
+    assert services.index.jobs.get(job.id).state is State.SUCCEEDED
+    found = [
+        load_manifest(services.store, s.stage, s.id) for s in services.index.shards.page(job=job.id, limit=99).items
+    ]
     return sorted(found, key=lambda manifest: manifest.batch)
 
 
-def work_off(parts: Parts, *, device: str = "cpu", seed: int = 0) -> list[EventKind]:
+def work_off(services: Services, *, device: str = "cpu", seed: int = 0) -> list[EventKind]:
     """Worker and controller in turns until nothing waits."""
-    controller, ends = Controller(parts), []
+    controller, ends = Controller(services), []
     controller.round()
-    while (delivery := parts.queue.take("w")) is not None:  # type: ignore[attr-defined]
+    while (delivery := services.queue.take("w")) is not None:  # type: ignore[attr-defined]
         # The name of a device is all that these stages see of it.
-        runner = Runner(fake_stages(), worker="w", publish=parts.queue.publish, check_device=lambda device: None)
+        runner = Runner(fake_stages(), worker="w", publish=services.queue.publish, check_device=lambda device: None)
         raw = delivery.message.model_dump(mode="json", by_alias=True)
-        outcome = runner.run(raw, TaskContext(parts.store, device=device))
-        parts.queue.finish(delivery)  # type: ignore[attr-defined]
+        outcome = runner.run(raw, TaskContext(services.store, device=device))
+        services.queue.finish(delivery)  # type: ignore[attr-defined]
         assert outcome is not None
-        parts.queue.publish(outcome)
+        services.queue.publish(outcome)
         ends.append(outcome.kind)
         controller.round()
     return ends
 
 
-def harm(parts: Parts, shards: list[ShardManifest]) -> dict[str, str]:
+def harm(services: Services, shards: list[ShardManifest]) -> dict[str, str]:
     """Five kinds of damage: what each does to which shard."""
-    flip(parts.store, shards[0].key)
-    cut(parts.store, shards[1].key)
-    remove(parts.store, shards[2].key)
-    overwrite(parts.store, names.shard_manifest(shards[3].stage, shards[3].shard_id), b'{"x": 1}')
-    remove(parts.store, names.shard_manifest(shards[4].stage, shards[4].shard_id))
+    flip(services.store, shards[0].key)
+    cut(services.store, shards[1].key)
+    remove(services.store, shards[2].key)
+    overwrite(services.store, names.shard_manifest(shards[3].stage, shards[3].shard_id), b'{"x": 1}')
+    remove(services.store, names.shard_manifest(shards[4].stage, shards[4].shard_id))
     return {
         shards[0].shard_id: "SHA-256",
         shards[1].shard_id: "bytes, expected",
@@ -76,89 +78,89 @@ def harm(parts: Parts, shards: list[ShardManifest]) -> dict[str, str]:
     }
 
 
-def test_five_kinds_of_damage_are_five_findings(parts: Parts, shards: list[ShardManifest]) -> None:
-    assert [wrong for _, wrong in scan(parts.store) if wrong is not None] == []
-    done = harm(parts, shards)
-    found = {wrong.shard: wrong.what for _, wrong in scan(parts.store) if wrong is not None}
+def test_five_kinds_of_damage_are_five_findings(services: Services, shards: list[ShardManifest]) -> None:
+    assert [wrong for _, wrong in scan(services.store) if wrong is not None] == []
+    done = harm(services, shards)
+    found = {wrong.shard: wrong.what for _, wrong in scan(services.store) if wrong is not None}
     assert found.keys() == done.keys()
     assert all(done[shard] in what for shard, what in found.items())
 
 
-def test_what_is_made_again_has_the_checksum_it_had(parts: Parts, shards: list[ShardManifest]) -> None:
-    harm(parts, shards)
+def test_what_is_made_again_has_the_checksum_it_had(services: Services, shards: list[ShardManifest]) -> None:
+    harm(services, shards)
     before = {m.shard_id: m.sha256 for m in shards}
-    found = [wrong for _, wrong in scan(parts.store) if wrong is not None]
-    repaired, left = repair(parts, found)
+    found = [wrong for _, wrong in scan(services.store) if wrong is not None]
+    repaired, left = repair(services, found)
     # The worker of a file without a manifest may be about to put it.
     assert [one.what for one in left] == [f"{NO_MANIFEST}; its manifest may be on its way; run it again in a minute"]
     assert len(repaired) == 4
-    work_off(parts)
+    work_off(services)
     for manifest in (*shards[:4], shards[5]):
-        load_shard(parts.store, manifest.stage, manifest.shard_id)
-        made = load_manifest(parts.store, manifest.stage, manifest.shard_id)
+        load_shard(services.store, manifest.stage, manifest.shard_id)
+        made = load_manifest(services.store, manifest.stage, manifest.shard_id)
         assert made.sha256 == before[manifest.shard_id]
-    assert [wrong.what for _, wrong in scan(parts.store) if wrong is not None] == [NO_MANIFEST]
+    assert [wrong.what for _, wrong in scan(services.store) if wrong is not None] == [NO_MANIFEST]
 
 
-def test_what_comes_out_otherwise_is_not_put(parts: Parts, shards: list[ShardManifest]) -> None:
-    remove(parts.store, shards[0].key)
-    repair(parts, [wrong for _, wrong in scan(parts.store) if wrong is not None])
-    assert work_off(parts, device="cuda:0") == [EventKind.CANCELLED]
+def test_what_comes_out_otherwise_is_not_put(services: Services, shards: list[ShardManifest]) -> None:
+    remove(services.store, shards[0].key)
+    repair(services, [wrong for _, wrong in scan(services.store) if wrong is not None])
+    assert work_off(services, device="cuda:0") == [EventKind.CANCELLED]
     with pytest.raises(DamagedShard):
-        load_shard(parts.store, shards[0].stage, shards[0].shard_id)
-    assert differences(parts.index, parts.store) == []
+        load_shard(services.store, shards[0].stage, shards[0].shard_id)
+    assert differences(services.index, services.store) == []
 
 
-def test_a_foreign_object_is_found_and_moved_aside(parts: Parts, shards: list[ShardManifest]) -> None:
-    parts.store.put("shards/base/notes.txt", b"mine")
-    found = [wrong for _, wrong in scan(parts.store) if wrong is not None]
+def test_a_foreign_object_is_found_and_moved_aside(services: Services, shards: list[ShardManifest]) -> None:
+    services.store.put("shards/base/notes.txt", b"mine")
+    found = [wrong for _, wrong in scan(services.store) if wrong is not None]
     assert [one.what for one in found] == [FOREIGN]
-    repair(parts, found)
-    assert parts.store.get("damaged/shards/base/notes.txt") == b"mine"
-    assert [wrong for _, wrong in scan(parts.store) if wrong is not None] == []
+    repair(services, found)
+    assert services.store.get("damaged/shards/base/notes.txt") == b"mine"
+    assert [wrong for _, wrong in scan(services.store) if wrong is not None] == []
 
 
-def test_a_damaged_record_is_found_and_said_to_need_a_copy(parts: Parts, shards: list[ShardManifest]) -> None:
-    key = names.job_record(parts.index.jobs.page().items[0].id)
-    overwrite(parts.store, key, b'{"x": 1}')
-    found = [wrong for _, wrong in scan(parts.store) if wrong is not None]
+def test_a_damaged_record_is_found_and_said_to_need_a_copy(services: Services, shards: list[ShardManifest]) -> None:
+    key = names.job_record(services.index.jobs.page().items[0].id)
+    overwrite(services.store, key, b'{"x": 1}')
+    found = [wrong for _, wrong in scan(services.store) if wrong is not None]
     assert [one.key for one in found] == [key]
-    repaired, left = repair(parts, found)
+    repaired, left = repair(services, found)
     assert not repaired
     assert "put a copy in its place" in left[0].what
 
 
 def test_the_command_tells_what_is_damaged_and_exits_with_1(
-    parts: Parts, shards: list[ShardManifest], monkeypatch: pytest.MonkeyPatch
+    services: Services, shards: list[ShardManifest], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from typer.testing import CliRunner
 
     from service.run.store_commands import app
 
-    monkeypatch.setenv("GRASPD_STORE_URL", parts.store.url)
-    command = ["store", "verify", "--json", "--data-dir", str(parts.settings.data_dir)]
+    monkeypatch.setenv("GRASPD_STORE_URL", services.store.url)
+    command = ["store", "verify", "--json", "--data-dir", str(services.settings.data_dir)]
     sound = CliRunner().invoke(app, command)
     assert (sound.exit_code, json.loads(sound.stdout)["damaged"]) == (0, []), sound.output
-    done = harm(parts, shards)
+    done = harm(services, shards)
     told = CliRunner().invoke(app, command)
     assert told.exit_code == 1
     said = json.loads(told.stdout.splitlines()[-1])
     assert {one["shard"] for one in said["damaged"]} | set(said["missing"]) == done.keys()
     assert said["missing"] == [shards[2].shard_id]
-    assert parts.index.damage.known()[0] == 5
+    assert services.index.damage.known()[0] == 5
 
 
 def test_a_check_of_the_index_sees_damaged_shards_too(
-    parts: Parts, shards: list[ShardManifest], monkeypatch: pytest.MonkeyPatch
+    services: Services, shards: list[ShardManifest], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from typer.testing import CliRunner
 
     from service.run.commands import app
 
-    monkeypatch.setenv("GRASPD_STORE_URL", parts.store.url)
-    command = ["index", "rebuild", "--check", "--data-dir", str(parts.settings.data_dir)]
+    monkeypatch.setenv("GRASPD_STORE_URL", services.store.url)
+    command = ["index", "rebuild", "--check", "--data-dir", str(services.settings.data_dir)]
     assert CliRunner().invoke(app, command).exit_code == 0
-    flip(parts.store, shards[0].key)
+    flip(services.store, shards[0].key)
     told = CliRunner().invoke(app, command)
     assert told.exit_code == 1
     assert shards[0].key in told.output

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from service.model import names
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.controller import Controller
 from service.pipeline.integrity import FOLDERS, MISSING, NO_MANIFEST
 from service.pipeline.integrity_scan import IntegrityScan, Interrupted, Turn
@@ -39,113 +39,113 @@ class Slept(threading.Event):
 
 
 @pytest.fixture
-def shards(parts: Parts) -> list[ShardManifest]:
-    return [make_shard(parts.store, message_for(seed=seed)) for seed in range(4)]
+def shards(services: Services) -> list[ShardManifest]:
+    return [make_shard(services.store, message_for(seed=seed)) for seed in range(4)]
 
 
-def a_round(parts: Parts, stop: Slept | None = None) -> None:
+def a_round(services: Services, stop: Slept | None = None) -> None:
     stop = stop or Slept()
-    scan = IntegrityScan(parts, stop, clock=stop.clock)
+    scan = IntegrityScan(services, stop, clock=stop.clock)
     for _ in FOLDERS:
         scan.advance()
     scan.end()
-    assert parts.index.notes.scan_note().ended
+    assert services.index.notes.scan_note().ended
 
 
-def found(parts: Parts) -> dict[str, str]:
-    return {one.shard: one.what for one in parts.index.damage.known()[1]}
+def found(services: Services) -> dict[str, str]:
+    return {one.shard: one.what for one in services.index.damage.known()[1]}
 
 
-def test_a_round_notes_what_is_damaged_and_nothing_else(parts: Parts, shards: list[ShardManifest]) -> None:
-    a_round(parts)
-    assert parts.index.damage.known() == (0, [])
-    parts.index.notes.set_scan_note(type(parts.index.notes.scan_note())())
-    flip(parts.store, shards[0].key)
-    remove(parts.store, shards[1].key)
-    a_round(parts)
-    noted = found(parts)
+def test_a_round_notes_what_is_damaged_and_nothing_else(services: Services, shards: list[ShardManifest]) -> None:
+    a_round(services)
+    assert services.index.damage.known() == (0, [])
+    services.index.notes.set_scan_note(type(services.index.notes.scan_note())())
+    flip(services.store, shards[0].key)
+    remove(services.store, shards[1].key)
+    a_round(services)
+    noted = found(services)
     assert noted.keys() == {shards[0].shard_id, shards[1].shard_id}
     assert "SHA-256" in noted[shards[0].shard_id]
     assert noted[shards[1].shard_id] == MISSING
 
 
-def test_what_is_mended_or_removed_since_is_forgotten(parts: Parts, shards: list[ShardManifest]) -> None:
-    whole = parts.store.get(shards[0].key)
-    parts.store.put("shards/base/notes.txt", b"mine")
+def test_what_is_mended_or_removed_since_is_forgotten(services: Services, shards: list[ShardManifest]) -> None:
+    whole = services.store.get(shards[0].key)
+    services.store.put("shards/base/notes.txt", b"mine")
     for manifest in shards[:3]:
-        flip(parts.store, manifest.key)
-    a_round(parts)
-    assert parts.index.damage.known()[0] == 4
-    overwrite(parts.store, shards[0].key, whole)
-    remove(parts.store, names.shard_manifest(shards[1].stage, shards[1].shard_id))
-    remove(parts.store, shards[1].key)
-    remove(parts.store, "shards/base/notes.txt")
-    IntegrityScan(parts, Slept()).look_again()
-    assert found(parts).keys() == {shards[2].shard_id}
+        flip(services.store, manifest.key)
+    a_round(services)
+    assert services.index.damage.known()[0] == 4
+    overwrite(services.store, shards[0].key, whole)
+    remove(services.store, names.shard_manifest(shards[1].stage, shards[1].shard_id))
+    remove(services.store, shards[1].key)
+    remove(services.store, "shards/base/notes.txt")
+    IntegrityScan(services, Slept()).look_again()
+    assert found(services).keys() == {shards[2].shard_id}
 
 
-def test_a_file_whose_manifest_may_be_on_its_way_is_no_damage(parts: Parts, shards: list[ShardManifest]) -> None:
-    remove(parts.store, names.shard_manifest(shards[0].stage, shards[0].shard_id))
-    a_round(parts)
-    assert NO_MANIFEST not in found(parts).values()
+def test_a_file_whose_manifest_may_be_on_its_way_is_no_damage(services: Services, shards: list[ShardManifest]) -> None:
+    remove(services.store, names.shard_manifest(shards[0].stage, shards[0].shard_id))
+    a_round(services)
+    assert NO_MANIFEST not in found(services).values()
 
 
-def test_it_reads_no_faster_than_the_settings_say(parts: Parts, shards: list[ShardManifest]) -> None:
+def test_it_reads_no_faster_than_the_settings_say(services: Services, shards: list[ShardManifest]) -> None:
     size = sum(manifest.size_bytes for manifest in shards)
     stop = Slept()
-    slow = Parts(
-        parts.settings.model_copy(update={"integrity_scan_mb_per_s": size / 2**20 / 100}),
-        parts.store,
-        parts.index,
-        parts.queue,
+    slow = Services(
+        services.settings.model_copy(update={"integrity_scan_mb_per_s": size / 2**20 / 100}),
+        services.store,
+        services.index,
+        services.queue,
     )
     a_round(slow, stop)
     assert stop.now > 99.0
 
 
-def test_a_successor_goes_on_where_it_stopped(parts: Parts, shards: list[ShardManifest]) -> None:
+def test_a_successor_goes_on_where_it_stopped(services: Services, shards: list[ShardManifest]) -> None:
     for manifest in shards:
-        flip(parts.store, manifest.key)
+        flip(services.store, manifest.key)
     ordered = sorted(names.shard_manifest(one.stage, one.shard_id) for one in shards)
-    note = parts.index.notes.scan_note()
-    parts.index.notes.set_scan_note(type(note)(started="2026-01-01T00:00:00.000Z", after=ordered[1]))
-    a_round(parts)
-    assert {names.shard_manifest(shards[0].stage, shard) for shard in found(parts)} == set(ordered[2:])
+    note = services.index.notes.scan_note()
+    services.index.notes.set_scan_note(type(note)(started="2026-01-01T00:00:00.000Z", after=ordered[1]))
+    a_round(services)
+    assert {names.shard_manifest(shards[0].stage, shard) for shard in found(services)} == set(ordered[2:])
 
 
-def test_a_small_store_is_not_read_over_and_over(parts: Parts, shards: list[ShardManifest]) -> None:
-    a_round(parts)
-    flip(parts.store, shards[0].key)
-    scan = IntegrityScan(parts, Slept())
+def test_a_small_store_is_not_read_over_and_over(services: Services, shards: list[ShardManifest]) -> None:
+    a_round(services)
+    flip(services.store, shards[0].key)
+    scan = IntegrityScan(services, Slept())
     assert not scan.advance()
-    note = parts.index.notes.scan_note()
-    parts.index.notes.set_scan_note(type(note)(**vars(note) | {"started": "2026-01-01T00:00:00.000Z"}))
+    note = services.index.notes.scan_note()
+    services.index.notes.set_scan_note(type(note)(**vars(note) | {"started": "2026-01-01T00:00:00.000Z"}))
     assert scan.advance()
-    assert found(parts).keys() == {shards[0].shard_id}
+    assert found(services).keys() == {shards[0].shard_id}
 
 
-def test_it_makes_way_for_a_verify_and_goes_on_afterwards(parts: Parts, shards: list[ShardManifest]) -> None:
+def test_it_makes_way_for_a_verify_and_goes_on_afterwards(services: Services, shards: list[ShardManifest]) -> None:
     stop = Slept()
-    scan = IntegrityScan(parts, stop, clock=stop.clock)
-    verify = Turn(parts, is_controller=False)
+    scan = IntegrityScan(services, stop, clock=stop.clock)
+    verify = Turn(services, is_controller=False)
     assert verify.is_mine()
     with pytest.raises(Interrupted):
         scan.advance()
-    assert not Turn(parts, is_controller=False).is_mine()
-    assert not Turn(parts, is_controller=True).is_mine()
+    assert not Turn(services, is_controller=False).is_mine()
+    assert not Turn(services, is_controller=True).is_mine()
     verify.end()
     assert scan.advance()
 
 
-def test_a_verify_takes_the_turn_from_a_controller(parts: Parts) -> None:
-    controller = Turn(parts, is_controller=True)
+def test_a_verify_takes_the_turn_from_a_controller(services: Services) -> None:
+    controller = Turn(services, is_controller=True)
     assert controller.is_mine()
-    assert not Turn(parts, is_controller=True).is_mine()
-    assert Turn(parts, is_controller=False).is_mine()
+    assert not Turn(services, is_controller=True).is_mine()
+    assert Turn(services, is_controller=False).is_mine()
 
 
 def test_a_second_verify_is_refused(
-    parts: Parts, shards: list[ShardManifest], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    services: Services, shards: list[ShardManifest], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     from typer.testing import CliRunner
 
@@ -153,7 +153,7 @@ def test_a_second_verify_is_refused(
 
     folder = tmp_path / "one"
     settings = Settings(data_dir=folder)
-    other = Parts(
+    other = Services(
         settings, open_store(settings.resolved_store_url), empty_index(settings.resolved_index_url), MemoryQueue()
     )
     assert Turn(other, is_controller=False).is_mine()
@@ -166,12 +166,12 @@ def test_a_second_verify_is_refused(
 
 @pytest.mark.parametrize("rate", [100.0, 0.0])
 def test_the_controller_scans_beside_its_rounds_unless_it_is_off(
-    parts: Parts, shards: list[ShardManifest], rate: float
+    services: Services, shards: list[ShardManifest], rate: float
 ) -> None:
-    flip(parts.store, shards[0].key)
-    set_so = Parts(
-        parts.settings.model_copy(update={"integrity_scan_mb_per_s": rate, "controller_interval_s": 0.05}),
-        parts.store, parts.index, parts.queue,
+    flip(services.store, shards[0].key)
+    set_so = Services(
+        services.settings.model_copy(update={"integrity_scan_mb_per_s": rate, "controller_interval_s": 0.05}),
+        services.store, services.index, services.queue,
     )  # fmt: skip
     stop = threading.Event()
     thread = threading.Thread(target=Controller(set_so).run, args=(stop,))
@@ -181,12 +181,12 @@ def test_the_controller_scans_beside_its_rounds_unless_it_is_off(
         if rate:
             pause = threading.Event()
             for _ in range(round(WAIT_S / 0.05)):
-                if found(parts):
+                if found(services):
                     break
                 pause.wait(0.05)
     finally:
         stop.set()
         thread.join(WAIT_S)
-    assert found(parts).keys() == ({shards[0].shard_id} if rate else set())
+    assert found(services).keys() == ({shards[0].shard_id} if rate else set())
     assert ("integrity scan" in names_now) <= bool(rate)
     assert not any(one.name == "integrity scan" for one in threading.enumerate())

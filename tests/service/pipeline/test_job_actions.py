@@ -9,7 +9,7 @@ from service.model import names
 from service.model.errors import ConflictError, InputError, NotFoundError, QueueUnavailable
 from service.model.states import AssetKind, Lane, State
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.library import publish_asset
 from service.store.records import job_events
 from tests.fakes import HAND_FILES, request
@@ -17,117 +17,117 @@ from tests.memory_queue import MemoryQueue
 from tests.service.index.test_index import fail, run_all
 
 
-def queue_of(parts: Parts) -> MemoryQueue:
-    assert isinstance(parts.queue, MemoryQueue)
-    return parts.queue
+def queue_of(services: Services) -> MemoryQueue:
+    assert isinstance(services.queue, MemoryQueue)
+    return services.queue
 
 
-def test_a_submitted_job_is_in_store_index_and_queue(parts: Parts) -> None:
-    job, new = job_actions.submit(parts, request(grasps=64, scenes=1))
+def test_a_submitted_job_is_in_store_index_and_queue(services: Services) -> None:
+    job, new = job_actions.submit(services, request(grasps=64, scenes=1))
     assert new
-    assert parts.store.exists(names.job_record(job.id))
+    assert services.store.exists(names.job_record(job.id))
     assert [stage.tasks for stage in job.stages] == [2, 2]
-    assert len(parts.queue.waiting()) == 2, "only what may start"
+    assert len(services.queue.waiting()) == 2, "only what may start"
 
 
-def test_the_same_request_is_the_same_job(parts: Parts) -> None:
-    first, _ = job_actions.submit(parts, request())
-    second, new = job_actions.submit(parts, request())
+def test_the_same_request_is_the_same_job(services: Services) -> None:
+    first, _ = job_actions.submit(services, request())
+    second, new = job_actions.submit(services, request())
     assert (second.id, second.created, new) == (first.id, first.created, False)
-    assert len(parts.queue.waiting()) == 1
+    assert len(services.queue.waiting()) == 1
 
 
-def test_a_hand_named_by_its_digest_is_the_same_job(parts: Parts) -> None:
-    digest = parts.index.assets.get(AssetKind.HAND, "gripper").digest
-    assert job_actions.submit(parts, request(hand=digest))[0].id == job_actions.submit(parts, request())[0].id
+def test_a_hand_named_by_its_digest_is_the_same_job(services: Services) -> None:
+    digest = services.index.assets.get(AssetKind.HAND, "gripper").digest
+    assert job_actions.submit(services, request(hand=digest))[0].id == job_actions.submit(services, request())[0].id
 
 
-def test_an_unknown_hand_or_object_leaves_nothing_behind(parts: Parts) -> None:
+def test_an_unknown_hand_or_object_leaves_nothing_behind(services: Services) -> None:
     for changes in ({"hand": "unknown"}, {"object": "unknown"}):
         with pytest.raises(NotFoundError, match="unknown"):
-            job_actions.submit(parts, request(**changes))
-    assert list(parts.store.list(names.JOBS)) == []
+            job_actions.submit(services, request(**changes))
+    assert list(services.store.list(names.JOBS)) == []
 
 
-def test_a_refused_hand_cannot_be_used_and_says_why(parts: Parts) -> None:
-    asset = publish_asset(parts.store, AssetKind.HAND, "broken", HAND_FILES | {"extra": b"1"})
-    parts.index.write.add_asset(asset, {"verdict": "refuse", "message": "it has no joints"})
+def test_a_refused_hand_cannot_be_used_and_says_why(services: Services) -> None:
+    asset = publish_asset(services.store, AssetKind.HAND, "broken", HAND_FILES | {"extra": b"1"})
+    services.index.write.add_asset(asset, {"verdict": "refuse", "message": "it has no joints"})
     with pytest.raises(InputError, match="it has no joints"):
-        job_actions.submit(parts, request(hand="broken"))
+        job_actions.submit(services, request(hand="broken"))
 
 
-def test_an_unchecked_hand_must_wait_for_its_check(parts: Parts) -> None:
-    asset = publish_asset(parts.store, AssetKind.HAND, "fresh", HAND_FILES | {"extra": b"2"})
-    parts.index.write.add_asset(asset, None)
+def test_an_unchecked_hand_must_wait_for_its_check(services: Services) -> None:
+    asset = publish_asset(services.store, AssetKind.HAND, "fresh", HAND_FILES | {"extra": b"2"})
+    services.index.write.add_asset(asset, None)
     with pytest.raises(ConflictError, match="still being checked"):
-        job_actions.submit(parts, request(hand="fresh"))
+        job_actions.submit(services, request(hand="fresh"))
 
 
 def test_without_redis_a_submit_is_refused_and_nothing_is_recorded(
-    parts: Parts, monkeypatch: pytest.MonkeyPatch
+    services: Services, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def gone() -> float:
         raise QueueUnavailable("Redis does not answer")
 
-    monkeypatch.setattr(parts.queue, "ping", gone)
+    monkeypatch.setattr(services.queue, "ping", gone)
     with pytest.raises(QueueUnavailable):
-        job_actions.submit(parts, request())
-    assert list(parts.store.list(names.JOBS)) == []
-    assert parts.index.jobs.page().items == []
+        job_actions.submit(services, request())
+    assert list(services.store.list(names.JOBS)) == []
+    assert services.index.jobs.page().items == []
 
 
-def test_a_large_job_fills_the_window_and_no_more(parts: Parts) -> None:
-    small = parts.settings.model_copy(update={"queue_window": 10})
-    job, _ = job_actions.submit(Parts(small, parts.store, parts.index, parts.queue), request(grasps=3200))
-    assert len(parts.queue.waiting()) == 10
+def test_a_large_job_fills_the_window_and_no_more(services: Services) -> None:
+    small = services.settings.model_copy(update={"queue_window": 10})
+    job, _ = job_actions.submit(Services(small, services.store, services.index, services.queue), request(grasps=3200))
+    assert len(services.queue.waiting()) == 10
     assert job.lane is Lane.BULK
     assert job.stages[0].tasks == 100
 
 
-def test_a_cancelled_job_leaves_the_queue(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request(grasps=64))
-    queue_of(parts).take("w")
-    run_all(parts, job.id, batches=1)
-    after = job_actions.cancel(parts, job.id)
+def test_a_cancelled_job_leaves_the_queue(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=64))
+    queue_of(services).take("w")
+    run_all(services, job.id, batches=1)
+    after = job_actions.cancel(services, job.id)
     assert after.state is State.CANCELLED
     assert (after.stages[0].succeeded, after.stages[0].cancelled) == (1, 1)
-    assert parts.queue.waiting() == set()
-    assert [event.what for event in job_events(parts.store, job.id)] == ["cancelled"]
+    assert services.queue.waiting() == set()
+    assert [event.what for event in job_events(services.store, job.id)] == ["cancelled"]
 
 
-def test_where_a_cancelled_task_ran_is_no_difference_to_the_store(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request())
-    parts.index.live.set_running({task.id: "w" for task in parts.index.jobs.tasks(job=job.id).items})
-    job_actions.cancel(parts, job.id)
-    assert differences(parts.index, parts.store) == []
+def test_where_a_cancelled_task_ran_is_no_difference_to_the_store(services: Services) -> None:
+    job, _ = job_actions.submit(services, request())
+    services.index.live.set_running({task.id: "w" for task in services.index.jobs.tasks(job=job.id).items})
+    job_actions.cancel(services, job.id)
+    assert differences(services.index, services.store) == []
 
 
-def test_a_finished_job_cannot_be_cancelled(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request())
-    run_all(parts, job.id)
+def test_a_finished_job_cannot_be_cancelled(services: Services) -> None:
+    job, _ = job_actions.submit(services, request())
+    run_all(services, job.id)
     with pytest.raises(ConflictError, match="succeeded"):
-        job_actions.cancel(parts, job.id)
+        job_actions.cancel(services, job.id)
 
 
-def test_a_retried_job_gets_fresh_attempts_and_keeps_what_is_done(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request(grasps=64))
-    run_all(parts, job.id, batches=1)
+def test_a_retried_job_gets_fresh_attempts_and_keeps_what_is_done(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=64))
+    run_all(services, job.id, batches=1)
     for number in (1, 2, 3):
-        fail(parts, job.id, 1, number, last=number == 3)
-    failed = parts.index.jobs.get(job.id)
+        fail(services, job.id, 1, number, last=number == 3)
+    failed = services.index.jobs.get(job.id)
     assert (failed.state, failed.reason) == (State.FAILED, "attempt 3 went wrong")
-    queue = queue_of(parts)
+    queue = queue_of(services)
     while queue.take("w") is not None:
         pass
-    after = job_actions.retry(parts, job.id)
+    after = job_actions.retry(services, job.id)
     assert (after.state, after.reason) == (State.RUNNING, None)
     delivery = queue.take("w")
     assert delivery is not None
     assert (delivery.message.attempt, delivery.message.max_attempt) == (4, 6)
-    assert len(parts.index.jobs.attempts(job=job.id)) == 3, "the history stays"
+    assert len(services.index.jobs.attempts(job=job.id)) == 3, "the history stays"
 
 
-def test_only_what_failed_or_was_cancelled_can_be_retried(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, request())
+def test_only_what_failed_or_was_cancelled_can_be_retried(services: Services) -> None:
+    job, _ = job_actions.submit(services, request())
     with pytest.raises(ConflictError, match="queued"):
-        job_actions.retry(parts, job.id)
+        job_actions.retry(services, job.id)

@@ -14,7 +14,7 @@ from service.index.index import Index
 from service.index.notes import Notes
 from service.index.rebuild import differences
 from service.pipeline import controller, job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.settings import Settings
 from service.store.store import open_store
@@ -35,26 +35,26 @@ def rebuilt(monkeypatch: pytest.MonkeyPatch) -> list[object]:
     return made
 
 
-def in_service(folder: Path, act: Callable[[Parts], object] = lambda parts: None) -> list[str]:
+def in_service(folder: Path, act: Callable[[Services], object] = lambda services: None) -> list[str]:
     """A controller starts, a user does something, the controller stops; how the index then differs from the store."""
     settings = Settings(data_dir=folder)
     store = open_store(settings.resolved_store_url)
-    parts = Parts(settings, store, Index(settings.resolved_index_url), MemoryQueue())
+    services = Services(settings, store, Index(settings.resolved_index_url), MemoryQueue())
     try:
-        working = controller.Controller(parts)
+        working = controller.Controller(services)
         working.round()
-        add_assets(parts)
-        act(parts)
+        add_assets(services)
+        act(services)
         stop = threading.Event()
         stop.set()
         working.run(stop)
-        return [line for line in differences(parts.index, store) if not line.startswith("assets ")]
+        return [line for line in differences(services.index, store) if not line.startswith("assets ")]
     finally:
-        parts.close()
+        services.close()
 
 
-def submit(seed: int) -> Callable[[Parts], object]:
-    return lambda parts: job_actions.submit(parts, request(seed=seed))
+def submit(seed: int) -> Callable[[Services], object]:
+    return lambda services: job_actions.submit(services, request(seed=seed))
 
 
 def copy_index(folder: Path, target: Path) -> None:
@@ -71,7 +71,7 @@ def test_an_older_copy_of_the_index_is_made_anew(tmp_path: Path, rebuilt: list[o
     in_service(data, submit(1))
     copy_index(data, backup)
     in_service(data, submit(2))
-    in_service(data, lambda parts: actions.add_object_set(parts, "balls", ["ball"]))
+    in_service(data, lambda services: actions.add_object_set(services, "balls", ["ball"]))
     copy_index(backup, data)
     assert rebuilt == []
     assert in_service(data) == []
@@ -118,15 +118,15 @@ def test_an_index_exchanged_while_the_controller_runs_is_made_anew(tmp_path: Pat
     in_service(data, submit(2))
     settings = Settings(data_dir=data)
     store = open_store(settings.resolved_store_url)
-    parts = Parts(settings, store, Index(settings.resolved_index_url), MemoryQueue())
-    working = controller.Controller(parts)
+    services = Services(settings, store, Index(settings.resolved_index_url), MemoryQueue())
+    working = controller.Controller(services)
     working.round()
     for file in data.glob("index.sqlite*"):
         file.unlink()
     copy_index(backup, data)
     working.round()
-    assert len(parts.index.jobs.page().items) == 2
-    parts.close()
+    assert len(services.index.jobs.page().items) == 2
+    services.close()
 
 
 def test_a_controller_killed_between_index_and_store_leaves_nothing_to_mend(

@@ -16,7 +16,7 @@ from service.index import at_scrape
 from service.index.damage import Damage
 from service.model.messages import TaskMessage
 from service.model.states import Lane, Stage, State
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.job_actions import submit
 from service.pipeline.series import SERIES
 from service.pipeline.tally import MOST_KINDS, OTHER_KIND, Tally, parse_field
@@ -67,20 +67,20 @@ def test_no_read_of_the_index_for_metrics_scans_a_table(tmp_path: Path, query: A
     assert all(step.startswith("SEARCH") and "USING" in step for step in tables)
 
 
-def test_damage_of_the_store_is_told(parts: Parts) -> None:
-    assert at_scrape.read_index(parts.index.database).damaged == 0
-    parts.index.damage.mark([Damage("shards/base/a.h5", "its file is gone", "a")])
-    assert at_scrape.read_index(parts.index.database).damaged == 1
+def test_damage_of_the_store_is_told(services: Services) -> None:
+    assert at_scrape.read_index(services.index.database).damaged == 0
+    services.index.damage.mark([Damage("shards/base/a.h5", "its file is gone", "a")])
+    assert at_scrape.read_index(services.index.database).damaged == 1
     shown = Snapshot()
-    shown.add_index(at_scrape.read_index(parts.index.database))
+    shown.add_index(at_scrape.read_index(services.index.database))
     assert b"graspd_store_damaged 1.0" in Metrics().render(shown)
 
 
-def test_unfinished_jobs_and_the_yield_of_the_last_minute_are_told(parts: Parts) -> None:
-    submit(parts, request(grasps=32))
-    manifest = make_shard(parts.store, message_for())
-    parts.index.write.add_manifest(manifest)
-    found = at_scrape.read_index(parts.index.database)
+def test_unfinished_jobs_and_the_yield_of_the_last_minute_are_told(services: Services) -> None:
+    submit(services, request(grasps=32))
+    manifest = make_shard(services.store, message_for())
+    services.index.write.add_manifest(manifest)
+    found = at_scrape.read_index(services.index.database)
     assert found.jobs[State.QUEUED] == 1
     assert 0 <= found.oldest_s[State.QUEUED] < 60
     assert found.grasps_per_s == pytest.approx(manifest.count / 60)
@@ -138,10 +138,10 @@ def test_sums_outlive_the_process_that_counts(rq_queue: RqQueue) -> None:
     assert rq_queue.counted() == {'["graspd_jobs_ended_total", "succeeded"]': 2.0}
 
 
-def test_a_shard_counts_its_grasps_and_its_seconds(parts: Parts) -> None:
+def test_a_shard_counts_its_grasps_and_its_seconds(services: Services) -> None:
     sums = Sums()
     tally = Tally(sums)
-    manifest = make_shard(parts.store, message_for())
+    manifest = make_shard(services.store, message_for())
     tally.made([manifest])
     tally.flush()
     assert sums.sums["graspd_grasps_total", "all"] == 32

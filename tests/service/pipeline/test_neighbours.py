@@ -17,7 +17,7 @@ from service.model.planning import message_of, plan
 from service.model.records import JobRecord
 from service.model.states import AssetKind, Stage
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.deletion import delete_asset
@@ -31,87 +31,87 @@ FLOOR = {"kind": "half_space"}
 UPRIGHT = [1.0, 0, 0, 0]
 
 
-def add(parts: Parts, name: str, *, words: str = "", **facts: Any) -> str:
+def add(services: Services, name: str, *, words: str = "", **facts: Any) -> str:
     """An object that was found good; its digest."""
     files = {"asset.json": b'{"file": "a.stl"}', "a.stl": f"solid {name}{words}\nendsolid\n".encode()}
-    asset = publish_asset(parts.store, AssetKind.OBJECT, name, files)
+    asset = publish_asset(services.store, AssetKind.OBJECT, name, files)
     check = {"verdict": "accept", "message": "fine", "repairs": [], "facts": facts}
-    parts.store.put(names.asset_check(AssetKind.OBJECT, asset.digest), json.dumps(check).encode())
-    parts.index.write.add_asset(asset, check)
+    services.store.put(names.asset_check(AssetKind.OBJECT, asset.digest), json.dumps(check).encode())
+    services.index.write.add_asset(asset, check)
     return asset.digest
 
 
-def submit(parts: Parts, **changes: Any) -> JobRecord:
-    job, _ = job_actions.submit(parts, request(**{"scene": "table", **changes}))
-    return read_record(JobRecord, parts.store, names.job_record(job.id))
+def submit(services: Services, **changes: Any) -> JobRecord:
+    job, _ = job_actions.submit(services, request(**{"scene": "table", **changes}))
+    return read_record(JobRecord, services.store, names.job_record(job.id))
 
 
-def test_a_job_keeps_the_very_files_of_its_neighbours(parts: Parts) -> None:
-    cup = add(parts, "cup")
-    job = submit(parts, neighbours=("cup", "ball"))
+def test_a_job_keeps_the_very_files_of_its_neighbours(services: Services) -> None:
+    cup = add(services, "cup")
+    job = submit(services, neighbours=("cup", "ball"))
     assert [(one.object, one.digest) for one in job.request.beside] == [("cup", cup), ("ball", job.object_digest)]
     assert [one.digest for one in job.request.place.neighbours] == [cup, job.object_digest]
-    assert submit(parts, neighbours=("cup", "ball")).id == job.id
+    assert submit(services, neighbours=("cup", "ball")).id == job.id
     first = next(plan(job)).output
-    newer = add(parts, "cup", words="!")
-    later = submit(parts, neighbours=("cup", "ball"))
+    newer = add(services, "cup", words="!")
+    later = submit(services, neighbours=("cup", "ball"))
     assert newer != cup and later.id != job.id and next(plan(later)).output != first
     # The request of the first job, as its page tells it, is still that job.
-    assert submit(parts, **job.request.model_dump(exclude={"hand", "object"})).id == job.id
+    assert submit(services, **job.request.model_dump(exclude={"hand", "object"})).id == job.id
 
 
 @pytest.mark.parametrize("other", [{"neighbours": ("cup",)}, {"neighbours": ("ball", "cup")}, {}])
-def test_other_neighbours_or_another_order_are_other_scenes(parts: Parts, other: dict[str, Any]) -> None:
-    add(parts, "cup")
-    known = submit(parts, neighbours=("cup", "ball"))
-    assert next(plan(submit(parts, **other))).output != next(plan(known)).output
+def test_other_neighbours_or_another_order_are_other_scenes(services: Services, other: dict[str, Any]) -> None:
+    add(services, "cup")
+    known = submit(services, neighbours=("cup", "ball"))
+    assert next(plan(submit(services, **other))).output != next(plan(known)).output
 
 
-def test_a_document_places_its_neighbours(parts: Parts) -> None:
-    cup = add(parts, "cup")
+def test_a_document_places_its_neighbours(services: Services) -> None:
+    cup = add(services, "cup")
     places = [{"object": "cup", "pose": [0.2, 0, 0, *UPRIGHT]}, {"object": "cup", "pose": [-0.2, 0, 0, *UPRIGHT]}]
-    job = submit(parts, scene={"supports": [FLOOR], "target": [0, 0, 0, *UPRIGHT], "neighbours": places})
+    job = submit(services, scene={"supports": [FLOOR], "target": [0, 0, 0, *UPRIGHT], "neighbours": places})
     found = job.request.place.neighbours
     assert [one.pose and one.pose[0] for one in found] == [0.2, -0.2]
     assert {one.digest for one in found} == {cup}
 
 
-def test_a_neighbour_is_needed_until_its_job_and_its_dataset_are_deleted(parts: Parts) -> None:
-    add(parts, "cup")
-    job = submit(parts, neighbours=("cup",))
+def test_a_neighbour_is_needed_until_its_job_and_its_dataset_are_deleted(services: Services) -> None:
+    add(services, "cup")
+    job = submit(services, neighbours=("cup",))
     wanted = DatasetRequest(
         name="d", hands=("gripper",), objects=("ball",), grasps=32, scene="bin", neighbours=("cup",)
     )
-    needed_until_its_users_are_deleted(parts, AssetKind.OBJECT, "cup", job.id, wanted)
+    needed_until_its_users_are_deleted(services, AssetKind.OBJECT, "cup", job.id, wanted)
     with pytest.raises(NotFoundError, match="there is no object 'cup'"):
-        submit(parts, neighbours=("cup",))
+        submit(services, neighbours=("cup",))
 
 
-def test_a_dataset_hands_its_neighbours_on_to_each_job(parts: Parts) -> None:
-    cup = add(parts, "cup")
+def test_a_dataset_hands_its_neighbours_on_to_each_job(services: Services) -> None:
+    cup = add(services, "cup")
     wanted = DatasetRequest(
         name="d", hands=("gripper",), objects=("ball", "cup"), grasps=32, scene="table", neighbours=("cup",)
     )
-    made, new = actions.create(parts, wanted)
+    made, new = actions.create(services, wanted)
     assert new and made.options.beside[0].digest == cup
-    plan_all(parts)
-    jobs = parts.index.jobs.page().items
+    plan_all(services)
+    jobs = services.index.jobs.page().items
     assert len(jobs) == 2 and all(job.request.beside[0].digest == cup for job in jobs)
-    assert actions.create(parts, wanted)[1] is False, "the same again is the same dataset"
+    assert actions.create(services, wanted)[1] is False, "the same again is the same dataset"
     with pytest.raises(ConflictError, match="its neighbours is cup"):
-        actions.create(parts, wanted.model_copy(update={"neighbours": ()}))
+        actions.create(services, wanted.model_copy(update={"neighbours": ()}))
 
 
-def test_a_rebuilt_index_knows_the_same_of_neighbours(parts: Parts) -> None:
-    add(parts, "cup")
-    job = submit(parts, neighbours=("cup",))
+def test_a_rebuilt_index_knows_the_same_of_neighbours(services: Services) -> None:
+    add(services, "cup")
+    job = submit(services, neighbours=("cup",))
     for stage in (Stage.SCENE, Stage.SYNTHESIZE):
         task = next(task for task in plan(job) if task.stage is stage)
-        parts.index.write.add_manifest(make_shard(parts.store, message_of(job, task, attempt=1, max_attempt=3)))
-    assert differences(parts.index, parts.store) == []
-    found = parts.index.grasps.page(GraspFilter(neighbours=True), limit=200).items
+        services.index.write.add_manifest(make_shard(services.store, message_of(job, task, attempt=1, max_attempt=3)))
+    assert differences(services.index, services.store) == []
+    found = services.index.grasps.page(GraspFilter(neighbours=True), limit=200).items
     assert len(found) == 32 and {grasp.neighbours for grasp in found} == {1}
-    assert parts.index.grasps.page(GraspFilter(neighbours=False), limit=200).items == []
+    assert services.index.grasps.page(GraspFilter(neighbours=False), limit=200).items == []
 
 
 @pytest.mark.parametrize(
@@ -128,27 +128,27 @@ def test_a_rebuilt_index_knows_the_same_of_neighbours(parts: Parts) -> None:
     ],
 )
 def test_what_cannot_stand_there_is_told_before_any_work(
-    parts: Parts, changes: dict[str, Any], error: type[Exception], words: str
+    services: Services, changes: dict[str, Any], error: type[Exception], words: str
 ) -> None:
-    cup = add(parts, "cup", centre_of_mass_m=[0.0, 0.0, 0.0])
+    cup = add(services, "cup", centre_of_mass_m=[0.0, 0.0, 0.0])
     for one in changes.get("neighbours", ()):
         if isinstance(one, dict) and one["digest"] == "cup":
             one["digest"] = cup
     with pytest.raises(error, match=words):
-        submit(parts, **changes)
-    assert parts.index.jobs.page().items == []
+        submit(services, **changes)
+    assert services.index.jobs.page().items == []
 
 
-def test_a_neighbour_that_is_being_checked_is_waited_for(parts: Parts) -> None:
+def test_a_neighbour_that_is_being_checked_is_waited_for(services: Services) -> None:
     files = {"asset.json": b'{"file": "a.stl"}', "a.stl": b"solid\nendsolid\n"}
-    parts.index.write.add_asset(publish_asset(parts.store, AssetKind.OBJECT, "cup", files), None)
+    services.index.write.add_asset(publish_asset(services.store, AssetKind.OBJECT, "cup", files), None)
     with pytest.raises(ConflictError, match="still being checked"):
-        submit(parts, neighbours=("cup",))
+        submit(services, neighbours=("cup",))
 
 
-def test_a_forged_entry_cannot_name_a_neighbour_without_its_files(parts: Parts) -> None:
-    add(parts, "cup")
-    job = submit(parts, neighbours=("cup",))
+def test_a_forged_entry_cannot_name_a_neighbour_without_its_files(services: Services) -> None:
+    add(services, "cup")
+    job = submit(services, neighbours=("cup",))
     said = message_of(job, next(plan(job)), attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
     assert TaskMessage.model_validate(said).request == job.request
     for forged in ({"object": "cup"}, {"object": "../cup", "digest": "a" * 32}, {"object": "cup", "digest": "../x"}):
@@ -156,9 +156,9 @@ def test_a_forged_entry_cannot_name_a_neighbour_without_its_files(parts: Parts) 
             TaskMessage.model_validate({**said, "request": {**said["request"], "neighbours": [forged]}})
 
 
-def test_a_job_without_neighbours_needs_no_other_object(parts: Parts) -> None:
-    add(parts, "cup")
-    job = submit(parts)
+def test_a_job_without_neighbours_needs_no_other_object(services: Services) -> None:
+    add(services, "cup")
+    job = submit(services)
     assert job.assets == ((AssetKind.HAND, job.hand_digest), (AssetKind.OBJECT, job.object_digest))
     assert "neighbours" not in job.request.model_dump()
-    delete_asset(parts, AssetKind.OBJECT, "cup")
+    delete_asset(services, AssetKind.OBJECT, "cup")

@@ -18,7 +18,7 @@ from service.model.errors import InputError
 from service.model.records import JobRecord
 from service.model.states import Stage, State
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.integrity import scan
 from service.pipeline.repair import repair
 from service.readers import open_shards
@@ -34,68 +34,68 @@ from tests.service.pipeline.test_integrity import work_off
 
 
 @pytest.fixture
-def parts(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Parts]:
+def services(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Services]:
     yield from parts_on("files", request, tmp_path)
 
 
-def submit(parts: Parts, batches: int) -> tuple[str, list[Any]]:
+def submit(services: Services, batches: int) -> tuple[str, list[Any]]:
     """A job, and its first tasks."""
-    job, _ = job_actions.submit(parts, request(grasps=32 * batches))
-    return job.id, tasks_of(read_record(JobRecord, parts.store, names.job_record(job.id)))
+    job, _ = job_actions.submit(services, request(grasps=32 * batches))
+    return job.id, tasks_of(read_record(JobRecord, services.store, names.job_record(job.id)))
 
 
-def is_whole(parts: Parts, job: str) -> bool:
-    return parts.index.jobs.get(job).state is State.SUCCEEDED and differences(parts.index, parts.store) == []
+def is_whole(services: Services, job: str) -> bool:
+    return services.index.jobs.get(job).state is State.SUCCEEDED and differences(services.index, services.store) == []
 
 
-def test_a_controller_takes_packs_apart_when_it_starts(parts: Parts) -> None:
-    job, tasks = submit(parts, 3)
-    pack(parts.store, tasks)
-    Bench(parts).controller.round()
-    assert not has_packs(parts.store)
-    assert is_whole(parts, job)
-    assert not parts.index.jobs.attempts(job=job)
+def test_a_controller_takes_packs_apart_when_it_starts(services: Services) -> None:
+    job, tasks = submit(services, 3)
+    pack(services.store, tasks)
+    Bench(services).controller.round()
+    assert not has_packs(services.store)
+    assert is_whole(services, job)
+    assert not services.index.jobs.attempts(job=job)
 
 
-def test_what_a_worker_of_0_2_packs_meanwhile_is_found_and_no_attempt_is_used_up(parts: Parts) -> None:
-    bench = Bench(parts)
+def test_what_a_worker_of_0_2_packs_meanwhile_is_found_and_no_attempt_is_used_up(services: Services) -> None:
+    bench = Bench(services)
     bench.controller.round()
-    job, tasks = submit(parts, 3)
+    job, tasks = submit(services, 3)
     in_hand = [bench.take() for _ in tasks]
     bench.pass_time(1)
-    pack(parts.store, tasks)  # what it tells of them, an event `packed`, nobody understands any more
+    pack(services.store, tasks)  # what it tells of them, an event `packed`, nobody understands any more
     for delivery in in_hand:
         bench.queue.finish(delivery)
     bench.pass_time(6)
-    assert not has_packs(parts.store)
-    assert is_whole(parts, job)
-    assert (parts.index.jobs.attempts(job=job), parts.queue.waiting()) == ([], set())
+    assert not has_packs(services.store)
+    assert is_whole(services, job)
+    assert (services.index.jobs.attempts(job=job), services.queue.waiting()) == ([], set())
 
 
-def test_what_is_harmed_in_a_pack_is_made_again_with_the_checksum_it_had(parts: Parts) -> None:
-    job, tasks = submit(parts, 2)
-    key = pack(parts.store, tasks)
-    overwrite(parts.store, key, flipped(parts.store.get(key), len(parts.store.get(key)) - 200))
-    Bench(parts).controller.round()
-    found = [wrong for _, wrong in scan(parts.store) if wrong is not None]
+def test_what_is_harmed_in_a_pack_is_made_again_with_the_checksum_it_had(services: Services) -> None:
+    job, tasks = submit(services, 2)
+    key = pack(services.store, tasks)
+    overwrite(services.store, key, flipped(services.store.get(key), len(services.store.get(key)) - 200))
+    Bench(services).controller.round()
+    found = [wrong for _, wrong in scan(services.store) if wrong is not None]
     assert [wrong.shard for wrong in found] == [tasks[1].output]
-    assert repair(parts, found) == (found, [])
-    work_off(parts)
-    assert [wrong for _, wrong in scan(parts.store) if wrong is not None] == []
-    assert is_whole(parts, job)
+    assert repair(services, found) == (found, [])
+    work_off(services)
+    assert [wrong for _, wrong in scan(services.store) if wrong is not None] == []
+    assert is_whole(services, job)
 
 
-def test_readers_name_the_command_and_then_read_a_snapshot_of_places_in_packs(parts: Parts) -> None:
-    job, tasks = submit(parts, 2)
-    pack(parts.store, tasks)
-    for source in (parts.store, parts.settings.data_dir / "store"):
+def test_readers_name_the_command_and_then_read_a_snapshot_of_places_in_packs(services: Services) -> None:
+    job, tasks = submit(services, 2)
+    pack(services.store, tasks)
+    for source in (services.store, services.settings.data_dir / "store"):
         with pytest.raises(InputError, match="graspd admin store upgrade"):
             open_shards(source, job=job)
     told = CliRunner().invoke(
-        store_commands.app, ["store", "upgrade", "--json", "--data-dir", str(parts.settings.data_dir)]
+        store_commands.app, ["store", "upgrade", "--json", "--data-dir", str(services.settings.data_dir)]
     )
     assert json.loads(told.stdout.splitlines()[-1]) == {"shards": 2}
-    found = open_shards(parts.store, job=job, cache=parts.settings.data_dir / "cache")
+    found = open_shards(services.store, job=job, cache=services.settings.data_dir / "cache")
     shards = [
         {
             "id": file.id, "kind": "base", "key": f"packs/{'a' * 32}/{'b' * 32}.pack@{row}+100", "sha256": file.sha256,
@@ -105,16 +105,20 @@ def test_readers_name_the_command_and_then_read_a_snapshot_of_places_in_packs(pa
     ]  # fmt: skip
     sums = {"complete": True, "grasps": 64, "valid": 2, "size_bytes": 2, "dataset_digest": "d" * 32}
     taken = Snapshot(dataset="d", digest="c" * 32, created=timestamp(), shards=shards, **sums)
-    put_record(parts.store, f"{names.DATASETS}/d/snapshots/{taken.digest}.json", taken)
-    of_snapshot = open_shards(parts.store, dataset="d", snapshot=taken.digest, cache=parts.settings.data_dir / "cache")
+    put_record(services.store, f"{names.DATASETS}/d/snapshots/{taken.digest}.json", taken)
+    of_snapshot = open_shards(
+        services.store, dataset="d", snapshot=taken.digest, cache=services.settings.data_dir / "cache"
+    )
     assert [of_snapshot.path(file) for file in of_snapshot] == [found.path(file) for file in found]
 
 
-def test_an_index_that_is_made_anew_has_what_was_in_packs(parts: Parts) -> None:
-    job, tasks = submit(parts, 2)
-    pack(parts.store, tasks)
-    told = CliRunner().invoke(commands.app, ["index", "rebuild", "--json", "--data-dir", str(parts.settings.data_dir)])
+def test_an_index_that_is_made_anew_has_what_was_in_packs(services: Services) -> None:
+    job, tasks = submit(services, 2)
+    pack(services.store, tasks)
+    told = CliRunner().invoke(
+        commands.app, ["index", "rebuild", "--json", "--data-dir", str(services.settings.data_dir)]
+    )
     assert told.exit_code == 0, told.output
     assert json.loads(told.stdout.splitlines()[-1])["shards"] == 2
-    assert is_whole(parts, job)
-    assert [shard.stage for shard in parts.index.shards.page(job=job).items] == [Stage.SYNTHESIZE] * 2
+    assert is_whole(services, job)
+    assert [shard.stage for shard in services.index.shards.page(job=job).items] == [Stage.SYNTHESIZE] * 2

@@ -20,7 +20,7 @@ from service.model.states import AssetKind, Lane, Stage, State
 from service.model.version import SCHEMA_OF_RANGES, STAGE_REVISIONS, TASK_SCHEMA
 from service.model.worker_beat import WorkerBeat
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.ranges import TaskRanges, span_of
@@ -35,9 +35,9 @@ from worker.stages.output import shard_of
 
 
 @pytest.fixture
-def parts(parts: Parts) -> Parts:
+def services(services: Services) -> Services:
     """A service whose tasks last half a minute."""
-    return replace(parts, settings=parts.settings.model_copy(update={"task_s": 30.0}))
+    return replace(services, settings=services.settings.model_copy(update={"task_s": 30.0}))
 
 
 def worker(name: str = "w", *, device: str = "cpu", schemas: tuple[int, int] = (2, TASK_SCHEMA)) -> WorkerBeat:
@@ -48,23 +48,23 @@ def worker(name: str = "w", *, device: str = "cpu", schemas: tuple[int, int] = (
     )  # fmt: skip
 
 
-def here(parts: Parts, *workers: WorkerBeat) -> None:
-    parts.queue._workers = {one.name: one for one in workers}  # type: ignore[attr-defined]
+def here(services: Services, *workers: WorkerBeat) -> None:
+    services.queue._workers = {one.name: one for one in workers}  # type: ignore[attr-defined]
 
 
-def measured(parts: Parts, seconds: float) -> None:
+def measured(services: Services, seconds: float) -> None:
     """A batch took so long."""
-    job, _ = job_actions.submit(parts, request(seed=99))
-    (task,) = plan(record := JobRecord.model_validate_json(parts.store.get(f"jobs/{job.id}/job.json")))
+    job, _ = job_actions.submit(services, request(seed=99))
+    (task,) = plan(record := JobRecord.model_validate_json(services.store.get(f"jobs/{job.id}/job.json")))
     message = message_of(record, task, attempt=1, max_attempt=1)
-    made = fake_stages()[Stage.SYNTHESIZE](message, TaskContext(parts.store))
+    made = fake_stages()[Stage.SYNTHESIZE](message, TaskContext(services.store))
     manifest, data = shard_of(message, made, device="cpu", seconds=seconds, worker="w")
-    publish_shard(parts.store, manifest, data)
-    parts.index.write.add_manifest(manifest)
+    publish_shard(services.store, manifest, data)
+    services.index.write.add_manifest(manifest)
 
 
-def span(parts: Parts, grasps: int, lane: Lane = Lane.BULK, **changes: object) -> int:
-    return job_actions.prepare(parts, request(grasps=grasps, **changes), lane=lane).span
+def span(services: Services, grasps: int, lane: Lane = Lane.BULK, **changes: object) -> int:
+    return job_actions.prepare(services, request(grasps=grasps, **changes), lane=lane).span
 
 
 @given(st.integers(1, 40_000), st.integers(0, 5000), st.integers(0, 300))
@@ -79,112 +79,118 @@ def test_tasks_are_of_one_length_and_no_worker_waits_while_another_has_two(
         assert found <= math.ceil(batches / workers)
 
 
-def test_a_task_of_a_larger_job_lasts_about_as_long_as_the_settings_say(parts: Parts) -> None:
-    here(parts, worker())
-    assert span(parts, 32 * 100) == 4, "nothing was measured: a stored rate on two cores, 7 s a batch"
+def test_a_task_of_a_larger_job_lasts_about_as_long_as_the_settings_say(services: Services) -> None:
+    here(services, worker())
+    assert span(services, 32 * 100) == 4, "nothing was measured: a stored rate on two cores, 7 s a batch"
     # Half of what the fakes make is valid, so that a job of so many valid ones takes twice the tries of a batch.
-    measured(parts, 0.5)
-    assert 20 <= span(parts, 32 * 1000) <= 40
-    measured(parts, 60.0)
-    assert span(parts, 32 * 1000) == 1
+    measured(services, 0.5)
+    assert 20 <= span(services, 32 * 1000) <= 40
+    measured(services, 60.0)
+    assert span(services, 32 * 1000) == 1
 
 
-def test_a_job_of_ten_thousand_grasps_makes_few_objects(parts: Parts) -> None:
-    here(parts, worker())
-    usual = replace(parts, settings=Settings(data_dir=parts.settings.data_dir))
+def test_a_job_of_ten_thousand_grasps_makes_few_objects(services: Services) -> None:
+    here(services, worker())
+    usual = replace(services, settings=Settings(data_dir=services.settings.data_dir))
     on_two_cores = job_actions.prepare(usual, request(grasps=10_000), lane=Lane.BULK)
     assert 2 * len(list(plan(on_two_cores))) == 80
-    measured(parts, 0.1)
-    job = job_actions.prepare(parts, request(grasps=10_000), lane=Lane.BULK)
+    measured(services, 0.1)
+    job = job_actions.prepare(services, request(grasps=10_000), lane=Lane.BULK)
     assert 2 * len(list(plan(job))) <= 12
-    slow = replace(parts, settings=parts.settings.model_copy(update={"task_s": 0.0}))
+    slow = replace(services, settings=services.settings.model_copy(update={"task_s": 0.0}))
     assert 2 * len(list(plan(job_actions.prepare(slow, request(grasps=10_000), lane=Lane.BULK)))) == 626
 
 
-def test_workers_share_a_job_fairly(parts: Parts) -> None:
-    measured(parts, 0.01)
-    here(parts, *(worker(f"w{number}") for number in range(4)))
-    assert span(parts, 32 * 16) == 4
-    here(parts, worker("a"), worker("b"))
-    assert span(parts, 32 * 16) == 8
-    here(parts)
-    assert span(parts, 32 * 16) == 2, "a fleet may start once tasks wait"
+def test_workers_share_a_job_fairly(services: Services) -> None:
+    measured(services, 0.01)
+    here(services, *(worker(f"w{number}") for number in range(4)))
+    assert span(services, 32 * 16) == 4
+    here(services, worker("a"), worker("b"))
+    assert span(services, 32 * 16) == 8
+    here(services)
+    assert span(services, 32 * 16) == 2, "a fleet may start once tasks wait"
 
 
 @pytest.mark.parametrize(("cells", "tasks"), [(1, 4), (2, 2), (8, 1)])
-def test_cells_of_a_dataset_share_the_workers(parts: Parts, cells: int, tasks: int) -> None:
-    measured(parts, 0.01)
-    here(parts, *(worker(f"w{number}") for number in range(4)))
+def test_cells_of_a_dataset_share_the_workers(services: Services, cells: int, tasks: int) -> None:
+    measured(services, 0.01)
+    here(services, *(worker(f"w{number}") for number in range(4)))
     for number in range(1, cells):
-        asset = publish_asset(parts.store, AssetKind.OBJECT, f"ball{number}", {**OBJECT_FILES, "n": bytes([number])})
-        parts.index.write.add_asset(asset, {"verdict": "accept", "message": "fine"})
+        asset = publish_asset(services.store, AssetKind.OBJECT, f"ball{number}", {**OBJECT_FILES, "n": bytes([number])})
+        services.index.write.add_asset(asset, {"verdict": "accept", "message": "fine"})
     objects = ("ball", *(f"ball{number}" for number in range(1, cells)))
-    actions.create(parts, DatasetRequest(name="d", hands=("gripper",), objects=objects, grasps=32 * 16))
-    assert parts.index.datasets.get("d").tasks == 16 * cells, "what it would be with a batch a task, until it is known"
-    plan_all(parts)
-    dataset = parts.index.datasets.get("d")
+    actions.create(services, DatasetRequest(name="d", hands=("gripper",), objects=objects, grasps=32 * 16))
+    assert services.index.datasets.get("d").tasks == 16 * cells, (
+        "what it would be with a batch a task, until it is known"
+    )
+    plan_all(services)
+    dataset = services.index.datasets.get("d")
     assert dataset.tasks == tasks * cells
-    assert {cell.tasks for cell in parts.index.datasets.cells("d").items} == {tasks}
+    assert {cell.tasks for cell in services.index.datasets.cells("d").items} == {tasks}
 
 
-def test_a_small_job_shows_its_grasps_batch_by_batch_but_for_a_gpu_that_makes_them_in_one_launch(parts: Parts) -> None:
-    measured(parts, 0.01)
-    here(parts, worker())
-    assert span(parts, 128, Lane.INTERACTIVE) == 1
-    here(parts, worker(device="cuda:0"))
-    assert span(parts, 128, Lane.INTERACTIVE) == 4
-    here(parts, worker("a", device="cuda:0"), worker("b"))
-    assert span(parts, 128, Lane.INTERACTIVE) == 1
+def test_a_small_job_shows_its_grasps_batch_by_batch_but_for_a_gpu_that_makes_them_in_one_launch(
+    services: Services,
+) -> None:
+    measured(services, 0.01)
+    here(services, worker())
+    assert span(services, 128, Lane.INTERACTIVE) == 1
+    here(services, worker(device="cuda:0"))
+    assert span(services, 128, Lane.INTERACTIVE) == 4
+    here(services, worker("a", device="cuda:0"), worker("b"))
+    assert span(services, 128, Lane.INTERACTIVE) == 1
 
 
-def test_pictures_and_older_workers_keep_one_batch_a_task(parts: Parts) -> None:
-    measured(parts, 0.01)
-    here(parts, worker())
-    assert span(parts, 3200, scenes=1, views=1) == 1
-    assert span(parts, 3200, scenes=1) > 1
-    here(parts, worker("new"), worker("old", schemas=(2, SCHEMA_OF_RANGES - 1)))
-    assert span(parts, 3200) == 1
-    known = job_actions.prepare(parts, request(grasps=3200, scenes=1, views=1))
+def test_pictures_and_older_workers_keep_one_batch_a_task(services: Services) -> None:
+    measured(services, 0.01)
+    here(services, worker())
+    assert span(services, 3200, scenes=1, views=1) == 1
+    assert span(services, 3200, scenes=1) > 1
+    here(services, worker("new"), worker("old", schemas=(2, SCHEMA_OF_RANGES - 1)))
+    assert span(services, 3200) == 1
+    known = job_actions.prepare(services, request(grasps=3200, scenes=1, views=1))
     with pytest.raises(ValidationError, match="pictures"):
         JobRecord.model_validate({**known.model_dump(mode="json"), "span": 2})
 
 
-def test_rates_and_workers_are_read_once_for_many_jobs(parts: Parts) -> None:
-    here(parts, worker())
+def test_rates_and_workers_are_read_once_for_many_jobs(services: Services) -> None:
+    here(services, worker())
     now = 0.0
-    ranges = TaskRanges(parts, clock=lambda: now)
-    job = job_actions.prepare(replace(parts, settings=parts.settings.model_copy(update={"task_s": 0.0})),
+    ranges = TaskRanges(services, clock=lambda: now)
+    job = job_actions.prepare(replace(services, settings=services.settings.model_copy(update={"task_s": 0.0})),
                               request(grasps=3200), lane=Lane.BULK)  # fmt: skip
     assert ranges.sized(job).span == 4
-    measured(parts, 0.01)
+    measured(services, 0.01)
     assert ranges.sized(job).span == 4
     now = 60.0
     assert ranges.sized(job).span > 4
 
 
-def test_a_job_of_ranges_goes_through_its_stages_and_the_index_is_the_store(parts: Parts) -> None:
-    bench = Bench(parts)
+def test_a_job_of_ranges_goes_through_its_stages_and_the_index_is_the_store(services: Services) -> None:
+    bench = Bench(services)
     bench.controller.round()
-    here(parts, worker())
-    job = job_actions.prepare(parts, request(grasps=32 * 6 + 5, scenes=2), lane=Lane.BULK)
+    here(services, worker())
+    job = job_actions.prepare(services, request(grasps=32 * 6 + 5, scenes=2), lane=Lane.BULK)
     assert job.span == 4
-    job_actions.enter(parts, job)
+    job_actions.enter(services, job)
     bench.work_off()
-    done = parts.index.jobs.get(job.id)
+    done = services.index.jobs.get(job.id)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 197)
     assert [stage.tasks for stage in done.stages] == [2, 2]
-    shards = parts.index.shards.page(job=job.id).items
+    shards = services.index.shards.page(job=job.id).items
     assert {(shard.stage, shard.batch) for shard in shards} == {
         (s, b) for s in (Stage.SYNTHESIZE, Stage.SCENE) for b in (0, 4)
     }
-    assert differences(parts.index, parts.store) == []
+    assert differences(services.index, services.store) == []
 
 
-def test_shards_of_many_batches_enter_the_index_in_short_turns(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench = Bench(parts)
+def test_shards_of_many_batches_enter_the_index_in_short_turns(
+    services: Services, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(services)
     bench.controller.round()
-    record = job_actions.prepare(parts, request(grasps=32 * 64 * 5), lane=Lane.BULK)
-    job, _ = job_actions.enter(parts, record.model_copy(update={"span": 64}))
+    record = job_actions.prepare(services, request(grasps=32 * 64 * 5), lane=Lane.BULK)
+    job, _ = job_actions.enter(services, record.model_copy(update={"span": 64}))
     turns: list[int] = []
     add = Changes.add_manifests
 
@@ -196,5 +202,5 @@ def test_shards_of_many_batches_enter_the_index_in_short_turns(parts: Parts, mon
     while (delivery := bench.queue.take("w")) is not None:
         bench.do(delivery)
     bench.pass_time(1)
-    assert parts.index.jobs.get(job.id).state is State.SUCCEEDED
+    assert services.index.jobs.get(job.id).state is State.SUCCEEDED
     assert turns == [256, 64]

@@ -11,7 +11,7 @@ from service.model import names
 from service.model.errors import SceneError
 from service.model.states import AssetKind
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.scene_check import check_scene
 from service.store.library import load_asset
 from tests.fakes import request
@@ -54,10 +54,10 @@ def test_where_the_centre_is_not_known_a_worker_tells() -> None:
     check_scene(request(scene={"supports": [GROUND], "target": [0, 0, -1, *UPRIGHT]}), ball(None))
 
 
-def test_a_refused_scene_leaves_no_job_behind(parts: Parts) -> None:
-    asset = parts.index.assets.get(AssetKind.OBJECT, "ball")
+def test_a_refused_scene_leaves_no_job_behind(services: Services) -> None:
+    asset = services.index.assets.get(AssetKind.OBJECT, "ball")
     facts = {"verdict": "accept", "facts": {"centre_of_mass_m": [0.0, 0.0, 0.0]}}
-    parts.index.write.add_asset(load_asset(parts.store, AssetKind.OBJECT, asset.digest), facts)
+    services.index.write.add_asset(load_asset(services.store, AssetKind.OBJECT, asset.digest), facts)
     with pytest.raises(SceneError, match="ball stands in support 0"):
-        job_actions.submit(parts, request(scene={"supports": [GROUND], "target": [0, 0, 0, *UPRIGHT]}))
-    assert list(parts.store.list(names.JOBS)) == []
+        job_actions.submit(services, request(scene={"supports": [GROUND], "target": [0, 0, 0, *UPRIGHT]}))
+    assert list(services.store.list(names.JOBS)) == []

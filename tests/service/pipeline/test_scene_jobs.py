@@ -11,104 +11,104 @@ from service.model.planning import message_of, plan
 from service.model.records import AttemptRecord, JobRecord
 from service.model.states import Stage, State
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.store.records import put_record, read_record
 from tests.fakes import make_shard, request
 
 
-def submit(parts: Parts, **changes: object) -> JobRecord:
-    job, _ = job_actions.submit(parts, request(**{"scene": "table", **changes}))
-    return read_record(JobRecord, parts.store, names.job_record(job.id))
+def submit(services: Services, **changes: object) -> JobRecord:
+    job, _ = job_actions.submit(services, request(**{"scene": "table", **changes}))
+    return read_record(JobRecord, services.store, names.job_record(job.id))
 
 
-def make(parts: Parts, job: JobRecord, stage: Stage, batch: int = 0) -> None:
+def make(services: Services, job: JobRecord, stage: Stage, batch: int = 0) -> None:
     task = next(task for task in plan(job) if task.stage is stage and task.batch == batch)
-    parts.index.write.add_manifest(make_shard(parts.store, message_of(job, task, attempt=1, max_attempt=3)))
+    services.index.write.add_manifest(make_shard(services.store, message_of(job, task, attempt=1, max_attempt=3)))
 
 
-def fail(parts: Parts, job: JobRecord, batch: int, kind: str, number: int = 1) -> None:
+def fail(services: Services, job: JobRecord, batch: int, kind: str, number: int = 1) -> None:
     """The last attempt at a batch's grasps."""
     task = next(task for task in plan(job) if task.stage is Stage.SYNTHESIZE and task.batch == batch)
     attempt = AttemptRecord(
         task_id=task.id, job_id=job.id, stage=task.stage, number=number, kind=kind,
         reason="none of 128 grasps tried is valid in its scene", worker="w", ended=timestamp(), last=True,
     )  # fmt: skip
-    put_record(parts.store, names.attempt(task.id, number), attempt)
-    parts.index.write.add_attempt(attempt)
+    put_record(services.store, names.attempt(task.id, number), attempt)
+    services.index.write.add_attempt(attempt)
 
 
-def states(parts: Parts, job: JobRecord) -> dict[tuple[int, Stage], State]:
-    return {(task.batch, task.stage): task.state for task in parts.index.jobs.tasks(job=job.id).items}
+def states(services: Services, job: JobRecord) -> dict[tuple[int, Stage], State]:
+    return {(task.batch, task.stage): task.state for task in services.index.jobs.tasks(job=job.id).items}
 
 
-def test_scenes_are_made_before_grasps_and_told_in_that_order(parts: Parts) -> None:
-    job = submit(parts, grasps=64, views=1)
-    assert len(parts.queue.waiting()) == 2, "the scenes of both batches"
-    told = parts.index.jobs.get(job.id).stages
+def test_scenes_are_made_before_grasps_and_told_in_that_order(services: Services) -> None:
+    job = submit(services, grasps=64, views=1)
+    assert len(services.queue.waiting()) == 2, "the scenes of both batches"
+    told = services.index.jobs.get(job.id).stages
     assert [(stage.stage, stage.tasks) for stage in told] == [
         (Stage.SCENE, 2), (Stage.SYNTHESIZE, 2), (Stage.RENDER, 2)
     ]  # fmt: skip
-    make(parts, job, Stage.SCENE)
-    ready = [(task.task.batch, task.task.stage) for task in parts.index.feed.ready_of_job(job.id, limit=9)]
+    make(services, job, Stage.SCENE)
+    ready = [(task.task.batch, task.task.stage) for task in services.index.feed.ready_of_job(job.id, limit=9)]
     assert ready == [(0, Stage.SYNTHESIZE)], "the other batch's scenes are queued already"
 
 
 @pytest.mark.parametrize("kind", ["SceneError", "LoadError"])
-def test_a_job_ends_when_its_first_batch_finds_nothing_in_its_scenes(parts: Parts, kind: str) -> None:
-    job = submit(parts, grasps=128)
+def test_a_job_ends_when_its_first_batch_finds_nothing_in_its_scenes(services: Services, kind: str) -> None:
+    job = submit(services, grasps=128)
     for batch in range(2):
-        make(parts, job, Stage.SCENE, batch)
-    make(parts, job, Stage.SYNTHESIZE, 1)
-    fail(parts, job, 0, kind)
-    ended = parts.index.jobs.get(job.id)
+        make(services, job, Stage.SCENE, batch)
+    make(services, job, Stage.SYNTHESIZE, 1)
+    fail(services, job, 0, kind)
+    ended = services.index.jobs.get(job.id)
     assert (ended.state, ended.reason) == (State.FAILED, "none of 128 grasps tried is valid in its scene")
-    found = states(parts, job)
+    found = states(services, job)
     assert found[0, Stage.SYNTHESIZE] is State.FAILED
     assert found[1, Stage.SYNTHESIZE] is State.SUCCEEDED, "what is made stays"
     assert {found[batch, stage] for batch in (2, 3) for stage in (Stage.SCENE, Stage.SYNTHESIZE)} == {State.CANCELLED}
-    assert parts.index.feed.ready_of_job(job.id, limit=9) == []
+    assert services.index.feed.ready_of_job(job.id, limit=9) == []
 
 
-def test_a_retry_takes_up_the_batches_that_were_not_made(parts: Parts) -> None:
-    job = submit(parts, grasps=64)
-    make(parts, job, Stage.SCENE)
-    fail(parts, job, 0, "SceneError")
-    job_actions.retry(parts, job.id)
-    found = states(parts, job)
+def test_a_retry_takes_up_the_batches_that_were_not_made(services: Services) -> None:
+    job = submit(services, grasps=64)
+    make(services, job, Stage.SCENE)
+    fail(services, job, 0, "SceneError")
+    job_actions.retry(services, job.id)
+    found = states(services, job)
     assert {found[0, Stage.SYNTHESIZE], found[1, Stage.SCENE], found[1, Stage.SYNTHESIZE]} == {State.QUEUED}
-    fail(parts, job, 0, "SceneError", number=2)
-    assert states(parts, job)[1, Stage.SCENE] is State.CANCELLED
+    fail(services, job, 0, "SceneError", number=2)
+    assert states(services, job)[1, Stage.SCENE] is State.CANCELLED
 
 
 @pytest.mark.parametrize(("batch", "kind"), [(1, "SceneError"), (0, "WorkerLost")])
-def test_a_later_batch_or_another_fault_stops_no_other_batch(parts: Parts, batch: int, kind: str) -> None:
-    job = submit(parts, grasps=96)
+def test_a_later_batch_or_another_fault_stops_no_other_batch(services: Services, batch: int, kind: str) -> None:
+    job = submit(services, grasps=96)
     for one in range(2):
-        make(parts, job, Stage.SCENE, one)
-    fail(parts, job, batch, kind)
-    found = states(parts, job)
+        make(services, job, Stage.SCENE, one)
+    fail(services, job, batch, kind)
+    found = states(services, job)
     assert found[batch, Stage.SYNTHESIZE] is State.FAILED
     assert found[1 - batch, Stage.SYNTHESIZE] is State.QUEUED
     assert found[2, Stage.SCENE] is State.QUEUED
-    assert parts.index.jobs.get(job.id).state is State.RUNNING
+    assert services.index.jobs.get(job.id).state is State.RUNNING
 
 
-def test_grasps_are_found_by_their_scene_and_what_they_hold_there(parts: Parts) -> None:
-    free = read_record(JobRecord, parts.store, names.job_record(job_actions.submit(parts, request())[0].id))
-    make(parts, free, Stage.SYNTHESIZE)
-    table, inside = submit(parts), submit(parts, scene="bin", seed=1)
+def test_grasps_are_found_by_their_scene_and_what_they_hold_there(services: Services) -> None:
+    free = read_record(JobRecord, services.store, names.job_record(job_actions.submit(services, request())[0].id))
+    make(services, free, Stage.SYNTHESIZE)
+    table, inside = submit(services), submit(services, scene="bin", seed=1)
     for job in (table, inside):
-        make(parts, job, Stage.SCENE)
-        make(parts, job, Stage.SYNTHESIZE)
+        make(services, job, Stage.SCENE)
+        make(services, job, Stage.SYNTHESIZE)
 
     def count(**where: object) -> int:
-        return len(parts.index.grasps.page(GraspFilter.model_validate(where), limit=200).items)
+        return len(services.index.grasps.page(GraspFilter.model_validate(where), limit=200).items)
 
     assert [count(scene=kind) for kind in ("free", "table", "bin", "shelf", "any", None)] == [32, 32, 32, 0, 64, 96]
     held = count(scene="table", lift_hard=True)
     assert held == count(scene="table", valid=True) > 0
     assert count(lift_hard=True, scene="free") == 0
-    far = parts.index.grasps.page(
+    far = services.index.grasps.page(
         GraspFilter(at_least={"clearance_m": 0.5}), sort=GraspSort(by="clearance_m"), limit=200
     ).items
     assert far and {grasp.scene_kind for grasp in far} == {"table", "bin"}

@@ -23,7 +23,7 @@ from rq.worker import BaseWorker
 
 from service.model.states import Lane, Stage, State
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.indexer import Indexer
 from service.pipeline.lease_reaper import LeaseReaper
 from service.queue.lists import queue_name
@@ -38,43 +38,43 @@ LEASE_S = 60
 
 
 @pytest.fixture
-def held(parts: Parts, rq_queue: RqQueue) -> tuple[Parts, Job]:
+def held(services: Services, rq_queue: RqQueue) -> tuple[Services, Job]:
     """A task that a worker of RQ took just now, and beats for."""
-    parts = replace(parts, queue=rq_queue)
-    job, _ = job_actions.submit(parts, request())
-    (task,) = parts.index.jobs.tasks(job=job.id).items
+    services = replace(services, queue=rq_queue)
+    job, _ = job_actions.submit(services, request())
+    (task,) = services.index.jobs.tasks(job=job.id).items
     assert Queue(NAME, connection=rq_queue.connection).pop_job_id() == rq_id(task.id, 1)
     taken = Job.fetch(rq_id(task.id, 1), connection=rq_queue.connection, serializer=JSONSerializer)
     with rq_queue.connection.pipeline() as pipe:
         Execution.create(taken, ttl=LEASE_S, pipeline=pipe)
         pipe.execute()
-    return parts, taken
+    return services, taken
 
 
 def test_a_clock_that_is_ahead_takes_no_task_from_a_worker_that_lives(
-    held: tuple[Parts, Job], monkeypatch: pytest.MonkeyPatch
+    held: tuple[Services, Job], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    parts, job = held
-    registry = StartedJobRegistry(NAME, connection=parts.queue.connection, serializer=JSONSerializer)  # type: ignore[attr-defined]
+    services, job = held
+    registry = StartedJobRegistry(NAME, connection=services.queue.connection, serializer=JSONSerializer)  # type: ignore[attr-defined]
     now = [0.0]
-    reaper = LeaseReaper(parts, Indexer(parts), clock=lambda: now[0])
+    reaper = LeaseReaper(services, Indexer(services), clock=lambda: now[0])
     ahead = time.time() + 10 * LEASE_S
     monkeypatch.setattr(time, "time", lambda: ahead)
     for _ in range(50):
         now[0] += 1.0
         for entry, score in registry.connection.zrange(registry.key, 0, -1, withscores=True):
             registry.connection.zadd(registry.key, {entry: score + 1})  # a beat, by the worker's own clock
-        assert reaper.reap(parts.queue.leases()) == []
-    assert not parts.index.jobs.attempts(task=job.id.rpartition("-")[0])
+        assert reaper.reap(services.queue.leases()) == []
+    assert not services.index.jobs.attempts(task=job.id.rpartition("-")[0])
     # RQ's own cleaning up, at that moment by that clock.
     registry.cleanup(timestamp=ahead)
     assert job.get_status() == "failed", "RQ calls it abandoned"
     assert not registry.connection.exists(held_key(NAME))
 
 
-def test_a_command_that_is_published_while_nobody_listens_is_lost_and_a_key_is_not(held: tuple[Parts, Job]) -> None:
-    parts, job = held
-    connection = parts.queue.connection  # type: ignore[attr-defined]
+def test_a_command_that_is_published_while_nobody_listens_is_lost_and_a_key_is_not(held: tuple[Services, Job]) -> None:
+    services, job = held
+    connection = services.queue.connection  # type: ignore[attr-defined]
     job.worker_name = "w"
     job.save()
     connection.hset(job.key, "worker_name", "w")
@@ -87,7 +87,7 @@ def test_a_command_that_is_published_while_nobody_listens_is_lost_and_a_key_is_n
     ]
     assert said == []
     task = job.id.rpartition("-")[0]
-    parts.queue.discard([task])
+    services.queue.discard([task])
     assert connection.exists(cancel_key(task)), "its next beat finds this"
     listener.close()
 
@@ -96,21 +96,21 @@ def _fail() -> None:
     raise RuntimeError("as a task does")
 
 
-def test_retries_that_redis_counts_are_lost_with_it_and_those_of_the_store_are_not(held: tuple[Parts, Job]) -> None:
-    parts, job = held
-    connection = parts.queue.connection  # type: ignore[attr-defined]
+def test_retries_that_redis_counts_are_lost_with_it_and_those_of_the_store_are_not(held: tuple[Services, Job]) -> None:
+    services, job = held
+    connection = services.queue.connection  # type: ignore[attr-defined]
     plain = Queue("plain", connection=connection, serializer=JSONSerializer)
     failed = plain.enqueue(_fail, retry=Retry(max=1, interval=1))
     SimpleWorker([plain], connection=connection, serializer=JSONSerializer).work(burst=True, logging_level="CRITICAL")
     waits = ScheduledJobRegistry(queue=plain)
     assert (failed.get_status(), waits.get_job_ids()) == ("scheduled", [failed.id])
     now = [0.0]
-    reaper = LeaseReaper(parts, Indexer(parts), clock=lambda: now[0])
-    while not reaper.reap(parts.queue.leases()):  # a worker that is silent
+    reaper = LeaseReaper(services, Indexer(services), clock=lambda: now[0])
+    while not reaper.reap(services.queue.leases()):  # a worker that is silent
         now[0] += 1.0
     connection.flushdb()
     assert waits.get_job_ids() == [], "nobody knows of it"
-    task = parts.index.jobs.task(job.id.rpartition("-")[0])
+    task = services.index.jobs.task(job.id.rpartition("-")[0])
     assert (task.attempt, task.state) == (2, State.QUEUED), "the second attempt is due"
 
 

@@ -16,7 +16,7 @@ from service.model.clock import timestamp
 from service.model.errors import UnavailableError
 from service.model.states import Stage, State
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.controller import Controller
 from service.pipeline.leading import PART
 from service.queue.port import Event, EventKind
@@ -81,18 +81,20 @@ FORGERIES: dict[str, Callable[[Any], object]] = {
 
 
 @pytest.fixture
-def parts(tmp_path: Path, rq_queue: RqQueue) -> Parts:
+def services(tmp_path: Path, rq_queue: RqQueue) -> Services:
     settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0)
-    made = Parts(settings, open_store(settings.resolved_store_url), empty_index(settings.resolved_index_url), rq_queue)
+    made = Services(
+        settings, open_store(settings.resolved_store_url), empty_index(settings.resolved_index_url), rq_queue
+    )
     add_assets(made)
     return made
 
 
 @pytest.mark.parametrize("what", FORGERIES)
-def test_a_forged_entry_stops_neither_feeding_nor_reaping_nor_pages(parts: Parts, what: str) -> None:
+def test_a_forged_entry_stops_neither_feeding_nor_reaping_nor_pages(services: Services, what: str) -> None:
     now = [1000.0]
-    controller = Controller(parts, clock=lambda: now[0])
-    queue: Any = parts.queue
+    controller = Controller(services, clock=lambda: now[0])
+    queue: Any = services.queue
     controller.round()
     queue.connection.zadd(WIP, {"b" * 32 + "-1:execution": 1})  # of a worker that died
     FORGERIES[what](queue.connection)
@@ -101,13 +103,13 @@ def test_a_forged_entry_stops_neither_feeding_nor_reaping_nor_pages(parts: Parts
         with contextlib.suppress(UnavailableError):  # a round may find a part out of order; it puts that right
             controller.round()
     controller.round()
-    job, _ = job_actions.submit(parts, request())
-    (task,) = parts.index.jobs.tasks(job=job.id).items
+    job, _ = job_actions.submit(services, request())
+    (task,) = services.index.jobs.tasks(job=job.id).items
     assert task.id in queue.waiting(), "feeding goes on"
     assert queue.leases() == [], "what nobody holds is taken off"
     queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), task_id=task.id, stage=Stage.SYNTHESIZE))
     controller.round()
-    assert parts.index.jobs.get(job.id).state is State.RUNNING, "events are read"
+    assert services.index.jobs.get(job.id).state is State.RUNNING, "events are read"
     queue.discard([task.id])
     assert task.id not in queue.waiting()
     page = Snapshot()

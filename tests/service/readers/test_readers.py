@@ -13,7 +13,7 @@ from service.model.errors import DamagedShard, InputError, NotFoundError
 from service.model.names import dataset_snapshot, shard_file
 from service.model.records import JobRecord
 from service.model.transforms import compose, pose_from_matrix
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.readers import Grasps, Pictures, ShardCache, Shards, open_shards
 from service.store.records import put_record
 from service.store.shards import Shard, read_shard
@@ -24,58 +24,58 @@ GRASPS = 40
 
 
 @pytest.fixture
-def job(parts: Parts) -> JobRecord:
+def job(services: Services) -> JobRecord:
     """A finished job of two batches with scenes and pictures."""
-    factories.add_builtins(parts)
-    record = factories.add_job(parts, grasps=GRASPS, scenes=2, views=2, width=24, height=16)
-    factories.finish_all(parts, record)
+    factories.add_builtins(services)
+    record = factories.add_job(services, grasps=GRASPS, scenes=2, views=2, width=24, height=16)
+    factories.finish_all(services, record)
     return record
 
 
 @pytest.fixture
-def folder(parts: Parts, job: JobRecord, tmp_path: Path) -> Path:
+def folder(services: Services, job: JobRecord, tmp_path: Path) -> Path:
     """The job's files as a user has them who downloaded them."""
     out = tmp_path / "files"
     out.mkdir()
-    for number, shard in enumerate(open_shards(parts.store, job=job.id, cache=tmp_path / "cache")):
-        (out / f"{number}.h5").write_bytes(parts.store.get(shard.key))
+    for number, shard in enumerate(open_shards(services.store, job=job.id, cache=tmp_path / "cache")):
+        (out / f"{number}.h5").write_bytes(services.store.get(shard.key))
     return out
 
 
-def bases(parts: Parts, shards: Shards) -> list[Shard]:
-    return [read_shard(parts.store.get(file.key), kind="base") for file in shards.of("base")]
+def bases(services: Services, shards: Shards) -> list[Shard]:
+    return [read_shard(services.store.get(file.key), kind="base") for file in shards.of("base")]
 
 
-def test_a_job_in_a_store_is_read_whole(parts: Parts, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(parts.store, job=job.id, cache=tmp_path / "cache")
+def test_a_job_in_a_store_is_read_whole(services: Services, job: JobRecord, tmp_path: Path) -> None:
+    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
     assert [file.kind for file in shards] == ["base", "scene", "views"] * 2
     assert len(Grasps(shards, valid=False)) == GRASPS
 
 
-def test_only_valid_grasps_are_read_unless_all_are_wanted(parts: Parts, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(parts.store, job=job.id, cache=tmp_path / "cache")
-    valid = sum(int(np.count_nonzero(base["quality/valid"])) for base in bases(parts, shards))
+def test_only_valid_grasps_are_read_unless_all_are_wanted(services: Services, job: JobRecord, tmp_path: Path) -> None:
+    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
+    valid = sum(int(np.count_nonzero(base["quality/valid"])) for base in bases(services, shards))
     assert 0 < valid < GRASPS
     assert len(Grasps(shards)) == valid
 
 
-def test_a_sample_is_a_row_of_its_shard(parts: Parts, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(parts.store, job=job.id, cache=tmp_path / "cache")
+def test_a_sample_is_a_row_of_its_shard(services: Services, job: JobRecord, tmp_path: Path) -> None:
+    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
     sample = Grasps(shards)[-1]
     base = read_shard(shards.path(shards.by_id(sample["shard_id"])), kind="base")
     np.testing.assert_array_equal(sample["grasp/hand_pose"], base["grasp/hand_pose"][sample["row"]])
     assert (sample["hand"], sample["object"]) == ("allegro", "mug")
 
 
-def test_arrays_hold_the_samples_in_their_order(parts: Parts, job: JobRecord, tmp_path: Path) -> None:
-    grasps = Grasps(open_shards(parts.store, job=job.id, cache=tmp_path / "cache"))
+def test_arrays_hold_the_samples_in_their_order(services: Services, job: JobRecord, tmp_path: Path) -> None:
+    grasps = Grasps(open_shards(services.store, job=job.id, cache=tmp_path / "cache"))
     arrays = grasps.arrays("quality/epsilon")
     np.testing.assert_array_equal(arrays["quality/epsilon"], [sample["quality/epsilon"] for sample in grasps])
     assert len(arrays["hand"]) == len(grasps)
 
 
-def test_a_condition_keeps_the_grasps_it_holds_for(parts: Parts, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(parts.store, job=job.id, cache=tmp_path / "cache")
+def test_a_condition_keeps_the_grasps_it_holds_for(services: Services, job: JobRecord, tmp_path: Path) -> None:
+    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
     good = Grasps(shards, where=lambda columns: columns["quality/penetration_depth_mm"] < 0.5)
     assert 0 < len(good) < len(Grasps(shards))
     assert all(sample["quality/penetration_depth_mm"] < 0.5 for sample in good)
@@ -86,8 +86,10 @@ def test_a_condition_of_the_wrong_length_is_told(folder: Path) -> None:
         Grasps(open_shards(folder), where=lambda columns: np.ones(3, bool))
 
 
-def test_files_in_a_folder_are_the_same_dataset(parts: Parts, job: JobRecord, folder: Path, tmp_path: Path) -> None:
-    stored = Grasps(open_shards(parts.store, job=job.id, cache=tmp_path / "cache")).arrays()
+def test_files_in_a_folder_are_the_same_dataset(
+    services: Services, job: JobRecord, folder: Path, tmp_path: Path
+) -> None:
+    stored = Grasps(open_shards(services.store, job=job.id, cache=tmp_path / "cache")).arrays()
     local = Grasps(open_shards(folder)).arrays()
     np.testing.assert_array_equal(local["grasp/joint_positions"], stored["grasp/joint_positions"])
 
@@ -120,28 +122,28 @@ def test_a_scene_shard_that_is_missing_is_named(folder: Path) -> None:
         Pictures(Shards(shards.of("views")))
 
 
-def test_the_newest_snapshot_of_a_dataset_is_read(parts: Parts, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(parts.store, job=job.id, cache=tmp_path / "cache")
+def test_the_newest_snapshot_of_a_dataset_is_read(services: Services, job: JobRecord, tmp_path: Path) -> None:
+    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
     for number, some in enumerate((shards.files[:1], shards.files)):
-        _put_snapshot(parts, "kitchen", Shards(some), created=f"2026-01-0{number + 1}T00:00:00Z")
-    assert len(open_shards(parts.store, dataset="kitchen", cache=tmp_path / "cache")) == len(shards)
+        _put_snapshot(services, "kitchen", Shards(some), created=f"2026-01-0{number + 1}T00:00:00Z")
+    assert len(open_shards(services.store, dataset="kitchen", cache=tmp_path / "cache")) == len(shards)
 
 
-def test_a_dataset_without_a_snapshot_says_how_to_take_one(parts: Parts, tmp_path: Path) -> None:
+def test_a_dataset_without_a_snapshot_says_how_to_take_one(services: Services, tmp_path: Path) -> None:
     with pytest.raises(NotFoundError, match="graspd datasets snapshot kitchen"):
-        open_shards(parts.store, dataset="kitchen", cache=tmp_path / "cache")
+        open_shards(services.store, dataset="kitchen", cache=tmp_path / "cache")
 
 
-def test_a_file_that_changed_in_the_store_is_refused(parts: Parts, job: JobRecord, tmp_path: Path) -> None:
-    shard = open_shards(parts.store, job=job.id, cache=tmp_path / "cache").files[0]
+def test_a_file_that_changed_in_the_store_is_refused(services: Services, job: JobRecord, tmp_path: Path) -> None:
+    shard = open_shards(services.store, job=job.id, cache=tmp_path / "cache").files[0]
     cache = ShardCache(tmp_path / "other")
     with pytest.raises(DamagedShard, match=shard.id):
-        cache.fetch(parts.store, shard.key, "0" * 64)
+        cache.fetch(services.store, shard.key, "0" * 64)
     assert not list((tmp_path / "other").iterdir())
 
 
-def test_a_cached_file_that_changed_is_fetched_again(parts: Parts, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(parts.store, job=job.id, cache=tmp_path / "cache")
+def test_a_cached_file_that_changed_is_fetched_again(services: Services, job: JobRecord, tmp_path: Path) -> None:
+    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
     path = shards.path(shards.files[0])
     data = path.read_bytes()
     path.write_bytes(flipped(data))
@@ -157,24 +159,24 @@ def test_a_wrong_value_in_a_file_is_refused_and_not_handed_out(folder: Path) -> 
         Grasps(open_shards(folder))[0]
 
 
-def test_a_full_cache_drops_what_was_unused_longest(parts: Parts, tmp_path: Path) -> None:
+def test_a_full_cache_drops_what_was_unused_longest(services: Services, tmp_path: Path) -> None:
     from service.model.states import Stage
 
     data = [bytes([number]) * 1000 for number in range(3)]
     keys = [shard_file(Stage.SYNTHESIZE, f"{number:032x}") for number in range(3)]
     sums = [hashlib.sha256(blob).hexdigest() for blob in data]
     for key, blob in zip(keys, data, strict=True):
-        parts.store.put(key, blob)
+        services.store.put(key, blob)
     cache = ShardCache(tmp_path / "small", limit_bytes=2500)
     import os
 
     for age, (key, digest) in enumerate(zip(keys[:2], sums[:2], strict=True)):
-        os.utime(cache.fetch(parts.store, key, digest), (1000 - 100 * age, 1000 - 100 * age))
-    cache.fetch(parts.store, keys[2], sums[2])
+        os.utime(cache.fetch(services.store, key, digest), (1000 - 100 * age, 1000 - 100 * age))
+    cache.fetch(services.store, keys[2], sums[2])
     assert {path.stem for path in cache.folder.iterdir()} == {sums[0], sums[2]}
 
 
-def _put_snapshot(parts: Parts, dataset: str, shards: Shards, *, created: str) -> None:
+def _put_snapshot(services: Services, dataset: str, shards: Shards, *, created: str) -> None:
     digest = hashlib.sha256(created.encode()).hexdigest()[:32]
     listed = tuple(
         SnapshotShard(
@@ -202,4 +204,4 @@ def _put_snapshot(parts: Parts, dataset: str, shards: Shards, *, created: str) -
         created=created,
         shards=listed,
     )
-    put_record(parts.store, dataset_snapshot(dataset, digest), taken)
+    put_record(services.store, dataset_snapshot(dataset, digest), taken)

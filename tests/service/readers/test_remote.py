@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from service.model.records import JobRecord
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.readers import Grasps, Pictures, open_shards
 from service.settings import Settings
 from service.store.store import open_store
@@ -22,22 +22,24 @@ pytestmark = pytest.mark.s3
 
 
 @pytest.fixture
-def remote(tmp_path: Path, s3_url: str) -> Iterator[Parts]:
+def remote(tmp_path: Path, s3_url: str) -> Iterator[Services]:
     index = empty_index(f"sqlite:///{tmp_path / 'index.sqlite'}")
-    made = Parts(Settings(data_dir=tmp_path), open_store(s3_url), index, MemoryQueue())
+    made = Services(Settings(data_dir=tmp_path), open_store(s3_url), index, MemoryQueue())
     factories.add_builtins(made)
     yield made
     made.close()
 
 
 @pytest.fixture
-def job(remote: Parts) -> JobRecord:
+def job(remote: Services) -> JobRecord:
     record = factories.add_job(remote, grasps=40, scenes=2, views=2, width=24, height=16)
     factories.finish_all(remote, record)
     return record
 
 
-def test_what_is_read_from_s3_is_what_was_written(remote: Parts, job: JobRecord, s3_url: str, tmp_path: Path) -> None:
+def test_what_is_read_from_s3_is_what_was_written(
+    remote: Services, job: JobRecord, s3_url: str, tmp_path: Path
+) -> None:
     shards = open_shards(s3_url, job=job.id, cache=tmp_path / "cache")
     written = [remote.store.get(file.key) for file in shards]
     assert [shards.path(file).read_bytes() for file in shards] == written
@@ -45,7 +47,7 @@ def test_what_is_read_from_s3_is_what_was_written(remote: Parts, job: JobRecord,
 
 
 def test_what_was_read_once_needs_the_server_no_more(
-    remote: Parts, job: JobRecord, s3_url: str, s3_server: S3Server, tmp_path: Path
+    remote: Services, job: JobRecord, s3_url: str, s3_server: S3Server, tmp_path: Path
 ) -> None:
     shards = open_shards(s3_url, job=job.id, cache=tmp_path / "cache")
     first = Grasps(shards).arrays("grasp/hand_pose")
@@ -58,7 +60,7 @@ def test_what_was_read_once_needs_the_server_no_more(
 
 
 def test_a_cache_smaller_than_the_job_still_reads_all_of_it(
-    remote: Parts, job: JobRecord, s3_url: str, tmp_path: Path
+    remote: Services, job: JobRecord, s3_url: str, tmp_path: Path
 ) -> None:
     shards = open_shards(s3_url, job=job.id, cache=tmp_path / "cache", cache_bytes=60_000)
     largest = max(len(remote.store.get(file.key)) for file in shards)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.readers import Grasps, Pictures, Shards, open_shards
 from tests.api import factories
 from tests.service.readers import box_scenes
@@ -19,12 +19,12 @@ from service.readers.torch_data import Samples, ShuffledShards, collate  # noqa:
 
 
 @pytest.fixture
-def shards(parts: Parts, tmp_path: Path) -> Shards:
+def shards(services: Services, tmp_path: Path) -> Shards:
     """Three batches of a finished job."""
-    factories.add_builtins(parts)
-    record = factories.add_job(parts, grasps=80, scenes=1, views=2, width=24, height=16)
-    factories.finish_all(parts, record)
-    return open_shards(parts.store, job=record.id, cache=tmp_path / "cache")
+    factories.add_builtins(services)
+    record = factories.add_job(services, grasps=80, scenes=1, views=2, width=24, height=16)
+    factories.finish_all(services, record)
+    return open_shards(services.store, job=record.id, cache=tmp_path / "cache")
 
 
 def rows(batches: Any) -> list[tuple[str, int]]:

@@ -20,7 +20,7 @@ from graspd import cli as program
 from service.cli import load_settings, reporting_errors
 from service.model.errors import InputError, StoreUnavailable, UnavailableError
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.run.commands import app
 from service.run.supervisor import _SETTLED, Supervisor
 from service.settings import Settings
@@ -104,19 +104,19 @@ def test_a_setting_of_0_2_is_refused_with_its_new_name(monkeypatch: pytest.Monke
     assert float(getattr(load_settings(), new.removeprefix("GRASPD_").lower())) == 1.0
 
 
-def on_disk(parts: Parts) -> Parts:
+def on_disk(services: Services) -> Services:
     """The same service with its store in the data folder, as the commands find it."""
-    store = open_store(parts.settings.resolved_store_url)
-    for entry in list(parts.store.list("assets")):
-        store.put(entry.key, parts.store.get(entry.key))
-    return Parts(parts.settings, store, parts.index, parts.queue)
+    store = open_store(services.settings.resolved_store_url)
+    for entry in list(services.store.list("assets")):
+        store.put(entry.key, services.store.get(entry.key))
+    return Services(services.settings, store, services.index, services.queue)
 
 
-def test_a_rebuild_of_a_sound_index_finds_no_difference(parts: Parts) -> None:
-    parts = on_disk(parts)
-    job, _ = job_actions.submit(parts, request())
-    run_all(parts, job.id)
-    shown = runner.invoke(app, ["index", "rebuild", "--data-dir", str(parts.settings.data_dir), "--json"])
+def test_a_rebuild_of_a_sound_index_finds_no_difference(services: Services) -> None:
+    services = on_disk(services)
+    job, _ = job_actions.submit(services, request())
+    run_all(services, job.id)
+    shown = runner.invoke(app, ["index", "rebuild", "--data-dir", str(services.settings.data_dir), "--json"])
     assert shown.exit_code == 0, shown.output
     told = json.loads(shown.stdout.splitlines()[-1])
     assert (told["differences"], told["changed"]) == ([], False)
@@ -131,13 +131,13 @@ def test_what_reads_a_store_makes_none_where_there_is_none(tmp_path: Path, comma
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_check_tells_differences_changes_nothing_and_exits_with_1(parts: Parts) -> None:
-    parts = on_disk(parts)
-    job_actions.submit(parts, request())
-    damaged = ["index", "rebuild", "--check", "--data-dir", str(parts.settings.data_dir)]
+def test_a_check_tells_differences_changes_nothing_and_exits_with_1(services: Services) -> None:
+    services = on_disk(services)
+    job_actions.submit(services, request())
+    damaged = ["index", "rebuild", "--check", "--data-dir", str(services.settings.data_dir)]
     assert runner.invoke(app, damaged).exit_code == 0
-    (parts.settings.data_dir / "index.sqlite").unlink()
-    for leftover in parts.settings.data_dir.glob("index.sqlite-*"):
+    (services.settings.data_dir / "index.sqlite").unlink()
+    for leftover in services.settings.data_dir.glob("index.sqlite-*"):
         leftover.unlink()
     for _ in range(2):
         shown = runner.invoke(app, damaged)

@@ -8,7 +8,7 @@ import pytest
 
 from service.index.index import Index
 from service.model.errors import InputError
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.run.supervisor import Supervisor
 from service.settings import Settings
 from service.store.store import open_store
@@ -54,9 +54,9 @@ def test_a_whole_service_gets_ready_in_an_odd_folder(name: str, tmp_path: Path) 
     settings = Settings(data_dir=tmp_path / name, port=0)
     with Supervisor(settings, workers=0) as supervisor:
         assert supervisor.wait_ready(PATIENCE_S)
-        parts = Parts.open(supervisor.settings)
-        assert parts.queue.service() == parts.index.notes.service()
-        parts.close()
+        services = Services.open(supervisor.settings)
+        assert services.queue.service() == services.index.notes.service()
+        services.close()
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.identity import identify
 from service.queue.connection import connect
 from service.queue.rq_queue import RqQueue
@@ -22,10 +22,10 @@ COMMANDS = [["up", "--workers", "0", "--port", "0"], ["api", "--port", "0"], ["c
 
 
 @pytest.fixture
-def first(tmp_path: Path, rq_queue: RqQueue, redis_server: str) -> Iterator[Parts]:
+def first(tmp_path: Path, rq_queue: RqQueue, redis_server: str) -> Iterator[Services]:
     settings = Settings(data_dir=tmp_path / "first", redis_url=redis_server)
     empty_index(settings.resolved_index_url).close()
-    made = Parts.open(settings)
+    made = Services.open(settings)
     identify(made)
     yield made
     made.close()
@@ -49,7 +49,7 @@ def run(command: list[str], folder: Path, **environment: str) -> subprocess.Comp
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 def test_a_command_of_a_second_service_on_a_redis_is_refused(
-    command: list[str], first: Parts, redis_server: str, tmp_path: Path
+    command: list[str], first: Services, redis_server: str, tmp_path: Path
 ) -> None:
     done = run(command, tmp_path / "second", GRASPD_REDIS_URL=redis_server)
     said = done.stderr.splitlines()[-1]
@@ -59,7 +59,7 @@ def test_a_command_of_a_second_service_on_a_redis_is_refused(
 
 @pytest.mark.parametrize("command", COMMANDS[:3], ids=" ".join)
 def test_a_command_of_a_second_service_on_a_store_is_refused(
-    command: list[str], first: Parts, beside: str, tmp_path: Path
+    command: list[str], first: Services, beside: str, tmp_path: Path
 ) -> None:
     done = run(command, tmp_path / "second", GRASPD_STORE_URL=first.store.url, GRASPD_REDIS_URL=beside)
     said = done.stderr.splitlines()[-1]
@@ -69,7 +69,7 @@ def test_a_command_of_a_second_service_on_a_store_is_refused(
     )
 
 
-def test_the_doctor_says_so(first: Parts, redis_server: str, tmp_path: Path) -> None:
+def test_the_doctor_says_so(first: Services, redis_server: str, tmp_path: Path) -> None:
     Settings(data_dir=tmp_path / "second").data_dir.joinpath("store").mkdir(parents=True)
     doctor = ["doctor", "--only", "identity"]
     assert run(doctor, first.settings.data_dir, GRASPD_REDIS_URL=redis_server).returncode == 0
@@ -78,9 +78,9 @@ def test_the_doctor_says_so(first: Parts, redis_server: str, tmp_path: Path) -> 
     assert "bad      identity" in done.stdout
 
 
-def test_another_number_of_database_is_another_redis(first: Parts, beside: str, tmp_path: Path) -> None:
+def test_another_number_of_database_is_another_redis(first: Services, beside: str, tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path / "second", redis_url=beside)
     empty_index(settings.resolved_index_url).close()
-    second = Parts.open(settings)
+    second = Services.open(settings)
     assert identify(second) != first.queue.service()
     second.close()

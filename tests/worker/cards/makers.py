@@ -16,7 +16,7 @@ from service.model.dataset_records import Snapshot
 from service.model.planning import message_of, plan
 from service.model.records import AttemptRecord, JobRecord
 from service.model.states import Stage
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
 from service.settings import Settings
@@ -51,9 +51,9 @@ Array = NDArray[Any]
 
 @dataclass
 class Made:
-    """The service's parts, the dataset's snapshot, and where its store is."""
+    """Its services, the dataset's snapshot, and where its store is."""
 
-    parts: Parts
+    services: Services
     snapshot: Snapshot
     url: str
 
@@ -78,24 +78,24 @@ def dataset(
         options: of the jobs.
     """
     index = f"sqlite:///{folder / 'index.sqlite'}"
-    parts = Parts(Settings(data_dir=folder), open_store(url), empty_index(index), MemoryQueue())
-    add_builtins(parts)
+    services = Services(Settings(data_dir=folder), open_store(url), empty_index(index), MemoryQueue())
+    add_builtins(services)
     given = {"scenes": 2, "views": 1, "width": 24, "height": 16, **options}
     wanted = DatasetRequest.model_validate(
         {"name": NAME, "hands": HANDS, "objects": OBJECTS, "grasps": grasps, **given}
     )
-    actions.create(parts, wanted)
-    plan_all(parts)
-    for cell in parts.index.datasets.cells(NAME, limit=200).items:
-        record = read_record(JobRecord, parts.store, names.job_record(cell.job_id))
+    actions.create(services, wanted)
+    plan_all(services)
+    for cell in services.index.datasets.cells(NAME, limit=200).items:
+        record = read_record(JobRecord, services.store, names.job_record(cell.job_id))
         if (cell.hand, cell.object) == fails:
-            _fail(parts, record)
+            _fail(services, record)
         else:
-            _finish(parts, record, change)
-    return Made(parts, actions.snapshot(parts, NAME)[0], url)
+            _finish(services, record, change)
+    return Made(services, actions.snapshot(services, NAME)[0], url)
 
 
-def _fail(parts: Parts, record: JobRecord) -> None:
+def _fail(services: Services, record: JobRecord) -> None:
     task = next(plan(record))
     attempt = AttemptRecord(
         task_id=task.id,
@@ -108,11 +108,11 @@ def _fail(parts: Parts, record: JobRecord) -> None:
         ended=timestamp(),
         last=True,
     )
-    put_record(parts.store, names.attempt(task.id, 1), attempt)
-    parts.index.write.add_attempt(attempt)
+    put_record(services.store, names.attempt(task.id, 1), attempt)
+    services.index.write.add_attempt(attempt)
 
 
-def _finish(parts: Parts, record: JobRecord, change: Callable[[str, str, dict[str, Array]], None]) -> None:
+def _finish(services: Services, record: JobRecord, change: Callable[[str, str, dict[str, Array]], None]) -> None:
     base: dict[str, Array] = {}
     for task in plan(record):
         rng = np.random.default_rng([task.batch, *map(ord, record.request.hand + record.request.object)])
@@ -148,8 +148,8 @@ def _finish(parts: Parts, record: JobRecord, change: Callable[[str, str, dict[st
         else:
             output = Output(_views(scenes * record.request.views), {"scene_shard": task.inputs[0], **place})
         manifest, data = shard_of(message, output, device="cpu", seconds=SECONDS[task.stage], worker="w1")
-        publish_shard(parts.store, manifest, data)
-        parts.index.write.add_manifest(manifest)
+        publish_shard(services.store, manifest, data)
+        services.index.write.add_manifest(manifest)
 
 
 _ALLEGRO = tuple(

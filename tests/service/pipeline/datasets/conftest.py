@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from pydantic import SecretStr
 
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.settings import Settings
 from service.store.store import open_store
 from tests.fakes import add_assets
@@ -18,20 +18,20 @@ from tests.service.pipeline.datasets.makers import add_asset
 
 
 @pytest.fixture
-def either(index_url: str, tmp_path: Path) -> Iterator[Parts]:
+def either(index_url: str, tmp_path: Path) -> Iterator[Services]:
     """The service on an empty index of each kind in turn."""
     yield from _service(tmp_path, index_url)
 
 
 @pytest.fixture
-def parts(tmp_path: Path) -> Iterator[Parts]:
+def services(tmp_path: Path) -> Iterator[Services]:
     """The service on SQLite."""
     yield from _service(tmp_path, f"sqlite:///{tmp_path / 'index.sqlite'}")
 
 
-def _service(folder: Path, url: str) -> Iterator[Parts]:
+def _service(folder: Path, url: str) -> Iterator[Services]:
     settings = Settings(data_dir=folder, retry_backoff_s=0.0, task_s=0.0, index_url=SecretStr(url))
-    made = Parts(settings, open_store("memory://"), empty_index(url), MemoryQueue())
+    made = Services(settings, open_store("memory://"), empty_index(url), MemoryQueue())
     add_assets(made)
     for kind, name in (("hand", "claw"), ("object", "cube"), ("object", "cone")):
         add_asset(made, kind, name)

@@ -10,21 +10,21 @@ from service.model.clock import timestamp
 from service.model.planning import message_of, plan
 from service.model.records import AttemptRecord, JobRecord
 from service.model.states import AssetKind, Stage
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets.spec import DatasetRequest
 from service.store.library import publish_asset
 from service.store.records import put_record, read_record
 from tests.fakes import make_shard
 
 
-def add_asset(parts: Parts, kind: str, name: str, *, content: str = "", verdict: str | None = "accept") -> str:
+def add_asset(services: Services, kind: str, name: str, *, content: str = "", verdict: str | None = "accept") -> str:
     """A hand or object; returns its digest."""
     files = {"asset.json": b'{"file": "it"}', "it": f"{name} {content}".encode()}
-    asset = publish_asset(parts.store, AssetKind(kind), name, files)
+    asset = publish_asset(services.store, AssetKind(kind), name, files)
     found = {"verdict": verdict, "message": "as it is"} if verdict else None
     if found:
-        parts.store.put(names.asset_check(AssetKind(kind), asset.digest), json.dumps(found).encode())
-    parts.index.write.add_asset(asset, found)
+        services.store.put(names.asset_check(AssetKind(kind), asset.digest), json.dumps(found).encode())
+    services.index.write.add_asset(asset, found)
     return asset.digest
 
 
@@ -34,30 +34,30 @@ def wanted(name: str = "grasps", **changes: Any) -> DatasetRequest:
     return DatasetRequest.model_validate({"name": name, **given, **changes})
 
 
-def finish(parts: Parts, job: str, *, batches: int | None = None, lost: dict[str, int] | None = None) -> None:
+def finish(services: Services, job: str, *, batches: int | None = None, lost: dict[str, int] | None = None) -> None:
     """Do the first tasks of a job; of each, so many candidates are `lost` by outcome."""
-    record = read_record(JobRecord, parts.store, names.job_record(job))
+    record = read_record(JobRecord, services.store, names.job_record(job))
     for task in plan(record):
         if batches is None or task.batch < batches:
-            made = make_shard(parts.store, message_of(record, task, attempt=1, max_attempt=3))
-            parts.index.write.add_manifest(made.model_copy(update={"info": {"outcomes": lost}}) if lost else made)
+            made = make_shard(services.store, message_of(record, task, attempt=1, max_attempt=3))
+            services.index.write.add_manifest(made.model_copy(update={"info": {"outcomes": lost}}) if lost else made)
 
 
-def fail(parts: Parts, job: str, reason: str = "it broke") -> None:
+def fail(services: Services, job: str, reason: str = "it broke") -> None:
     """The first task of each batch of a job, failed for the last time."""
-    record = read_record(JobRecord, parts.store, names.job_record(job))
+    record = read_record(JobRecord, services.store, names.job_record(job))
     for task in plan(record):
         if task.stage is not Stage.SYNTHESIZE:
             continue
-        number = parts.index.jobs.task(task.id).attempt
+        number = services.index.jobs.task(task.id).attempt
         attempt = AttemptRecord(
             task_id=task.id, job_id=job, stage=task.stage, number=number, kind="ValueError", reason=reason,
             worker="w", ended=timestamp(), last=True,
         )  # fmt: skip
-        put_record(parts.store, names.attempt(task.id, number), attempt)
-        parts.index.write.add_attempt(attempt)
+        put_record(services.store, names.attempt(task.id, number), attempt)
+        services.index.write.add_attempt(attempt)
 
 
-def jobs_of(parts: Parts, name: str) -> list[str]:
+def jobs_of(services: Services, name: str) -> list[str]:
     """Jobs of a dataset's cells, in their order."""
-    return [cell.job_id for cell in parts.index.datasets.cells(name, limit=200).items]
+    return [cell.job_id for cell in services.index.datasets.cells(name, limit=200).items]

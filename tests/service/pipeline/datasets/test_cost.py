@@ -7,7 +7,7 @@ import pytest
 from service.index.queries.costs import BatchCost
 from service.model.domain import JobRequest
 from service.model.errors import LimitError, NotFoundError
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.cost import estimate
 from service.pipeline.datasets.estimate import Estimate
@@ -19,16 +19,16 @@ from tests.service.pipeline.datasets.makers import finish, jobs_of, wanted
 FAKE_SECONDS = 0.5
 
 
-def run(parts: Parts, **changes: object) -> Estimate:
+def run(services: Services, **changes: object) -> Estimate:
     """A dataset of one batch a cell, done; the estimate of the same."""
-    actions.create(parts, wanted(**changes))
-    plan_all(parts)
-    for job in jobs_of(parts, "grasps"):
-        finish(parts, job)
-    return estimate(parts.index, wanted(**changes))
+    actions.create(services, wanted(**changes))
+    plan_all(services)
+    for job in jobs_of(services, "grasps"):
+        finish(services, job)
+    return estimate(services.index, wanted(**changes))
 
 
-def test_what_was_measured_is_what_it_costs(either: Parts) -> None:
+def test_what_was_measured_is_what_it_costs(either: Services) -> None:
     found = run(either, want="raw")
     assert found.seconds == pytest.approx(4 * FAKE_SECONDS)
     assert (found.cells, found.tasks, found.asked, found.tried) == (4, 4, 128, 128)
@@ -40,85 +40,85 @@ def test_what_was_measured_is_what_it_costs(either: Parts) -> None:
     }
 
 
-def test_scenes_cost_their_share(parts: Parts) -> None:
-    found = run(parts, want="raw", scenes=2)
+def test_scenes_cost_their_share(services: Services) -> None:
+    found = run(services, want="raw", scenes=2)
     assert found.seconds_by_stage == pytest.approx({"synthesize": 4 * FAKE_SECONDS, "scene": 4 * FAKE_SECONDS})
-    assert found.storage_bytes == parts.index.datasets.get("grasps").size_bytes
-    longer = estimate(parts.index, wanted(want="raw", scenes=4))
+    assert found.storage_bytes == services.index.datasets.get("grasps").size_bytes
+    longer = estimate(services.index, wanted(want="raw", scenes=4))
     assert longer.seconds_by_stage["scene"] == pytest.approx(8 * FAKE_SECONDS)
 
 
-def test_valid_grasps_cost_the_tries_that_fail(parts: Parts) -> None:
-    run(parts)
-    one = estimate(parts.index, wanted(hands=("claw",), objects=("cube",), grasps=3200, budget=100))
+def test_valid_grasps_cost_the_tries_that_fail(services: Services) -> None:
+    run(services)
+    one = estimate(services.index, wanted(hands=("claw",), objects=("cube",), grasps=3200, budget=100))
     (rate,) = one.rates
     assert one.valid == 3200 and one.tried == round(3200 / rate.valid_yield)
     assert one.seconds == pytest.approx(3200 * rate.seconds_per_valid)
-    scarce = estimate(parts.index, wanted(hands=("claw",), objects=("cube",), grasps=3200, budget=1))
+    scarce = estimate(services.index, wanted(hands=("claw",), objects=("cube",), grasps=3200, budget=1))
     assert scarce.tried == 3200 and scarce.valid == round(3200 * rate.valid_yield)
 
 
-def test_another_object_takes_the_hand_and_another_hand_takes_all(parts: Parts) -> None:
-    run(parts, hands=("claw",), objects=("cube",))
+def test_another_object_takes_the_hand_and_another_hand_takes_all(services: Services) -> None:
+    run(services, hands=("claw",), objects=("cube",))
     for hand, obj, words in (
         ("claw", "cube", "measured here: claw on cube, cpu"),
         ("claw", "cone", "measured here: claw on other objects, cpu"),
         ("gripper", "cone", "measured here: other hands and objects, cpu"),
     ):
-        found = estimate(parts.index, wanted(hands=(hand,), objects=(obj,)))
+        found = estimate(services.index, wanted(hands=(hand,), objects=(obj,)))
         assert [rate.origin for rate in found.rates] == [words]
 
 
-def test_a_small_batch_says_less_than_a_whole_one(parts: Parts) -> None:
+def test_a_small_batch_says_less_than_a_whole_one(services: Services) -> None:
     few = {"hands": ("claw",), "objects": ("cube",), "want": "raw"}
-    actions.create(parts, wanted("few", grasps=2, **few))
-    plan_all(parts)
-    finish(parts, jobs_of(parts, "few")[0])
-    (small,) = estimate(parts.index, wanted(**few)).rates
+    actions.create(services, wanted("few", grasps=2, **few))
+    plan_all(services)
+    finish(services, jobs_of(services, "few")[0])
+    (small,) = estimate(services.index, wanted(**few)).rates
     assert small.seconds_per_try == pytest.approx(FAKE_SECONDS / 2)
-    (whole,) = run(parts, **few).rates
+    (whole,) = run(services, **few).rates
     assert whole.seconds_per_try == pytest.approx(FAKE_SECONDS / 32)
 
 
-def test_another_recipe_is_not_measured_by_this_one(parts: Parts) -> None:
-    run(parts)
+def test_another_recipe_is_not_measured_by_this_one(services: Services) -> None:
+    run(services)
     for changes in ({"fidelity": "draft"}, {"referee": "screen"}, {"want": "raw"}):
-        found = estimate(parts.index, wanted(**changes))
+        found = estimate(services.index, wanted(**changes))
         assert all(rate.origin.startswith(ORIGIN) for rate in found.rates) and found.measured_share == 0
 
 
-def test_what_was_measured_at_one_fidelity_scales_the_stored_rates_of_all(parts: Parts) -> None:
-    done = run(parts)
+def test_what_was_measured_at_one_fidelity_scales_the_stored_rates_of_all(services: Services) -> None:
+    done = run(services)
     factor = done.rates[0].seconds_per_try / STORED["standard"][0]
     assert done.machine_factor == pytest.approx(factor)
     for name in ("draft", "fine"):
-        (rate,) = {rate.seconds_per_try for rate in estimate(parts.index, wanted(fidelity=name)).rates}
+        (rate,) = {rate.seconds_per_try for rate in estimate(services.index, wanted(fidelity=name)).rates}
         assert rate == pytest.approx(factor * STORED[name][0])
-    (rate,) = {rate.seconds_per_try for rate in estimate(parts.index, wanted(method="graspit")).rates}
+    (rate,) = {rate.seconds_per_try for rate in estimate(services.index, wanted(method="graspit")).rates}
     assert rate == pytest.approx(factor * STORED_METHODS["graspit"][0])
 
 
-def test_fidelities_stand_in_the_order_of_their_cost_whichever_was_measured(parts: Parts) -> None:
-    run(parts, fidelity="standard")
+def test_fidelities_stand_in_the_order_of_their_cost_whichever_was_measured(services: Services) -> None:
+    run(services, fidelity="standard")
     draft, standard, fine = (
-        estimate(parts.index, wanted(fidelity=name)).seconds for name in ("draft", "standard", "fine")
+        estimate(services.index, wanted(fidelity=name)).seconds for name in ("draft", "standard", "fine")
     )
     assert draft < standard < fine
 
 
-def test_scenes_and_pictures_that_nobody_measured_are_scaled_too(parts: Parts) -> None:
-    fresh = estimate(parts.index, wanted(scenes=2, views=2)).seconds_by_stage
-    factor = run(parts).machine_factor or 0.0
-    scaled = estimate(parts.index, wanted(scenes=2, views=2)).seconds_by_stage
+def test_scenes_and_pictures_that_nobody_measured_are_scaled_too(services: Services) -> None:
+    fresh = estimate(services.index, wanted(scenes=2, views=2)).seconds_by_stage
+    factor = run(services).machine_factor or 0.0
+    scaled = estimate(services.index, wanted(scenes=2, views=2)).seconds_by_stage
     for stage in ("scene", "render"):
         assert scaled[stage] == pytest.approx(factor * fresh[stage])  # type: ignore[index]
 
 
-def test_an_interval_holds_the_estimate_and_shrinks_with_what_is_known(parts: Parts) -> None:
-    unknown = estimate(parts.index, wanted(fidelity="fine"))
+def test_an_interval_holds_the_estimate_and_shrinks_with_what_is_known(services: Services) -> None:
+    unknown = estimate(services.index, wanted(fidelity="fine"))
     assert unknown.machine_factor is None
-    run(parts)
-    scaled, measured = estimate(parts.index, wanted(fidelity="fine")), estimate(parts.index, wanted())
+    run(services)
+    scaled, measured = estimate(services.index, wanted(fidelity="fine")), estimate(services.index, wanted())
     widths = []
     for found in (unknown, scaled, measured):
         for one in (found, *found.plans):
@@ -140,26 +140,26 @@ def batch_of(seconds: float) -> BatchCost:
     return BatchCost("claw", "cube", "cpu", options, seconds, 32, 32, 32, 1000)
 
 
-def test_knobs_without_a_measurement_say_what_stands_in(parts: Parts) -> None:
-    found = estimate(parts.index, wanted(fidelity={"starts": 3}))
+def test_knobs_without_a_measurement_say_what_stands_in(services: Services) -> None:
+    found = estimate(services.index, wanted(fidelity={"starts": 3}))
     assert {rate.origin for rate in found.rates} == {f"{ORIGIN}, of standard for want of custom"}
     assert {rate.seconds_per_try for rate in found.rates} == {STORED["standard"][0]}
 
 
-def test_a_method_that_anneals_costs_more_than_one_that_descends(parts: Parts) -> None:
+def test_a_method_that_anneals_costs_more_than_one_that_descends(services: Services) -> None:
     """As in docs/results/chart.md: a chain of GraspIt's takes about ten times as long as a grasp of fast_graspd."""
-    slow, fast = (estimate(parts.index, wanted(method=method)) for method in ("graspit", "fast_graspd"))
+    slow, fast = (estimate(services.index, wanted(method=method)) for method in ("graspit", "fast_graspd"))
     assert {rate.origin for rate in slow.rates} == {f"{ORIGIN}, graspit"}
     assert slow.plans[0].seconds > 5 * fast.plans[0].seconds
 
 
-def test_a_method_nobody_measured_says_what_stands_in(parts: Parts) -> None:
-    found = estimate(parts.index, wanted(method="mine"))
+def test_a_method_nobody_measured_says_what_stands_in(services: Services) -> None:
+    found = estimate(services.index, wanted(method="mine"))
     assert {rate.origin for rate in found.rates} == {f"{ORIGIN}, of fast_graspd for want of mine"}
 
 
-def test_a_million_grasps_on_one_eight_and_sixty_four_workers(parts: Parts) -> None:
-    found = estimate(parts.index, wanted(hands=("claw",), objects=("cube",), grasps=1_000_000, scenes=2, views=3))
+def test_a_million_grasps_on_one_eight_and_sixty_four_workers(services: Services) -> None:
+    found = estimate(services.index, wanted(hands=("claw",), objects=("cube",), grasps=1_000_000, scenes=2, views=3))
     assert found.tasks == 3 * 31_250 and found.asked == 1_000_000
     one, eight, many = found.plans
     assert (one.workers, eight.workers, many.workers) == (1, 8, 64)
@@ -170,44 +170,44 @@ def test_a_million_grasps_on_one_eight_and_sixty_four_workers(parts: Parts) -> N
     assert one.network_bytes > found.storage_bytes
 
 
-def test_more_workers_than_batches_do_not_help(parts: Parts) -> None:
-    _, eight, many = estimate(parts.index, wanted()).plans
+def test_more_workers_than_batches_do_not_help(services: Services) -> None:
+    _, eight, many = estimate(services.index, wanted()).plans
     assert eight.seconds == many.seconds
 
 
-def test_what_is_not_known_yet_is_named_and_estimated(parts: Parts) -> None:
-    found = estimate(parts.index, wanted(hands=("claw", "foot"), objects=("moon",)))
+def test_what_is_not_known_yet_is_named_and_estimated(services: Services) -> None:
+    found = estimate(services.index, wanted(hands=("claw", "foot"), objects=("moon",)))
     assert found.unknown == ["foot", "moon"] and found.seconds > 0
     with pytest.raises(NotFoundError, match="no set of objects"):
-        estimate(parts.index, wanted(sets=("none",)))
+        estimate(services.index, wanted(sets=("none",)))
     with pytest.raises(LimitError):
-        estimate(parts.index, wanted(objects=[f"o{i}" for i in range(60_000)]))
+        estimate(services.index, wanted(objects=[f"o{i}" for i in range(60_000)]))
 
 
 @pytest.mark.parametrize(("referee", "word"), [("none", "sound"), ("certificate", "valid")])
-def test_an_estimate_says_what_it_counts(parts: Parts, referee: str, word: str) -> None:
-    assert estimate(parts.index, wanted(referee=referee)).counted == word
+def test_an_estimate_says_what_it_counts(services: Services, referee: str, word: str) -> None:
+    assert estimate(services.index, wanted(referee=referee)).counted == word
 
 
-def test_grasps_in_scenes_have_a_price_of_their_own(parts: Parts) -> None:
+def test_grasps_in_scenes_have_a_price_of_their_own(services: Services) -> None:
     """Neither are free grasps measured for them, nor do they tell what free ones cost."""
-    run(parts, scenes=2)
-    stored = estimate(parts.index, wanted(scene="table", scenes=2))
+    run(services, scenes=2)
+    stored = estimate(services.index, wanted(scene="table", scenes=2))
     assert {rate.batches for rate in stored.rates} == {0} and all("in a scene" in rate.origin for rate in stored.rates)
-    assert stored.tried > estimate(parts.index, wanted(scenes=2)).tried
+    assert stored.tried > estimate(services.index, wanted(scenes=2)).tried
     assert stored.storage_by_kind["scene"] == 4 * 2 * STORED_PLACE.size_bytes
     there = wanted(scene="table", scenes=2, name="placed")
-    actions.create(parts, there)
-    plan_all(parts)
-    for job in jobs_of(parts, "placed"):
-        finish(parts, job)
-    placed = estimate(parts.index, there)
+    actions.create(services, there)
+    plan_all(services)
+    for job in jobs_of(services, "placed"):
+        finish(services, job)
+    placed = estimate(services.index, there)
     assert placed.measured_share == 1
     assert placed.seconds_by_stage["scene"] == pytest.approx(4 * FAKE_SECONDS)
 
 
-def test_other_models_cost_what_they_take_of_each_valid_grasp(parts: Parts) -> None:
-    told = [estimate(parts.index, wanted(**models)) for models in ({}, {"robust": 0.9}, {"robust_models": 16})]
+def test_other_models_cost_what_they_take_of_each_valid_grasp(services: Services) -> None:
+    told = [estimate(services.index, wanted(**models)) for models in ({}, {"robust": 0.9}, {"robust_models": 16})]
     none, eight, sixteen = (one.seconds_by_stage["synthesize"] for one in told)
     assert eight - none == pytest.approx(8 * STORED_MODEL_S * told[0].valid, rel=0.01)
     assert sixteen - none == pytest.approx(2 * (eight - none), rel=0.01)

@@ -12,7 +12,7 @@ from service.model.domain import JobRequest
 from service.model.errors import ConflictError, InputError, LimitError, NotFoundError
 from service.model.states import AssetKind, Lane, State
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.datasets.status import status
@@ -22,7 +22,7 @@ from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import add_asset, fail, finish, jobs_of, wanted
 
 
-def test_a_dataset_has_a_job_for_each_hand_and_object(either: Parts) -> None:
+def test_a_dataset_has_a_job_for_each_hand_and_object(either: Services) -> None:
     dataset, new = actions.create(either, wanted(scenes=1))
     assert new and (dataset.cells, dataset.asked, dataset.state) == (4, 128, State.QUEUED)
     plan_all(either)
@@ -35,70 +35,70 @@ def test_a_dataset_has_a_job_for_each_hand_and_object(either: Parts) -> None:
     assert {either.index.jobs.get(job).request.scenes for job in jobs_of(either, "grasps")} == {1}
 
 
-def test_the_same_dataset_again_is_the_same_and_repeats_nothing(parts: Parts) -> None:
-    actions.create(parts, wanted())
-    plan_all(parts)
-    finish(parts, jobs_of(parts, "grasps")[0])
-    queued = parts.queue.waiting()
-    again, new = actions.create(parts, wanted())
-    plan_all(parts)
+def test_the_same_dataset_again_is_the_same_and_repeats_nothing(services: Services) -> None:
+    actions.create(services, wanted())
+    plan_all(services)
+    finish(services, jobs_of(services, "grasps")[0])
+    queued = services.queue.waiting()
+    again, new = actions.create(services, wanted())
+    plan_all(services)
     assert not new and again.states[State.SUCCEEDED] == 1
-    assert parts.queue.waiting() == queued
-    assert len(parts.index.jobs.page().items) == 4
+    assert services.queue.waiting() == queued
+    assert len(services.index.jobs.page().items) == 4
 
 
-def test_a_planner_that_was_stopped_is_continued(parts: Parts) -> None:
-    actions.create(parts, wanted())
+def test_a_planner_that_was_stopped_is_continued(services: Services) -> None:
+    actions.create(services, wanted())
     ticks = iter(range(100))
-    assert DatasetRounds(parts, clock=lambda: next(ticks)).advance(2.5)
-    planned = [cell.planned for cell in parts.index.datasets.cells("grasps").items]
+    assert DatasetRounds(services, clock=lambda: next(ticks)).advance(2.5)
+    planned = [cell.planned for cell in services.index.datasets.cells("grasps").items]
     assert planned.count(True) == 2
-    plan_all(parts)
-    assert all(cell.planned for cell in parts.index.datasets.cells("grasps").items)
-    assert not DatasetRounds(parts).advance(10)
+    plan_all(services)
+    assert all(cell.planned for cell in services.index.datasets.cells("grasps").items)
+    assert not DatasetRounds(services).advance(10)
 
 
-def test_two_datasets_share_the_jobs_that_both_want(parts: Parts) -> None:
-    actions.create(parts, wanted("one"))
-    actions.create(parts, wanted("two", hands=("gripper",), objects=("cube", "cone")))
-    plan_all(parts)
-    assert jobs_of(parts, "one")[1] == jobs_of(parts, "two")[0]
-    assert len(parts.index.jobs.page().items) == 5
+def test_two_datasets_share_the_jobs_that_both_want(services: Services) -> None:
+    actions.create(services, wanted("one"))
+    actions.create(services, wanted("two", hands=("gripper",), objects=("cube", "cone")))
+    plan_all(services)
+    assert jobs_of(services, "one")[1] == jobs_of(services, "two")[0]
+    assert len(services.index.jobs.page().items) == 5
 
 
-def test_a_job_that_was_submitted_by_itself_is_a_cell(parts: Parts) -> None:
-    job, _ = job_actions.submit(parts, JobRequest(hand="claw", object="ball", grasps=32))
-    actions.create(parts, wanted())
-    assert jobs_of(parts, "grasps")[2] == job.id
+def test_a_job_that_was_submitted_by_itself_is_a_cell(services: Services) -> None:
+    job, _ = job_actions.submit(services, JobRequest(hand="claw", object="ball", grasps=32))
+    actions.create(services, wanted())
+    assert jobs_of(services, "grasps")[2] == job.id
 
 
-def test_a_name_stands_for_one_dataset(parts: Parts) -> None:
-    actions.create(parts, wanted())
+def test_a_name_stands_for_one_dataset(services: Services) -> None:
+    actions.create(services, wanted())
     with pytest.raises(ConflictError, match="its objects are ball, cube; its grasps is 32\\); take another name"):
-        actions.create(parts, wanted(objects=("ball",), grasps=64))
+        actions.create(services, wanted(objects=("ball",), grasps=64))
 
 
-def test_a_dataset_of_an_older_graspd_with_fewer_options_is_the_same(parts: Parts) -> None:
-    actions.create(parts, wanted())
-    old = json.loads(parts.store.get(names.dataset_record("grasps")))
+def test_a_dataset_of_an_older_graspd_with_fewer_options_is_the_same(services: Services) -> None:
+    actions.create(services, wanted())
+    old = json.loads(services.store.get(names.dataset_record("grasps")))
     del old["options"]["robustness"], old["checksum"]
-    fresh = Parts(parts.settings, open_store("memory://"), parts.index, parts.queue)
+    fresh = Services(services.settings, open_store("memory://"), services.index, services.queue)
     fresh.store.put(names.dataset_record("grasps"), json.dumps(old | {"digest": "0" * 32}).encode())
     dataset, new = actions.create(fresh, wanted())
     assert not new and dataset.digest == "0" * 32
 
 
-def test_a_dataset_keeps_the_versions_it_was_created_with(parts: Parts) -> None:
-    first = parts.index.assets.get(AssetKind.OBJECT, "ball").digest
-    actions.create(parts, wanted())
-    add_asset(parts, "object", "ball", content="other")
-    plan_all(parts)
-    assert parts.index.jobs.get(jobs_of(parts, "grasps")[0]).object_digest == first
+def test_a_dataset_keeps_the_versions_it_was_created_with(services: Services) -> None:
+    first = services.index.assets.get(AssetKind.OBJECT, "ball").digest
+    actions.create(services, wanted())
+    add_asset(services, "object", "ball", content="other")
+    plan_all(services)
+    assert services.index.jobs.get(jobs_of(services, "grasps")[0]).object_digest == first
 
 
-def test_what_cannot_be_used_is_refused_before_anything_is_recorded(parts: Parts) -> None:
-    add_asset(parts, "object", "torn", verdict="refuse")
-    add_asset(parts, "object", "fresh", verdict=None)
+def test_what_cannot_be_used_is_refused_before_anything_is_recorded(services: Services) -> None:
+    add_asset(services, "object", "torn", verdict="refuse")
+    add_asset(services, "object", "fresh", verdict=None)
     for changes, error, words in (
         ({"hands": ("foot",)}, NotFoundError, "there is no hand 'foot'; there are: claw, gripper"),
         ({"objects": ("torn",)}, InputError, "was refused"),
@@ -106,18 +106,18 @@ def test_what_cannot_be_used_is_refused_before_anything_is_recorded(parts: Parts
         ({"sets": ("kitchen",)}, NotFoundError, "there is no set of objects 'kitchen'"),
     ):
         with pytest.raises(error, match=words):
-            actions.create(parts, wanted(**changes))
+            actions.create(services, wanted(**changes))
     with pytest.raises(ValueError, match="needs objects"):
         wanted(objects=())
-    assert parts.index.datasets.page().items == [] and not list(parts.store.list(names.DATASETS))
+    assert services.index.datasets.page().items == [] and not list(services.store.list(names.DATASETS))
 
 
-def test_a_matrix_over_the_limit_is_refused(parts: Parts) -> None:
+def test_a_matrix_over_the_limit_is_refused(services: Services) -> None:
     with pytest.raises(LimitError, match="over 100000 cells"):
-        actions.create(parts, wanted(hands=("gripper", "claw"), objects=[f"o{i}" for i in range(60_000)]))
+        actions.create(services, wanted(hands=("gripper", "claw"), objects=[f"o{i}" for i in range(60_000)]))
 
 
-def test_status_tells_each_cell(either: Parts) -> None:
+def test_status_tells_each_cell(either: Services) -> None:
     actions.create(either, wanted(grasps=64))
     plan_all(either)
     jobs = jobs_of(either, "grasps")
@@ -137,7 +137,7 @@ def test_status_tells_each_cell(either: Parts) -> None:
     assert whole.seconds == pytest.approx(1.5) and whole.shards == 3
 
 
-def test_a_dataset_that_found_fewer_grasps_says_what_became_of_the_others(either: Parts) -> None:
+def test_a_dataset_that_found_fewer_grasps_says_what_became_of_the_others(either: Services) -> None:
     actions.create(either, wanted(objects=("ball",)))
     plan_all(either)
     first, second = jobs_of(either, "grasps")
@@ -152,7 +152,7 @@ def test_a_dataset_that_found_fewer_grasps_says_what_became_of_the_others(either
     assert "3 slipped;" in reasons[0] and "2 turned in the hand, 1 slipped;" in reasons[1]
 
 
-def test_cells_come_in_pages_and_by_state(either: Parts) -> None:
+def test_cells_come_in_pages_and_by_state(either: Services) -> None:
     actions.create(either, wanted(objects=("ball", "cube", "cone")))
     plan_all(either)
     for job in jobs_of(either, "grasps")[1:4]:
@@ -162,29 +162,29 @@ def test_cells_come_in_pages_and_by_state(either: Parts) -> None:
     assert [cell.position for cell in first.items + rest.items] == [1, 2, 3] and rest.next is None
 
 
-def test_datasets_come_newest_first_in_pages(parts: Parts) -> None:
+def test_datasets_come_newest_first_in_pages(services: Services) -> None:
     for name in ("a", "b", "c"):
-        actions.create(parts, wanted(name))
-    first = parts.index.datasets.page(limit=2)
-    rest = parts.index.datasets.page(limit=2, cursor=first.next)
+        actions.create(services, wanted(name))
+    first = services.index.datasets.page(limit=2)
+    rest = services.index.datasets.page(limit=2, cursor=first.next)
     assert sorted(view.name for view in first.items + rest.items) == ["a", "b", "c"] and rest.next is None
 
 
-def test_cancel_stops_what_is_planned_and_what_is_not(parts: Parts) -> None:
-    actions.create(parts, wanted())
+def test_cancel_stops_what_is_planned_and_what_is_not(services: Services) -> None:
+    actions.create(services, wanted())
     ticks = iter(range(100))
-    DatasetRounds(parts, clock=lambda: next(ticks)).advance(2.5)
-    finish(parts, jobs_of(parts, "grasps")[0])
-    assert actions.cancel(parts, "grasps").cancelled
-    plan_all(parts)
-    found = status(parts.index, "grasps")
+    DatasetRounds(services, clock=lambda: next(ticks)).advance(2.5)
+    finish(services, jobs_of(services, "grasps")[0])
+    assert actions.cancel(services, "grasps").cancelled
+    plan_all(services)
+    found = status(services.index, "grasps")
     assert [cell.state for cell in found.cells] == ["succeeded", "cancelled", "cancelled", "cancelled"]
-    assert found.dataset.state == "cancelled" and parts.index.feed.believed_queued()[0] == set()
+    assert found.dataset.state == "cancelled" and services.index.feed.believed_queued()[0] == set()
     with pytest.raises(ConflictError, match="nothing to cancel"):
-        actions.cancel(parts, "grasps")
+        actions.cancel(services, "grasps")
 
 
-def test_a_job_that_another_dataset_waits_for_goes_on(either: Parts) -> None:
+def test_a_job_that_another_dataset_waits_for_goes_on(either: Services) -> None:
     actions.create(either, wanted("one"))
     actions.create(either, wanted("two", hands=("gripper",), objects=("cube",)))
     plan_all(either)
@@ -198,54 +198,54 @@ def test_a_job_that_another_dataset_waits_for_goes_on(either: Parts) -> None:
     ]
 
 
-def test_retry_starts_failed_and_cancelled_cells_again_and_repeats_nothing(parts: Parts) -> None:
-    actions.create(parts, wanted(grasps=64))
-    plan_all(parts)
-    jobs = jobs_of(parts, "grasps")
-    finish(parts, jobs[0])
-    finish(parts, jobs[1], batches=1)
-    fail(parts, jobs[2])
+def test_retry_starts_failed_and_cancelled_cells_again_and_repeats_nothing(services: Services) -> None:
+    actions.create(services, wanted(grasps=64))
+    plan_all(services)
+    jobs = jobs_of(services, "grasps")
+    finish(services, jobs[0])
+    finish(services, jobs[1], batches=1)
+    fail(services, jobs[2])
     with pytest.raises(NotFoundError):
-        actions.retry(parts, "other")
-    actions.cancel(parts, "grasps")
-    plan_all(parts)
-    assert actions.retry(parts, "grasps").state is State.QUEUED
-    plan_all(parts)
-    found = status(parts.index, "grasps")
+        actions.retry(services, "other")
+    actions.cancel(services, "grasps")
+    plan_all(services)
+    assert actions.retry(services, "grasps").state is State.QUEUED
+    plan_all(services)
+    found = status(services.index, "grasps")
     assert [cell.state for cell in found.cells] == ["succeeded", "running", "queued", "queued"]
-    assert len(parts.index.feed.believed_queued()[0]) == 1 + 2 + 2
+    assert len(services.index.feed.believed_queued()[0]) == 1 + 2 + 2
     for job in jobs:
-        finish(parts, job)
-    assert parts.index.datasets.get("grasps").state == "succeeded" and parts.index.datasets.get("grasps").finished
+        finish(services, job)
+    assert services.index.datasets.get("grasps").state == "succeeded" and services.index.datasets.get("grasps").finished
     with pytest.raises(ConflictError, match="nothing to retry"):
-        actions.retry(parts, "grasps")
+        actions.retry(services, "grasps")
 
 
-def test_an_event_reaches_a_job_once_however_often_the_planner_runs(parts: Parts) -> None:
-    actions.create(parts, wanted())
-    plan_all(parts)
-    actions.cancel(parts, "grasps")
-    plan_all(parts)
-    started = jobs_of(parts, "grasps")[0]
-    job_actions.retry(parts, started)
-    rebuild(parts.index, parts.store)  # forgets how far the planner was
-    plan_all(parts)
-    assert parts.index.jobs.get(started).state == "queued"
-    assert [event.what for event in job_events(parts.store, started)] == ["cancelled", "retried"]
-    assert [event.what for event in job_events(parts.store, jobs_of(parts, "grasps")[1])] == ["cancelled"]
+def test_an_event_reaches_a_job_once_however_often_the_planner_runs(services: Services) -> None:
+    actions.create(services, wanted())
+    plan_all(services)
+    actions.cancel(services, "grasps")
+    plan_all(services)
+    started = jobs_of(services, "grasps")[0]
+    job_actions.retry(services, started)
+    rebuild(services.index, services.store)  # forgets how far the planner was
+    plan_all(services)
+    assert services.index.jobs.get(started).state == "queued"
+    assert [event.what for event in job_events(services.store, started)] == ["cancelled", "retried"]
+    assert [event.what for event in job_events(services.store, jobs_of(services, "grasps")[1])] == ["cancelled"]
 
 
-def test_a_large_dataset_leaves_the_queue_to_others(parts: Parts) -> None:
-    small = parts.settings.model_copy(update={"queue_window": 10})
-    parts = Parts(small, parts.store, parts.index, parts.queue)
-    actions.create(parts, wanted(grasps=320))
-    plan_all(parts)
-    assert len(parts.queue.waiting()) == 10
-    assert parts.queue.depths()[(Lane.INTERACTIVE, "synthesize")] == 0
-    assert parts.index.datasets.get("grasps").tasks == 40
+def test_a_large_dataset_leaves_the_queue_to_others(services: Services) -> None:
+    small = services.settings.model_copy(update={"queue_window": 10})
+    services = Services(small, services.store, services.index, services.queue)
+    actions.create(services, wanted(grasps=320))
+    plan_all(services)
+    assert len(services.queue.waiting()) == 10
+    assert services.queue.depths()[(Lane.INTERACTIVE, "synthesize")] == 0
+    assert services.index.datasets.get("grasps").tasks == 40
 
 
-def test_the_store_alone_tells_everything(either: Parts) -> None:
+def test_the_store_alone_tells_everything(either: Services) -> None:
     actions.add_object_set(either, "round", ["ball", "cone"])
     actions.create(either, wanted("a"))
     actions.create(either, wanted("b", objects=(), sets=("round",)))
@@ -263,24 +263,24 @@ def test_the_store_alone_tells_everything(either: Parts) -> None:
     assert [view.shards for view in either.index.datasets.snapshots("a").items] == [4]
 
 
-def test_a_difference_between_index_and_store_is_found(parts: Parts) -> None:
-    actions.create(parts, wanted())
-    parts.index.write_dataset.set_events("grasps", [])
-    actions.add_dataset_event(parts.store, "grasps", "cancelled")
-    assert differences(parts.index, parts.store) == [
+def test_a_difference_between_index_and_store_is_found(services: Services) -> None:
+    actions.create(services, wanted())
+    services.index.write_dataset.set_events("grasps", [])
+    actions.add_dataset_event(services.store, "grasps", "cancelled")
+    assert differences(services.index, services.store) == [
         "datasets grasps: cancelled is False, the store says True",
         "datasets grasps: events is 0, the store says 1",
     ]
 
 
-def test_a_set_of_objects_is_spelled_out_when_the_dataset_is_created(parts: Parts) -> None:
-    actions.add_object_set(parts, "round", ["cone", "ball"])
-    actions.create(parts, wanted(objects=("cube",), sets=("round",)))
-    actions.add_object_set(parts, "round", ["ball"])
-    assert parts.index.datasets.get("grasps").objects == ["cube", "ball", "cone"]
+def test_a_set_of_objects_is_spelled_out_when_the_dataset_is_created(services: Services) -> None:
+    actions.add_object_set(services, "round", ["cone", "ball"])
+    actions.create(services, wanted(objects=("cube",), sets=("round",)))
+    actions.add_object_set(services, "round", ["ball"])
+    assert services.index.datasets.get("grasps").objects == ["cube", "ball", "cone"]
 
 
-def test_a_set_has_versions_and_the_newest_counts(either: Parts) -> None:
+def test_a_set_has_versions_and_the_newest_counts(either: Services) -> None:
     for objects in (["ball", "cone"], ["ball"], ["ball"], ["cone", "ball"]):
         assert set(actions.add_object_set(either, "round", objects).objects) == set(objects)
     assert len(list(either.store.list(names.OBJECT_SETS))) == 3
@@ -291,20 +291,20 @@ def test_a_set_has_versions_and_the_newest_counts(either: Parts) -> None:
         actions.add_object_set(either, "none", [])
 
 
-def test_the_same_shards_are_the_same_snapshot(parts: Parts) -> None:
-    actions.create(parts, wanted())
+def test_the_same_shards_are_the_same_snapshot(services: Services) -> None:
+    actions.create(services, wanted())
     with pytest.raises(ConflictError, match="no shard yet"):
-        actions.snapshot(parts, "grasps")
-    plan_all(parts)
-    jobs = jobs_of(parts, "grasps")
-    finish(parts, jobs[0])
-    first, new = actions.snapshot(parts, "grasps")
+        actions.snapshot(services, "grasps")
+    plan_all(services)
+    jobs = jobs_of(services, "grasps")
+    finish(services, jobs[0])
+    first, new = actions.snapshot(services, "grasps")
     assert new and not first.complete and first.grasps == 32
-    assert actions.snapshot(parts, "grasps") == (first, False)
+    assert actions.snapshot(services, "grasps") == (first, False)
     for job in jobs[1:]:
-        finish(parts, job)
-    last, new = actions.snapshot(parts, "grasps")
+        finish(services, job)
+    last, new = actions.snapshot(services, "grasps")
     assert new and last.complete and last.digest != first.digest
     assert [(shard.hand, shard.object) for shard in last.shards][1:3] == [("gripper", "cube"), ("claw", "ball")]
-    assert last.size_bytes == sum(parts.store.size(shard.key) for shard in last.shards)
-    assert actions.load_snapshot(parts.store, "grasps", first.digest) == first
+    assert last.size_bytes == sum(services.store.size(shard.key) for shard in last.shards)
+    assert actions.load_snapshot(services.store, "grasps", first.digest) == first

@@ -15,7 +15,7 @@ from service.model.domain import JobRequest
 from service.model.errors import ConflictError, InputError
 from service.model.records import JobRecord
 from service.model.scene_spec import SceneSpec
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.cost import estimate
 from service.pipeline.datasets.spec import DatasetRequest
@@ -44,9 +44,9 @@ def chart(created: str = "2026-11-21T10:00:00.000Z", *, claw: str = "fine") -> d
     return {"created": created, "runs": runs}
 
 
-def requests_of(parts: Parts, name: str = "grasps") -> list[JobRequest]:
-    plan_all(parts)
-    return [read_record(JobRecord, parts.store, names.job_record(job)).request for job in jobs_of(parts, name)]
+def requests_of(services: Services, name: str = "grasps") -> list[JobRequest]:
+    plan_all(services)
+    return [read_record(JobRecord, services.store, names.job_record(job)).request for job in jobs_of(services, name)]
 
 
 def test_a_cell_without_options_is_the_job_it_always_was(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -57,28 +57,28 @@ def test_a_cell_without_options_is_the_job_it_always_was(monkeypatch: pytest.Mon
     assert digests.job_id(request, "0" * 32, "1" * 32) == "3451e42bdce0eab4549fc73883b4bbbd"
 
 
-def test_options_of_the_method_are_those_of_each_cells_job(either: Parts) -> None:
+def test_options_of_the_method_are_those_of_each_cells_job(either: Services) -> None:
     actions.create(either, wanted(**ANNEALED))
     assert [(r.method, r.options) for r in requests_of(either)] == 4 * [("graspit", {"keep": 20, "steps": 40000})]
 
 
-def test_other_options_are_another_dataset(parts: Parts) -> None:
-    actions.create(parts, wanted(**ANNEALED))
+def test_other_options_are_another_dataset(services: Services) -> None:
+    actions.create(services, wanted(**ANNEALED))
     with pytest.raises(ConflictError, match="its options is"):
-        actions.create(parts, wanted(**ANNEALED | {"options": {"keep": 5}}))
+        actions.create(services, wanted(**ANNEALED | {"options": {"keep": 5}}))
 
 
-def test_batches_with_other_options_say_nothing_about_the_cost(parts: Parts) -> None:
+def test_batches_with_other_options_say_nothing_about_the_cost(services: Services) -> None:
 
-    actions.create(parts, wanted(**ANNEALED))
-    plan_all(parts)
-    for job in jobs_of(parts, "grasps"):
-        finish(parts, job)
-    assert estimate(parts.index, wanted(**ANNEALED)).measured_share == 1
-    assert estimate(parts.index, wanted(method="graspit")).measured_share == 0
+    actions.create(services, wanted(**ANNEALED))
+    plan_all(services)
+    for job in jobs_of(services, "grasps"):
+        finish(services, job)
+    assert estimate(services.index, wanted(**ANNEALED)).measured_share == 1
+    assert estimate(services.index, wanted(method="graspit")).measured_share == 0
 
 
-def test_with_auto_each_cell_gets_what_the_chart_promises_for_it(either: Parts) -> None:
+def test_with_auto_each_cell_gets_what_the_chart_promises_for_it(either: Services) -> None:
     publish(either.store, "charts", chart())
     actions.create(either, wanted(**AUTO))
     assert [(r.fidelity, r.target) for r in requests_of(either)] == [
@@ -89,29 +89,29 @@ def test_with_auto_each_cell_gets_what_the_chart_promises_for_it(either: Parts) 
     assert either.index.datasets.get("grasps").options.target == "gsr>=0.6"
 
 
-def test_a_cell_that_auto_chose_is_the_job_that_names_its_fidelity(parts: Parts) -> None:
-    publish(parts.store, "charts", chart())
-    actions.create(parts, wanted("chosen", **AUTO))
-    actions.create(parts, wanted("named", fidelity="fine"))
-    assert jobs_of(parts, "chosen")[2:] == jobs_of(parts, "named")[2:]
+def test_a_cell_that_auto_chose_is_the_job_that_names_its_fidelity(services: Services) -> None:
+    publish(services.store, "charts", chart())
+    actions.create(services, wanted("chosen", **AUTO))
+    actions.create(services, wanted("named", fidelity="fine"))
+    assert jobs_of(services, "chosen")[2:] == jobs_of(services, "named")[2:]
 
 
-def test_a_later_chart_changes_nothing_of_a_dataset_that_is_there(parts: Parts) -> None:
-    publish(parts.store, "charts", chart())
-    actions.create(parts, wanted(**AUTO))
-    before = jobs_of(parts, "grasps")
-    publish(parts.store, "charts", chart("2026-11-21T11:00:00.000Z", claw="draft"))
-    _, new = actions.create(parts, wanted(**AUTO))
-    assert not new and jobs_of(parts, "grasps") == before
-    publish(parts.store, "charts", {"created": "2026-11-21T12:00:00.000Z", "runs": []})
-    assert actions.create(parts, wanted(**AUTO))[1] is False
+def test_a_later_chart_changes_nothing_of_a_dataset_that_is_there(services: Services) -> None:
+    publish(services.store, "charts", chart())
+    actions.create(services, wanted(**AUTO))
+    before = jobs_of(services, "grasps")
+    publish(services.store, "charts", chart("2026-11-21T11:00:00.000Z", claw="draft"))
+    _, new = actions.create(services, wanted(**AUTO))
+    assert not new and jobs_of(services, "grasps") == before
+    publish(services.store, "charts", {"created": "2026-11-21T12:00:00.000Z", "runs": []})
+    assert actions.create(services, wanted(**AUTO))[1] is False
 
 
-def test_a_rebuilt_index_knows_the_fidelity_of_each_cell(parts: Parts) -> None:
-    publish(parts.store, "charts", chart())
-    actions.create(parts, wanted(**AUTO))
-    rebuild(parts.index, parts.store)
-    assert [cell.fidelity for cell in parts.index.datasets.cells("grasps").items] == [
+def test_a_rebuilt_index_knows_the_fidelity_of_each_cell(services: Services) -> None:
+    publish(services.store, "charts", chart())
+    actions.create(services, wanted(**AUTO))
+    rebuild(services.index, services.store)
+    assert [cell.fidelity for cell in services.index.datasets.cells("grasps").items] == [
         "standard",
         "draft",
         "fine",
@@ -119,29 +119,29 @@ def test_a_rebuilt_index_knows_the_fidelity_of_each_cell(parts: Parts) -> None:
     ]
 
 
-def test_a_target_out_of_reach_on_one_cell_makes_no_dataset(parts: Parts) -> None:
-    publish(parts.store, "charts", chart())
+def test_a_target_out_of_reach_on_one_cell_makes_no_dataset(services: Services) -> None:
+    publish(services.store, "charts", chart())
     with pytest.raises(InputError, match=r"no fidelity of fast_graspd meets gsr>=0\.75"):
-        actions.create(parts, wanted(**AUTO | {"target": "gsr>=0.75"}))
-    assert not parts.store.exists(names.dataset_record("grasps"))
+        actions.create(services, wanted(**AUTO | {"target": "gsr>=0.75"}))
+    assert not services.store.exists(names.dataset_record("grasps"))
 
 
-def test_the_cost_of_auto_is_that_of_the_fidelities_it_stands_for(parts: Parts) -> None:
-    publish(parts.store, "charts", chart())
-    both = estimate(parts.index, wanted(hands=("gripper",), **AUTO), Resolver(parts.store))
+def test_the_cost_of_auto_is_that_of_the_fidelities_it_stands_for(services: Services) -> None:
+    publish(services.store, "charts", chart())
+    both = estimate(services.index, wanted(hands=("gripper",), **AUTO), Resolver(services.store))
     apart = [
-        estimate(parts.index, wanted(hands=("gripper",), objects=(obj,), fidelity=fidelity))
+        estimate(services.index, wanted(hands=("gripper",), objects=(obj,), fidelity=fidelity))
         for obj, fidelity in (("ball", "standard"), ("cube", "draft"))
     ]
     assert both.seconds == pytest.approx(sum(one.seconds for one in apart))
 
 
-def test_a_record_from_before_has_neither_and_is_read(parts: Parts) -> None:
-    actions.create(parts, wanted())
-    stored = json.loads(parts.store.get(names.dataset_record("grasps")))
+def test_a_record_from_before_has_neither_and_is_read(services: Services) -> None:
+    actions.create(services, wanted())
+    stored = json.loads(services.store.get(names.dataset_record("grasps")))
     stored["options"] = {k: v for k, v in stored["options"].items() if k not in ("options", "target")}
     del stored["fidelities"]
-    assert DatasetRecord.model_validate(stored) == load_dataset(parts.store, "grasps")
+    assert DatasetRecord.model_validate(stored) == load_dataset(services.store, "grasps")
 
 
 @pytest.mark.parametrize("changes", [{"fidelity": "auto"}, {"target": "gsr>=0.6"}])
@@ -150,7 +150,7 @@ def test_auto_and_target_go_together(changes: dict[str, str]) -> None:
         wanted(**changes)
 
 
-def test_each_cell_of_a_dataset_in_scenes_says_how_its_fidelity_was_chosen(either: Parts) -> None:
+def test_each_cell_of_a_dataset_in_scenes_says_how_its_fidelity_was_chosen(either: Services) -> None:
     def run(fidelity: str, speed: float, lift: float, hand: str, object_: str) -> dict[str, Any]:
         return {"way": IN_SCENE, "method": "fast_graspd", "fidelity": fidelity, "hand": hand, "object": object_,
                 "end_to_end_per_second": speed, "lift": lift}  # fmt: skip

@@ -17,7 +17,7 @@ from service.model import names
 from service.model.finding import Condition, Finding
 from service.model.states import Stage
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.run.doctor import database
 from service.settings import Settings
 from service.store.store import open_store
@@ -31,37 +31,37 @@ Look = Callable[[], Finding]
 
 
 @pytest.fixture
-def kept(tmp_path: Path) -> Iterator[Parts]:
+def kept(tmp_path: Path) -> Iterator[Services]:
     """A data folder with a job of two batches, done."""
     settings = Settings(data_dir=tmp_path)
     index = empty_index(settings.resolved_index_url)
-    parts = Parts(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
-    add_assets(parts)
-    run_all(parts, job_actions.submit(parts, request(grasps=64))[0].id)
+    services = Services(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
+    add_assets(services)
+    run_all(services, job_actions.submit(services, request(grasps=64))[0].id)
     index.notes.set_complete()
-    yield parts
+    yield services
     index.close()
 
 
 @pytest.fixture(params=["whole", "sample"])
-def look(request: pytest.FixtureRequest, kept: Parts, monkeypatch: pytest.MonkeyPatch) -> Look:
+def look(request: pytest.FixtureRequest, kept: Services, monkeypatch: pytest.MonkeyPatch) -> Look:
     """The comparison of all rows, and that of a sample."""
     if request.param == "sample":
         monkeypatch.setattr(database, "_ALL_SHARDS", 0)
     return lambda: database.index_is_store(kept.settings, settles_s=0.0)
 
 
-def shard_of(parts: Parts) -> Path:
-    return next((parts.settings.data_dir / "store" / names.SHARDS / "base").glob("*.json"))
+def shard_of(services: Services) -> Path:
+    return next((services.settings.data_dir / "store" / names.SHARDS / "base").glob("*.json"))
 
 
-def test_an_index_that_is_what_the_store_says_is_good(kept: Parts, look: Look) -> None:
+def test_an_index_that_is_what_the_store_says_is_good(kept: Services, look: Look) -> None:
     found = look()
     assert found.condition is Condition.GOOD, found
     assert database.index(kept.settings).condition is Condition.GOOD
 
 
-def test_a_manifest_that_is_gone_is_bad(kept: Parts, look: Look) -> None:
+def test_a_manifest_that_is_gone_is_bad(kept: Services, look: Look) -> None:
     lost = shard_of(kept)
     lost.unlink()
     found = look()
@@ -71,13 +71,13 @@ def test_a_manifest_that_is_gone_is_bad(kept: Parts, look: Look) -> None:
     assert "index rebuild" in found.mend
 
 
-def test_a_row_that_is_gone_is_bad(kept: Parts, look: Look) -> None:
+def test_a_row_that_is_gone_is_bad(kept: Services, look: Look) -> None:
     with kept.index.database.writing() as connection:
         connection.exec_driver_sql(f"DELETE FROM shards WHERE id = '{shard_of(kept).stem}'")
     assert "not in the index" in look().message
 
 
-def test_a_row_that_says_something_else_is_bad(kept: Parts, look: Look) -> None:
+def test_a_row_that_says_something_else_is_bad(kept: Services, look: Look) -> None:
     with kept.index.database.writing() as connection:
         connection.exec_driver_sql("UPDATE shards SET valid = valid + 1")
     found = look()
@@ -85,7 +85,7 @@ def test_a_row_that_says_something_else_is_bad(kept: Parts, look: Look) -> None:
     assert "the store says" in found.message
 
 
-def test_what_is_on_its_way_in_is_no_difference(kept: Parts, look: Look, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_on_its_way_in_is_no_difference(kept: Services, look: Look, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between the two looks a controller takes up what was written."""
     key = shard_of(kept)
     data = key.read_bytes()
@@ -94,7 +94,7 @@ def test_what_is_on_its_way_in_is_no_difference(kept: Parts, look: Look, monkeyp
     assert look().condition is Condition.GOOD
 
 
-def test_known_damage_is_told_with_its_mend(kept: Parts) -> None:
+def test_known_damage_is_told_with_its_mend(kept: Services) -> None:
     assert database.damage(kept.settings).condition is Condition.GOOD
     kept.index.damage.mark([Damage("shards/base/x.h5", "has another checksum", "x")])
     found = database.damage(kept.settings)
@@ -110,7 +110,7 @@ def test_where_there_is_no_index_none_is_made(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_damaged_file_is_bad_and_left_where_it_is(kept: Parts) -> None:
+def test_a_damaged_file_is_bad_and_left_where_it_is(kept: Services) -> None:
     kept.index.close()
     file = kept.settings.data_dir / "index.sqlite"
     for beside in kept.settings.data_dir.glob("index.sqlite-*"):
@@ -124,7 +124,7 @@ def test_a_damaged_file_is_bad_and_left_where_it_is(kept: Parts) -> None:
 
 
 @pytest.mark.parametrize("revision", [f"{int(REVISION) - 1:04}", "9999"])
-def test_tables_of_another_version_are_bad_and_left_as_they_are(kept: Parts, revision: str) -> None:
+def test_tables_of_another_version_are_bad_and_left_as_they_are(kept: Services, revision: str) -> None:
     with kept.index.database.writing() as connection:
         connection.exec_driver_sql(f"UPDATE alembic_version SET version_num = '{revision}'")
     kept.index.close()
@@ -160,13 +160,13 @@ def test_a_postgresql_that_is_away_or_refuses_is_bad(tmp_path: Path, postgres_se
 
 
 @pytest.mark.postgres
-def test_an_index_in_postgresql_is_compared_too(kept: Parts, postgres_server: PostgresServer) -> None:
+def test_an_index_in_postgresql_is_compared_too(kept: Services, postgres_server: PostgresServer) -> None:
     settings = Settings(data_dir=kept.settings.data_dir, index_url=postgres_server.database())
     index = Index(settings.resolved_index_url)
     rebuild(index, kept.store)
     assert database.index_is_store(settings, settles_s=0.0).condition is Condition.GOOD
     job = index.jobs.page(limit=1).items[0].id
-    fail(Parts(settings, open_store("memory://"), index, MemoryQueue()), job, 0, 1, last=False)
+    fail(Services(settings, open_store("memory://"), index, MemoryQueue()), job, 0, 1, last=False)
     index.close()
     found = database.index_is_store(settings, settles_s=0.0)
     assert not found.ok

@@ -13,7 +13,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from service.model.errors import InputError
-from service.pipeline.backends import Parts
+from service.pipeline.backends import Services
 from service.readers import Pictures, Shards, open_shards
 from service.settings import Settings
 from service.store.shards import Shard
@@ -105,12 +105,12 @@ def shards(tmp_path: Path) -> Shards:
     from tests.api import factories
 
     settings = Settings(data_dir=tmp_path)
-    parts = Parts(settings, open_store("memory://"), empty_index(settings.resolved_index_url), MemoryQueue())
-    factories.add_builtins(parts)
-    record = factories.add_job(parts, scenes=2, views=2, width=W, height=H)
-    factories.finish_all(parts, record)
-    found = open_shards(parts.store, job=record.id, cache=tmp_path / "cache")
-    parts.close()
+    services = Services(settings, open_store("memory://"), empty_index(settings.resolved_index_url), MemoryQueue())
+    factories.add_builtins(services)
+    record = factories.add_job(services, scenes=2, views=2, width=W, height=H)
+    factories.finish_all(services, record)
+    found = open_shards(services.store, job=record.id, cache=tmp_path / "cache")
+    services.close()
     return found
 
 
@@ -123,7 +123,7 @@ def test_every_picture_is_one_sample_of_a_tar_file(shards: Shards, tmp_path: Pat
                 key, _, what = member.partition(".")
                 keys.setdefault(key, set()).add(what)
     assert len(keys) == len(Pictures(shards)) == 4
-    assert all(parts == {"rgb.png", "depth.exr", "segmentation.png", "json"} for parts in keys.values())
+    assert all(services == {"rgb.png", "depth.exr", "segmentation.png", "json"} for services in keys.values())
     assert len(written) == 2
 
 
