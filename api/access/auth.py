@@ -18,7 +18,7 @@ from starlette.types import Scope as AsgiScope
 from api.access.keys import Key, KeyFile, Scope
 from api.access.proxy import Proxy
 from api.problems import ApiError
-from service.model.projects import EVERYTHING, Reach
+from service.model.projects import EVERYTHING, ProjectScope
 
 SESSION_COOKIE: Final = "graspd_session"
 #: Headers that a proxy adds: while the service is open they mean that somebody else's requests arrive here.
@@ -34,10 +34,10 @@ def caller_id() -> str:
     return key.id if key else ""
 
 
-def reach() -> Reach:
+def project_scope() -> ProjectScope:
     """What the key of the present request may see: its project; with `admin`, and while the service is open, all."""
     key = caller.get()
-    return EVERYTHING if key is None else Reach(key.project, everything=key.scope.includes(Scope.ADMIN))
+    return EVERYTHING if key is None else ProjectScope(key.project, everything=key.scope.includes(Scope.ADMIN))
 
 
 class NotYours(ApiError):

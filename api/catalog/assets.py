@@ -10,7 +10,7 @@ from collections.abc import Mapping, MutableMapping
 from dataclasses import replace
 from typing import Final
 
-from api.access.auth import caller_id, must_own, reach
+from api.access.auth import caller_id, must_own, project_scope
 from service.index.views import AssetView, Page
 from service.model import names
 from service.model.digests import digest_files
@@ -33,7 +33,7 @@ _NAMES_TRIED: Final = 100
 
 
 class Assets:
-    """Hands, objects and networks within the caller's reach; what takes one away asks whose it is. A `name` may be a
+    """Hands, objects and networks in the caller's scope; what takes one away asks whose it is. A `name` may be a
     digest."""
 
     def __init__(self, services: Services) -> None:
@@ -43,10 +43,12 @@ class Assets:
         self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None, refused: bool = False
     ) -> Page[AssetView]:
         """All of a kind, newest first; those that the check refused only where asked for."""
-        return self._services.index.assets.page(kind, limit=limit, cursor=cursor, refused=refused, reach=reach())
+        return self._services.index.assets.page(
+            kind, limit=limit, cursor=cursor, refused=refused, scope=project_scope()
+        )
 
     def one(self, kind: AssetKind, name: str) -> AssetView:
-        return self._services.index.assets.get(kind, name, reach=reach())
+        return self._services.index.assets.get(kind, name, scope=project_scope())
 
     def files(self, asset: AssetView) -> Mapping[str, bytes]:
         """Its files as they were uploaded, `asset.json` among them."""
@@ -84,7 +86,7 @@ class Assets:
             InputError: no network.
         """
         found = network_report(files, name) if kind is AssetKind.NETWORK else None
-        project = reach().project
+        project = project_scope().project
         digest = self._mark(kind, name, files, "" if shared else project)
         self._refuse_hidden(kind, digest)
         with contextlib.suppress(NotFoundError):
@@ -143,7 +145,7 @@ class Assets:
         files["asset.json"] = text
         if not new_name:
             # The same corrections are the same hand.
-            for mark in ({}, marks_of(files, reach().project)):
+            for mark in ({}, marks_of(files, project_scope().project)):
                 files.update(mark)
                 with contextlib.suppress(NotFoundError):
                     return self.one(AssetKind.HAND, digest_files(AssetKind.HAND, files))
@@ -170,7 +172,7 @@ class Assets:
         asset = self.one(kind, name)
         if not asset.builtin:
             must_own(asset.owner, f"{kind.value} {name!r}", asset.project)
-        deletion.delete_asset(self._services, kind, asset.digest, owner=caller_id(), reach=reach())
+        deletion.delete_asset(self._services, kind, asset.digest, owner=caller_id(), scope=project_scope())
         log.info("%s %s deleted", kind, asset.name)
 
     def _mark(self, kind: AssetKind, name: str, files: MutableMapping[str, bytes], project: str) -> str:
@@ -201,7 +203,7 @@ class Assets:
         """Digest of what a name stands for; empty: it is free."""
         with contextlib.suppress(NotFoundError):
             # Another project's names take none from this one, an admin's neither.
-            known = self._services.index.assets.get(kind, name, reach=replace(reach(), everything=False))
+            known = self._services.index.assets.get(kind, name, scope=replace(project_scope(), everything=False))
             # A refused upload holds no name: the same file with the fix must get in.
             return known.digest if known.verdict != "refuse" else ""
         return ""

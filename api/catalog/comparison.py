@@ -58,7 +58,7 @@ class Comparison:
 
 
 class Comparisons:
-    """Compares datasets within the caller's reach."""
+    """Compares datasets in the caller's scope."""
 
     def __init__(self, services: Services, datasets: Datasets) -> None:
         self._services = services
@@ -68,7 +68,7 @@ class Comparisons:
         """Two datasets by name.
 
         Raises:
-            NotFoundError: there is no such dataset within reach.
+            NotFoundError: there is no such dataset in scope.
         """
         both = self._datasets.one(one), self._datasets.one(other)
         filters = [

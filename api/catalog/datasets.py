@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 
-from api.access.auth import caller, caller_id, must_own, reach
+from api.access.auth import caller, caller_id, must_own, project_scope
 from api.access.quotas import Quotas
 from api.access.unfinished import DATASET_PREFIX
 from service.index.dataset_views import CellView, DatasetView, ObjectSetView, SnapshotView
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 
 class Datasets:
-    """Datasets within the caller's reach; what changes one asks whose it is."""
+    """Datasets in the caller's scope; what changes one asks whose it is."""
 
     def __init__(self, services: Services, quotas: Quotas) -> None:
         self._services = services
@@ -39,10 +39,10 @@ class Datasets:
         Raises:
             QuotaError: the caller's key has all it may have.
         """
-        hands, objects = actions.members(self._services, request, reach())
+        hands, objects = actions.members(self._services, request, project_scope())
         asked = len(hands) * len(objects) * request.grasps
         with self._quotas.claim(caller.get(), DATASET_PREFIX + request.name, asked) as claim:
-            dataset, claim.counts = actions.create(self._services, request, owner=caller_id(), reach=reach())
+            dataset, claim.counts = actions.create(self._services, request, owner=caller_id(), scope=project_scope())
         return dataset
 
     def cancel(self, name: str) -> DatasetView:
@@ -79,24 +79,24 @@ class Datasets:
 
     def estimate(self, matrix: Matrix) -> Estimate:
         """What a matrix will cost. Nothing is recorded."""
-        return estimate(self._services.index, matrix, Resolver(self._services.store), reach=reach())
+        return estimate(self._services.index, matrix, Resolver(self._services.store), scope=project_scope())
 
     def page(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
         """Datasets, the newest first."""
-        return self._services.index.datasets.page(limit=limit, cursor=cursor, reach=reach())
+        return self._services.index.datasets.page(limit=limit, cursor=cursor, scope=project_scope())
 
     def one(self, name: str) -> DatasetView:
-        return self._services.index.datasets.get(name, reach=reach())
+        return self._services.index.datasets.get(name, scope=project_scope())
 
     def cells(
         self, name: str, *, state: State | None = None, limit: int = 50, cursor: str | None = None
     ) -> Page[CellView]:
         """Each hand x object of a dataset with its job, hand by hand."""
-        return self._services.index.datasets.cells(name, state=state, limit=limit, cursor=cursor, reach=reach())
+        return self._services.index.datasets.cells(name, state=state, limit=limit, cursor=cursor, scope=project_scope())
 
     def matrix(self) -> list[MatrixCell]:
         """Each hand x object of which there is a job, of a dataset or not."""
-        return self._services.index.overview.matrix(reach=reach())
+        return self._services.index.overview.matrix(scope=project_scope())
 
     def take_snapshot(self, name: str) -> tuple[Snapshot, bool]:
         """Write down which shards a dataset holds now; and whether that made a new snapshot."""
@@ -105,7 +105,7 @@ class Datasets:
 
     def snapshots(self, name: str, *, limit: int = 50, cursor: str | None = None) -> Page[SnapshotView]:
         """Snapshots of a dataset, the newest first."""
-        return self._services.index.datasets.snapshots(name, limit=limit, cursor=cursor, reach=reach())
+        return self._services.index.datasets.snapshots(name, limit=limit, cursor=cursor, scope=project_scope())
 
     def snapshot(self, name: str, digest: str) -> Snapshot:
         """A snapshot with its list of shards."""
@@ -123,16 +123,16 @@ class Datasets:
             name,
             objects,
             owner=caller_id(),
-            reach=reach(),
+            scope=project_scope(),
             may_follow=lambda owner, project: must_own(owner, f"the set {name!r}", project),
         )
 
     def object_sets(self) -> list[ObjectSetView]:
         """The newest version of each set, by name."""
-        return self._services.index.object_sets.newest(reach=reach())
+        return self._services.index.object_sets.newest(scope=project_scope())
 
     def object_set(self, name: str) -> ObjectSetView:
-        return self._services.index.object_sets.get(name, reach=reach())
+        return self._services.index.object_sets.get(name, scope=project_scope())
 
     def _owned(self, name: str) -> DatasetView:
         dataset = self.one(name)

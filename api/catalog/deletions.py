@@ -7,7 +7,7 @@ from datetime import datetime, timedelta
 
 from pydantic import Field
 
-from api.access.auth import must_own, reach
+from api.access.auth import must_own, project_scope
 from service.index.views import View
 from service.pipeline import deletion
 from service.pipeline.backends import Services
@@ -29,7 +29,7 @@ class DeletionView(View):
 
 
 class Deletions:
-    """Deletions within the caller's reach; who may delete a thing may restore it."""
+    """Deletions in the caller's scope; who may delete a thing may restore it."""
 
     def __init__(self, services: Services) -> None:
         self._services = services
@@ -55,7 +55,7 @@ class Deletions:
         return self._view(found)
 
     def _is_seen(self, one: Deletion) -> bool:
-        return reach().everything or one.project == reach().project
+        return project_scope().everything or one.project == project_scope().project
 
     def _view(self, one: Deletion) -> DeletionView:
         ends = datetime.fromisoformat(one.at) + timedelta(seconds=self._services.settings.shard_grace_s)

@@ -15,7 +15,7 @@ from typing import IO, Any, Final, Literal
 
 import numpy as np
 
-from api.access.auth import reach
+from api.access.auth import project_scope
 from api.catalog.grasps import Grasps
 from api.catalog.tags import Tags
 from service.index.views import GraspView
@@ -105,7 +105,7 @@ class GraspExports:
         looked_at, names = 0, list[PurePosixPath]()
         with zipfile.ZipFile(file, "w") as packed:
             for shard_id, rows in shards.items():
-                known = self._services.index.shards.get(shard_id, reach=reach())
+                known = self._services.index.shards.get(shard_id, scope=project_scope())
                 shard = read_shard(
                     read_checked(self._services.store, known.key, known.sha256), kind="base", name=known.key
                 )

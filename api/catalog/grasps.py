@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from api.access.auth import reach
+from api.access.auth import project_scope
 from api.catalog.grasp_files import GraspFiles
 from api.models import Diversity, GraspDetail, GraspQuery, Histogram, JobDetail
 from service.index.filters import GraspFilter, GraspSort, Metric
@@ -22,7 +22,7 @@ MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(metric.name for metric in indexe
 
 
 class Grasps:
-    """Grasps of the jobs within the caller's reach; they never change."""
+    """Grasps of the jobs in the caller's scope; they never change."""
 
     def __init__(self, services: Services) -> None:
         self._index = services.index
@@ -51,24 +51,24 @@ class Grasps:
         return self._index.grasps.listed(places)
 
     def _filter(self, query: GraspQuery) -> GraspFilter:
-        """The index's filter behind a request's parameters, within the caller's reach.
+        """The index's filter behind a request's parameters, in the caller's scope.
 
         Raises:
             NotFoundError: there is no such tag, or dataset.
         """
-        seen = reach()
+        seen = project_scope()
         if query.dataset is not None:
-            self._index.datasets.get(query.dataset, reach=seen)
+            self._index.datasets.get(query.dataset, scope=seen)
         named = {
             "project": None if seen.everything else seen.project,
             "dataset": query.dataset,
-            "tag": query.tag and self._index.tags.named(query.tag, reach=seen),
+            "tag": query.tag and self._index.tags.named(query.tag, scope=seen),
         }
         return _bounded(query).model_copy(update=named)
 
     def one(self, shard_id: str, row: int) -> GraspDetail:
         """One grasp with all that its shard says of it."""
-        grasp, shard = self._index.grasps.get(shard_id, row, reach=reach()), self._index.shards.get(shard_id)
+        grasp, shard = self._index.grasps.get(shard_id, row, scope=project_scope()), self._index.shards.get(shard_id)
         return self._files.detail(grasp, shard)
 
     def histograms(self, job: JobView | JobDetail, *, bins: int = 20) -> list[Histogram]:

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Sequence
 from typing import Final
 
-from api.access.auth import caller, caller_id, must_own, reach
+from api.access.auth import caller, caller_id, must_own, project_scope
 from api.access.idempotency import Idempotency
 from api.access.quotas import Quotas
 from api.catalog.grasps import MEAN_METRICS, Grasps
@@ -31,7 +31,7 @@ _LOSS_BATCHES: Final = 8
 
 
 class Jobs:
-    """Jobs within the caller's reach; what changes one asks whose it is."""
+    """Jobs in the caller's scope; what changes one asks whose it is."""
 
     def __init__(
         self, services: Services, quotas: Quotas, idempotency: Idempotency, grasps: Grasps, shards: Shards
@@ -56,7 +56,7 @@ class Jobs:
         if idempotency_key is not None:
             bound = self._idempotency.claim(key.name if key else "", idempotency_key, request)
         with bound:
-            record = job_actions.prepare(self._services, request, owner=caller_id(), reach=reach())
+            record = job_actions.prepare(self._services, request, owner=caller_id(), scope=project_scope())
             with bind(job=record.id), self._quotas.claim(key, record.id, record.request.grasps) as claim:
                 job, is_new = job_actions.enter(self._services, record)
                 claim.counts = is_new
@@ -111,17 +111,17 @@ class Jobs:
     ) -> Page[Job]:
         """Jobs, newest first."""
         page = self._services.index.jobs.page(
-            state=state, hand=hand, object=object, limit=limit, cursor=cursor, reach=reach()
+            state=state, hand=hand, object=object, limit=limit, cursor=cursor, scope=project_scope()
         )
         return Page[Job](items=[self._job(job, ()) for job in page.items], next=page.next)
 
     def one(self, job_id: str) -> JobDetail:
         """A job with its attempts, mean metrics and shards."""
-        return self._detail(self._services.index.jobs.get(job_id, reach=reach()))
+        return self._detail(self._services.index.jobs.get(job_id, scope=project_scope()))
 
     def moving(self, job_id: str) -> Job:
         """A job with the progress of its stages and nothing else: what a stream of events repeats."""
-        return self._job(self._services.index.jobs.get(job_id, reach=reach()), self._running(job_id))
+        return self._job(self._services.index.jobs.get(job_id, scope=project_scope()), self._running(job_id))
 
     def loss_curve(self, job: JobDetail) -> LossCurve | None:
         """Mean loss of the planner over the first batches of a job; None where the planner keeps none."""
@@ -145,7 +145,7 @@ class Jobs:
         return self._losses[shard_id]
 
     def _owned(self, job_id: str) -> JobView:
-        job = self._services.index.jobs.get(job_id, reach=reach())
+        job = self._services.index.jobs.get(job_id, scope=project_scope())
         must_own(job.owner, f"job {job_id}", job.project)
         return job
 

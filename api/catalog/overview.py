@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
 from typing import Final
 
-from api.access.auth import reach
+from api.access.auth import project_scope
 from api.catalog.health import Probes
 from api.catalog.jobs import Jobs
 from api.metrics import Snapshot
@@ -19,7 +19,7 @@ from service.index.damage import Damage
 from service.index.views import FailureGroup, Stats, TaskView
 from service.model.digests import digest_json
 from service.model.errors import NotFoundError, UnavailableError
-from service.model.projects import Reach
+from service.model.projects import ProjectScope
 from service.model.states import Lane, Stage
 from service.pipeline.backends import Services
 from service.pipeline.leading import PART
@@ -34,14 +34,14 @@ FINGERPRINT_S: Final = 1.0
 class Overview:
     """What the home page, probes and Prometheus ask for; it changes nothing.
 
-    Workers, queue and health are everybody's; what the jobs are and made is told within the caller's reach.
+    Workers, queue and health are everybody's; what the jobs are and made is told in the caller's scope.
     """
 
     def __init__(self, services: Services, jobs: Jobs) -> None:
         self._services = services
         self._jobs = jobs
         self._probes = Probes(services)
-        self._fingerprints: dict[Reach, tuple[float, str]] = {}
+        self._fingerprints: dict[ProjectScope, tuple[float, str]] = {}
         self._lock = threading.Lock()
 
     def workers(self) -> list[Worker]:
@@ -67,26 +67,26 @@ class Overview:
         if worker.state != "busy" or not worker.task_id:
             return None
         try:
-            return self._services.index.jobs.task(worker.task_id, reach=reach())
+            return self._services.index.jobs.task(worker.task_id, scope=project_scope())
         except NotFoundError:
             return None
 
     def stats(self) -> Stats:
-        return self._services.index.overview.stats(reach=reach())
+        return self._services.index.overview.stats(scope=project_scope())
 
     def valid_per_minute(self, *, minutes: int = 60) -> list[int]:
         """Valid grasps made in each of the last minutes, the oldest first."""
         start = datetime.now(UTC).replace(second=0, microsecond=0) - timedelta(minutes=minutes - 1)
         made = [0] * minutes
         for bucket in self._services.index.overview.throughput(
-            since=start.isoformat().replace("+00:00", "Z"), bucket_s=60, reach=reach()
+            since=start.isoformat().replace("+00:00", "Z"), bucket_s=60, scope=project_scope()
         ):
             minute = int((datetime.fromisoformat(bucket.start) - start).total_seconds() // 60)
             made[min(max(minute, 0), minutes - 1)] += bucket.valid
         return made
 
     def failures(self, *, limit: int = 5) -> list[FailureGroup]:
-        return self._services.index.overview.failures(limit=limit, reach=reach())
+        return self._services.index.overview.failures(limit=limit, scope=project_scope())
 
     def depths(self) -> dict[tuple[Lane, Stage], int]:
         """Waiting tasks by lane and stage."""
@@ -97,9 +97,8 @@ class Overview:
         return self._probes.health()
 
     def damage(self) -> tuple[int, list[Damage]]:
-        """Number of objects of the store known to be damaged or missing, and the first of them, for whom all is in
-        reach."""
-        if not reach().everything:
+        """Number of objects of the store known to be damaged or missing, and the first of them, if all is in scope."""
+        if not project_scope().everything:
             return 0, []
         return self._services.index.damage.known(limit=_DAMAGE_SHOWN)
 
@@ -117,13 +116,13 @@ class Overview:
         return found
 
     def fingerprint(self) -> str:
-        """Another text whenever a job or a task within reach, or a worker, changed."""
+        """Another text whenever a job or a task in scope, or a worker, changed."""
         with self._lock:
-            at, digest = self._fingerprints.get(reach(), (0.0, ""))
+            at, digest = self._fingerprints.get(project_scope(), (0.0, ""))
             now = time.monotonic()
             if not digest or now - at >= FINGERPRINT_S:
                 digest = self._digest()
-                self._fingerprints[reach()] = (now, digest)
+                self._fingerprints[project_scope()] = (now, digest)
             return digest
 
     def _digest(self) -> str:
@@ -133,9 +132,13 @@ class Overview:
         return digest_json({"stats": self.stats().model_dump(mode="json"), "workers": workers, "jobs": moving})
 
     def _seen(self, tasks: Iterable[str]) -> set[str]:
-        """Of these tasks, those within reach, and those that no job owns, such as the check of an upload."""
+        """Of these tasks, those in scope, and those that no job owns, such as the check of an upload."""
         wanted = set(tasks)
-        return wanted if reach().everything else wanted - self._services.index.jobs.out_of_reach(wanted, reach())
+        return (
+            wanted
+            if project_scope().everything
+            else wanted - self._services.index.jobs.out_of_scope(wanted, project_scope())
+        )
 
     def _queue_now(self) -> QueueNow:
         # A worker's registration lives for whole seconds: see `worker.process.heartbeat`.

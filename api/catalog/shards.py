@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from typing import Literal
 
-from api.access.auth import reach
+from api.access.auth import project_scope
 from api.models import Shard
 from service.index.views import Page, ShardView
 from service.pipeline.backends import Services
@@ -13,7 +13,7 @@ from service.store.integrity import Checked
 
 
 class Shards:
-    """Shards of the jobs within the caller's reach; they never change."""
+    """Shards of the jobs in the caller's scope; they never change."""
 
     def __init__(self, services: Services) -> None:
         self._services = services
@@ -28,11 +28,11 @@ class Shards:
         cursor: str | None = None,
     ) -> Page[Shard]:
         """Shards, all or those of a job."""
-        page = self._services.index.shards.page(job=job, kind=kind, limit=limit, cursor=cursor, reach=reach())
+        page = self._services.index.shards.page(job=job, kind=kind, limit=limit, cursor=cursor, scope=project_scope())
         return Page[Shard](items=[_shard(shard) for shard in page.items], next=page.next)
 
     def one(self, shard_id: str) -> Shard:
-        return _shard(self._services.index.shards.get(shard_id, reach=reach()))
+        return _shard(self._services.index.shards.get(shard_id, scope=project_scope()))
 
     def intact(self, shard_id: str) -> Shard:
         """A shard whose file is what its checksum says; read through once, then again only where it was changed.
@@ -62,7 +62,7 @@ class Shards:
 
     def job_of(self, shard_id: str) -> str | None:
         """A job that a shard belongs to; None where it is gone."""
-        return self._services.index.shards.job_of(shard_id, reach=reach())
+        return self._services.index.shards.job_of(shard_id, scope=project_scope())
 
     def assets_of(self, ids: Collection[str]) -> dict[str, tuple[str, str]]:
         """Digests of the hand and the object of each shard."""

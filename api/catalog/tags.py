@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection
 
-from api.access.auth import caller_id, may_change, must_own, reach
+from api.access.auth import caller_id, may_change, must_own, project_scope
 from api.catalog.grasps import Grasps
 from api.models import Selection, TagChange
 from service.index.views import TagView
 from service.model.errors import InputError, LimitError, NotFoundError
-from service.model.projects import Reach
+from service.model.projects import ProjectScope
 from service.model.tags import MOST_TAGS, Grasp, Tag, tag_id
 from service.pipeline import tagging
 from service.pipeline.backends import Services
@@ -26,28 +26,28 @@ class Tags:
         self._grasps = grasps
 
     def all(self) -> list[TagView]:
-        """Tags within reach, by name."""
-        return self._services.index.tags.all(reach=reach())
+        """Tags in scope, by name."""
+        return self._services.index.tags.all(scope=project_scope())
 
     def one(self, name: str) -> TagView:
         """A tag by its name or id."""
-        wanted = self._services.index.tags.named(name, reach=reach())
+        wanted = self._services.index.tags.named(name, scope=project_scope())
         return next(tag for tag in self.all() if tag.id == wanted)
 
     def of(self, grasps: Collection[Grasp]) -> dict[Grasp, list[str]]:
         """Names of the tags of each of these grasps that has one."""
-        return self._services.index.tags.of(grasps, reach=reach())
+        return self._services.index.tags.of(grasps, scope=project_scope())
 
     def chosen(self, selection: Selection) -> list[Grasp]:
         """The grasps of a selection, each once, in order.
 
         Raises:
-            NotFoundError: one that is named is not there, or not within reach.
+            NotFoundError: one that is named is not there, or not in scope.
         """
         if selection.filter is not None:
             return self._grasps.members(selection.filter)
         named = sorted({(grasp.shard_id, grasp.row) for grasp in selection.grasps or ()})
-        there = self._services.index.tags.there(named, reach=reach())
+        there = self._services.index.tags.there(named, scope=project_scope())
         for shard, row in named:
             if (shard, row) not in there:
                 raise NotFoundError(f"there is no grasp {row} in shard {shard!r}")
@@ -63,7 +63,7 @@ class Tags:
         """
         if not (grasps := self.chosen(selection)):
             raise InputError("no grasp passes this filter, so none gets the tag")
-        project = reach().project
+        project = project_scope().project
 
         def permit(tag: Tag | None) -> None:
             _permit(tag)
@@ -80,7 +80,7 @@ class Tags:
         Raises:
             NotYours: another key made it.
         """
-        tag = self._services.index.tags.named(name, reach=reach())
+        tag = self._services.index.tags.named(name, scope=project_scope())
         changed = tagging.take_off(self._services, tag, self.chosen(selection), permit=_permit)
         return TagChange(tag=self.one(tag), changed=changed)
 
@@ -90,13 +90,13 @@ class Tags:
         Raises:
             NotYours: another key made it.
         """
-        tag = self._services.index.tags.named(name, reach=reach())
+        tag = self._services.index.tags.named(name, scope=project_scope())
         tagging.remove(self._services, tag, permit=_permit, owner=caller_id())
         log.info("tag %s removed", name)
 
     def _mine(self, project: str) -> int:
         """Tags of the project; where it has no name, those of the caller's key."""
-        found = self._services.index.tags.all(reach=Reach(project, everything=False))
+        found = self._services.index.tags.all(scope=ProjectScope(project, everything=False))
         return sum(bool(project) or may_change(tag.owner, tag.project) for tag in found)
 
 

@@ -7,7 +7,7 @@ import io
 from datetime import UTC, date, datetime, timedelta
 from typing import Final
 
-from api.access.auth import caller, reach
+from api.access.auth import caller, project_scope
 from api.access.keys import KeyFile, ProjectLimits
 from service.index.views import UsageDay
 from service.model.errors import InputError
@@ -20,7 +20,7 @@ _COLUMNS: Final = tuple(UsageDay.model_fields)
 
 
 class Usage:
-    """Use within the caller's reach: of the project of the key, and with `admin` of all."""
+    """Use in the caller's scope: of the project of the key, and with `admin` of all."""
 
     def __init__(self, services: Services, keys: KeyFile) -> None:
         self._services = services
@@ -38,14 +38,14 @@ class Usage:
             raise InputError(f"since {first} is after until {last}")
         if (last - first).days >= MOST_DAYS:
             raise InputError(f"at most {MOST_DAYS} days are told at once; ask for fewer")
-        return self._services.index.usage.days(first.isoformat(), last.isoformat(), reach=reach())
+        return self._services.index.usage.days(first.isoformat(), last.isoformat(), scope=project_scope())
 
     def limits(self) -> dict[str, ProjectLimits]:
-        """What each project within reach may use together."""
+        """What each project in scope may use together."""
         key = caller.get()
         if key is None:
             return {}
-        return {name: limits for name, limits in self._keys.projects().items() if reach().sees(name)}
+        return {name: limits for name, limits in self._keys.projects().items() if project_scope().sees(name)}
 
 
 def as_csv(days: list[UsageDay]) -> str:

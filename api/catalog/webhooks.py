@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 import secrets
 
-from api.access.auth import caller, caller_id, may_change, must_own, reach
+from api.access.auth import caller, caller_id, may_change, must_own, project_scope
 from service.index.views import DeliveryView, EndView, WebhookView
 from service.model import names
 from service.model.clock import timestamp
 from service.model.errors import ConflictError, LimitError
-from service.model.projects import Reach
+from service.model.projects import ProjectScope
 from service.model.webhooks import MOST_HOOKS, End, Webhook, check_url, secret_of
 from service.pipeline.backends import Services
 from service.pipeline.recording import recording
@@ -25,8 +25,8 @@ class Webhooks:
         self._services = services
 
     def ends(self, since: int, *, limit: int) -> list[EndView]:
-        """The next ends of jobs and datasets within reach, behind a number."""
-        return self._services.index.outbox.ends(since, limit=limit, reach=reach())
+        """The next ends of jobs and datasets in scope, behind a number."""
+        return self._services.index.outbox.ends(since, limit=limit, scope=project_scope())
 
     def add(self, url: str, states: tuple[End, ...]) -> tuple[WebhookView, str]:
         """A webhook and its secret, which is told this once.
@@ -41,7 +41,7 @@ class Webhooks:
             raise ConflictError(
                 "webhooks are switched off; the operator sets GRASPD_WEBHOOK_SECRET for API and controller"
             )
-        project = reach().project
+        project = project_scope().project
         hook = Webhook(
             id=secrets.token_hex(16),
             url=check_url(url),
@@ -51,7 +51,7 @@ class Webhooks:
             project=project,
         )
         with recording(self._services) as (connection, put):
-            if len(self._services.index.outbox.hooks(reach=Reach(project, everything=False))) >= MOST_HOOKS:
+            if len(self._services.index.outbox.hooks(scope=ProjectScope(project, everything=False))) >= MOST_HOOKS:
                 raise LimitError(f"there are {MOST_HOOKS} webhooks, which is the most; delete one")
             put(names.webhook(hook.id), hook)
             self._services.index.outbox.add(hook, within=connection)
@@ -61,7 +61,7 @@ class Webhooks:
 
     def all(self) -> list[WebhookView]:
         """Webhooks that the caller may change: the addresses of others may hold words that let somebody in."""
-        return [hook for hook in self._services.index.outbox.hooks(reach=reach()) if self._is_theirs(hook)]
+        return [hook for hook in self._services.index.outbox.hooks(scope=project_scope()) if self._is_theirs(hook)]
 
     def log(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
         """Deliveries of a webhook, the newest first.
@@ -84,7 +84,7 @@ class Webhooks:
         log.info("webhook %s deleted", hook.id)
 
     def _owned(self, webhook: str) -> WebhookView:
-        hook = self._services.index.outbox.hook(webhook, reach=reach())
+        hook = self._services.index.outbox.hook(webhook, scope=project_scope())
         must_own(hook.owner, f"webhook {webhook}", hook.project)
         return hook
 

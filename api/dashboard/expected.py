@@ -10,12 +10,12 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from api.access.auth import reach
+from api.access.auth import project_scope
 from service.index.index import Index
 from service.index.queries.costs import BatchCost, Costs
 from service.model.errors import GraspdError
 from service.model.fidelity import OFFERED
-from service.model.projects import Reach
+from service.model.projects import ProjectScope
 from service.model.states import Stage
 from service.pipeline.datasets.cost import estimate
 from service.pipeline.datasets.spec import Matrix
@@ -68,7 +68,7 @@ class Expectations:
     def _one(self, name: str, wanted: dict[str, Any], hand: str, obj: str) -> Expected:
         try:
             matrix = Matrix.model_validate(wanted | {"hands": (hand,), "objects": (obj,), "fidelity": name})
-            cost = estimate(self._index, matrix, costs=self._costs.of_batches, reach=reach())
+            cost = estimate(self._index, matrix, costs=self._costs.of_batches, scope=project_scope())
         except (ValidationError, GraspdError):
             return Expected(name, WORDS[name], None, None, None, None, "")
         rate = cost.rates[0] if cost.rates else None
@@ -81,13 +81,13 @@ class _RememberedCosts:
 
     def __init__(self, costs: Costs) -> None:
         self._costs = costs
-        self._read: dict[tuple[Stage, Reach], tuple[float, list[BatchCost]]] = {}
+        self._read: dict[tuple[Stage, ProjectScope], tuple[float, list[BatchCost]]] = {}
         self._lock = threading.Lock()
 
     def of_batches(self, stage: Stage) -> list[BatchCost]:
         with self._lock:
             now = time.monotonic()
-            key = (stage, reach())
+            key = (stage, project_scope())
             if key not in self._read or now - self._read[key][0] > KEPT_S:
-                self._read[key] = (now, self._costs.of_batches(stage, reach=reach()))
+                self._read[key] = (now, self._costs.of_batches(stage, scope=project_scope()))
             return self._read[key][1]

@@ -30,7 +30,7 @@ from service.index.tables import datasets, metadata
 from service.index.views import DeliveryView, EndView, WebhookView
 from service.model.clock import timestamp
 from service.model.errors import NotFoundError
-from service.model.projects import EVERYTHING, Reach
+from service.model.projects import EVERYTHING, ProjectScope
 from service.model.webhooks import MOST_WAITING, WAITS_S, Webhook
 
 #: Ends and deliveries older than this are forgotten [s].
@@ -105,11 +105,11 @@ class Outbox:
 
     database: Database
 
-    def ends(self, since: int, *, limit: int, reach: Reach = EVERYTHING) -> list[EndView]:
+    def ends(self, since: int, *, limit: int, scope: ProjectScope = EVERYTHING) -> list[EndView]:
         """The next ends behind a number."""
         query = select(ends).where(ends.c.seq > since).order_by(ends.c.seq).limit(limit)
-        if not reach.everything:
-            query = query.where(ends.c.project == reach.project)
+        if not scope.everything:
+            query = query.where(ends.c.project == scope.project)
         with self.database.reading() as connection:
             return [EndView(**row) for row in connection.execute(query).mappings()]
 
@@ -164,17 +164,17 @@ class Outbox:
         for name, events in told.items():
             within.execute(update(datasets).where(datasets.c.name == name).values(told=events))
 
-    def hooks(self, *, reach: Reach = EVERYTHING) -> list[WebhookView]:
+    def hooks(self, *, scope: ProjectScope = EVERYTHING) -> list[WebhookView]:
         """Webhooks, the oldest first."""
         query = select(webhooks).order_by(webhooks.c.created, webhooks.c.id)
-        if not reach.everything:
-            query = query.where(webhooks.c.project == reach.project)
+        if not scope.everything:
+            query = query.where(webhooks.c.project == scope.project)
         with self.database.reading() as connection:
             return [_hook(row) for row in connection.execute(query).mappings()]
 
-    def hook(self, webhook: str, *, reach: Reach = EVERYTHING) -> WebhookView:
+    def hook(self, webhook: str, *, scope: ProjectScope = EVERYTHING) -> WebhookView:
         """A webhook; NotFoundError if there is none."""
-        for one in self.hooks(reach=reach):
+        for one in self.hooks(scope=scope):
             if one.id == webhook:
                 return one
         raise NotFoundError(f"there is no webhook {webhook!r}")

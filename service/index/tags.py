@@ -10,11 +10,11 @@ from sqlalchemy import Connection, case, delete, func, select, tuple_
 
 from service.index.bulk import upsert
 from service.index.database import Database, chunks
-from service.index.reach import seen_shards, seen_tags
+from service.index.project_scope import seen_shards, seen_tags
 from service.index.tables import grasps, tagged, tags
 from service.index.views import TagView
 from service.model.errors import NotFoundError
-from service.model.projects import EVERYTHING, Reach
+from service.model.projects import EVERYTHING, ProjectScope
 from service.model.tags import Grasp, Tag
 
 #: Grasps that one statement names: two parameters each.
@@ -27,33 +27,33 @@ class Tags:
 
     database: Database
 
-    def all(self, *, reach: Reach = EVERYTHING) -> list[TagView]:
+    def all(self, *, scope: ProjectScope = EVERYTHING) -> list[TagView]:
         """Tags by name, with how many grasps of each are there."""
         there = (grasps.c.shard_id == tagged.c.shard_id) & (grasps.c.row == tagged.c.row)
         number = select(func.count()).select_from(tagged.join(grasps, there)).where(tagged.c.tag == tags.c.id)
-        query = select(tags, number.scalar_subquery().label("grasps")).where(*seen_tags(reach))
+        query = select(tags, number.scalar_subquery().label("grasps")).where(*seen_tags(scope))
         with self.database.reading() as connection:
             rows = connection.execute(query.order_by(tags.c.name, tags.c.project)).mappings()
             return [TagView(**row) for row in rows]
 
-    def named(self, name: str, *, reach: Reach = EVERYTHING) -> str:
-        """Id of a tag by its name, or by its id; of several of a name the one of the reach's own project.
+    def named(self, name: str, *, scope: ProjectScope = EVERYTHING) -> str:
+        """Id of a tag by its name, or by its id; of several of a name the one of the scope's own project.
 
         Raises:
-            NotFoundError: there is none within reach.
+            NotFoundError: there is none in scope.
         """
-        own_first = case((tags.c.id == name, 0), (tags.c.project == reach.project, 1), else_=2)
-        query = select(tags.c.id).where((tags.c.name == name) | (tags.c.id == name), *seen_tags(reach))
+        own_first = case((tags.c.id == name, 0), (tags.c.project == scope.project, 1), else_=2)
+        query = select(tags.c.id).where((tags.c.name == name) | (tags.c.id == name), *seen_tags(scope))
         with self.database.reading() as connection:
             found: str | None = connection.scalar(query.order_by(own_first, tags.c.project).limit(1))
         if found is None:
             raise NotFoundError(f"there is no tag {name!r}")
         return found
 
-    def of(self, wanted: Collection[Grasp], *, reach: Reach = EVERYTHING) -> dict[Grasp, list[str]]:
+    def of(self, wanted: Collection[Grasp], *, scope: ProjectScope = EVERYTHING) -> dict[Grasp, list[str]]:
         """Names of the tags of each of these grasps that has one."""
         found: dict[Grasp, list[str]] = {}
-        query = select(tagged.c.shard_id, tagged.c.row, tags.c.name).where(tags.c.id == tagged.c.tag, *seen_tags(reach))
+        query = select(tagged.c.shard_id, tagged.c.row, tags.c.name).where(tags.c.id == tagged.c.tag, *seen_tags(scope))
         with self.database.reading() as connection:
             for some in chunks(sorted(wanted), _AT_ONCE):
                 those = tuple_(tagged.c.shard_id, tagged.c.row).in_(some)
@@ -61,9 +61,9 @@ class Tags:
                     found.setdefault((shard, row), []).append(name)
         return found
 
-    def there(self, wanted: Sequence[Grasp], *, reach: Reach = EVERYTHING) -> set[Grasp]:
-        """Those of these grasps that are there, and within reach."""
-        query = select(grasps.c.shard_id, grasps.c.row).where(*seen_shards(reach, grasps.c.shard_id))
+    def there(self, wanted: Sequence[Grasp], *, scope: ProjectScope = EVERYTHING) -> set[Grasp]:
+        """Those of these grasps that are there, and in scope."""
+        query = select(grasps.c.shard_id, grasps.c.row).where(*seen_shards(scope, grasps.c.shard_id))
         found: set[Grasp] = set()
         with self.database.reading() as connection:
             for some in chunks(wanted, _AT_ONCE):

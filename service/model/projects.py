@@ -21,7 +21,7 @@ MARK: Final = "graspd-project.txt"
 
 
 @dataclass(frozen=True)
-class Reach:
+class ProjectScope:
     """What somebody may see: the things of a project, and the hands and objects that are shared; or everything."""
 
     project: str = ""
@@ -29,12 +29,12 @@ class Reach:
     everything: bool = True
 
     def sees(self, project: str) -> bool:
-        """Whether the jobs and datasets of a project are within reach."""
+        """Whether the jobs and datasets of a project are in scope."""
         return self.everything or project == self.project
 
 
-#: The reach of an admin, of the controller, and of everybody while the service is open.
-EVERYTHING: Final = Reach()
+#: The scope of an admin, of the controller, and of everybody while the service is open.
+EVERYTHING: Final = ProjectScope()
 
 
 def marks_of(files: Mapping[str, bytes], project: str) -> dict[str, bytes]:

@@ -18,7 +18,7 @@ from service.model import names
 from service.model.clock import timestamp
 from service.model.dataset_records import Snapshot
 from service.model.errors import ConflictError, DamagedError, NotFoundError
-from service.model.projects import EVERYTHING, Reach
+from service.model.projects import EVERYTHING, ProjectScope
 from service.model.records import AttemptRecord, JobRecord
 from service.model.states import AssetKind
 from service.model.tags import Tag
@@ -32,12 +32,14 @@ from service.store.records import Put, job_events, put_record, read_record
 from service.store.store import Store
 
 
-def delete_asset(services: Services, kind: AssetKind, name: str, *, owner: str = "", reach: Reach = EVERYTHING) -> None:
+def delete_asset(
+    services: Services, kind: AssetKind, name: str, *, owner: str = "", scope: ProjectScope = EVERYTHING
+) -> None:
     """Take a hand, object or network away.
 
     Args:
         owner: id of the API key that deletes it.
-        reach: what a refusal may name.
+        scope: what a refusal may name.
 
     Raises:
         NotFoundError: there is none of that name or digest.
@@ -48,7 +50,7 @@ def delete_asset(services: Services, kind: AssetKind, name: str, *, owner: str =
         raise ConflictError(f"the {kind.value} {asset.name!r} comes with graspd and cannot be deleted")
     with recording(services) as (connection, put):
         if user := services.index.removals.user_of_asset(asset, within=connection):
-            if asset.shared and not reach.everything:
+            if asset.shared and not scope.everything:
                 user = "a job, a dataset or a set of objects"
             raise ConflictError(f"the {kind.value} {asset.name!r} is needed by {user}; delete that first")
         said = {"name": asset.name, "submitter": asset.owner, "project": asset.project}
@@ -133,7 +135,7 @@ def restore(
     Args:
         name: of the thing, or its id.
         permit: asked with the deletion; raises where it must not be taken back.
-        among: whether a deletion is within reach.
+        among: whether a deletion is in scope.
 
     Raises:
         NotFoundError: nothing of that name was deleted within the grace time.
@@ -202,7 +204,7 @@ def _enter(services: Services, deletion: Deletion, connection: Connection) -> No
         kind = AssetKind(deletion.what)
         asset = load_asset(store, kind, deletion.id)
         with contextlib.suppress(NotFoundError):
-            other = index.assets.get(kind, asset.name, reach=Reach(asset.project, everything=False))
+            other = index.assets.get(kind, asset.name, scope=ProjectScope(asset.project, everything=False))
             if other.verdict != "refuse" and other.digest != asset.digest:
                 raise ConflictError(f"there is another {kind.value} named {asset.name!r} now; delete that first")
         index.write.add_asset(asset, load_check(store, kind, asset.digest), within=connection)

@@ -20,7 +20,7 @@ from service.model.domain import JobRequest
 from service.model.errors import ConflictError, NotFoundError, UnavailableError
 from service.model.messages import Origin, TaskMessage
 from service.model.planning import lane_of, message_of
-from service.model.projects import EVERYTHING, Reach
+from service.model.projects import EVERYTHING, ProjectScope
 from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane, State
 from service.pipeline.backends import Services
@@ -55,13 +55,18 @@ def submit(services: Services, request: JobRequest, *, lane: Lane | None = None)
 
 
 def prepare(
-    services: Services, request: JobRequest, *, lane: Lane | None = None, owner: str = "", reach: Reach = EVERYTHING
+    services: Services,
+    request: JobRequest,
+    *,
+    lane: Lane | None = None,
+    owner: str = "",
+    scope: ProjectScope = EVERYTHING,
 ) -> JobRecord:
     """The job that a request stands for, of a hand and an object that may be used.
 
     Args:
         owner: id of the API key that submits it.
-        reach: which hands, objects and networks it may name, and the project that it belongs to.
+        scope: which hands, objects and networks it may name, and the project that it belongs to.
 
     Raises:
         NotFoundError: unknown hand, object, neighbour or network.
@@ -70,16 +75,16 @@ def prepare(
         ConflictError: the check of one of them is still running.
         QueueUnavailable, StoreUnavailable, IndexUnavailable: a part is away.
     """
-    hand = usable(services, AssetKind.HAND, request.hand, reach)
-    obj = usable(services, AssetKind.OBJECT, request.object, reach)
-    request, beside = with_neighbours(services, request, reach)
-    request = with_network(services, request, [hand], reach)
+    hand = usable(services, AssetKind.HAND, request.hand, scope)
+    obj = usable(services, AssetKind.OBJECT, request.object, scope)
+    request, beside = with_neighbours(services, request, scope)
+    request = with_network(services, request, [hand], scope)
     check_scene(request, obj, beside)
     services.queue.ping()
     named = request.model_copy(update={"hand": hand.name, "object": obj.name})
     request, choice = Resolver(services.store).choose(named)
     record = JobRecord(
-        id=job_id(request, hand.digest, obj.digest, reach.project),
+        id=job_id(request, hand.digest, obj.digest, scope.project),
         request=request,
         hand_digest=hand.digest,
         object_digest=obj.digest,
@@ -87,10 +92,10 @@ def prepare(
         created=timestamp(),
         origin=_present_origin(),
         owner=owner,
-        project=reach.project,
+        project=scope.project,
         choice=choice,
     )
-    return TaskRanges(services, reach=reach).sized(record)
+    return TaskRanges(services, scope=scope).sized(record)
 
 
 def enter(services: Services, record: JobRecord, *, keeps_assets: bool = False) -> tuple[JobView, bool]:

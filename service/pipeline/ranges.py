@@ -9,7 +9,7 @@ from typing import Final
 
 from service.index.queries.costs import BatchCost
 from service.model.domain import JobRequest, batches_of
-from service.model.projects import EVERYTHING, Reach
+from service.model.projects import EVERYTHING, ProjectScope
 from service.model.records import MOST_BATCHES, JobRecord
 from service.model.states import Lane, Stage
 from service.model.version import SCHEMA_OF_RANGES
@@ -29,10 +29,10 @@ class TaskRanges:
     """Chooses the ranges of jobs as they are planned."""
 
     def __init__(
-        self, services: Services, *, reach: Reach = EVERYTHING, clock: Callable[[], float] = time.monotonic
+        self, services: Services, *, scope: ProjectScope = EVERYTHING, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """`reach`: whose measurements count."""
-        self._services, self._reach, self._clock = services, reach, clock
+        """`scope`: whose measurements count."""
+        self._services, self._scope, self._clock = services, scope, clock
         self._read_again = -math.inf
         self._workers: list[WorkerBeat] = []
         self._costs: list[BatchCost] = []
@@ -53,7 +53,7 @@ class TaskRanges:
             return job
         if self._clock() >= self._read_again:
             self._workers = self._services.queue.workers()
-            self._costs = self._services.index.costs.of_batches(Stage.SYNTHESIZE, limit=_LOOKED_AT, reach=self._reach)
+            self._costs = self._services.index.costs.of_batches(Stage.SYNTHESIZE, limit=_LOOKED_AT, scope=self._scope)
             self._read_again = self._clock() + _KNOWN_S
         able = [worker for worker in self._workers if Stage.SYNTHESIZE in worker.stages]
         if any(worker.ability.schemas[1] < SCHEMA_OF_RANGES for worker in able):

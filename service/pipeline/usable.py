@@ -9,22 +9,22 @@ from service.index.views import AssetView
 from service.model.dataset_records import Member
 from service.model.domain import JobOptions
 from service.model.errors import ConflictError, InputError
-from service.model.projects import EVERYTHING, Reach
+from service.model.projects import EVERYTHING, ProjectScope
 from service.model.states import AssetKind
 from service.pipeline.backends import Services
 
 Options = TypeVar("Options", bound=JobOptions)
 
 
-def usable(services: Services, kind: AssetKind, name: str, reach: Reach = EVERYTHING) -> AssetView:
+def usable(services: Services, kind: AssetKind, name: str, scope: ProjectScope = EVERYTHING) -> AssetView:
     """A hand, object or network by name or digest that jobs may use.
 
     Raises:
-        NotFoundError: there is none within reach.
+        NotFoundError: there is none in scope.
         InputError: it was refused when it was checked.
         ConflictError: its check is still running.
     """
-    asset = services.index.assets.get(kind, name, reach=reach)
+    asset = services.index.assets.get(kind, name, scope=scope)
     if asset.verdict == "refuse":
         raise InputError(f"{kind.value} {name!r} was refused: {asset.message}")
     if asset.verdict is None:
@@ -34,7 +34,7 @@ def usable(services: Services, kind: AssetKind, name: str, reach: Reach = EVERYT
 
 
 def with_neighbours(
-    services: Services, options: Options, reach: Reach = EVERYTHING
+    services: Services, options: Options, scope: ProjectScope = EVERYTHING
 ) -> tuple[Options, Sequence[AssetView]]:
     """Options whose neighbours have the digests of the very files that the names stand for, and these neighbours.
 
@@ -43,7 +43,7 @@ def with_neighbours(
     Raises:
         what `usable` raises; InputError where a name and a digest are of two objects.
     """
-    beside = [usable(services, AssetKind.OBJECT, one.digest or one.object, reach) for one in options.beside]
+    beside = [usable(services, AssetKind.OBJECT, one.digest or one.object, scope) for one in options.beside]
     for one, asset in zip(options.beside, beside, strict=True):
         if one.object not in (asset.name, asset.digest):
             raise InputError(f"the neighbour {one.object!r} has a digest that is of {asset.name!r}; leave it out")
@@ -55,7 +55,7 @@ def with_neighbours(
 
 
 def with_network(
-    services: Services, options: Options, hands: Sequence[AssetView | Member], reach: Reach = EVERYTHING
+    services: Services, options: Options, hands: Sequence[AssetView | Member], scope: ProjectScope = EVERYTHING
 ) -> Options:
     """Options that say by its digest which network they set out from; as they are where their method takes none.
 
@@ -67,7 +67,7 @@ def with_network(
     """
     if not options.network:
         return options
-    network = usable(services, AssetKind.NETWORK, options.network, reach)
+    network = usable(services, AssetKind.NETWORK, options.network, scope)
     own = str(network.facts.get("hand_digest", ""))
     if other := next((hand for hand in hands if hand.digest != own), None):
         raise InputError(

@@ -10,12 +10,12 @@ from sqlalchemy import ColumnElement, Connection, and_, case, or_, select, tuple
 
 from service.index.database import Database, chunks
 from service.index.dataset_views import ObjectSetView
+from service.index.project_scope import nearest_asset, seen_assets, seen_sets
 from service.index.queries import cursors
-from service.index.reach import nearest_asset, seen_assets, seen_sets
 from service.index.tables import assets, object_sets
 from service.index.views import AssetView, Page
 from service.model.errors import NotFoundError
-from service.model.projects import EVERYTHING, Reach
+from service.model.projects import EVERYTHING, ProjectScope
 from service.model.states import AssetKind
 from service.model.suggestions import SEARCHED, known_names
 
@@ -33,11 +33,11 @@ class Assets:
         limit: int = 50,
         cursor: str | None = None,
         refused: bool = False,
-        reach: Reach = EVERYTHING,
+        scope: ProjectScope = EVERYTHING,
     ) -> Page[AssetView]:
         """Hands or objects, all versions, newest first; those that the check refused only where asked for."""
         size = cursors.page_size(limit)
-        query = select(assets).where(assets.c.kind == kind.value, *seen_assets(reach))
+        query = select(assets).where(assets.c.kind == kind.value, *seen_assets(scope))
         if not refused:
             query = query.where(_not_refused())
         query = query.order_by(assets.c.created.desc(), assets.c.digest.desc()).limit(size + 1)
@@ -49,8 +49,8 @@ class Assets:
         last = views[-1] if len(rows) > size else None
         return Page(items=views, next=last and cursors.encode(last.created, last.digest))
 
-    def get(self, kind: AssetKind, name_or_digest: str, *, reach: Reach = EVERYTHING) -> AssetView:
-        """A hand or object by its digest, or the newest of its name that was not refused, those of the reach's own
+    def get(self, kind: AssetKind, name_or_digest: str, *, scope: ProjectScope = EVERYTHING) -> AssetView:
+        """A hand or object by its digest, or the newest of its name that was not refused, those of the scope's own
         project first.
 
         Raises:
@@ -59,16 +59,16 @@ class Assets:
         named = and_(assets.c.kind == kind.value, assets.c.name == name_or_digest)
         by_digest = and_(assets.c.kind == kind.value, assets.c.digest == name_or_digest)
         refused_last = case((assets.c.verdict == "refuse", 1), else_=0)
-        query = select(assets).where(named | by_digest, *seen_assets(reach))
+        query = select(assets).where(named | by_digest, *seen_assets(scope))
         query = query.order_by(
-            refused_last, nearest_asset(reach), assets.c.created.desc(), assets.c.digest.desc()
+            refused_last, nearest_asset(scope), assets.c.created.desc(), assets.c.digest.desc()
         ).limit(1)
         with self.database.reading() as connection:
             row = connection.execute(query).mappings().first()
             if row is None:
                 known = (
                     select(assets.c.name)
-                    .where(assets.c.kind == kind.value, _not_refused(), *seen_assets(reach))
+                    .where(assets.c.kind == kind.value, _not_refused(), *seen_assets(scope))
                     .distinct()
                     .order_by(assets.c.name)
                 )
@@ -76,10 +76,10 @@ class Assets:
                 raise NotFoundError(f"there is no {kind.value} {name_or_digest!r}{known_names(name_or_digest, names)}")
         return _asset_view(row)
 
-    def sizes(self, kind: AssetKind, wanted: Collection[str], *, reach: Reach = EVERYTHING) -> dict[str, int]:
+    def sizes(self, kind: AssetKind, wanted: Collection[str], *, scope: ProjectScope = EVERYTHING) -> dict[str, int]:
         """Bytes of the named hands or objects; those that are not known are left out."""
         names = set(wanted)
-        query = select(assets.c.name, assets.c.size_bytes).where(assets.c.kind == kind.value, *seen_assets(reach))
+        query = select(assets.c.name, assets.c.size_bytes).where(assets.c.kind == kind.value, *seen_assets(scope))
         query = query.order_by(assets.c.created)
         with self.database.reading() as connection:
             return {name: size for name, size in connection.execute(query) if name in names}
@@ -109,9 +109,9 @@ class ObjectSets:
 
     database: Database
 
-    def newest(self, *, reach: Reach = EVERYTHING) -> list[ObjectSetView]:
+    def newest(self, *, scope: ProjectScope = EVERYTHING) -> list[ObjectSetView]:
         """The newest version of each set of objects, by name."""
-        query = select(object_sets).where(*seen_sets(reach))
+        query = select(object_sets).where(*seen_sets(scope))
         query = query.order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
         with self.database.reading() as connection:
             newest = {row["name"]: ObjectSetView(**row) for row in connection.execute(query).mappings()}
@@ -125,9 +125,9 @@ class ObjectSets:
             row = connection.execute(query).mappings().first()
         return None if row is None else ObjectSetView(**row)
 
-    def get(self, name: str, *, reach: Reach = EVERYTHING) -> ObjectSetView:
+    def get(self, name: str, *, scope: ProjectScope = EVERYTHING) -> ObjectSetView:
         """The newest version of a set of objects; NotFoundError if there is none of that name."""
-        found = {view.name: view for view in self.newest(reach=reach)}
+        found = {view.name: view for view in self.newest(scope=scope)}
         if name not in found:
             raise NotFoundError(f"there is no set of objects {name!r}{known_names(name, list(found)[:SEARCHED])}")
         return found[name]

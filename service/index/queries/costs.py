@@ -8,11 +8,11 @@ from typing import Final
 from sqlalchemy import select
 
 from service.index.database import Database
-from service.index.reach import seen_shards
+from service.index.project_scope import seen_shards
 from service.index.tables import shards
 from service.model.domain import JobRequest
 from service.model.names import SHARD_KINDS
-from service.model.projects import EVERYTHING, Reach
+from service.model.projects import EVERYTHING, ProjectScope
 from service.model.states import Stage
 
 #: Tasks looked at of each stage, the newest first: what a machine did long ago says less.
@@ -46,12 +46,12 @@ class Costs:
 
     database: Database
 
-    def of_batches(self, stage: Stage, *, limit: int = _NEWEST, reach: Reach = EVERYTHING) -> list[BatchCost]:
+    def of_batches(self, stage: Stage, *, limit: int = _NEWEST, scope: ProjectScope = EVERYTHING) -> list[BatchCost]:
         """The newest finished batches of a stage, those of at most `limit` tasks."""
         columns = [shards.c[name] for name in BatchCost.__dataclass_fields__ if name != "request"]
         query = (
             select(*columns, shards.c.manifest["request"].label("request"))
-            .where(shards.c.kind == SHARD_KINDS[stage], *seen_shards(reach, shards.c.id))
+            .where(shards.c.kind == SHARD_KINDS[stage], *seen_shards(scope, shards.c.id))
             .order_by(shards.c.created.desc(), shards.c.id.desc())
             .limit(limit)
         )

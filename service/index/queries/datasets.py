@@ -11,9 +11,9 @@ from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, liter
 
 from service.index.database import Database
 from service.index.dataset_views import CellView, DatasetView, SnapshotView
+from service.index.project_scope import seen_datasets
 from service.index.queries import cursors
 from service.index.queries.outcomes import outcomes_of
-from service.index.reach import seen_datasets
 from service.index.tables import attempts, dataset_cells, dataset_snapshots, datasets, jobs, shards, tasks
 from service.index.views import Page
 from service.model.dataset_records import SnapshotShard
@@ -21,7 +21,7 @@ from service.model.domain import JobOptions
 from service.model.errors import NotFoundError
 from service.model.outcomes import shortfall
 from service.model.planning import job_state, ranges_of, stages_of
-from service.model.projects import EVERYTHING, Reach
+from service.model.projects import EVERYTHING, ProjectScope
 from service.model.states import Stage, State
 from service.model.suggestions import SEARCHED, known_names
 
@@ -39,10 +39,12 @@ class Datasets:
 
     database: Database
 
-    def page(self, *, limit: int = 50, cursor: str | None = None, reach: Reach = EVERYTHING) -> Page[DatasetView]:
+    def page(
+        self, *, limit: int = 50, cursor: str | None = None, scope: ProjectScope = EVERYTHING
+    ) -> Page[DatasetView]:
         """Datasets, newest first."""
         size = cursors.page_size(limit)
-        query = select(datasets).where(*seen_datasets(reach))
+        query = select(datasets).where(*seen_datasets(scope))
         query = query.order_by(datasets.c.created.desc(), datasets.c.name.desc()).limit(size + 1)
         if cursor is not None:
             query = query.where(tuple_(datasets.c.created, datasets.c.name) < cursors.decode(cursor, str, str))
@@ -52,10 +54,10 @@ class Datasets:
         last = views[-1] if len(rows) > size else None
         return Page(items=views, next=last and cursors.encode(last.created, last.name))
 
-    def get(self, name: str, *, reach: Reach = EVERYTHING) -> DatasetView:
+    def get(self, name: str, *, scope: ProjectScope = EVERYTHING) -> DatasetView:
         """A dataset; NotFoundError if there is none."""
         with self.database.reading() as connection:
-            view = _dataset_view(connection, _dataset_row(connection, name, reach))
+            view = _dataset_view(connection, _dataset_row(connection, name, scope))
             if view.reason is None:
                 return view
             cells = select(dataset_cells.c.job_id).where(dataset_cells.c.dataset == name)
@@ -80,12 +82,12 @@ class Datasets:
         state: State | None = None,
         limit: int = 50,
         cursor: str | None = None,
-        reach: Reach = EVERYTHING,
+        scope: ProjectScope = EVERYTHING,
     ) -> Page[CellView]:
         """Cells of a dataset by their position."""
         size = cursors.page_size(limit)
         with self.database.reading() as connection:
-            dataset = _dataset_row(connection, name, reach)
+            dataset = _dataset_row(connection, name, scope)
             now = _cell_state(dataset["cancelled"])
             query = (
                 select(
@@ -123,7 +125,7 @@ class Datasets:
         return [SnapshotShard(**row) for row in rows]
 
     def snapshots(
-        self, name: str, *, limit: int = 50, cursor: str | None = None, reach: Reach = EVERYTHING
+        self, name: str, *, limit: int = 50, cursor: str | None = None, scope: ProjectScope = EVERYTHING
     ) -> Page[SnapshotView]:
         """Snapshots of a dataset, newest first."""
         size = cursors.page_size(limit)
@@ -133,17 +135,17 @@ class Datasets:
         if cursor is not None:
             query = query.where(tuple_(*key) < cursors.decode(cursor, str, str))
         with self.database.reading() as connection:
-            _dataset_row(connection, name, reach)
+            _dataset_row(connection, name, scope)
             views = [SnapshotView(**row) for row in connection.execute(query).mappings()]
         last = views[size - 1] if len(views) > size else None
         return Page(items=views[:size], next=last and cursors.encode(last.created, last.digest))
 
 
-def _dataset_row(connection: Connection, name: str, reach: Reach = EVERYTHING) -> Any:
-    query = select(datasets).where(datasets.c.name == name, *seen_datasets(reach))
+def _dataset_row(connection: Connection, name: str, scope: ProjectScope = EVERYTHING) -> Any:
+    query = select(datasets).where(datasets.c.name == name, *seen_datasets(scope))
     row = connection.execute(query).mappings().first()
     if row is None:
-        known = select(datasets.c.name).where(*seen_datasets(reach)).order_by(datasets.c.created.desc())
+        known = select(datasets.c.name).where(*seen_datasets(scope)).order_by(datasets.c.created.desc())
         names = list(connection.scalars(known.limit(SEARCHED)))
         raise NotFoundError(f"there is no dataset {name!r}{known_names(name, names)}")
     return row

@@ -10,13 +10,13 @@ from sqlalchemy import select, tuple_
 
 from service.index.database import Database, chunks
 from service.index.filters import GraspFilter, GraspSort
+from service.index.project_scope import seen_shards
 from service.index.queries import cursors
 from service.index.queries.grasp_search import search, sql_conditions
-from service.index.reach import seen_shards
 from service.index.tables import grasps
 from service.index.views import GraspView, Page
 from service.model.errors import NotFoundError
-from service.model.projects import EVERYTHING, Reach
+from service.model.projects import EVERYTHING, ProjectScope
 from service.model.tags import Grasp
 
 _BEST_FIRST = GraspSort()
@@ -47,10 +47,10 @@ class Grasps:
         last = rows[size - 1] if len(rows) > size else None
         return Page(items=views, next=last and cursors.encode(last[sort.by], last["shard_id"], last["row"]))
 
-    def get(self, shard_id: str, row: int, *, reach: Reach = EVERYTHING) -> GraspView:
+    def get(self, shard_id: str, row: int, *, scope: ProjectScope = EVERYTHING) -> GraspView:
         """One grasp by its shard and row; NotFoundError if there is none."""
         query = select(grasps).where(grasps.c.shard_id == shard_id, grasps.c.row == row)
-        query = query.where(*seen_shards(reach, grasps.c.shard_id))
+        query = query.where(*seen_shards(scope, grasps.c.shard_id))
         with self.database.reading() as connection:
             found = connection.execute(query).mappings().first()
         if found is None:

@@ -10,14 +10,14 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, Float, and_, case, cast, func, select, tuple_
 
 from service.index.database import Database, chunks
+from service.index.project_scope import seen_jobs, seen_tasks
 from service.index.queries import cursors
 from service.index.queries.outcomes import outcomes_of
-from service.index.reach import seen_jobs, seen_tasks
 from service.index.tables import attempts, jobs, shards, tasks
 from service.index.views import AttemptView, JobView, Page, StageProgress, TaskView
 from service.model.errors import NotFoundError
 from service.model.planning import ranges_of
-from service.model.projects import EVERYTHING, Reach
+from service.model.projects import EVERYTHING, ProjectScope
 from service.model.states import Stage, State
 
 
@@ -35,11 +35,11 @@ class Jobs:
         object: str | None = None,
         limit: int = 50,
         cursor: str | None = None,
-        reach: Reach = EVERYTHING,
+        scope: ProjectScope = EVERYTHING,
     ) -> Page[JobView]:
         """Jobs, newest first."""
         size = cursors.page_size(limit)
-        query = select(jobs).where(*seen_jobs(reach)).order_by(jobs.c.created.desc(), jobs.c.id.desc()).limit(size + 1)
+        query = select(jobs).where(*seen_jobs(scope)).order_by(jobs.c.created.desc(), jobs.c.id.desc()).limit(size + 1)
         for column, wanted in ((jobs.c.state, state), (jobs.c.hand, hand), (jobs.c.object, object)):
             if wanted is not None:
                 query = query.where(column == wanted)
@@ -51,10 +51,10 @@ class Jobs:
         last = cursors.encode(views[-1].created, views[-1].id) if len(rows) > size else None
         return Page(items=views, next=last)
 
-    def get(self, job_id: str, *, reach: Reach = EVERYTHING) -> JobView:
+    def get(self, job_id: str, *, scope: ProjectScope = EVERYTHING) -> JobView:
         """A job with its progress; NotFoundError if there is none."""
         with self.database.reading() as connection:
-            rows = connection.execute(select(jobs).where(jobs.c.id == job_id, *seen_jobs(reach))).mappings().all()
+            rows = connection.execute(select(jobs).where(jobs.c.id == job_id, *seen_jobs(scope))).mappings().all()
             if not rows:
                 raise NotFoundError(f"there is no job {job_id!r}")
             (view,) = _job_views(connection, rows)
@@ -95,17 +95,17 @@ class Jobs:
         last = rows[size - 1] if len(rows) > size else None
         return Page(items=views, next=last and cursors.encode(last["job_id"], last["batch"], last["position"]))
 
-    def task(self, task_id: str, *, reach: Reach = EVERYTHING) -> TaskView:
+    def task(self, task_id: str, *, scope: ProjectScope = EVERYTHING) -> TaskView:
         """A task; NotFoundError if there is none."""
         with self.database.reading() as connection:
-            row = connection.execute(select(tasks).where(tasks.c.id == task_id, *seen_tasks(reach))).mappings().first()
+            row = connection.execute(select(tasks).where(tasks.c.id == task_id, *seen_tasks(scope))).mappings().first()
         if row is None:
             raise NotFoundError(f"there is no task {task_id!r}")
         return _task_view(row)
 
-    def out_of_reach(self, task_ids: Collection[str], reach: Reach) -> set[str]:
-        """Of these tasks, those of jobs that are not within reach."""
-        query = select(tasks.c.id).join(jobs, jobs.c.id == tasks.c.job_id).where(jobs.c.project != reach.project)
+    def out_of_scope(self, task_ids: Collection[str], scope: ProjectScope) -> set[str]:
+        """Of these tasks, those of jobs that are not in scope."""
+        query = select(tasks.c.id).join(jobs, jobs.c.id == tasks.c.job_id).where(jobs.c.project != scope.project)
         with self.database.reading() as connection:
             return {
                 task

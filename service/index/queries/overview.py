@@ -10,11 +10,11 @@ from typing import Any, Final
 from sqlalchemy import ColumnElement, Select, and_, case, func, select
 
 from service.index.database import Database
+from service.index.project_scope import seen_attempts, seen_jobs, seen_shards, seen_tasks
 from service.index.queries import cursors
-from service.index.reach import seen_attempts, seen_jobs, seen_shards, seen_tasks
 from service.index.tables import attempts, jobs, shards, tasks, workers
 from service.index.views import FailureGroup, MatrixCell, Stats, Throughput, WorkerView
-from service.model.projects import EVERYTHING, Reach
+from service.model.projects import EVERYTHING, ProjectScope
 from service.model.states import State
 
 
@@ -31,14 +31,14 @@ class Overview:
             rows = connection.execute(query).mappings().all()
         return [WorkerView(**row) for row in rows]
 
-    def stats(self, *, reach: Reach = EVERYTHING) -> Stats:
-        """All that is within reach in a few numbers."""
+    def stats(self, *, scope: ProjectScope = EVERYTHING) -> Stats:
+        """All that is in scope in a few numbers."""
         alive = select(func.count()).select_from(workers).where(workers.c.state != "lost")
         sums = (func.count(), *_MADE, func.sum(shards.c.size_bytes))
-        seen = seen_shards(reach, shards.c.id)
+        seen = seen_shards(scope, shards.c.id)
         with self.database.reading() as connection:
-            of_jobs = connection.execute(_counted(jobs.c.state, *seen_jobs(reach))).all()
-            of_tasks = connection.execute(_counted(tasks.c.state, *seen_tasks(reach))).all()
+            of_jobs = connection.execute(_counted(jobs.c.state, *seen_jobs(scope))).all()
+            of_tasks = connection.execute(_counted(tasks.c.state, *seen_tasks(scope))).all()
             of_shards = {
                 kind: tuple(map(int, row))
                 for kind, *row in connection.execute(select(shards.c.kind, *sums).where(*seen).group_by(shards.c.kind))
@@ -57,12 +57,12 @@ class Overview:
             workers=int(living or 0),
         )
 
-    def throughput(self, *, since: str, bucket_s: int = 60, reach: Reach = EVERYTHING) -> list[Throughput]:
+    def throughput(self, *, since: str, bucket_s: int = 60, scope: ProjectScope = EVERYTHING) -> list[Throughput]:
         """What was made since a time, in intervals of `bucket_s`; intervals without a shard are left out."""
         # The database adds up by the finest unit of time that divides the interval; what is left is little.
         unit = func.substr(shards.c.created, 1, next(n for s, n in _UNITS if bucket_s % s == 0)).label("unit")
         sums = (func.count(), func.sum(shards.c.count), func.sum(shards.c.valid), func.sum(shards.c.seconds))
-        query = select(unit, shards.c.kind, *sums).where(shards.c.created >= since, *seen_shards(reach, shards.c.id))
+        query = select(unit, shards.c.kind, *sums).where(shards.c.created >= since, *seen_shards(scope, shards.c.id))
         query = query.group_by(unit, shards.c.kind)
         made: dict[str, dict[str, float]] = defaultdict(lambda: {"grasps": 0, "valid": 0, "tasks": 0, "seconds": 0.0})
         with self.database.reading() as connection:
@@ -75,10 +75,10 @@ class Overview:
                     bucket["valid"] += int(valid)
         return [Throughput.model_validate({"start": start, **made[start]}) for start in sorted(made)]
 
-    def failures(self, *, limit: int = 20, reach: Reach = EVERYTHING) -> list[FailureGroup]:
+    def failures(self, *, limit: int = 20, scope: ProjectScope = EVERYTHING) -> list[FailureGroup]:
         """Failed attempts by stage and error, the most frequent first."""
         newest = func.max(attempts.c.ended)
-        seen = seen_attempts(reach)
+        seen = seen_attempts(scope)
         count = func.count()
         query = (
             select(
@@ -113,18 +113,18 @@ class Overview:
                 )
         return groups
 
-    def matrix(self, *, reach: Reach = EVERYTHING) -> list[MatrixCell]:
+    def matrix(self, *, scope: ProjectScope = EVERYTHING) -> list[MatrixCell]:
         """Jobs, task states and yield of each hand x object."""
         of_tasks = select(tasks.c.job_id, tasks.c.state, func.count()).group_by(tasks.c.job_id, tasks.c.state)
         made = (
             select(shards.c.hand, shards.c.object, *_MADE)
-            .where(shards.c.kind == "base", *seen_shards(reach, shards.c.id))
+            .where(shards.c.kind == "base", *seen_shards(scope, shards.c.id))
             .group_by(shards.c.hand, shards.c.object)
         )
         cells: dict[tuple[str, str], dict[str, int]] = {}
         with self.database.reading() as connection:
             pairs = {}
-            of_jobs = select(jobs.c.id, jobs.c.hand, jobs.c.object).where(*seen_jobs(reach))
+            of_jobs = select(jobs.c.id, jobs.c.hand, jobs.c.object).where(*seen_jobs(scope))
             for job, *pair in connection.execute(of_jobs):
                 cell = cells.setdefault((pair[0], pair[1]), dict.fromkeys(_CELL, 0))
                 cell["jobs"] += 1

@@ -9,12 +9,12 @@ from typing import Any, Literal
 from sqlalchemy import select, tuple_
 
 from service.index.database import Database
+from service.index.project_scope import seen_shards, seen_tasks
 from service.index.queries import cursors
-from service.index.reach import seen_shards, seen_tasks
 from service.index.tables import shards, tasks
 from service.index.views import Page, ShardView
 from service.model.errors import NotFoundError
-from service.model.projects import EVERYTHING, Reach
+from service.model.projects import EVERYTHING, ProjectScope
 
 
 @dataclass(frozen=True)
@@ -32,13 +32,13 @@ class Shards:
         object: str | None = None,
         limit: int = 50,
         cursor: str | None = None,
-        reach: Reach = EVERYTHING,
+        scope: ProjectScope = EVERYTHING,
     ) -> Page[ShardView]:
         """Shards, newest first, without their manifests."""
         size = cursors.page_size(limit)
         query = (
             select(shards)
-            .where(*seen_shards(reach, shards.c.id))
+            .where(*seen_shards(scope, shards.c.id))
             .order_by(shards.c.created.desc(), shards.c.id.desc())
             .limit(size + 1)
         )
@@ -61,17 +61,17 @@ class Shards:
         with self.database.reading() as connection:
             return {shard: (hand, obj) for shard, hand, obj in connection.execute(query)}
 
-    def job_of(self, shard_id: str, *, reach: Reach = EVERYTHING) -> str | None:
-        """A job within reach that wanted this shard; several may, and a pruned index may know none."""
+    def job_of(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> str | None:
+        """A job in scope that wanted this shard; several may, and a pruned index may know none."""
         with self.database.reading() as connection:
-            query = select(tasks.c.job_id).where(tasks.c.shard_id == shard_id, *seen_tasks(reach)).limit(1)
+            query = select(tasks.c.job_id).where(tasks.c.shard_id == shard_id, *seen_tasks(scope)).limit(1)
             found: str | None = connection.scalar(query)
         return found
 
-    def get(self, shard_id: str, *, reach: Reach = EVERYTHING) -> ShardView:
+    def get(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> ShardView:
         """A shard with its manifest; NotFoundError if there is none."""
         with self.database.reading() as connection:
-            seen = seen_shards(reach, shards.c.id)
+            seen = seen_shards(scope, shards.c.id)
             row = connection.execute(select(shards).where(shards.c.id == shard_id, *seen)).mappings().first()
         if row is None:
             raise NotFoundError(f"there is no shard {shard_id!r}")

@@ -11,7 +11,7 @@ from sqlalchemy import ColumnElement, case, func, select
 from service.index.database import Database
 from service.index.tables import shards, spent
 from service.index.views import UsageDay
-from service.model.projects import EVERYTHING, Reach
+from service.model.projects import EVERYTHING, ProjectScope
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Usage:
 
     database: Database
 
-    def days(self, since: str, until: str, *, reach: Reach = EVERYTHING) -> list[UsageDay]:
+    def days(self, since: str, until: str, *, scope: ProjectScope = EVERYTHING) -> list[UsageDay]:
         """Each project's use of each day on which it used anything, the newest first.
 
         Args:
@@ -37,9 +37,9 @@ class Usage:
             func.sum(shards.c.seconds),
         ).where(shards.c.created >= since, shards.c.created < f"{until}T99")
         gone = select(spent).where(spent.c.day >= since, spent.c.day <= until)
-        if not reach.everything:
-            made = made.where(shards.c.charged == reach.project)
-            gone = gone.where(spent.c.project == reach.project)
+        if not scope.everything:
+            made = made.where(shards.c.charged == scope.project)
+            gone = gone.where(spent.c.project == scope.project)
         sums: dict[tuple[str, str], dict[str, float]] = defaultdict(lambda: defaultdict(float))
         with self.database.reading() as connection:
             live = connection.execute(made.group_by(shards.c.charged, day, shards.c.device)).all()
@@ -64,7 +64,7 @@ class Usage:
 
     def gpu_seconds(self, project: str, day: str) -> float:
         """Time that GPU workers spent on what the project asked for, on one day [s]."""
-        return sum(one.gpu_seconds for one in self.days(day, day, reach=Reach(project, everything=False)))
+        return sum(one.gpu_seconds for one in self.days(day, day, scope=ProjectScope(project, everything=False)))
 
 
 def _base(column: ColumnElement[Any]) -> ColumnElement[Any]:

@@ -14,7 +14,7 @@ from service.model.dataset_records import DatasetRecord, Member, ObjectSet, Snap
 from service.model.digests import digest_json
 from service.model.domain import JobOptions
 from service.model.errors import ConflictError, InputError, LimitError, NotFoundError
-from service.model.projects import EVERYTHING, Reach
+from service.model.projects import EVERYTHING, ProjectScope
 from service.model.scene_options import NamedNeighbour, SceneDocument
 from service.model.states import AssetKind, State
 from service.pipeline.backends import Services
@@ -28,13 +28,13 @@ from service.store.records import Put, read_record
 
 
 def create(
-    services: Services, request: DatasetRequest, *, owner: str = "", reach: Reach = EVERYTHING
+    services: Services, request: DatasetRequest, *, owner: str = "", scope: ProjectScope = EVERYTHING
 ) -> tuple[DatasetView, bool]:
     """Record a dataset; the controller plans its jobs. The same hands, objects and options again are the same dataset.
 
     Args:
         owner: id of the API key that submits it; its jobs get the same.
-        reach: which hands, objects and networks it may name, and the project that it and its jobs belong to.
+        scope: which hands, objects and networks it may name, and the project that it and its jobs belong to.
 
     Returns:
         the dataset, and whether it is new. A failed or cancelled one is returned as it is: `retry` starts it again.
@@ -47,15 +47,15 @@ def create(
         LimitError: more than `MAX_CELLS` cells.
         QueueUnavailable, StoreUnavailable, IndexUnavailable: nothing was recorded.
     """
-    hands, objects = members(services, request, reach)
-    shared, beside = with_neighbours(services, request.shared, reach)
-    shared = with_network(services, shared, hands, reach)
+    hands, objects = members(services, request, scope)
+    shared, beside = with_neighbours(services, request.shared, scope)
+    shared = with_network(services, shared, hands, scope)
     services.queue.ping()
     key = names.dataset_record(request.name)
     # One that is there stays what it is: a later chart changes none of its fidelities.
     found = None
     if not services.store.exists(key):
-        found = describe(request.name, hands, objects, shared, Resolver(services.store).choose, owner, reach.project)
+        found = describe(request.name, hands, objects, shared, Resolver(services.store).choose, owner, scope.project)
     wanted = [(AssetKind.HAND, one.digest) for one in hands]
     wanted += [(AssetKind.OBJECT, one.digest) for one in objects]
     wanted += [(AssetKind.OBJECT, one.digest) for one in beside]
@@ -63,7 +63,7 @@ def create(
     with recording(services) as (connection, put):
         new = found is not None and put(key, found)
         record = found if found is not None and new else _present(services, request.name)
-        if record.project != reach.project:
+        if record.project != scope.project:
             # Nothing else of it is said: names are of the whole service.
             raise ConflictError(f"the name {record.name!r} is taken; take another name")
         # Not by the digest: a newer graspd knows more options, whose defaults an older one meant as well.
@@ -150,14 +150,14 @@ def add_object_set(
     objects: Iterable[str],
     *,
     owner: str = "",
-    reach: Reach = EVERYTHING,
+    scope: ProjectScope = EVERYTHING,
     may_follow: Callable[[str, str], None] = lambda owner, project: None,
 ) -> ObjectSetView:
     """Give objects a name together. The same objects again change nothing; others make a new version.
 
     Args:
         owner: id of the API key that asks; a new version keeps the owner of the set.
-        reach: which objects it may name, and the project that a new set belongs to.
+        scope: which objects it may name, and the project that a new set belongs to.
         may_follow: called with owner and project of the set before it gets a new version; raises where that is refused.
 
     Raises:
@@ -165,15 +165,15 @@ def add_object_set(
         InputError: an object was refused when it was checked, or there is none.
         ConflictError: a check is still running.
     """
-    assets = [services.index.assets.get(AssetKind.OBJECT, one, reach=reach) for one in objects]
+    assets = [services.index.assets.get(AssetKind.OBJECT, one, scope=scope) for one in objects]
     wanted = tuple(asset.name for asset in assets)
     if not wanted:
         raise InputError(f"the set {name!r} holds no object; name some")
     # Of two that want one name at once, the later one must see the earlier one's set.
     with recording(services) as (connection, put):
-        after, project = "", reach.project
+        after, project = "", scope.project
         if (present := services.index.object_sets.named(name)) is not None:
-            if not reach.sees(present.project):
+            if not scope.sees(present.project):
                 raise ConflictError(f"the name {name!r} is taken; take another name")
             if set(present.objects) == set(wanted):
                 return present
@@ -189,25 +189,25 @@ def add_object_set(
         if not put(key := names.object_set(name, found.digest), found):
             # It broke off before its row was there.
             found = read_record(ObjectSet, services.store, key)
-            if not reach.sees(found.project):
+            if not scope.sees(found.project):
                 raise ConflictError(f"the name {name!r} is taken; take another name")
         services.index.write_dataset.add_object_set(found, within=connection)
     return services.index.object_sets.get(name)
 
 
-def members(services: Services, matrix: Matrix, reach: Reach = EVERYTHING) -> tuple[list[Member], list[Member]]:
+def members(services: Services, matrix: Matrix, scope: ProjectScope = EVERYTHING) -> tuple[list[Member], list[Member]]:
     """Hands and objects of a matrix as they are now, sets spelled out; errors as in `create`."""
     objects = dict.fromkeys(matrix.objects)
     for name in matrix.sets:
-        objects |= dict.fromkeys(services.index.object_sets.get(name, reach=reach).objects)
+        objects |= dict.fromkeys(services.index.object_sets.get(name, scope=scope).objects)
     if len(matrix.hands) * len(objects) > MAX_CELLS:
         raise LimitError(f"{len(matrix.hands)} hands x {len(objects)} objects is over {MAX_CELLS} cells; split it")
-    hands = _members(services, AssetKind.HAND, matrix.hands, reach)
-    return hands, _members(services, AssetKind.OBJECT, objects, reach)
+    hands = _members(services, AssetKind.HAND, matrix.hands, scope)
+    return hands, _members(services, AssetKind.OBJECT, objects, scope)
 
 
-def _members(services: Services, kind: AssetKind, wanted: Iterable[str], reach: Reach) -> list[Member]:
-    assets = [usable(services, kind, name, reach) for name in wanted]
+def _members(services: Services, kind: AssetKind, wanted: Iterable[str], scope: ProjectScope) -> list[Member]:
+    assets = [usable(services, kind, name, scope) for name in wanted]
     found = [Member(name=asset.name, digest=asset.digest) for asset in assets]
     return list(dict.fromkeys(found))
 

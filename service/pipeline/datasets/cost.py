@@ -23,7 +23,7 @@ from service.model.dataset_records import request_of
 from service.model.domain import BATCH_SIZE, JobOptions, JobRequest
 from service.model.errors import LimitError
 from service.model.planning import stages_of
-from service.model.projects import EVERYTHING, Reach
+from service.model.projects import EVERYTHING, ProjectScope
 from service.model.states import AssetKind, Stage
 from service.pipeline.datasets.estimate import Estimate, RateUsed, WorkersPlan
 from service.pipeline.datasets.spec import MAX_CELLS, Matrix
@@ -61,14 +61,14 @@ def estimate(
     resolve: Callable[[JobRequest], JobRequest] = _explicit,
     *,
     costs: Batches | None = None,
-    reach: Reach = EVERYTHING,
+    scope: ProjectScope = EVERYTHING,
 ) -> Estimate:
     """The cost of a matrix. Hands and objects need not be known yet.
 
     Args:
         resolve: puts a fidelity in the place of `auto`; not needed where there is none.
         costs: gives the finished batches of a stage; None: they are read.
-        reach: which sets of objects the matrix may name, and whose measurements count.
+        scope: which sets of objects the matrix may name, and whose measurements count.
 
     Raises:
         NotFoundError: unknown set.
@@ -77,13 +77,13 @@ def estimate(
     """
     objects = list(matrix.objects)
     for name in matrix.sets:
-        objects += [one for one in index.object_sets.get(name, reach=reach).objects if one not in objects]
+        objects += [one for one in index.object_sets.get(name, scope=scope).objects if one not in objects]
     cells = len(matrix.hands) * len(objects)
     if cells > MAX_CELLS:
         raise LimitError(f"{len(matrix.hands)} hands x {len(objects)} objects is over {MAX_CELLS} cells; split it")
     options = matrix.shared
     devices = {worker.device for worker in index.overview.workers() if worker.state != "lost"}
-    costs = costs or partial(index.costs.of_batches, reach=reach)
+    costs = costs or partial(index.costs.of_batches, scope=scope)
     batches = costs(Stage.SYNTHESIZE)
     rates: dict[str, Rates] = {}
     sums = _Sums()
@@ -95,7 +95,7 @@ def estimate(
             sums.machine = rates[chosen.knobs.name].machine
             _add_cell(sums, hand, rates[chosen.knobs.name].of(hand, obj), options)
     later = _later_rates(costs, options, sums.machine)
-    return _estimate(options, cells, sums, later, _assets(index, matrix.hands, _once(objects, options), reach))
+    return _estimate(options, cells, sums, later, _assets(index, matrix.hands, _once(objects, options), scope))
 
 
 def _once(objects: list[str], options: JobOptions) -> list[str]:
@@ -194,10 +194,10 @@ def _pictures(options: JobOptions) -> int:
     return options.scenes * options.views * (2 if options.stereo else 1)
 
 
-def _assets(index: Index, hands: Sequence[str], objects: Sequence[str], reach: Reach) -> tuple[float, list[str]]:
+def _assets(index: Index, hands: Sequence[str], objects: Sequence[str], scope: ProjectScope) -> tuple[float, list[str]]:
     """Bytes of hand and object over all cells; names that are not known."""
-    of_hands = index.assets.sizes(AssetKind.HAND, hands, reach=reach)
-    of_objects = index.assets.sizes(AssetKind.OBJECT, objects, reach=reach)
+    of_hands = index.assets.sizes(AssetKind.HAND, hands, scope=scope)
+    of_objects = index.assets.sizes(AssetKind.OBJECT, objects, scope=scope)
     unknown = [name for name in hands if name not in of_hands] + [name for name in objects if name not in of_objects]
     hand_bytes = sum(of_hands.get(name, _ASSET_BYTES) for name in hands) * len(objects)
     object_bytes = sum(of_objects.get(name, _ASSET_BYTES) for name in objects) * len(hands)

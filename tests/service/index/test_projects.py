@@ -8,7 +8,7 @@ from service.model import names
 from service.model.clock import timestamp
 from service.model.messages import Origin
 from service.model.planning import message_of, plan
-from service.model.projects import Reach
+from service.model.projects import ProjectScope
 from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane
 from service.model.turns import Turns
@@ -65,7 +65,7 @@ def test_what_was_made_is_summed_for_each_project_and_day(services: Services) ->
         usage("red", DAY, batches=4, valid=red, gpu=30.0, cpu=4.0),
     ]
     assert services.index.usage.days(DAY, DAY) == services.index.usage.days(DAY, NEXT)[1:]
-    assert services.index.usage.days(DAY, NEXT, reach=Reach("blue", everything=False)) == [
+    assert services.index.usage.days(DAY, NEXT, scope=ProjectScope("blue", everything=False)) == [
         usage("blue", DAY, batches=1, valid=blue, gpu=2.5)
     ]
 

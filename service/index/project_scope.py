@@ -1,0 +1,65 @@
+"""Who sees which rows: conditions of queries."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import ColumnElement, Select, case, exists, or_, select
+
+from service.index.tables import assets, attempts, datasets, jobs, object_sets, tags, tasks
+from service.model.projects import ProjectScope
+
+Tests = tuple[ColumnElement[bool], ...]
+
+
+def seen_jobs(scope: ProjectScope) -> Tests:
+    """Of jobs, or of what is joined to them."""
+    return () if scope.everything else (jobs.c.project == scope.project,)
+
+
+def seen_datasets(scope: ProjectScope) -> Tests:
+    return () if scope.everything else (datasets.c.project == scope.project,)
+
+
+def seen_sets(scope: ProjectScope) -> Tests:
+    """Of sets of objects."""
+    return () if scope.everything else (object_sets.c.project == scope.project,)
+
+
+def seen_tags(scope: ProjectScope) -> Tests:
+    return () if scope.everything else (tags.c.project == scope.project,)
+
+
+def seen_assets(scope: ProjectScope) -> Tests:
+    """Of hands and objects: their own, what comes with graspd, and what its project shares."""
+    if scope.everything:
+        return ()
+    return (or_(assets.c.project == scope.project, assets.c.builtin.is_(True), assets.c.shared.is_(True)),)
+
+
+def nearest_asset(scope: ProjectScope) -> ColumnElement[int]:
+    """Order of hands and objects of one name: the project's own come first, then what is shared."""
+    shared = or_(assets.c.builtin.is_(True), assets.c.shared.is_(True))
+    return case((assets.c.project == scope.project, 0), (shared, 1), else_=2)
+
+
+def seen_tasks(scope: ProjectScope) -> Tests:
+    return () if scope.everything else (tasks.c.job_id.in_(jobs_of(scope)),)
+
+
+def seen_attempts(scope: ProjectScope) -> Tests:
+    """Of failed attempts."""
+    return () if scope.everything else (attempts.c.job_id.in_(jobs_of(scope)),)
+
+
+def seen_shards(scope: ProjectScope, shard: ColumnElement[Any]) -> Tests:
+    """Of shards by a column that holds their id: those that a job of the project makes or has found made."""
+    if scope.everything:
+        return ()
+    wanted = (tasks.c.shard_id == shard, tasks.c.job_id == jobs.c.id, jobs.c.project == scope.project)
+    return (exists().where(*wanted),)
+
+
+def jobs_of(scope: ProjectScope) -> Select[tuple[str]]:
+    """Ids of the project's jobs."""
+    return select(jobs.c.id).where(jobs.c.project == scope.project)
