@@ -44,10 +44,10 @@ def main(folder: Path, older_index: str) -> None:
     before = [getattr(grasp, NAME) for grasp in index.grasps.page().items]
     index.close()
     made = case(folder, drawn=False, change=measured)
-    parts = made.made.parts
+    services = made.made.services
     shard = next(shard.id for shard in made.made.snapshot.shards if shard.kind == "base")
-    engine = parts.index.database._engine
-    with TestClient(create_app(parts.settings, parts), base_url=BASE_URL) as http:
+    engine = services.index.database._engine
+    with TestClient(create_app(services.settings, services), base_url=BASE_URL) as http:
         query = {f"min_{NAME}": 5, f"max_{NAME}": 10, "sort": NAME, "order": "asc"}
         page = http.get("/v1/grasps", params=query).json()["items"]
         job = http.get("/v1/jobs").json()["items"][0]["id"]
@@ -55,7 +55,7 @@ def main(folder: Path, older_index: str) -> None:
         found = {
             "older index": before,
             "schema": SCHEMAS["base"][ROW.path].description,
-            "manifest": [getattr(one, NAME) for one in load_manifest(parts.store, Stage.SYNTHESIZE, shard).grasps],
+            "manifest": [getattr(one, NAME) for one in load_manifest(services.store, Stage.SYNTHESIZE, shard).grasps],
             "index columns": [column["name"] for column in inspect(engine).get_columns("grasps")],
             "index indexes": [one["name"] for one in inspect(engine).get_indexes("grasps")],
             "answer": [grasp[NAME] for grasp in page],
@@ -70,7 +70,7 @@ def main(folder: Path, older_index: str) -> None:
             "card's table": quality_table(made.card),
             "docs": schema_table("base"),
         }
-    parts.close()
+    services.close()
     print(json.dumps(found))
 
 

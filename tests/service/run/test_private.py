@@ -20,12 +20,12 @@ def test_a_service_keeps_its_data_from_other_users(tmp_path: Path, was_open: boo
     environment = os.environ | {"GRASPD_DATA_DIR": str(folder), "GRASPD_REDIS_URL": f"unix://{tmp_path}/none.sock"}
     program = (
         "from service.cli import keep_private, load_settings\n"
-        "from service.pipeline.backends import Parts\n"
+        "from service.pipeline.backends import Services\n"
         "settings = load_settings()\n"
         "keep_private(settings)\n"
-        "parts = Parts.open(settings)\n"
-        "parts.store.put('jobs/a/job.json', b'1')\n"
-        "parts.close()\n"
+        "services = Services.open(settings)\n"
+        "services.store.put('jobs/a/job.json', b'1')\n"
+        "services.close()\n"
     )
     subprocess.run([sys.executable, "-c", program], env=environment, check=True, timeout=120, umask=0o022)
     modes = {path: stat.S_IMODE(path.stat().st_mode) for path in (folder, *folder.rglob("*"))}

@@ -36,7 +36,7 @@ class Case:
 def case(folder: Path, *, drawn: bool = True, **options: Any) -> Case:
     """The card of a dataset, with its plots or without; options as of `makers.dataset`."""
     made = dataset(folder, (folder / "store").as_uri(), **options)
-    contents = contents_of_store(made.parts.store, "kitchen", cache=folder / "cache")
+    contents = contents_of_store(made.services.store, "kitchen", cache=folder / "cache")
     if drawn:
         card = write_card(contents, folder / "card", licence="CC-BY-4.0")
     else:
@@ -51,12 +51,12 @@ def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Case]:
     """A whole dataset of two hands and two objects; tests only read it."""
     made = case(tmp_path_factory.mktemp("kitchen"))
     yield made
-    made.made.parts.close()
+    made.made.services.close()
 
 
 @pytest.fixture(scope="package")
 def export(kitchen: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The shards of that dataset as `graspd datasets export` writes them; tests only read it."""
     folder = tmp_path_factory.mktemp("export") / "kitchen"
-    export_shards(kitchen.made.snapshot, folder, lambda shard: kitchen.made.parts.store.stream(shard.key))
+    export_shards(kitchen.made.snapshot, folder, lambda shard: kitchen.made.services.store.stream(shard.key))
     return folder

@@ -102,17 +102,17 @@ def test_few_pictures_are_fetched(kitchen: Case) -> None:
 def test_a_snapshot_on_s3_has_the_same_card(kitchen: Case, tmp_path: Path, s3_url: str) -> None:
     made = dataset(tmp_path, s3_url)
     try:
-        contents = contents_of_store(made.parts.store, "kitchen", cache=tmp_path / "cache")
+        contents = contents_of_store(made.services.store, "kitchen", cache=tmp_path / "cache")
         found = write_card(contents, tmp_path / "card")
     finally:
-        made.parts.close()
+        made.services.close()
     for part in ("quality", "table", "directions", "joints", "cells"):
         assert found[part] == kitchen.card[part], part
 
 
 def test_a_dataset_without_a_snapshot_says_how_to_take_one(kitchen: Case) -> None:
     with pytest.raises(NotFoundError, match="graspd datasets snapshot pantry"):
-        contents_of_store(kitchen.made.parts.store, "pantry")
+        contents_of_store(kitchen.made.services.store, "pantry")
 
 
 def test_licences_can_be_given_for_what_was_added_without(kitchen: Case, tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_a_file_of_licences_that_cannot_be_used_is_told(kitchen: Case, tmp_path:
 
 def test_a_cell_that_failed_is_told_with_its_reason(tmp_path: Path) -> None:
     found = case(tmp_path, drawn=False, fails=("barrett", "mug"))
-    found.made.parts.close()
+    found.made.services.close()
     assert "**barrett on mug lacks 6 of its shards**: the mesh is torn." in found.page
     assert "**Not complete**" in found.page
     failed = next(cell for cell in found.card["cells"] if cell["hand"] == "barrett" and cell["object"] == "mug")
@@ -152,7 +152,7 @@ def test_a_cell_that_failed_is_told_with_its_reason(tmp_path: Path) -> None:
 
 def test_a_dataset_without_scenes_has_a_card(tmp_path: Path) -> None:
     found = case(tmp_path, scenes=0, views=0)
-    found.made.parts.close()
+    found.made.services.close()
     assert "table.png" not in found.card["plots"] and "clearance of the table (no scenes)" in found.page
     assert found.card["composition"]["pictures"] == 0
 
@@ -167,7 +167,7 @@ def test_the_card_of_a_dataset_in_scenes_says_where_its_grasps_are_valid(tmp_pat
         # What is said of free grasps is not said of these.
         assert "planned around a free object" not in made.page and "clearance of the table (no scenes)" not in made.page
     finally:
-        made.made.parts.close()
+        made.made.services.close()
 
 
 def graspd(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:

@@ -24,12 +24,12 @@ from worker.cards.tally import JointUse
 
 def changed(tmp_path: Path, change: Any, **options: Any) -> Case:
     found = case(tmp_path, drawn=False, change=change, **options)
-    found.made.parts.close()
+    found.made.services.close()
     return found
 
 
 def test_counts_are_those_of_the_manifests(kitchen: Case) -> None:
-    store, shards = kitchen.made.parts.store, kitchen.made.snapshot.shards
+    store, shards = kitchen.made.services.store, kitchen.made.snapshot.shards
     base = [load_manifest(store, Stage.SYNTHESIZE, shard.id) for shard in shards if shard.kind == "base"]
     made, valid = kitchen.card["composition"], kitchen.card["validity"]
     assert made["valid"] == sum(one.valid for one in base) and valid["tried"] == sum(one.tried for one in base)
@@ -133,7 +133,7 @@ def test_a_cell_that_ran_out_of_budget_is_told(tmp_path: Path) -> None:
 
 def test_directions_that_are_preferred_are_told(tmp_path: Path) -> None:
     found = case(tmp_path, drawn=False)
-    found.made.parts.close()
+    found.made.services.close()
     level = np.zeros(36, int)
     level[17:19], level[30] = 80, 40
     found.card["elevation"] = {"barrett": {"all": level.tolist(), "clear": level.tolist()}}
