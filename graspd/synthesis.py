@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -57,9 +58,9 @@ def synthesize(
     Args:
         hand: a URDF, a ZIP with one, or the name of a built-in hand.
         object: a mesh (STL, OBJ, PLY, GLB, OFF) or the name of a built-in object.
-        count: grasps wanted; fewer come back where the budget of tries ends first.
+        count: grasps wanted, 1 to 1,000,000; fewer come back where the budget of tries ends first.
         scene: where they are used: free, table, bin, shelf, or a JSON or YAML file (docs/scenes.md).
-        scenes: scenes that they are shared out to.
+        scenes: scenes that they are shared out to, 1 to 4096.
         faces: drawn: as drops fall; all: a scene for each stable face.
         touch: distance that fingertips keep from supports [mm]: 2 as the rest of the hand; 0, the default: they may
             touch; down to -1: they may press into it.
@@ -88,6 +89,9 @@ def synthesize(
         join: batches of 32 grasps that are planned in one launch; auto: as many as a GPU needs to be busy, 1 on a CPU.
             The grasps are the same.
         progress: called with the share that is done, 0 to 1.
+
+    Returns:
+        at most `count` grasps: poses in the object frame [m], joints [rad or m]; `reason` says why there are fewer.
 
     Raises:
         InputError: something of it cannot be used (MeshError, HandError: a file); says what, and the mend.
@@ -121,7 +125,8 @@ def synthesize(
             shake=shake,
         )
     except ValidationError as error:
-        raise InputError(refusal(error)) from None
+        # The field is called `grasps`, the argument `count`.
+        raise InputError(re.sub("^grasps:", "count:", refusal(error, JobOptions))) from None
     request = request.model_copy(update={"fidelity": chosen_fidelity(fidelity)})
     place = parse_scene(str(scene), faces=faces, touch=touch, beside=[str(one) for one in beside])
     made = synthesized(

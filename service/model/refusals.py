@@ -6,7 +6,8 @@ import re
 from collections.abc import Mapping
 from typing import Any, Final
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from service.model.labels import NAME
 from service.model.suggestions import one_of
@@ -23,6 +24,8 @@ _WORDS: Final = {
     **dict.fromkeys(("float_type", "float_parsing"), "must be a number"),
     **dict.fromkeys(("bool_type", "bool_parsing"), "must be true or false"),
 }
+#: Kinds of errors about a bound, and how pydantic names it.
+_BOUNDS: Final = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_equal": "le", "less_than": "lt"}
 _NAMES: Final = "must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores"
 #: How pydantic begins: of what, not of which field.
 _SUBJECT: Final = re.compile(r"^(Value error, )|^\w+ should ")
@@ -31,12 +34,24 @@ _CLASS: Final = re.compile(r"_[A-Z]\w*$")
 _CHOICES: Final = re.compile(r"'(?P<word>.*?)' is not one of (?P<expected>'.*')")
 
 
-def refusal(error: ValidationError) -> str:
-    """The first thing that is wrong, after its place: `scene.touch: must be at least -1`."""
+def refusal(error: ValidationError, model: type[BaseModel] | None = None) -> str:
+    """The first thing that is wrong, after its place: `scene.touch: must be at least -1`.
+
+    With the model that refused, a number's whole range is named: `share: must be more than 0 and at most 1; got 3`.
+    """
     first = error.errors(include_url=False)[0]
     # Of several models that would do, pydantic names the one that it tried.
     where = ".".join(str(part) for part in first["loc"] if not _CLASS.match(str(part)))
-    return f"{where}: {words(first)}" if where else words(first)
+    field = model.model_fields.get(where) if model else None
+    said = f"{_range(field)}; got {first['input']!r}" if field and first["type"] in _BOUNDS else words(first)
+    return f"{where}: {said}" if where else said
+
+
+def _range(field: FieldInfo) -> str:
+    """The bounds of a number: `must be at least 0 and at most 3`."""
+    held = ((name, getattr(one, key, None)) for one in field.metadata for name, key in _BOUNDS.items())
+    said = [_WORDS[name].format(**{_BOUNDS[name]: f"{value:.12g}"}) for name, value in held if value is not None]
+    return " and ".join([*said[:1], *(words.removeprefix("must be ") for words in said[1:])])
 
 
 def words(entry: Mapping[str, Any]) -> str:

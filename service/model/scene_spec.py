@@ -28,6 +28,8 @@ MOST_TOUCH: Final = 2.0
 TOUCH: Final = 0.0
 SCENE_FILES: Final = (".json", ".yaml", ".yml")
 MOST_NEIGHBOURS: Final = 8
+#: Scenes that the grasps of one call are shared out to, at most.
+MOST_SCENES: Final = 4096
 #: A scene is no larger than this [m].
 FARTHEST_M: Final = 10.0
 #: Largest scene file [bytes].

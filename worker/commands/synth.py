@@ -28,7 +28,7 @@ from service.model.errors import InputError, TaskCancelled
 from service.model.fidelity import FIDELITIES
 from service.model.refusals import refusal
 from service.model.robust import MODELS
-from service.model.scene_spec import parse_scene
+from service.model.scene_spec import MOST_SCENES, parse_scene
 from service.model.suggestions import one_of
 from service.store.asset_options import (
     AllowOpenOption,
@@ -115,7 +115,7 @@ def synth(
     scene: Annotated[
         str, typer.Option(help="Where the grasps are used: free, table, bin, shelf, or a JSON or YAML file.")
     ] = "free",
-    scenes: Annotated[int, typer.Option(help="Scenes that the grasps are shared out to.", min=1, max=4096)] = 4,
+    scenes: Annotated[int, typer.Option(help="Scenes that the grasps are shared out to.", min=1, max=MOST_SCENES)] = 4,
     faces: Annotated[str, typer.Option(help="drawn: as drops fall; all: a scene for each stable face.")] = "drawn",
     touch: Annotated[
         float | None,
@@ -208,7 +208,7 @@ def _request(want: str, budget: float, referee: str, robust: float, models: int,
             want=want, budget=budget, referee=referee, audits=0, robust=robust, robust_models=models, **matter
         )
     except ValidationError as error:
-        raise InputError(refusal(error)) from None
+        raise InputError(refusal(error, JobOptions)) from None
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from service.model.domain import BATCH_SIZE, SHAKE_NEEDS_A_SCENE, JobOptions
 from service.model.errors import InputError, TaskCancelled
 from service.model.fidelity import FIDELITIES, Fidelity
 from service.model.outcomes import shortfall, totals
-from service.model.scene_spec import SceneSpec
+from service.model.scene_spec import MOST_SCENES, SceneSpec
 from service.model.suggestions import did_you_mean, one_of
 from service.store.attributes import Attribute
 from service.store.shards import json_attribute
@@ -217,6 +217,10 @@ def synthesized(
         TaskCancelled: `cancelled` answered True; with `partial`, before anything was judged.
     """
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
+    if place.kind != "free" and not 1 <= scenes <= MOST_SCENES:
+        raise InputError(f"scenes: must be at least 1 and at most {MOST_SCENES}; got {scenes}")
+    if threads < 0:
+        raise InputError(f"threads: must be at least 0; got {threads}")
     if request.shake and place.kind == "free":
         raise InputError(SHAKE_NEEDS_A_SCENE)
     wanted = parse_join(str(join))
