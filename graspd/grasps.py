@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, overload
+from typing import TYPE_CHECKING, Any, Final, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,9 @@ from service.store.attributes import Attribute
 from service.store.columns import SCHEMAS
 from service.store.manifests import INDEX_THRESHOLD_M
 from service.store.shards import Shard, read_shard, write_shard
+
+if TYPE_CHECKING:
+    from worker.viewing.viewer import Viewer
 
 Array = NDArray[Any]
 Floats = NDArray[np.float64]
@@ -43,6 +46,9 @@ class Postures:
     joint_positions: Floats
     """(N, J) [rad or m], order in `Grasps.joint_names`."""
 
+    def __repr__(self) -> str:
+        return f"<{len(self.hand_pose)} postures of {self.joint_positions.shape[-1]} joints>"
+
 
 @dataclass(frozen=True)
 class Grasp:
@@ -53,7 +59,15 @@ class Grasp:
     joints: dict[str, float]
     """Position of each joint at contact [rad or m]."""
     valid: bool
+    """Whether it is valid, see `Grasps.is_valid`."""
     metrics: dict[str, float]
+    """Value of each metric of docs/metrics.md, swept ones at a contact threshold of 5 mm."""
+
+    def __repr__(self) -> str:
+        x, y, z = self.hand_pose[:3]
+        said = f"epsilon {self.metrics['epsilon']:.3g}, " if "epsilon" in self.metrics else ""
+        valid = "valid" if self.valid else "not valid"
+        return f"<grasp at ({x:.3f}, {y:.3f}, {z:.3f}) m, {len(self.joints)} joints, {said}{valid}>"
 
 
 class Grasps:
@@ -62,8 +76,12 @@ class Grasps:
     Columns have the names, shapes, units and frames of docs/dataset.md.
     """
 
-    def __init__(self, columns: Mapping[str, Array], attributes: Mapping[str, Attribute]) -> None:
+    def __init__(
+        self, columns: Mapping[str, Array], attributes: Mapping[str, Attribute], path: Path | None = None
+    ) -> None:
         self._columns = dict(columns)
+        #: The file, in whose folder meshes are looked for.
+        self._path = path
         self._attributes = dict(attributes)
         if "object" not in self._columns:
             self._columns["object"] = np.full(len(columns["grasp/hand_pose"]), str(attributes.get("object", "")))
@@ -75,6 +93,11 @@ class Grasps:
         names = ", ".join(self.objects)
         return f"<{len(self)} grasps of {self.hand} on {names or 'nothing'}, {int(self.is_valid.sum())} valid>"
 
+    def _repr_html_(self) -> str:
+        from graspd.showing import html_of
+
+        return html_of(self)
+
     def __iter__(self) -> Iterator[Grasp]:
         return (self[i] for i in range(len(self)))
 
@@ -85,12 +108,14 @@ class Grasps:
     def __getitem__(self, rows: Any) -> Any:
         """One grasp by its number; some of them by a slice, a mask (N,) or numbers."""
         if isinstance(rows, int | np.integer):
-            return self._one(range(len(self))[int(rows)])
+            if not -len(self) <= rows < len(self):
+                raise IndexError(f"there is no grasp {rows}; of {len(self)} the last is {len(self) - 1}")
+            return self._one(int(rows) % len(self))
         chosen = rows if isinstance(rows, slice) else np.asarray(rows)
         if isinstance(chosen, np.ndarray) and not len(chosen):
             chosen = chosen.astype(int)
         kept = {path: data[chosen] if self._per_grasp(path) else data for path, data in self._columns.items()}
-        return Grasps(kept, self._attributes)
+        return Grasps(kept, self._attributes, self._path)
 
     # What they are of.
 
@@ -203,6 +228,11 @@ class Grasps:
             return values
         return values[:, int(np.argmin(np.abs(self._columns[_THRESHOLDS] - threshold_m)))]
 
+    @property
+    def columns(self) -> dict[str, Array]:
+        """All columns by their names in docs/dataset.md, and `object` (N,): the object's name."""
+        return dict(self._columns)
+
     def column(self, path: str) -> Array:
         """A column of docs/dataset.md, such as quality/verdict_margin; InputError if the file has none."""
         if path not in self._columns:
@@ -226,12 +256,62 @@ class Grasps:
             InputError: the file has no such metric, or `count` is negative.
         """
         if count < 0:
-            raise InputError(f"top {metric} of {count}: a number of grasps is not negative")
+            raise InputError(f"top {metric} of {count}: the number of grasps must be at least 0")
         values = np.asarray(self.metric(metric), float)
         order = np.argsort(values if self._known(metric).less_is_better else -values, kind="stable")
         return self[order[np.isfinite(values[order])][:count]]
 
+    # Shown.
+
+    def to_pandas(self) -> Any:
+        """A `pandas.DataFrame` with a row for each grasp.
+
+        Columns: `object`, `valid`; `x y z` [m] and the unit quaternion `qw qx qy qz` of `hand_pose` in the object
+        frame; each joint by its name [rad or m]; each metric by its name, swept ones at a contact threshold of 5 mm;
+        other numbers of a grasp by the last part of their column's name. `pregrasp.`, `squeeze.` and `lift.` stand
+        before the same names of these postures. A joint with the name of another column has `joint.` before it.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        from graspd.showing import frame_of
+
+        return frame_of(self)
+
+    def view(self, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
+        """Serve them to a browser, as `graspd view` does, until `close()` of what is returned; its `url` is where.
+
+        Args:
+            host: address to serve on; whoever reaches it sees the grasps.
+            port: the first port tried; 0: any free one.
+
+        Raises:
+            InputError: viser is not installed (`graspd[view]`), there are no grasps, they are of several objects, or
+                the address cannot be used.
+            NotFoundError: the file of the hand or the object is not found.
+        """
+        from graspd.showing import viewer_of
+
+        return viewer_of(self, host=host, port=port)
+
     # Files.
+
+    def shard(self) -> Shard:
+        """They as a base shard, as it is saved.
+
+        Raises:
+            InputError: they are of several objects.
+        """
+        if len(self.objects) > 1:
+            raise InputError(f"a file holds grasps on one object; these are on {', '.join(self.objects)}")
+        # Attributes of several files are those of the first: they are not true of another object.
+        if self.objects and self.objects != [str(self._attributes.get("object", ""))]:
+            raise InputError(
+                f"these were chosen among grasps on several objects; open the file of {self.objects[0]} alone"
+            )
+        said = {name: value for name, value in self._attributes.items() if name not in ("shard_id", "schema")}
+        columns = {name: data for name, data in self._columns.items() if name != "object"}
+        return Shard("base", said, columns, self._path)
 
     def save(self, path: str | Path) -> Path:
         """Write them as one file that every command and `graspd.open` reads.
@@ -239,12 +319,9 @@ class Grasps:
         Raises:
             InputError: they are of several objects, or the file cannot be written.
         """
-        if len(self.objects) > 1:
-            raise InputError(f"a file holds grasps on one object; these are on {', '.join(self.objects)}")
-        said = {name: value for name, value in self._attributes.items() if name not in ("shard_id", "schema")}
-        columns = {name: data for name, data in self._columns.items() if name != "object"}
+        shard = self.shard()
         try:
-            write_output(Path(path), write_shard("base", columns, said))
+            write_output(Path(path), write_shard("base", shard.arrays, shard.attributes))
         except OSError as error:
             raise InputError(f"{path} cannot be written: {error.strerror}") from None
         return Path(path)
@@ -315,7 +392,7 @@ def joined(shards: Sequence[Shard]) -> Grasps:
     counts = [len(shard["grasp/hand_pose"]) for shard in shards]
     names = [str(shard.attributes.get("object", "")) for shard in shards]
     columns["object"] = np.repeat(np.array(names), counts)
-    return Grasps(columns, first.attributes)
+    return Grasps(columns, first.attributes, first.path)
 
 
 def _of_hand(shards: Shards, hand: str | None) -> Shards:

@@ -16,6 +16,7 @@ from service.store.shards import read_shard
 
 try:
     from api.client.client import Client as HttpClient
+    from api.client.client import path_of
     from api.client.reports import open_client
     from api.models import JobDetail
 except ModuleNotFoundError as error:
@@ -32,6 +33,9 @@ class Client:
 
     def __init__(self, url: str | None = None, *, key: str | None = None) -> None:
         self._http = open_client(url, key=key)
+
+    def __repr__(self) -> str:
+        return f"<client of {self._http.url}>"
 
     def __enter__(self) -> Self:
         return self
@@ -58,12 +62,17 @@ class Client:
         try:
             request = JobRequest.model_validate({"hand": hand, "object": object, **options})
         except ValidationError as error:
-            raise InputError(refusal(error)) from None
+            raise InputError(refusal(error, JobRequest)) from None
         return Job(self._http, self._http.submit(request))
 
     def job(self, job_id: str) -> Job:
         """A job by its id; NotFoundError if there is none."""
         return Job(self._http, self._http.job(job_id))
+
+    def shard(self, shard_id: str) -> Grasps:
+        """The grasps of a base shard by its id; NotFoundError if there is none."""
+        file = b"".join(self._http.fetch(path_of("shards", shard_id, "file")))
+        return joined([read_shard(file, kind="base", name=shard_id[:12])])
 
 
 class Job:

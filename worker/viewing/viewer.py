@@ -78,6 +78,9 @@ class Viewer:
         self._load()
         self._aim()
 
+    def __repr__(self) -> str:
+        return f"<viewer at {self.url}>"
+
     @property
     def _wrist(self) -> Floats | None:
         """(1, U) angles of the wrist at the grasp that is shown; None: the file has none."""

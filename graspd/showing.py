@@ -1,0 +1,122 @@
+"""Grasps shown: as a table of pandas, as HTML of a notebook, and in the viewer of `graspd view`."""
+
+from __future__ import annotations
+
+import base64
+import time
+from html import escape
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from service.model.errors import InputError
+
+if TYPE_CHECKING:
+    from graspd.grasps import Grasps
+    from worker.viewing.viewer import Viewer
+
+#: Grasps of a notebook's picture, edge of each [px], and the time after which tracing stops [s].
+PICTURED: Final = 4
+EDGE: Final = 220
+PICTURE_S: Final = 10.0
+#: Largest picture that a notebook is given [bytes].
+PICTURE_BYTES: Final = 300_000
+#: Columns of the table where no picture can be drawn.
+_FIGURES: Final = ("epsilon", "contact_area_cm2", "penetration_depth_mm")
+_POSE: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")
+#: Postures besides that at contact: what stands before their names, and their columns.
+_MORE: Final = {
+    "pregrasp.": ("pregrasp/hand_pose", "pregrasp/joint_positions"),
+    "squeeze.": ("squeeze/hand_pose", "squeeze/joint_positions"),
+    "lift.": ("grasp/lift", ""),
+}
+
+
+def frame_of(grasps: Grasps) -> Any:
+    """A `pandas.DataFrame`; see `Grasps.to_pandas`."""
+    try:
+        import pandas
+    except ModuleNotFoundError:
+        raise InputError("to_pandas needs pandas; install it: pip install 'graspd[pandas]'") from None
+    columns = grasps.columns
+    found: dict[str, Any] = {"object": columns["object"], "valid": grasps.is_valid}
+
+    def add(before: str, pose: str, joints: str) -> None:
+        if pose in columns:
+            found.update({before + part: columns[pose][:, k] for k, part in enumerate(_POSE)})
+        for k, joint in enumerate(grasps.joint_names if joints in columns else ()):
+            # A joint of a gantry may be called x.
+            found[before + (joint if before + joint not in found else f"joint.{joint}")] = columns[joints][:, k]
+
+    add("", "grasp/hand_pose", "grasp/joint_positions")
+    found |= {name: grasps.metric(name) for name in grasps.metrics}
+    for path, data in columns.items():
+        name = path.rpartition("/")[2]
+        if path.startswith(("grasp/", "quality/")) and data.shape == (len(grasps),) and name not in found:
+            found[name] = data
+    for before, paths in _MORE.items():
+        add(before, *paths)
+    return pandas.DataFrame(found)
+
+
+def html_of(grasps: Grasps) -> str:
+    """The line of `repr` with a picture of the best grasps; where none can be drawn, with a table of their figures."""
+    head = f"<p>{escape(repr(grasps))}</p>"
+    try:
+        png = _picture(grasps)
+    # A notebook must show its grasps whatever a missing file, engine or driver says.
+    except Exception:
+        return head + _table(grasps)
+    if len(png) > PICTURE_BYTES:
+        return head + _table(grasps)
+    data = base64.b64encode(png).decode()
+    return f'{head}<img alt="the best of them" style="max-width:100%" src="data:image/png;base64,{data}">'
+
+
+def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:
+    """A viewer that serves; see `Grasps.view`."""
+    try:
+        from worker.files.of_shard import hand_of_shard, neighbours_of_shard, object_of_shard
+        from worker.viewing.viewer import Shown, Viewer, missing
+    except ModuleNotFoundError as error:
+        raise ImportError(f"view needs {error.name}; run pip install 'graspd[worker,view]'") from error
+    if said := missing():
+        raise InputError(said)
+    shard = grasps.shard()
+    shown = Shown(shard, hand_of_shard(shard, None), object_of_shard(shard, None), neighbours_of_shard(shard, []))
+    return Viewer(shown, host=host, port=port)
+
+
+def _picture(grasps: Grasps) -> bytes:
+    from worker.commands.grasp_sheet import GraspSheet
+    from worker.engines.devices import Device
+    from worker.files.of_shard import hand_of_shard, object_of_shard
+    from worker.run import Run
+
+    shard, until = grasps.shard(), time.monotonic() + PICTURE_S
+    rows = _best(grasps)
+    if not len(rows):
+        raise InputError("there is no grasp to draw")
+    hand, obj = hand_of_shard(shard, None), object_of_shard(shard, None)
+    run = Run(Device("auto").resolve(), cancelled=lambda: time.monotonic() > until)
+    return GraspSheet(shard, hand, obj, rows, "one side", run, EDGE).png(subtitle=f"best {len(rows)} by epsilon")
+
+
+def _table(grasps: Grasps) -> str:
+    rows = _best(grasps)
+    names = [name for name in _FIGURES if name in grasps.metrics]
+    head = "".join(f"<th>{escape(name)}</th>" for name in ("row", "valid", *names))
+    values = {name: grasps.metric(name) for name in names}
+    body = "".join(
+        f"<tr><td>{row}</td><td>{'yes' if grasps.is_valid[row] else 'no'}</td>"
+        + "".join(f"<td>{values[name][row]:.3g}</td>" for name in names)
+        + "</tr>"
+        for row in rows
+    )
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _best(grasps: Grasps) -> np.ndarray:
+    """Rows of the best by epsilon, the valid ones first."""
+    epsilon = np.nan_to_num(np.asarray(grasps.metric("epsilon"), float), nan=-1.0)
+    return np.lexsort((-epsilon, ~grasps.is_valid))[:PICTURED]
