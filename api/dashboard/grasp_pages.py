@@ -115,7 +115,7 @@ def grasp_page(
         type=GraspType(int(grasp.grasp_type or 0)),
         weakest=_WEAKEST.get(grasp.robust_weakest or ""),
         swept=[metric for metric in GRASP_METRICS if metric.name in grasp.sweep],
-        loader=snippets.grasp_loader(grasp, shard, base_url(request)),
+        loader=snippets.grasp_loader(grasp, base_url(request)),
     )
 
 

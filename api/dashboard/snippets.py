@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from api.models import GraspDetail, JobDetail, Shard
+from api.models import GraspDetail, JobDetail
 
 
 def loader(job: JobDetail, base_url: str) -> str:
-    """Python that downloads the job's first shard of grasps and reads it with h5py."""
-    shard = next((shard for shard in job.shards if shard.kind == "base"), None)
-    if shard is None:
+    """Python that fetches the job's grasps; empty while there are none."""
+    if not any(shard.kind == "base" for shard in job.shards):
         return ""
-    return f"""import io, urllib.request
-import h5py
+    return f"""import graspd  # pip install 'graspd[api]'
 
-url = "{base_url.rstrip("/")}{shard.file}"
-with h5py.File(io.BytesIO(urllib.request.urlopen(url).read())) as shard:
-    poses = shard["grasp/hand_pose"][:]          # (N, 7) x y z [m], quaternion w x y z
-    joints = shard["grasp/joint_positions"][:]   # (N, J) rad or m
-    names = shard["grasp/joint_positions"].attrs["joint_names"]
-    valid = shard["quality/valid"][:].astype(bool)
-    epsilon = shard["quality/epsilon"][:]        # (N, T) at the thresholds in quality/thresholds_m
-print(valid.sum(), "of", len(valid), "grasps are valid")"""
+with graspd.Client("{base_url.rstrip("/")}") as client:  # key="..." where the service asks for one
+    grasps = client.job("{job.id}").grasps()
+best = grasps.valid().top("epsilon", 10)
+best.hand_pose        # (N, 7) x y z [m], quaternion w x y z
+best.joint_positions  # (N, J) rad or m, in the order of best.joint_names
+print(grasps)"""
 
 
 def curl(job: JobDetail, base_url: str) -> str:
@@ -30,12 +26,11 @@ def curl(job: JobDetail, base_url: str) -> str:
     return "\n".join(lines)
 
 
-def grasp_loader(grasp: GraspDetail, shard: Shard, base_url: str) -> str:
-    """Python that reads one grasp out of its shard."""
-    return f"""import io, urllib.request
-import h5py
+def grasp_loader(grasp: GraspDetail, base_url: str) -> str:
+    """Python that fetches one grasp of a shard."""
+    return f"""import graspd  # pip install 'graspd[api]'
 
-url = "{base_url.rstrip("/")}{shard.file}"
-with h5py.File(io.BytesIO(urllib.request.urlopen(url).read())) as shard:
-    pose = shard["grasp/hand_pose"][{grasp.row}]           # x y z [m], quaternion w x y z
-    joints = shard["grasp/joint_positions"][{grasp.row}]   # rad or m"""
+with graspd.Client("{base_url.rstrip("/")}") as client:  # key="..." where the service asks for one
+    grasp = client.shard("{grasp.shard_id}")[{grasp.row}]
+grasp.hand_pose  # (7,) x y z [m], quaternion w x y z
+grasp.joints     # position of each joint by its name, rad or m"""
