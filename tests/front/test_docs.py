@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import os
 import re
@@ -14,6 +15,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+import graspd
 from service.run.supervisor import Supervisor
 from service.settings import Settings
 from tests.conftest import REPOSITORY
@@ -45,6 +47,25 @@ def test_the_page_runs_as_it_is_printed(environment: dict[str, str], tmp_path: P
     assert "<8 grasps of allegro on mug, 8 valid>" in said
     assert "<8 grasps of barrett on mug, 8 valid>" in said
     assert "no_such_file.stl" in said
+
+
+def test_the_code_on_the_pages_of_the_dashboard_runs(environment: dict[str, str], tmp_path: Path) -> None:
+    url = environment["GRASPD_API_URL"]
+    with graspd.Client(url) as client, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+        job = client.submit("barrett", "mug", grasps=8, fidelity="draft").wait()
+        shard = http.get(f"/v1/jobs/{job.id}").json()["shards"][0]["id"]
+        pages = [http.get(page).text for page in (f"/jobs/{job.id}", f"/grasps/{shard}/3")]
+    codes = [html.unescape(re.findall(r'<pre id="loader"[^>]*>(.*?)</pre>', page, re.DOTALL)[0]) for page in pages]
+    assert "<8 grasps of barrett on mug, 8 valid>" in run(codes[0], environment, tmp_path)
+    assert "<grasp at " in run(codes[1] + "\nprint(grasp)", environment, tmp_path)
+
+
+def test_the_notebook_is_stored_with_its_outputs() -> None:
+    notebook = json.loads((REPOSITORY / "examples" / "first_grasps.ipynb").read_text())
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    assert all(cell["outputs"] for cell in cells)
+    assert "data:image/png" in json.dumps(cells[0]["outputs"]) and '"error"' not in json.dumps(cells)
 
 
 @pytest.mark.slow
