@@ -17,7 +17,7 @@ import pin
 
 PAGE: Final = pin.ROOT / "docs" / "licences.md"
 #: Extras that a user runs with; tools of developers are not shipped.
-EXTRAS: Final = (*pin.EXTRAS, "embedded", "usd", "parquet", "arm", "view")
+EXTRAS: Final = (*pin.EXTRAS, "embedded", "usd", "pandas", "parquet", "arm", "view")
 #: Permissive ones, and of the others those that bind changes of the package itself alone.
 ACCEPTED: Final = frozenset(
     {"0BSD", "Apache-2.0", "BSD-2-Clause", "BSD-3-Clause", "CC0-1.0", "HPND", "ISC", "MIT", "MIT-CMU", "PSF-2.0"}
