@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from service.model.errors import InputError
+from service.model.transforms import POSE_PARTS
 
 if TYPE_CHECKING:
     from graspd.grasps import Grasps
@@ -23,7 +24,6 @@ PICTURE_S: Final = 10.0
 PICTURE_BYTES: Final = 300_000
 #: Columns of the table where no picture can be drawn.
 _FIGURES: Final = ("epsilon", "contact_area_cm2", "penetration_depth_mm")
-_POSE: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")
 #: Postures besides that at contact: what stands before their names, and their columns.
 _MORE: Final = {
     "pregrasp.": ("pregrasp/hand_pose", "pregrasp/joint_positions"),
@@ -43,7 +43,7 @@ def frame_of(grasps: Grasps) -> Any:
 
     def add(before: str, pose: str, joints: str) -> None:
         if pose in columns:
-            found.update({before + part: columns[pose][:, k] for k, part in enumerate(_POSE)})
+            found.update({before + part: columns[pose][:, k] for k, part in enumerate(POSE_PARTS)})
         for k, joint in enumerate(grasps.joint_names if joints in columns else ()):
             # A joint of a gantry may be called x.
             found[before + (joint if before + joint not in found else f"joint.{joint}")] = columns[joints][:, k]

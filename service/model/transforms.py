@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
 IDENTITY_POSE: Floats = np.array([0.0, 0, 0, 1, 0, 0, 0])
+#: Names of the parts of a pose (7,) in tables.
+POSE_PARTS: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 def quat_multiply(a: Floats, b: Floats) -> Floats:

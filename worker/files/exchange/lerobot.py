@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from service import parquet
 from service.model.errors import InputError
-from service.model.transforms import compose
+from service.model.transforms import POSE_PARTS, compose
 from service.readers import Pictures
 from service.readers.ways import way_of
 from worker.files.exchange.huggingface import png
@@ -64,7 +64,6 @@ _INDEXED: Final = {
         for name, kind, numpy in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
     ],
 }
-ROOT: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 def write(lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[str]) -> Written:
@@ -230,12 +229,12 @@ class _Writer:
         parquet.write(path, parquet.schema_of(columns), [self.episodes])
 
     def _features(self) -> dict[str, Any]:
-        names = [*ROOT, *self.hand.joint_names]
+        names = [*POSE_PARTS, *self.hand.joint_names]
         moving = {"dtype": "float32", "shape": [len(names)], "names": names}
         return {
             STATE: moving,
             ACTION: moving,
-            OBJECT: {"dtype": "float32", "shape": [7], "names": list(ROOT)},
+            OBJECT: {"dtype": "float32", "shape": [7], "names": list(POSE_PARTS)},
             PICTURE: {"dtype": "image", "shape": list(self._size), "names": ["height", "width", "channels"]},
             **{name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in NUMBERS.items()},
         }

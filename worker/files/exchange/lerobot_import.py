@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from service import parquet
 from service.model.errors import InputError
 from service.model.refusals import why
-from service.model.transforms import compose, invert
+from service.model.transforms import POSE_PARTS, compose, invert
 from worker.files.exchange.bench_scene import placed_of
 from worker.files.exchange.imported import Imported, joints_by_name, verdicts
-from worker.files.exchange.lerobot import ACTION, EPISODE, OBJECT, ROOT, STATE, VERDICT, task_of
+from worker.files.exchange.lerobot import ACTION, EPISODE, OBJECT, STATE, VERDICT, task_of
 from worker.files.exchange.objects import scaled_object
 from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
@@ -72,8 +72,8 @@ def _names(path: Path) -> list[str]:
             names = [str(name) for name in json.loads(stream.read(_LARGEST))["features"][STATE]["names"]]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{file} is no description of a LeRobot data set: {why(error)}") from None
-    if tuple(names[:7]) != ROOT:
-        raise InputError(f"{path} is no data set of ours: its states do not begin with {', '.join(ROOT)}")
+    if tuple(names[:7]) != POSE_PARTS:
+        raise InputError(f"{path} is no data set of ours: its states do not begin with {', '.join(POSE_PARTS)}")
     return names[7:]
 
 

@@ -9,12 +9,11 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
+from service.model.transforms import POSE_PARTS
 from worker.files.exchange.robots.bundle import Bundle, numbers
 from worker.robots.execution import POSTURES
-
-POSE: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 def write(bundle: Bundle, folder: Path) -> list[Path]:
@@ -34,12 +33,16 @@ def write(bundle: Bundle, folder: Path) -> list[Path]:
                 "valid",
                 "success",
                 "epsilon",
-                *(f"object_{part}" for part in POSE),
+                *(f"object_{part}" for part in POSE_PARTS),
             ),
             _grasps(bundle),
         ),
-        _table(folder / "postures.csv", ("grasp", "posture", *POSE, *joints), _postures(bundle)),
-        _table(folder / "trajectories.csv", ("grasp", "phase", "time_s", *POSE, *of_trajectory), _trajectories(bundle)),
+        _table(folder / "postures.csv", ("grasp", "posture", *POSE_PARTS, *joints), _postures(bundle)),
+        _table(
+            folder / "trajectories.csv",
+            ("grasp", "phase", "time_s", *POSE_PARTS, *of_trajectory),
+            _trajectories(bundle),
+        ),
     ]
 
 
