@@ -14,7 +14,7 @@ from PIL import Image
 from benchmarks.results import manifest, page
 from benchmarks.results.__main__ import main
 from benchmarks.results.manifest import DOCS, INDEX, digests, faults, load, staleness, there
-from benchmarks.results.running import Runner
+from benchmarks.results.running import Runner, slim
 from benchmarks.results.studies import BY_NAME, STUDIES, Study, is_raw
 from service.model.version import STAGE_REVISIONS
 from tests.conftest import REPOSITORY
@@ -60,6 +60,13 @@ def test_a_page_keeps_no_link_to_a_raw_result_and_a_picture_gets_a_palette(tmp_p
     assert (tmp_path / "docs/results/page.md").read_text() == "`all`, [seen](seen.png)"
     with Image.open(tmp_path / "docs/results/seen.png") as picture:
         assert picture.mode == "P"
+
+
+def test_a_picture_that_would_show_steps_keeps_its_colours(tmp_path: Path) -> None:
+    Image.merge("RGB", [Image.effect_noise((99, 99), 50) for _ in "RGB"]).save(tmp_path / "depth.png")
+    before = (tmp_path / "depth.png").read_bytes()
+    slim(tmp_path / "depth.png")
+    assert (tmp_path / "depth.png").read_bytes() == before
 
 
 def test_raw_results_stand_beside_the_pages_and_not_in_the_manifest(tmp_path: Path) -> None:
