@@ -14,7 +14,7 @@ from tests.worker.models import object_from_mesh
 from tests.worker.quality.helpers import pad_hand, posture
 from worker.grasps import GraspSet, Posture
 from worker.quality.referee.decomposition import ConvexPieces
-from worker.quality.referee.lift import Lift, LiftOutcome
+from worker.quality.referee.lift import RISING, RISING_S, Lift, LiftOutcome
 from worker.quality.referee.lifting import lift_key
 from worker.quality.referee.model import MujocoOptions, build
 from worker.simulation.obstacles import obstacle_distances
@@ -63,6 +63,13 @@ def test_glue_lifts_what_the_same_squeeze_does_not_hold() -> None:
     weak = grasp(0.0005)
     assert lift_test(MujocoOptions(friction=(0.05, 0.001))).lift(weak, 0).outcome is LiftOutcome.NOT_LIFTED
     assert lift_test(MujocoOptions(friction=(50.0, 1.0))).lift(weak, 0).outcome is LiftOutcome.LIFTED
+
+
+def test_a_lift_ends_where_its_object_is_lost() -> None:
+    lost, held = lift_test().lift(grasp(-0.01), 0), lift_test().lift(grasp(0.05), 0)
+    # Half of the rise takes the hand 5 cm away from a box that stays.
+    rise = RISING * RISING_S / MujocoOptions().timestep
+    assert lost.steps < held.steps - 0.3 * rise
 
 
 def test_a_slippery_table_changes_nothing_once_the_box_is_lifted() -> None:
