@@ -83,7 +83,7 @@ def _gains(hand: HandModel) -> tuple[Floats, Floats, Floats]:
         for dof in range(hand.dofs):
             q = np.tile(posture(hand, share), (3, 1))
             q[:, dof] = hand.lower[dof] + np.array([0.0, 0.5, 1.0]) * hand.span[dof]
-            low, _, high = seen = np.array([tips(hand, one) for one in q])
+            low, _, high = seen = tips(hand, q)
             nearer = _apart(low) - _apart(high)
             to_palm = (np.linalg.norm(one - hand.palm.centre, axis=1) for one in (low, high))
             flexing[dof] += nearer + next(to_palm) - next(to_palm)
@@ -138,7 +138,9 @@ def posture(hand: HandModel, share: float) -> Floats:
 
 
 def tips(hand: HandModel, q: Floats) -> Floats:
-    """(T, 3) centres of the fingertip bodies in the root frame [m]."""
-    poses = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0]
+    """(..., T, 3) centres of the fingertip bodies in the root frame [m] of postures (..., D)."""
+    many = q.reshape(-1, hand.dofs)
+    poses = body_poses(hand, np.tile(IDENTITY_POSE, (len(many), 1)), hand.expand(many))
     centre = {p.body: p.vertices.mean(axis=0) for p in hand.pieces}
-    return np.array([apply(poses[b], centre.get(b, np.zeros(3))) for b in hand.fingertips])
+    at = [apply(poses[:, b], centre.get(b, np.zeros(3))) for b in hand.fingertips]
+    return np.stack(at, axis=1).reshape(*q.shape[:-1], -1, 3)

@@ -18,7 +18,7 @@ from service.model.transforms import compose
 from service.store.assets import builtin_files, builtin_names, unpack_file, without_common_folder
 from service.store.hand_files import files_of_hand
 from service.store.hand_main import hand_name, main_of
-from worker.hands import collisions, guess, primitives
+from worker.hands import collisions, guess, primitives, shapes
 from worker.hands.collisions import resting_neighbours
 from worker.hands.drive import with_drive
 from worker.hands.guess import complete
@@ -59,7 +59,7 @@ def load_hand(
     settings = parse_options(files, options)
     main = main_file(files, settings)
     robot = read_robot(files, main, settings.xacro)
-    with recalling("hand_shapes", (digest_files(AssetKind.HAND, files),), (collisions, guess, primitives)):
+    with recalling("hand_shapes", (digest_files(AssetKind.HAND, files),), (collisions, guess, primitives, shapes)):
         hand = assemble(robot, settings, files, main, name=name, digest=digest)
     return replace(hand, drag=_drag(robot, hand)) if drag else hand
 

@@ -24,11 +24,12 @@ def hull(points: Floats) -> tuple[Floats, Ints]:
     Raises:
         HandError: the points lie in a plane.
     """
-    made = recalled("hull", [points], lambda: _hull(points))
+    made = recalled("hull", [points], lambda: new_hull(points))
     return made["0"], made["1"]
 
 
-def _hull(points: Floats) -> tuple[Floats, Ints]:
+def new_hull(points: Floats) -> tuple[Floats, Ints]:
+    """The same, of points that are asked about once."""
     from scipy.spatial import ConvexHull, QhullError  # slow to load
 
     scale = float(np.ptp(points, axis=0).max()) if len(points) else 0.0

@@ -11,10 +11,11 @@ from service.model.errors import HandError, MeshError
 from service.model.transforms import IDENTITY_POSE, Floats, apply
 from worker.hands.hollows import parts_of
 from worker.hands.model import ConvexPiece
-from worker.hands.primitives import hull, signed_distance, tessellate, volume
+from worker.hands.primitives import new_hull, signed_distance, tessellate, volume
 from worker.hands.references import find_mesh
 from worker.hands.robot import Ints, Shape
 from worker.objects.formats import read_mesh
+from worker.objects.kept_arrays import recalled
 
 #: A hull of V corners has at most 2 V - 4 triangles: 96 here. Every plane costs time in each distance query.
 MAX_HULL_VERTICES: Final = 50
@@ -91,7 +92,12 @@ def reduce_hull(points: Floats, limit: int = MAX_HULL_VERTICES) -> tuple[Floats,
     The corners are chosen one by one where the hull so far is farthest from the full one, then grown about their
     centroid until the volumes agree: the surface errs to both sides by half of what an inscribed hull would.
     """
-    vertices, faces = hull(points)
+    made = recalled("reduced hull", [points, np.array(limit)], lambda: _reduced(points, limit))
+    return made["0"], made["1"]
+
+
+def _reduced(points: Floats, limit: int) -> tuple[Floats, Ints]:
+    vertices, faces = new_hull(points)
     if len(vertices) <= limit:
         return vertices, faces
     full = volume("hull", (), vertices, faces)
@@ -102,7 +108,7 @@ def reduce_hull(points: Floats, limit: int = MAX_HULL_VERTICES) -> tuple[Floats,
         if farthest in chosen:
             break
         chosen.append(farthest)
-    corners, faces = hull(vertices[chosen])
+    corners, faces = new_hull(vertices[chosen])
     centre = corners.mean(axis=0)
     growth = (full / volume("hull", (), corners, faces)) ** (1 / 3)
     return centre + (corners - centre) * growth, faces
@@ -113,4 +119,4 @@ def _outside(points: Floats, corners: Floats) -> Floats:
     spread = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
     if len(corners) < 4 or spread[2] < 1e-6 * spread[0]:
         return np.linalg.norm(points[:, None] - corners[None], axis=2).min(axis=1)
-    return signed_distance("hull", (), *hull(corners), points)
+    return signed_distance("hull", (), *new_hull(corners), points)

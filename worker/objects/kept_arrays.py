@@ -87,7 +87,10 @@ def recalled(what: str, given: Sequence[NDArray[Any]], make: Callable[[], Sequen
     key = f"{whole.hexdigest()[:32]}-"
     if key + "0" not in known:
         known |= {f"{key}{number}": array for number, array in enumerate(make())}
-    return {name.removeprefix(key): array.copy() for name, array in known.items() if name.startswith(key)}
+    found: dict[str, NDArray[Any]] = {}
+    while (name := f"{key}{len(found)}") in known:
+        found[str(len(found))] = known[name].copy()
+    return found
 
 
 def _file(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Path:
