@@ -104,9 +104,8 @@ class MemoryQueue:
             self.forget_reports([event.task_id for event in events if event.kind.ends_attempt])
             self._changed.notify_all()
 
-    def report(self, task_id: str, report: Report) -> float:
+    def report(self, task_id: str, report: Report) -> None:
         self._reports[task_id] = report
-        return 0.0
 
     def reports(self) -> dict[str, Report]:
         return dict(self._reports)

@@ -18,7 +18,7 @@ from redis.exceptions import ResponseError
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Stage
 from service.model.worker_beat import WorkerBeat
-from service.queue.port import Event, Message
+from service.queue.port import Event, Message, Report
 
 _BEAT: Final = TypeAdapter(WorkerBeat)
 _ATTEMPT: Final = re.compile(r"(.+)-([0-9]{1,9})")
@@ -79,6 +79,14 @@ def event(data: bytes | None) -> Event | None:
         return Event.model_validate_json(data or b"")
     except ValidationError:
         return None
+
+
+def report(data: bytes) -> Report:
+    """How far a task is; one that cannot be read says nothing."""
+    try:
+        return Report.model_validate_json(data)
+    except ValidationError:
+        return Report()
 
 
 def sweep(connection: Any, kinds: Iterable[tuple[str, str]], streams: Iterable[str] = ()) -> None:

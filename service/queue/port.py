@@ -175,12 +175,8 @@ class Events(Protocol):
     def publish(self, *events: Event) -> None:
         """Append events."""
 
-    def report(self, task_id: str, report: Report) -> float:
-        """Say how far a task is, in place of what was said before; gone with the event that ends the attempt.
-
-        Returns:
-            time after which more is welcome [s].
-        """
+    def report(self, task_id: str, report: Report) -> None:
+        """Say how far a task is, in place of what was said before; gone with the event that ends the attempt."""
 
     def reports(self) -> dict[str, Report]:
         """The last report on each task."""

@@ -32,7 +32,6 @@ from service.queue.at_scrape import read_queue
 from service.queue.connection import connect
 from service.queue.lists import known_lists, place_of, queue_name, without_takers
 from service.queue.port import Event, Holder, Lease, Message, QueueNow, Report
-from service.queue.reports import REPORTS, drop_reports, put_report, read_reports
 from service.queue.rq_keys import LISTS, execution_keys, held_key, job_key, list_key
 from service.queue.streams import EVENTS, EventReader, put_event, readable
 from service.settings import Settings
@@ -40,6 +39,8 @@ from service.settings import Settings
 WORKERS: Final = "graspd:workers"
 #: Lease of the controller that leads. A graspd of 0.2 takes and keeps the same one: so the two give way to each other.
 LEAD: Final = "graspd:lead:keeper"
+#: How far running tasks are: one field of a hash for each, so that what is late replaces what was not yet read.
+REPORTS: Final = "graspd:reports"
 #: Sums for Prometheus, a few hundred fields.
 METRICS: Final = "graspd:metrics"
 _SERVICE: Final = "graspd:service"
@@ -161,17 +162,19 @@ class RqQueue:
                     pipe.hdel(REPORTS, event.task_id)
             pipe.execute()
 
-    def report(self, task_id: str, report: Report) -> float:
+    def report(self, task_id: str, report: Report) -> None:
         with _mapped():
-            return put_report(self.connection, task_id, report, WORKERS)
+            self.connection.hset(REPORTS, task_id, report.model_dump_json())
 
     def reports(self) -> dict[str, Report]:
         with _mapped():
-            return read_reports(self.connection)
+            found = self.connection.hgetall(REPORTS)
+        return {entries.text(task): entries.report(data) for task, data in found.items()}
 
     def forget_reports(self, task_ids: Collection[str]) -> None:
-        with _mapped():
-            drop_reports(self.connection, task_ids)
+        if task_ids:
+            with _mapped():
+                self.connection.hdel(REPORTS, *task_ids)
 
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         with _mapped():
@@ -318,13 +321,12 @@ def renew_lease(pipe: Any, job: Job, execution: Execution, ttl: int) -> None:
     pipe.zadd(registry.key, {execution.composite_key: time.time() + ttl}, xx=True)
 
 
-def list_worker(connection: Any, beat: Mapping[str, Any], lease_s: float) -> int:
-    """Register a worker for the length of a lease [s]; returns how many are listed."""
+def list_worker(connection: Any, beat: Mapping[str, Any], lease_s: float) -> None:
+    """Register a worker for the length of a lease [s]."""
     with connection.pipeline() as pipe:
         pipe.set(worker_key(beat["name"]), json.dumps(beat), ex=max(2, round(lease_s)))
         pipe.sadd(WORKERS, beat["name"])
-        pipe.scard(WORKERS)
-        return int(pipe.execute()[2])
+        pipe.execute()
 
 
 def unlist_worker(connection: Any, left: Event) -> None:

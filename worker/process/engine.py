@@ -25,7 +25,6 @@ from service.model.errors import BusyError, InputError, TaskRefused, Unavailable
 from service.model.imports import own_process
 from service.model.states import Stage
 from service.pipeline.identity import check_service
-from service.queue.port import Report
 from service.store.store import open_store
 from worker.engines.devices import Device
 from worker.process.fitness import Check, Fitness
@@ -58,7 +57,6 @@ class Engine:
         self._orders: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._reason: StopReason | None = None
         self._context: TaskContext | None = None
-        self._report_every_s: float | None = None
 
     def serve(self) -> None:
         """Until told to end."""
@@ -116,7 +114,7 @@ class Engine:
         return self._fitness.sit_out(stages, self, lambda: self._reason is not None)
 
     def _do(self, raw: dict[str, Any]) -> None:
-        context = self._surroundings.context(raw, self._tell)
+        context = self._surroundings.context(raw, lambda *report: self._say("report", report))
         with self._changing:
             self._context = context
             if self._reason is not None:
@@ -143,11 +141,6 @@ class Engine:
             return "outgrown"
         return "fit"
 
-    def _tell(self, task_id: str, report: Report) -> float | None:
-        """How far a task is; returns when more is welcome [s], as far as that is known."""
-        self._say("report", (task_id, report))
-        return self._report_every_s
-
     def _listen(self) -> None:
         while True:
             try:
@@ -155,15 +148,13 @@ class Engine:
             except (EOFError, OSError):
                 word, about = "end", StopReason.LEASE_LOST  # nobody waits for what is being done
             with self._changing:
-                if word == "report every":
-                    self._report_every_s = about
-                elif word in ("stop", "end"):
+                if word in ("stop", "end"):
                     self._reason = about
                     if self._context is not None:
                         self._context.stop(about)
                 elif word == "task":
                     self._reason = None
-            if word not in ("stop", "report every"):
+            if word != "stop":
                 self._orders.put((word, about))
             if word == "end":
                 return

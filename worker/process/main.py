@@ -166,7 +166,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             self._publish(about)
         else:
             with suppress(QueueUnavailable):
-                self._engine.say("report every", self._queue.report(*about))
+                self._queue.report(*about)
 
     def _publish(self, event: Event) -> None:
         try:

@@ -71,12 +71,11 @@ class Surroundings:
         if self._pool is not None:
             self._pool.close()
 
-    def context(self, raw: Mapping[str, Any], report: Callable[[str, Report], float | None]) -> TaskContext:
-        """The context of a task, whose progress goes to `report`; that says when more is welcome [s]."""
+    def context(self, raw: Mapping[str, Any], report: Callable[[str, Report], None]) -> TaskContext:
+        """The context of a task, whose progress goes to `report`."""
 
-        def tell(done: float, total: float, message: str) -> float | None:
-            how_far = Report(attempt=raw["attempt"], done=done, total=total, message=message[:200])
-            return report(raw["task_id"], how_far)
+        def tell(done: float, total: float, message: str) -> None:
+            report(raw["task_id"], Report(attempt=raw["attempt"], done=done, total=total, message=message[:200]))
 
         device = "cpu" if raw.get("stage") == Stage.INGEST else self._device.resolve()
         chosen = self.settings

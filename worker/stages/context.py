@@ -15,8 +15,8 @@ from worker.run import FirstJudge, Run
 if TYPE_CHECKING:
     from service.store.store import Store
 
-#: Pause between two reports where nobody asks for another [s]: enough for a smooth bar.
-_REPORT_EVERY_S: Final = 0.25
+#: Least time between two reports [s]: as often as the controller passes them on.
+REPORT_EVERY_S: Final = 0.5
 
 
 class StopReason(StrEnum):
@@ -40,10 +40,9 @@ class TaskContext:
         first_judge: FirstJudge = "auto",
         pool: Pool | None = None,
         join: int = 1,
-        tell: Callable[[float, float, str], float | None] | None = None,
+        tell: Callable[[float, float, str], None] | None = None,
     ) -> None:
-        """`join` is how many batches one launch plans; `tell` takes done, total and a message, and may answer when it
-        wants to hear more [s]."""
+        """`join` is how many batches one launch plans; `tell` takes done, total and a message."""
         self.store = store
         self.device = device
         self.threads = threads
@@ -59,8 +58,8 @@ class TaskContext:
         """Say how far the task is; most calls are dropped so that few are sent."""
         now = time.monotonic()
         if self._tell is not None and now >= self._tell_again:
-            self._tell_again = now + _REPORT_EVERY_S
-            self._tell_again = now + (self._tell(done, total, message) or _REPORT_EVERY_S)
+            self._tell_again = now + REPORT_EVERY_S
+            self._tell(done, total, message)
 
     @property
     def run(self) -> Run:
