@@ -10,9 +10,7 @@ from service.queue.port import Report
 from service.store.store import Store
 from worker.engines.devices import Device
 from worker.engines.joins import batches_at_once, parse_join
-from worker.pool.modules import MODULES
-from worker.pool.pool import Pool
-from worker.pool.size import processes_at_once
+from worker.pool.pool import MODULES, Pool, processes_at_once
 from worker.process.memory import limit_mb, resident_mb
 from worker.stages.context import TaskContext
 
