@@ -22,16 +22,16 @@ from rq.job import Job
 from rq.serializers import JSONSerializer
 
 from service.model.ability import need_of
+from service.model.clock import age_of
 from service.model.errors import QueueUnavailable
 from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
 from service.queue import entries, rq_keys
 from service.queue.address import redis_url
 from service.queue.allowed import TASK_FUNCTION, new_job
-from service.queue.at_scrape import read_queue
 from service.queue.connection import connect
 from service.queue.lists import known_lists, place_of, queue_name, without_takers
-from service.queue.port import Event, Holder, Lease, Message, QueueNow, Report
+from service.queue.port import Event, Holder, Lease, Message, Place, QueueNow, Report, WorkerPulse
 from service.queue.rq_keys import LISTS, execution_keys, held_key, job_key, list_key
 from service.queue.streams import EVENTS, EventReader, put_event, readable
 from service.settings import Settings
@@ -233,15 +233,31 @@ class RqQueue:
             self.connection.lock(LEAD).do_release(holder)
 
     def now(self, *, lease_s: float) -> QueueNow:
-        with _mapped():
-            return read_queue(
-                self.connection,
-                {name: place_of(name) for name in known_lists(self.connection)},
-                workers_key=WORKERS,
-                worker_key=_WORKER,
-                lease_s=lease_s,
-                read_beat=entries.beat,
-            )
+        beats = self.workers()
+        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+            lists = known_lists(self.connection)
+            for name in lists:
+                pipe.llen(list_key(name))
+                pipe.lindex(list_key(name), 0)
+                pipe.zcard(held_key(name))
+            found = pipe.execute()
+            for head in found[1::3]:
+                pipe.hget(job_key(entries.text(head)), "enqueued_at")
+            for beat in beats:
+                pipe.pttl(worker_key(beat.name))
+            # Under a name that anybody may have put there lies anything: that hides no other.
+            since = [None if isinstance(one, Exception) else one for one in pipe.execute(raise_on_error=False)]
+        depth, running, oldest = Counter[Place](), Counter[Place](), dict[Place, float]()
+        for place, waiting, held, when in zip(map(place_of, lists), found[0::3], found[2::3], since, strict=False):
+            depth[place] += waiting
+            running[place] += held
+            if (age := age_of(entries.text(when))) is not None:
+                oldest[place] = max(age, oldest.get(place, 0.0))
+        workers = {
+            beat.name: WorkerPulse(beat.device, beat.state, max(0.0, lease_s - (left_ms or 0) / 1000))
+            for beat, left_ms in zip(beats, since[len(lists) :], strict=True)
+        }
+        return QueueNow(depth, oldest, running, workers)
 
     def count(self, amounts: Mapping[str, float]) -> None:
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
