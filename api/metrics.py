@@ -10,8 +10,7 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, generate_la
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 
 from service.index.at_scrape import IndexNow
-from service.pipeline.series import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S
-from service.pipeline.tally import parse_field
+from service.pipeline.metrics import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S, parse_field
 from service.queue.port import QueueNow
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"

@@ -15,19 +15,20 @@ from contextlib import contextmanager
 from typing import Final
 
 from service.heartbeat_file import HeartbeatFile
+from service.index.notes import Marked
 from service.index.queries.feed import ReadyTask
 from service.index.rebuild import complete_if_new, rebuild
 from service.model import names
 from service.model.ability import need_of
 from service.model.clock import timestamp
-from service.model.errors import BusyError, DamagedError, StoreUnavailable, UnavailableError
+from service.model.errors import BusyError, DamagedError, NotFoundError, StoreUnavailable, UnavailableError
 from service.model.planning import ingest_id, ingest_message
+from service.model.records import JobRecord
 from service.model.states import Lane
 from service.model.turns import Turns
 from service.model.worker_beat import WorkerBeat
 from service.pipeline.backends import Services
 from service.pipeline.datasets.rounds import DatasetRounds
-from service.pipeline.entering import Entering
 from service.pipeline.garbage_collector import GarbageCollector
 from service.pipeline.identity import identify
 from service.pipeline.indexer import Indexer
@@ -35,14 +36,13 @@ from service.pipeline.integrity_scan import IntegrityScan
 from service.pipeline.job_actions import HELD_S, queue_tasks
 from service.pipeline.leading import PART
 from service.pipeline.lease_reaper import LeaseReaper
-from service.pipeline.marking import Marking
-from service.pipeline.pace import Pace
-from service.pipeline.reports import Reports
 from service.pipeline.routes import Routes
 from service.pipeline.webhook_dispatcher import WebhookDispatcher
-from service.queue.port import Event, EventKind
+from service.queue.port import Event, EventKind, Report
 from service.store.library import publish_builtins, stored_assets
+from service.store.marks import newest_mark, next_mark, set_mark
 from service.store.packs import take_apart
+from service.store.records import read_record
 
 log = logging.getLogger(__name__)
 #: Events of one round: a second's work. Those behind them wait for the next round, which follows at once.
@@ -61,6 +61,10 @@ _COLLECT_EVERY_S: Final = 5.0
 _IDENTIFY_EVERY_S: Final = 30.0
 #: What a read of the store that is under way has to end, once the controller stops [s].
 _LAST_READ_S: Final = 3.0
+#: Wait for a job that is to be entered [s].
+_ENTERING_PAUSE_S: Final = 0.5
+#: Least wait between two pieces [s]: longer than SQLite lets a waiting writer sleep.
+_ENTERING_GAP_S: Final = 0.15
 
 
 class Controller:
@@ -347,3 +351,129 @@ def _noted(away: list[UnavailableError]) -> Iterator[None]:
         away.append(error)
     except DamagedError as error:
         log.warning("%s", error)
+
+
+class Pace:
+    """When to do again what takes long with a large fleet: once in `every_s`, and no more than `share` of the time."""
+
+    def __init__(
+        self, clock: Callable[[], float], every_s: float, *, share: float = 0.2, longest_s: float = math.inf
+    ) -> None:
+        """`longest_s` is the longest pause, whatever the share then is [s]."""
+        self._clock = clock
+        self._every_s, self._share, self._longest_s = every_s, share, longest_s
+        self._again = -math.inf
+
+    @property
+    def is_due(self) -> bool:
+        return self._clock() >= self._again
+
+    def run(self, work: Callable[[], object]) -> None:
+        """Do it now. Where it breaks off, it is due again at once."""
+        begun = self._clock()
+        work()
+        ended = self._clock()
+        pause = max(self._every_s, (ended - begun) * (1 / self._share - 1))
+        self._again = ended + min(pause, max(self._every_s, self._longest_s))
+
+
+class Reports:
+    """Passes on what changed in the workers' reports to the progress that the index shows."""
+
+    def __init__(self, services: Services) -> None:
+        self._services = services
+        self._known: dict[str, Report] = {}
+
+    def take_up(self) -> None:
+        """Progress of the running tasks into the index."""
+        found = self._services.queue.reports()
+        changed = {task: report for task, report in found.items() if self._known.get(task) != report}
+        if changed:
+            self._services.index.live.set_progress({task: (r.done, r.total, r.message) for task, r in changed.items()})
+        self._known = found
+
+    def sweep(self, held: Collection[str]) -> None:
+        """Take away reports that were read before the leases were, and whose tasks nobody held then."""
+        gone = self._known.keys() - set(held)
+        if gone:
+            self._services.queue.forget_reports(gone)
+            for task in gone:
+                del self._known[task]
+
+
+class Marking:
+    """Keeps the mark of store and index in step, and finds that one of them is an older copy.
+
+    Every record that a user makes counts a change in the index. Store and index then get a new mark: an index that was
+    copied before has another one than the store, and is made anew.
+    """
+
+    def __init__(self, services: Services) -> None:
+        self._services = services
+        self._known: str | None = None
+        """The mark that the index had when it was last looked at."""
+
+    def agrees(self) -> bool:
+        """Whether the index is as old as the store, which is asked where the index has another mark than before."""
+        present = self._services.index.notes.marked()
+        if present.mark != self._known:
+            # Killed between the two, a controller leaves the store with the mark before.
+            if newest_mark(self._services.store) not in (present.mark, present.before):
+                return False
+            self._known = present.mark
+        return True
+
+    def advance(self, *, news: bool) -> None:
+        """A new mark if anything was changed since the last one.
+
+        Args:
+            news: whether workers made something.
+
+        Raises:
+            UnavailableError: a part is away; call it again.
+        """
+        present, changes = self._services.index.notes.marked(), self._services.index.notes.changes()
+        if changes == present.changes and not news:
+            return
+        fresh = next_mark(present.mark)
+        self._services.index.notes.set_marked(Marked(fresh, newest_mark(self._services.store), changes))
+        set_mark(self._services.store, fresh)
+        self._services.index.notes.set_marked(Marked(fresh, fresh, changes))
+        self._known = fresh
+
+
+class Entering:
+    """Enters the tasks of large jobs piece by piece, beside the rounds: others write between the pieces.
+
+    Killed at any moment, its successor goes on: a note in the index says where.
+    """
+
+    def __init__(self, services: Services, stop: threading.Event) -> None:
+        self._services = services
+        self._stop = stop
+
+    def run(self) -> None:
+        """Until told to stop. The index is free for at least as long as it was held."""
+        pause = 0.0
+        while not self._stop.wait(pause):
+            pause = _ENTERING_PAUSE_S
+            try:
+                for job in self._services.index.write.entering():
+                    start = time.monotonic()
+                    self.enter(job)
+                    pause = max(_ENTERING_GAP_S, time.monotonic() - start)
+                    if self._stop.wait(pause):
+                        return
+            except UnavailableError as error:
+                log.warning("large jobs wait: %s", error)
+            except Exception:
+                log.exception("entering a large job broke off")
+
+    def enter(self, job: str) -> None:
+        """The next piece of a job."""
+        record = None
+        try:
+            record = read_record(JobRecord, self._services.store, names.job_record(job))
+        except (NotFoundError, DamagedError) as error:
+            log.error("the rest of job %s is not entered: %s", job, error)
+        self._services.index.write.enter_more(job, record)

@@ -17,7 +17,7 @@ from service.model.planning import backoff
 from service.model.records import AttemptRecord
 from service.model.states import AssetKind, Stage, State
 from service.pipeline.backends import Services
-from service.pipeline.tally import Tally
+from service.pipeline.metrics import Tally
 from service.queue.port import Event, EventKind
 from service.store.library import load_asset, load_check
 from service.store.manifests import ShardManifest, load_manifest

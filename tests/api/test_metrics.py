@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from api.metrics import Metrics, Snapshot
-from service.pipeline.series import SERIES
+from service.pipeline.metrics import SERIES
 from service.queue.port import QueueNow, WorkerPulse
 
 STATES = ("checking", "idle", "busy", "stopping", "quarantined")

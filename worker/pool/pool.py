@@ -28,7 +28,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
 
-from service.model.cores import ROOT, available_cores, memory_limits
+from service.model.cores import ROOT, available_cores, available_memory
 from service.model.errors import GraspdError, TaskCancelled
 from worker.pool.child import Order
 
@@ -278,7 +278,6 @@ def processes_at_once(device: str, wanted: int, *, threads: int = 0, workers: in
     """
     if wanted or not device.startswith("cuda"):
         return wanted or 1
-    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    room = int(MEMORY_SHARE * min([machine, *memory_limits(root)]) / workers / BYTES_PER_PROCESS)
+    room = int(MEMORY_SHARE * available_memory(root) / workers / BYTES_PER_PROCESS)
     cores = min(threads or available_cores(root), max(1, available_cores(root) // workers))
     return max(1, min(cores - 1, room))

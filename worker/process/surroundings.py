@@ -1,17 +1,25 @@
-"""What a task gets besides its message, and what its worker counts."""
+"""What a task gets besides its message, and what its worker counts.
+
+Engines and drivers leak: a worker that grew makes room for a new one.
+"""
 
 from __future__ import annotations
 
+import os
+import resource
+import sys
 from collections.abc import Callable, Mapping
+from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from service.model.cores import available_memory
 from service.model.states import Stage
 from service.queue.port import Report
 from service.store.store import Store
 from worker.engines.devices import Device
 from worker.engines.joins import batches_at_once, parse_join
 from worker.pool.pool import MODULES, Pool, processes_at_once
-from worker.process.memory import limit_mb, resident_mb
 from worker.stages.context import TaskContext
 
 if TYPE_CHECKING:
@@ -25,9 +33,8 @@ class Surroundings:
         self.settings = settings
         self.store = store
         self._device = device
-        self._memory_mb = limit_mb(settings.worker_max_memory_mb)
+        self._memory_mb = settings.worker_max_memory_mb or available_memory() / 2 / 2**20
         self.tasks_done = 0
-        self._joined = 0
         self._pool: Pool | None = None
         self._processes = 0
 
@@ -41,13 +48,10 @@ class Surroundings:
             return f"it holds {held:.0f} MiB, over {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"
         return ""
 
-    def join(self, raw: Mapping[str, Any]) -> int:
-        """Batches that one launch of a task plans on the device; waits until that is known."""
-        if raw.get("stage") != Stage.SYNTHESIZE:
-            return 1
-        if not self._joined:
-            self._joined = batches_at_once(self._device.resolve(), parse_join(self.settings.join))
-        return self._joined
+    @cached_property
+    def _join(self) -> int:
+        """Batches that one launch plans on the device; waits until that is known."""
+        return batches_at_once(self._device.resolve(), parse_join(self.settings.join))
 
     def pool(self, stage: str) -> Pool | None:
         """The processes that judge and measure, if a task of this stage has work for them; waits until it is known how
@@ -75,9 +79,26 @@ class Surroundings:
         def tell(done: float, total: float, message: str) -> None:
             report(raw["task_id"], Report(attempt=raw["attempt"], done=done, total=total, message=message[:200]))
 
-        device = "cpu" if raw.get("stage") == Stage.INGEST else self._device.resolve()
-        chosen = self.settings
+        stage, chosen = raw.get("stage", ""), self.settings
         return TaskContext(
-            self.store, device=device, threads=chosen.threads, first_judge=chosen.first_judge,
-            pool=self.pool(raw.get("stage", "")), join=self.join(raw), tell=tell,
-        )  # fmt: skip
+            self.store,
+            device="cpu" if stage == Stage.INGEST else self._device.resolve(),
+            threads=chosen.threads,
+            first_judge=chosen.first_judge,
+            pool=self.pool(stage),
+            join=self._join if stage == Stage.SYNTHESIZE else 1,
+            tell=tell,
+        )
+
+
+def resident_mb(pid: int | None = None) -> float:
+    """Resident memory of this process, or of another [MiB]; where the system does not tell, the most this one ever
+    had, or nothing of another."""
+    try:
+        pages = int(Path(f"/proc/{pid or 'self'}/statm").read_text().split()[1])
+    except (OSError, ValueError, IndexError):
+        if pid is not None:
+            return 0.0
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak / (2**20 if sys.platform == "darwin" else 2**10)
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20

@@ -17,8 +17,8 @@ from service.model.errors import ConflictError
 from service.model.states import State
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
+from service.pipeline.controller import Entering
 from service.pipeline.deletion import delete_job
-from service.pipeline.entering import Entering
 from tests.fakes import request
 
 LARGE = 32 * (2 * RANGES_AT_ONCE + 1)

@@ -18,8 +18,7 @@ from service.model.messages import TaskMessage
 from service.model.states import Lane, Stage, State
 from service.pipeline.backends import Services
 from service.pipeline.job_actions import submit
-from service.pipeline.series import SERIES
-from service.pipeline.tally import MOST_KINDS, OTHER_KIND, Tally, parse_field
+from service.pipeline.metrics import MOST_KINDS, OTHER_KIND, SERIES, Tally, parse_field
 from service.queue.rq_queue import WORKERS, RqQueue, worker_key
 from tests.conftest import REPOSITORY
 from tests.fakes import make_shard, message_for, request

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.pipeline.pace import Pace
+from service.pipeline.controller import Pace
 
 
 class Clock:
