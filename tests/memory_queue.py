@@ -21,6 +21,7 @@ from service.queue.port import (
     WorkerPulse,
     lane_order,
 )
+from service.queue.rq_queue import RqQueue
 
 
 @dataclass
@@ -34,8 +35,8 @@ class Delivery:
 
 
 @dataclass
-class MemoryQueue:
-    """`TaskQueue` without Redis. `take`, `beat` and `finish` are the worker's side."""
+class MemoryQueue(RqQueue):
+    """The queue without Redis. `take`, `beat` and `finish` are the worker's side."""
 
     clock: Callable[[], float] = time.monotonic
     _lanes: dict[Lane, list[Message]] = field(default_factory=lambda: {lane: [] for lane in Lane})

@@ -42,7 +42,7 @@ class Indexer:
         self._services = services
         self._told: OrderedDict[str, State] = OrderedDict()
         self._deferrals: dict[str, int] = {}
-        self._tally = Tally(services.queue)
+        self._tally = Tally(services.queue.count)
         self._readers = ThreadPoolExecutor(_READERS, thread_name_prefix="manifests")
 
     def apply(self, events: Sequence[Event]) -> list[int]:

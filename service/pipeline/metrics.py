@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
 from pydantic_core import from_json
 
 from service.model.states import State
-from service.queue.port import Counters
 from service.store.manifests import ShardManifest
 
 #: Upper bounds of the histogram of stage times [s].
@@ -96,8 +95,9 @@ OTHER_KIND: Final = "other"
 class Tally:
     """Counts in memory; `flush` adds that to the sums in one go."""
 
-    def __init__(self, counters: Counters) -> None:
-        self._counters = counters
+    def __init__(self, count: Callable[[Mapping[str, float]], None]) -> None:
+        """`count` adds to the sums."""
+        self._count = count
         self._amounts: defaultdict[str, float] = defaultdict(float)
         self._kinds: set[tuple[str, str]] = set()
 
@@ -132,7 +132,7 @@ class Tally:
     def flush(self) -> None:
         """Add what was counted to the sums; QueueUnavailable keeps it for the next time."""
         if self._amounts:
-            self._counters.count(self._amounts)
+            self._count(self._amounts)
             self._amounts.clear()
 
     def _observe(self, name: str, *labels: str, seconds: float) -> None:

@@ -49,7 +49,11 @@ _WORKER: Final = b"graspd:worker:"
 
 
 class RqQueue:
-    """`TaskQueue` on Redis."""
+    """Tasks to workers and who holds which, events, who is there, and sums.
+
+    Every method raises QueueUnavailable when Redis is away. Nothing here is the truth: whatever is lost is queued again
+    from the index.
+    """
 
     def __init__(self, connection: Redis) -> None:
         self.connection: Any = connection
@@ -59,12 +63,22 @@ class RqQueue:
         """Locks of those who lead, or want to, through this connection."""
 
     def ping(self) -> float:
+        """Seconds a round trip takes."""
         start = time.perf_counter()
         with _mapped():
             self.connection.ping()
         return time.perf_counter() - start
 
     def enqueue(self, messages: Sequence[Message], lane: Lane, *, again: bool = False, apart: bool = False) -> int:
+        """Append tasks to a lane. A task (by id and attempt) that already waits or runs is not queued twice.
+
+        Args:
+            again: the caller has seen that the queue lost these tasks; what it still remembers of them is replaced.
+            apart: only some workers of the stage can do them, and only those see them.
+
+        Returns:
+            number of tasks added.
+        """
         stale = [cancel_key(message.task_id) for message in messages]
         if again:
             stale += [job_key(rq_id(message.task_id, message.attempt)) for message in messages]
@@ -82,6 +96,7 @@ class RqQueue:
         return added
 
     def discard(self, task_ids: Collection[str]) -> None:
+        """Take waiting tasks off the queue and tell the workers that run one of them to stop at the next launch."""
         wanted = set(task_ids)
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for task in wanted:
@@ -95,12 +110,14 @@ class RqQueue:
             pipe.execute()
 
     def waiting(self) -> set[str]:
+        """Ids of the tasks in the queue."""
         with _mapped(), self.connection.pipeline(transaction=True) as pipe:
             for key in self._list_keys():
                 pipe.lrange(key, 0, -1)
             return {entries.task_of(entries.text(job))[0] for jobs in pipe.execute() for job in jobs}
 
     def depths(self) -> dict[tuple[Lane, Stage], int]:
+        """Number of waiting tasks of each lane and stage."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             lists = known_lists(self.connection)
             for name in lists:
@@ -111,6 +128,7 @@ class RqQueue:
             return dict(depths)
 
     def clear_untaken(self, present: Collection[WorkerBeat]) -> None:
+        """Forget tasks that wait apart for workers of a kind that is gone. The controller then finds them missing."""
         abilities = [(stage, beat.ability) for beat in present for stage in beat.stages]
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for name in without_takers(known_lists(self.connection), abilities):
@@ -124,6 +142,7 @@ class RqQueue:
             pipe.execute()
 
     def leases(self) -> list[Lease]:
+        """Tasks held by workers, living or dead. Reading changes nothing."""
         # RQ's own readers clean up as they read, which moves lost tasks aside and runs callbacks; so the keys are read.
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             keys = [held_key(name) for name in known_lists(self.connection)]
@@ -133,12 +152,14 @@ class RqQueue:
         return [_lease(key, entry, score) for key, held in zip(keys, found, strict=True) for entry, score in held]
 
     def holder(self, lease: Lease) -> Holder:
+        """Who holds a lease. Only of one that is lost is this asked: reading all leases stays one round trip."""
         job = entries.text(bytes.fromhex(lease.key.partition(" ")[2]).partition(b":")[0])
         with _mapped():
             worker, data = entries.fields(self.connection, job_key(job), "worker_name", "data")
         return Holder(entries.text(worker), entries.message(data))
 
     def release(self, lease: Lease) -> None:
+        """Forget a lease whose worker is lost; if it lives after all, it notices and stops."""
         key, _, digits = lease.key.partition(" ")
         entry = bytes.fromhex(digits)
         name = entries.text(entry)
@@ -149,12 +170,14 @@ class RqQueue:
             pipe.execute()
 
     def workers(self) -> list[WorkerBeat]:
+        """Workers that gave a sign of life within the last lease."""
         with _mapped():
             names = sorted(self.connection.smembers(WORKERS))
             found = self.connection.mget([_WORKER + name for name in names]) if names else []
         return [beat for beat in map(entries.beat, found) if beat is not None]
 
     def publish(self, *events: Event) -> None:
+        """Append events."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for event in events:
                 put_event(pipe, event)
@@ -163,51 +186,63 @@ class RqQueue:
             pipe.execute()
 
     def report(self, task_id: str, report: Report) -> None:
+        """Say how far a task is, in place of what was said before; gone with the event that ends the attempt."""
         with _mapped():
             self.connection.hset(REPORTS, task_id, report.model_dump_json())
 
     def reports(self) -> dict[str, Report]:
+        """The last report on each task."""
         with _mapped():
             found = self.connection.hgetall(REPORTS)
         return {entries.text(task): entries.report(data) for task, data in found.items()}
 
     def forget_reports(self, task_ids: Collection[str]) -> None:
+        """Take reports away whose tasks nobody holds."""
         if task_ids:
             with _mapped():
                 self.connection.hdel(REPORTS, *task_ids)
 
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
+        """Next events for the controller, the oldest first; those never acknowledged come again to the next one."""
         with _mapped():
             return self._reader.read(limit=limit, wait_s=wait_s)
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
+        """Say that the events are in the index."""
         if event_ids:
             with _mapped():
                 self._reader.acknowledge(event_ids)
 
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
+        """Events after an id, for any number of readers. `"$"`: only what comes from now on; `"0"`:
+        all kept."""
         with _mapped():
             block = max(1, int(wait_s * 1000)) if wait_s > 0 else None
             return readable(self.connection.xread({EVENTS: after}, count=limit, block=block))
 
     def announce(self, part: str, seconds: float) -> None:
+        """Say that a part of the service (the controller) lives, for that long."""
         with _mapped():
             self.connection.set(_part_key(part), "1", px=int(seconds * 1000))
 
     def announced(self, part: str) -> bool:
+        """Whether a part said so."""
         with _mapped():
             return bool(self.connection.exists(_part_key(part)))
 
     def service(self) -> str | None:
+        """Identity of the service that this queue belongs to; None if none has it yet, or Redis was lost."""
         with _mapped():
             found = self.connection.get(_SERVICE)
         return None if found is None else entries.text(found)
 
     def set_service(self, identity: str, *, instead: bool = False) -> None:
+        """Say which service the queue belongs to, where nobody said it before or `instead` of that."""
         with _mapped():
             self.connection.set(_SERVICE, identity, nx=not instead)
 
     def lead(self, holder: str, seconds: float) -> bool:
+        """Lead the controllers for that long, or go on to; False: another one does."""
         with _mapped():
             new = self.connection.lock(LEAD, timeout=seconds, thread_local=False)
             lease = self._leases.setdefault(holder, new)
@@ -229,10 +264,16 @@ class RqQueue:
             return False
 
     def resign(self, holder: str) -> None:
+        """Lead no longer; nothing happens where this one does not."""
         with _mapped(), suppress(LockError):
             self.connection.lock(LEAD).do_release(holder)
 
     def now(self, *, lease_s: float) -> QueueNow:
+        """Lengths, ages and workers for the metrics, at a cost that does not grow with the queue.
+
+        Args:
+            lease_s: how long a worker's registration outlives its beat [s].
+        """
         beats = self.workers()
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             lists = known_lists(self.connection)
@@ -260,17 +301,20 @@ class RqQueue:
         return QueueNow(depth, oldest, running, workers)
 
     def count(self, amounts: Mapping[str, float]) -> None:
+        """Add to sums that outlive this process."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for name, amount in amounts.items():
                 pipe.hincrbyfloat(METRICS, name, amount)
             pipe.execute()
 
     def counted(self) -> dict[str, float]:
+        """All those sums."""
         with _mapped():
             found = self.connection.hgetall(METRICS)
         return {entries.text(name): amount for name, raw in found.items() if (amount := _amount(raw)) is not None}
 
     def tidy(self) -> None:
+        """Throw away what dead workers and refused entries left behind."""
         # RQ's registries of workers and failures are emptied by its own maintenance, which is off.
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             entries.sweep(self.connection, _KINDS, (EVENTS,))
@@ -291,6 +335,7 @@ class RqQueue:
             pipe.execute()
 
     def close(self) -> None:
+        """Give the connections back."""
         self.connection.close()
 
     def _job(self, message: Message) -> Job:

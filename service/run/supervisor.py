@@ -23,8 +23,7 @@ from service.pipeline.backends import Services
 from service.pipeline.identity import identify_if_redis_answers, recorded
 from service.pipeline.leading import PART
 from service.queue.address import redis_url
-from service.queue.port import Presence
-from service.queue.rq_queue import open_queue
+from service.queue.rq_queue import RqQueue, open_queue
 from service.run.address import forget_address, record_address
 from service.run.children import Child, end_leftovers
 from service.run.embedded import find_server, give_up_log, lock_file, own_redis, server_command, set_log_aside
@@ -174,7 +173,7 @@ class Supervisor:
     def _starts(self) -> dict[str, int]:
         return {child.name: child.starts for child in list(self._children)}
 
-    def _missing(self, queue: Presence) -> list[str]:
+    def _missing(self, queue: RqQueue) -> list[str]:
         missing = []
         try:
             if not queue.announced(PART):

@@ -130,7 +130,7 @@ def test_forged_entries_in_redis_do_not_break_the_metrics(rq_queue: RqQueue) -> 
 
 def test_sums_outlive_the_process_that_counts(rq_queue: RqQueue) -> None:
     for _ in range(2):
-        tally = Tally(rq_queue)
+        tally = Tally(rq_queue.count)
         tally.ended(State.SUCCEEDED)
         tally.flush()
         tally.flush()
@@ -139,7 +139,7 @@ def test_sums_outlive_the_process_that_counts(rq_queue: RqQueue) -> None:
 
 def test_a_shard_counts_its_grasps_and_its_seconds(services: Services) -> None:
     sums = Sums()
-    tally = Tally(sums)
+    tally = Tally(sums.count)
     manifest = make_shard(services.store, message_for())
     tally.made([manifest])
     tally.flush()
@@ -151,7 +151,7 @@ def test_a_shard_counts_its_grasps_and_its_seconds(services: Services) -> None:
 
 def test_error_names_cannot_become_series_without_end() -> None:
     sums = Sums()
-    tally = Tally(sums)
+    tally = Tally(sums.count)
     for number in range(3 * MOST_KINDS):
         tally.failed("scene", f"Error{number}")
     tally.flush()
