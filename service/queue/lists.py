@@ -92,7 +92,5 @@ def _apart(lane: Lane, stage: Stage, ability: Ability | None) -> list[str]:
 
 def _needs(stage: Stage, ability: Ability) -> list[Need]:
     """What a worker can do of what may wait apart."""
-    if not ability.looks_apart:
-        return []
     revision = ability.revisions.get(stage.value, 0)
     return [Need(stage, schema, schema, revision) for schema in range(FIRST_SCHEMA, ability.schemas[1] + 1)]
