@@ -61,9 +61,7 @@ _COLLECT_EVERY_S: Final = 5.0
 _IDENTIFY_EVERY_S: Final = 30.0
 #: What a read of the store that is under way has to end, once the controller stops [s].
 _LAST_READ_S: Final = 3.0
-#: Wait for a job that is to be entered [s].
-_ENTERING_PAUSE_S: Final = 0.5
-#: Least wait between two pieces [s]: longer than SQLite lets a waiting writer sleep.
+#: Least wait between two pieces of large jobs [s]: longer than SQLite lets a waiting writer sleep.
 _ENTERING_GAP_S: Final = 0.15
 
 
@@ -100,6 +98,10 @@ class Controller:
         self._feeding = Pace(clock, 0.0)
         self._reporting = Pace(clock, min(_REPORTS_EVERY_S, interval_s), share=0.1)
         self._counting = Pace(clock, _WORKERS_EVERY_S, share=0.1)
+        # The index is free for at least as long as it was held.
+        self._entering = Pace(clock, _ENTERING_GAP_S, share=0.5)
+        self._entered = ""
+        """The large job whose next tasks were entered last."""
         self._plan_again = self._collect_again = self._identify_again = -math.inf
 
     def run(self, stop: threading.Event) -> None:
@@ -109,12 +111,8 @@ class Controller:
 
     @contextmanager
     def _beside(self, stop: threading.Event) -> Iterator[None]:
-        """What goes on beside the rounds: webhooks are told what ended, large jobs are entered, and the store is read
-        through, where the settings want it."""
-        duties = {
-            "webhooks": WebhookDispatcher(self._services, stop).run,
-            "entering": Entering(self._services, stop).run,
-        }
+        """What goes on beside the rounds: webhooks are told what ended; where settings want it, the store is read."""
+        duties = {"webhooks": WebhookDispatcher(self._services, stop).run}
         if self._services.settings.integrity_scan_mb_per_s:
             duties["integrity scan"] = IntegrityScan(self._services, stop).run
         threads = [threading.Thread(target=duty, name=name, daemon=True) for name, duty in duties.items()]
@@ -184,6 +182,9 @@ class Controller:
         if self._reporting.is_due:
             with _noted(away):
                 self._reporting.run(self._reports.take_up)
+        if self._entering.is_due:
+            with _noted(away):
+                self._entering.run(self._enter_large_job)
         self._do_what_users_want(now, away)
         if away:
             raise away[0]
@@ -198,6 +199,21 @@ class Controller:
             with _noted(away):
                 is_left = self._garbage.advance() or self._garbage.collect()
                 self._collect_again = now if is_left else now + _COLLECT_EVERY_S
+
+    def _enter_large_job(self) -> None:
+        """The next tasks of a job that has too many for one turn of the index's writers: others write in between.
+
+        Such jobs alternate. Killed at any moment, the successor goes on where a note in the index says.
+        """
+        if not (jobs := self._services.index.write.entering()):
+            return
+        self._entered = next((job for job in jobs if job > self._entered), jobs[0])
+        record = None
+        try:
+            record = read_record(JobRecord, self._services.store, names.job_record(self._entered))
+        except (NotFoundError, DamagedError) as error:
+            log.error("the rest of job %s is not entered: %s", self._entered, error)
+        self._services.index.write.enter_more(self._entered, record)
 
     def _look_after_workers(self) -> None:
         self._announce()
@@ -440,40 +456,3 @@ class Marking:
         set_mark(self._services.store, fresh)
         self._services.index.notes.set_marked(Marked(fresh, fresh, changes))
         self._known = fresh
-
-
-class Entering:
-    """Enters the tasks of large jobs piece by piece, beside the rounds: others write between the pieces.
-
-    Killed at any moment, its successor goes on: a note in the index says where.
-    """
-
-    def __init__(self, services: Services, stop: threading.Event) -> None:
-        self._services = services
-        self._stop = stop
-
-    def run(self) -> None:
-        """Until told to stop. The index is free for at least as long as it was held."""
-        pause = 0.0
-        while not self._stop.wait(pause):
-            pause = _ENTERING_PAUSE_S
-            try:
-                for job in self._services.index.write.entering():
-                    start = time.monotonic()
-                    self.enter(job)
-                    pause = max(_ENTERING_GAP_S, time.monotonic() - start)
-                    if self._stop.wait(pause):
-                        return
-            except UnavailableError as error:
-                log.warning("large jobs wait: %s", error)
-            except Exception:
-                log.exception("entering a large job broke off")
-
-    def enter(self, job: str) -> None:
-        """The next piece of a job."""
-        record = None
-        try:
-            record = read_record(JobRecord, self._services.store, names.job_record(job))
-        except (NotFoundError, DamagedError) as error:
-            log.error("the rest of job %s is not entered: %s", job, error)
-        self._services.index.write.enter_more(job, record)
