@@ -31,10 +31,8 @@ from service.model.clock import timestamp
 from service.model.messages import TaskMessage
 from service.model.states import Lane, Stage
 from service.model.version import PACKAGE_VERSION
-from service.queue.lists import queue_name
+from service.queue.lists import execution_keys, held_key, job_key, list_key, queue_name, rq_worker_key
 from service.queue.port import Event, EventKind, Report
-from service.queue.rq_keys import execution_keys, held_key, job_key, list_key
-from service.queue.rq_keys import worker_key as rq_worker_key
 from service.queue.rq_queue import REPORTS, WORKERS, RqQueue, cancel_key, open_queue, worker_key
 from service.queue.streams import put_event
 from service.settings import Settings

@@ -26,13 +26,26 @@ from service.model.clock import age_of
 from service.model.errors import QueueUnavailable
 from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
-from service.queue import entries, rq_keys
-from service.queue.address import redis_url
+from service.queue import entries
 from service.queue.allowed import TASK_FUNCTION, new_job
-from service.queue.connection import connect
-from service.queue.lists import known_lists, place_of, queue_name, without_takers
+from service.queue.connection import connect, redis_url
+from service.queue.lists import (
+    LISTS,
+    RQ_WORKERS,
+    execution_keys,
+    failed_key,
+    held_key,
+    job_key,
+    kinds,
+    known_lists,
+    list_key,
+    place_of,
+    queue_name,
+    rq_worker_key,
+    without_takers,
+    workers_key,
+)
 from service.queue.port import Event, Holder, Lease, Message, Place, QueueNow, Report, WorkerPulse
-from service.queue.rq_keys import LISTS, execution_keys, held_key, job_key, list_key
 from service.queue.streams import EVENTS, EventReader, put_event, readable
 from service.settings import Settings
 
@@ -319,19 +332,19 @@ class RqQueue:
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             entries.sweep(self.connection, _KINDS, (EVENTS,))
             lists = known_lists(self.connection)
-            entries.sweep(self.connection, rq_keys.kinds(lists))
+            entries.sweep(self.connection, kinds(lists))
             known = list(self.connection.smembers(WORKERS))
             for name in known:
                 pipe.exists(_WORKER + name)
             for name, lives in zip(known, pipe.execute(), strict=True):
                 if not lives:
-                    key = rq_keys.worker_key(entries.text(name))
+                    key = rq_worker_key(entries.text(name))
                     pipe.delete(key)
-                    for registry in (rq_keys.WORKERS, *map(rq_keys.workers_key, lists)):
+                    for registry in (RQ_WORKERS, *map(workers_key, lists)):
                         pipe.srem(registry, key)
                     pipe.srem(WORKERS, name)
             for queue in lists:
-                pipe.zremrangebyscore(rq_keys.failed_key(queue), 0, time.time())
+                pipe.zremrangebyscore(failed_key(queue), 0, time.time())
             pipe.execute()
 
     def close(self) -> None:
@@ -422,7 +435,7 @@ _KINDS: Final = (
     (METRICS, "hash"),
     (REPORTS, "hash"),
     (_SERVICE, "string"),
-    (rq_keys.WORKERS, "set"),
+    (RQ_WORKERS, "set"),
     (LISTS, "set"),
 )
 

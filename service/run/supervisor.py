@@ -22,7 +22,7 @@ from service.model.errors import BusyError, GraspdError, InputError, Unavailable
 from service.pipeline.backends import Services
 from service.pipeline.identity import identify_if_redis_answers, recorded
 from service.pipeline.leading import PART
-from service.queue.address import redis_url
+from service.queue.connection import redis_url
 from service.queue.rq_queue import RqQueue, open_queue
 from service.run.address import forget_address, record_address
 from service.run.children import Child, end_leftovers
