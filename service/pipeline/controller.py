@@ -93,16 +93,23 @@ class Controller:
         self._clock = clock
         self._reports = Reports(services)
         interval_s = services.settings.controller_interval_s
-        # Each lease is seen three times before it can be called lost.
-        self._looking = Pace(clock, interval_s, longest_s=services.settings.lease_s / 3)
-        self._feeding = Pace(clock, 0.0)
-        self._reporting = Pace(clock, min(_REPORTS_EVERY_S, interval_s), share=0.1)
-        self._counting = Pace(clock, _WORKERS_EVERY_S, share=0.1)
-        # The index is free for at least as long as it was held.
-        self._entering = Pace(clock, _ENTERING_GAP_S, share=0.5)
         self._entered = ""
         """The large job whose next tasks were entered last."""
-        self._plan_again = self._collect_again = self._identify_again = -math.inf
+        self._identify = Duty(clock, lambda: identify(services, holds_redis=True), _IDENTIFY_EVERY_S)
+        self._duties = [
+            Duty(clock, services.queue.tidy, _WORKERS_EVERY_S),
+            Duty(clock, self._mark, _WORKERS_EVERY_S),
+            Duty(clock, self._indexer.flush, _WORKERS_EVERY_S),
+            Duty(clock, self._look_after_workers, _WORKERS_EVERY_S, share=0.1),
+            # Each lease is seen three times before it can be called lost.
+            Duty(clock, self._look_after_queue, interval_s, longest_s=services.settings.lease_s / 3),
+            Duty(clock, self._feed_news, 0.0),
+            Duty(clock, self._reports.take_up, min(_REPORTS_EVERY_S, interval_s), share=0.1),
+            # The index is free for at least as long as it was held.
+            Duty(clock, self._enter_large_job, _ENTERING_GAP_S, share=0.5),
+            Duty(clock, self._plan, interval_s),
+            Duty(clock, lambda: self._garbage.advance() or self._garbage.collect(), _COLLECT_EVERY_S),
+        ]
 
     def run(self, stop: threading.Event) -> None:
         """Rounds until told to stop. Where a part is away, waits longer and longer, and loses nothing."""
@@ -145,7 +152,7 @@ class Controller:
                 stop.wait(pause)
         if self._started:
             with _noted([]):
-                self._marking.advance(news=self._made)
+                self._mark()
 
     def round(self, *, wait_s: float = 0.0) -> None:
         """Index what came in, then look after queue, leases and workers.
@@ -154,51 +161,24 @@ class Controller:
             UnavailableError: a part is away; the round can be run again.
             BusyError: another service has taken over the store.
         """
-        if self._clock() >= self._identify_again:
-            identify(self._services, holds_redis=True)
-            self._identify_again = self._clock() + _IDENTIFY_EVERY_S
+        self._identify()
         self._see_to_the_index()
         away: list[UnavailableError] = []
         with _noted(away):
             self._index_events(0.0 if self._has_plans else min(wait_s, _REPORTS_EVERY_S))
-        now = self._clock()
-        if self._counting.is_due:
+        for duty in self._duties:
             with _noted(away):
-                self._services.queue.tidy()
-            with _noted(away):
-                self._marking.advance(news=self._made)
-                self._made = False
-            with _noted(away):
-                self._indexer.flush()
-                self._counting.run(self._look_after_workers)
-        if self._looking.is_due:
-            with _noted(away):
-                self._looking.run(self._look_after_queue)
-                self._news = False
-        elif self._news and self._feeding.is_due:
-            with _noted(away):
-                self._feeding.run(self._feed)
-                self._news = False
-        if self._reporting.is_due:
-            with _noted(away):
-                self._reporting.run(self._reports.take_up)
-        if self._entering.is_due:
-            with _noted(away):
-                self._entering.run(self._enter_large_job)
-        self._do_what_users_want(now, away)
+                duty()
         if away:
             raise away[0]
 
-    def _do_what_users_want(self, now: float, away: list[UnavailableError]) -> None:
-        """Plan datasets and collect garbage, a little of each."""
-        if self._has_plans or now >= self._plan_again:
-            with _noted(away):
-                self._has_plans = self._planner.advance()
-                self._plan_again = now + self._services.settings.controller_interval_s
-        if now >= self._collect_again:
-            with _noted(away):
-                is_left = self._garbage.advance() or self._garbage.collect()
-                self._collect_again = now if is_left else now + _COLLECT_EVERY_S
+    def _mark(self) -> None:
+        self._marking.advance(news=self._made)
+        self._made = False
+
+    def _plan(self) -> bool:
+        self._has_plans = self._planner.advance()
+        return self._has_plans
 
     def _enter_large_job(self) -> None:
         """The next tasks of a job that has too many for one turn of the index's writers: others write in between.
@@ -306,6 +286,13 @@ class Controller:
             self._services.queue.discard(stray)
         missing = {*self._reaper.find_missing(present), *(lease.task_id for lease in lost)}
         self._feed(present, missing)
+        self._news = False
+
+    def _feed_news(self) -> None:
+        """What became ready by what came in, without a wait."""
+        if self._news:
+            self._feed()
+            self._news = False
 
     def _feed(self, present: set[str] | None = None, missing: Collection[str] = ()) -> None:
         """Queue what is ready. Where nobody knows what is in the queue (`present`), the index's own marks say so, and
@@ -369,28 +356,36 @@ def _noted(away: list[UnavailableError]) -> Iterator[None]:
         log.warning("%s", error)
 
 
-class Pace:
-    """When to do again what takes long with a large fleet: once in `every_s`, and no more than `share` of the time."""
+class Duty:
+    """What need not be done in every round: once in `every_s`, and no more than `share` of the time.
+
+    It is called in each, and where the work breaks off, or answers True for something left to do, also does it in the
+    next one.
+    """
 
     def __init__(
-        self, clock: Callable[[], float], every_s: float, *, share: float = 0.2, longest_s: float = math.inf
+        self,
+        clock: Callable[[], float],
+        work: Callable[[], object],
+        every_s: float,
+        *,
+        share: float = 0.2,
+        longest_s: float = math.inf,
     ) -> None:
         """`longest_s` is the longest pause, whatever the share then is [s]."""
-        self._clock = clock
+        self._clock, self._work = clock, work
         self._every_s, self._share, self._longest_s = every_s, share, longest_s
         self._again = -math.inf
 
-    @property
-    def is_due(self) -> bool:
-        return self._clock() >= self._again
-
-    def run(self, work: Callable[[], object]) -> None:
-        """Do it now. Where it breaks off, it is due again at once."""
+    def __call__(self) -> None:
+        """Do it if it is due."""
         begun = self._clock()
-        work()
+        if begun < self._again:
+            return
+        is_left = self._work() is True
         ended = self._clock()
         pause = max(self._every_s, (ended - begun) * (1 / self._share - 1))
-        self._again = ended + min(pause, max(self._every_s, self._longest_s))
+        self._again = ended if is_left else ended + min(pause, max(self._every_s, self._longest_s))
 
 
 class Reports:
