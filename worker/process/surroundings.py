@@ -20,6 +20,7 @@ from service.store.store import Store
 from worker.engines.devices import Device
 from worker.engines.joins import batches_at_once, parse_join
 from worker.pool.pool import MODULES, Pool, processes_at_once
+from worker.run import Run
 from worker.stages.context import TaskContext
 
 if TYPE_CHECKING:
@@ -80,15 +81,9 @@ class Surroundings:
             report(raw["task_id"], Report(attempt=raw["attempt"], done=done, total=total, message=message[:200]))
 
         stage, chosen = raw.get("stage", ""), self.settings
-        return TaskContext(
-            self.store,
-            device="cpu" if stage == Stage.INGEST else self._device.resolve(),
-            threads=chosen.threads,
-            first_judge=chosen.first_judge,
-            pool=self.pool(stage),
-            join=self._join if stage == Stage.SYNTHESIZE else 1,
-            tell=tell,
-        )
+        device = "cpu" if stage == Stage.INGEST else self._device.resolve()
+        run = Run(device, chosen.threads, first_judge=chosen.first_judge, pool=self.pool(stage))
+        return TaskContext(self.store, run, join=self._join if stage == Stage.SYNTHESIZE else 1, tell=tell)
 
 
 def resident_mb(pid: int | None = None) -> float:
