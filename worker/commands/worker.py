@@ -5,10 +5,9 @@ from __future__ import annotations
 import socket
 import sys
 import threading
-import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
@@ -19,8 +18,6 @@ from service.model.states import Stage
 from service.settings import Settings
 
 app = typer.Typer(no_args_is_help=True)
-#: Pause between two looks at whether one of several workers ended [s].
-_WATCH_S: Final = 0.1
 
 
 @app.command(epilog="graspd worker --workers 4 --stages synthesize,render")
@@ -96,22 +93,14 @@ def run_workers(
         settings: how long a worker may take to stop.
         stop: set by whoever ends it all.
     """
-    from service.run.children import Child
+    from service.run.children import Child, keep_alive, stop_children
 
     of_each = [{"GRASPD_WORKER_NUMBER": str(number), "GRASPD_WORKERS_HERE": str(count)} for number in range(count)]
     children = [Child(f"worker-{number}", (*program, *arguments), own, None) for number, own in enumerate(of_each)]
     try:
-        for child in children:
-            child.start()
-        while not stop.wait(_WATCH_S):
-            for child in children:
-                child.watch()
+        keep_alive(children, stop)
     finally:
-        for child in children:
-            child.ask_to_stop()
-        deadline = time.monotonic() + settings.stop_grace_s
-        for child in children:
-            child.join(deadline)
+        stop_children(children, settings.stop_grace_s)
 
 
 def check_worker(settings: Settings) -> None:
