@@ -13,12 +13,10 @@ from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
 from service.queue.port import (
     Event,
-    Holder,
     Lease,
     Message,
     QueueNow,
     Report,
-    WorkerPulse,
     lane_order,
 )
 from service.queue.rq_queue import RqQueue
@@ -87,9 +85,9 @@ class MemoryQueue(RqQueue):
             Lease(held.message.task_id, held.message.attempt, held.key, str(held.beat)) for held in self._held.values()
         ]
 
-    def holder(self, lease: Lease) -> Holder:
+    def holder(self, lease: Lease) -> tuple[str, Message | None]:
         held = self._held.get(lease.key)
-        return Holder(held.worker, held.message) if held else Holder("", None)
+        return (held.worker, held.message) if held else ("", None)
 
     def release(self, lease: Lease) -> None:
         self._held.pop(lease.key, None)
@@ -164,7 +162,7 @@ class MemoryQueue(RqQueue):
 
     def now(self, *, lease_s: float) -> QueueNow:
         running = Counter((Lane.BULK, held.message.stage) for held in self._held.values())
-        pulses = {name: WorkerPulse(beat.device, beat.state, 0.0) for name, beat in self._workers.items()}
+        pulses = {name: (beat, 0.0) for name, beat in self._workers.items()}
         return QueueNow(depth=self.depths(), running=running, workers=pulses)
 
     def count(self, amounts: Mapping[str, float]) -> None:

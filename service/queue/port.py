@@ -13,7 +13,7 @@ from service.model.base import Model
 from service.model.domain import Word
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Lane, Stage
-from service.model.worker_beat import Count, HostWord
+from service.model.worker_beat import Count, HostWord, WorkerBeat
 
 Message = TaskMessage | IngestMessage
 
@@ -101,33 +101,15 @@ class Lease:
     beat: str
 
 
-@dataclass(frozen=True)
-class Holder:
-    """Who holds a lease, and what was asked of it."""
-
-    worker: str
-    message: Message | None
-    """None if Redis no longer knows."""
-
-
 Place = tuple[Lane, Stage]
 
 
 @dataclass(frozen=True)
-class WorkerPulse:
-    """A living worker."""
-
-    device: str
-    state: str
-    lease_age_s: float
-    """Time since its last beat, by Redis's clock."""
-
-
-@dataclass(frozen=True)
 class QueueNow:
-    """Waiting and running tasks, and the workers. Places without a task may be left out."""
+    """Waiting and running tasks; the living workers by name, each with the time since its last beat by Redis's clock
+    [s]. Places without a task may be left out."""
 
     depth: Mapping[Place, int] = field(default_factory=dict)
     oldest_s: Mapping[Place, float] = field(default_factory=dict)
     running: Mapping[Place, int] = field(default_factory=dict)
-    workers: Mapping[str, WorkerPulse] = field(default_factory=dict)
+    workers: Mapping[str, tuple[WorkerBeat, float]] = field(default_factory=dict)

@@ -45,7 +45,7 @@ from service.queue.lists import (
     without_takers,
     workers_key,
 )
-from service.queue.port import Event, Holder, Lease, Message, Place, QueueNow, Report, WorkerPulse
+from service.queue.port import Event, Lease, Message, Place, QueueNow, Report
 from service.queue.streams import EVENTS, EventReader, put_event, readable
 from service.settings import Settings
 
@@ -164,12 +164,15 @@ class RqQueue:
             found = pipe.execute()
         return [_lease(key, entry, score) for key, held in zip(keys, found, strict=True) for entry, score in held]
 
-    def holder(self, lease: Lease) -> Holder:
-        """Who holds a lease. Only of one that is lost is this asked: reading all leases stays one round trip."""
+    def holder(self, lease: Lease) -> tuple[str, Message | None]:
+        """Which worker holds a lease, and what was asked of it; None if Redis no longer knows.
+
+        Only of one that is lost is this asked: reading all leases stays one round trip.
+        """
         job = entries.text(bytes.fromhex(lease.key.partition(" ")[2]).partition(b":")[0])
         with _mapped():
             worker, data = entries.fields(self.connection, job_key(job), "worker_name", "data")
-        return Holder(entries.text(worker), entries.message(data))
+        return entries.text(worker), entries.message(data)
 
     def release(self, lease: Lease) -> None:
         """Forget a lease whose worker is lost; if it lives after all, it notices and stops."""
@@ -308,7 +311,7 @@ class RqQueue:
             if (age := age_of(entries.text(when))) is not None:
                 oldest[place] = max(age, oldest.get(place, 0.0))
         workers = {
-            beat.name: WorkerPulse(beat.device, beat.state, max(0.0, lease_s - (left_ms or 0) / 1000))
+            beat.name: (beat, max(0.0, lease_s - (left_ms or 0) / 1000))
             for beat, left_ms in zip(beats, since[len(lists) :], strict=True)
         }
         return QueueNow(depth, oldest, running, workers)

@@ -101,8 +101,8 @@ def test_depth_age_and_workers_are_told_from_redis(rq_queue: RqQueue) -> None:
     assert found.depth[place] == 2
     assert 0 <= found.oldest_s[place] < 60
     assert set(found.workers) == {"w1"}
-    assert found.workers["w1"].state == "busy"
-    assert 200.0 <= found.workers["w1"].lease_age_s < 400.0
+    assert found.workers["w1"][0].state == "busy"
+    assert 200.0 <= found.workers["w1"][1] < 400.0
 
 
 def test_the_cost_of_a_look_does_not_grow_with_the_queue(rq_queue: RqQueue) -> None:

@@ -16,7 +16,7 @@ from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
 from service.queue.lists import queue_names
-from service.queue.port import BULK_EVERY, Event, EventKind, Holder
+from service.queue.port import BULK_EVERY, Event, EventKind
 from service.queue.rq_queue import LEAD, RqQueue, lease_state, list_worker, renew_lease, worker_key
 from tests.fakes import request
 from tests.memory_queue import MemoryQueue
@@ -193,7 +193,7 @@ def test_a_lease_says_who_holds_which_attempt_of_what(sides: tuple[RqQueue, Work
     worker.take()
     (lease,) = queue.leases()
     assert (lease.task_id, lease.attempt) == ("a", 2)
-    assert queue.holder(lease) == Holder("w", task("a", attempt=2))
+    assert queue.holder(lease) == ("w", task("a", attempt=2))
     assert queue.waiting() == set()
     worker.finish()
     assert queue.leases() == []
