@@ -43,6 +43,9 @@ from worker.stages import stage_table
 from worker.stages.context import StopReason, TaskContext
 from worker.stages.output import StageFunction
 
+if TYPE_CHECKING:
+    from service.settings import Settings
+
 log = logging.getLogger(__name__)
 
 
@@ -169,10 +172,6 @@ class Engine:
     def _say(self, word: str, about: Any) -> None:
         with self._speaking, suppress(OSError):  # a worker that is gone
             self._connection.send((word, about))
-
-
-if TYPE_CHECKING:
-    from service.settings import Settings
 
 
 class Surroundings:
