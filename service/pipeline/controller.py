@@ -74,7 +74,8 @@ class Controller:
         self._reaper = LeaseReaper(services, self._indexer, clock=clock)
         self._planner = DatasetRounds(services, clock=clock)
         self._garbage = GarbageCollector(services, clock=clock)
-        self._marking = Marking(services)
+        self._known: str | None = None
+        """Mark that the index had when it was last compared with the store's."""
         self._has_plans = False
         self._turns = Turns()
         self._backlog: list[tuple[str, Event]] = []
@@ -91,7 +92,8 @@ class Controller:
         self._workers = 0
         """Workers that were there when they were last counted."""
         self._clock = clock
-        self._reports = Reports(services)
+        self._reports: dict[str, Report] = {}
+        """How far tasks were when it was last passed on."""
         interval_s = services.settings.controller_interval_s
         self._entered = ""
         """The large job whose next tasks were entered last."""
@@ -104,7 +106,7 @@ class Controller:
             # Each lease is seen three times before it can be called lost.
             Duty(clock, self._look_after_queue, interval_s, longest_s=services.settings.lease_s / 3),
             Duty(clock, self._feed_news, 0.0),
-            Duty(clock, self._reports.take_up, min(_REPORTS_EVERY_S, interval_s), share=0.1),
+            Duty(clock, self._pass_on_reports, min(_REPORTS_EVERY_S, interval_s), share=0.1),
             # The index is free for at least as long as it was held.
             Duty(clock, self._enter_large_job, _ENTERING_GAP_S, share=0.5),
             Duty(clock, self._plan, interval_s),
@@ -173,8 +175,24 @@ class Controller:
             raise away[0]
 
     def _mark(self) -> None:
-        self._marking.advance(news=self._made)
-        self._made = False
+        """Give index and store a new mark if users or workers changed anything: an index that was copied before has
+        another one than the store, and is made anew."""
+        notes = self._services.index.notes
+        present, changes = notes.marked(), notes.changes()
+        if changes != present.changes or self._made:
+            fresh = next_mark(present.mark)
+            notes.set_marked(Marked(fresh, newest_mark(self._services.store), changes))
+            set_mark(self._services.store, fresh)
+            notes.set_marked(Marked(fresh, fresh, changes))
+            self._known, self._made = fresh, False
+
+    def _pass_on_reports(self) -> None:
+        """What changed in the workers' reports to the progress that the index shows."""
+        found = self._services.queue.reports()
+        changed = {task: report for task, report in found.items() if self._reports.get(task) != report}
+        if changed:
+            self._services.index.live.set_progress({task: (r.done, r.total, r.message) for task, r in changed.items()})
+        self._reports = found
 
     def _plan(self) -> bool:
         self._has_plans = self._planner.advance()
@@ -236,7 +254,10 @@ class Controller:
 
     def _is_stale(self) -> bool:
         """Whether the index, or the store, was exchanged for an older copy."""
-        if self._marking.agrees():
+        present = self._services.index.notes.marked()
+        # Killed between the two, a controller leaves the store with the mark before.
+        if present.mark == self._known or newest_mark(self._services.store) in (present.mark, present.before):
+            self._known = present.mark
             return False
         log.warning("index and store have different marks: one of them is an older copy")
         self._services.index.notes.set_incomplete()
@@ -279,7 +300,11 @@ class Controller:
         # Waiting tasks are read before leases: one that a worker takes in between is then seen as held.
         waiting = self._services.queue.waiting()
         leases = self._services.queue.leases()
-        self._reports.sweep({lease.task_id for lease in leases})
+        # Reports that were read before the leases were, and whose tasks nobody held then.
+        gone = self._reports.keys() - {lease.task_id for lease in leases}
+        self._services.queue.forget_reports(gone)
+        for task in gone:
+            del self._reports[task]
         lost = self._reaper.reap(leases)
         present = waiting | {lease.task_id for lease in leases if lease not in lost}
         if stray := self._services.index.feed.cancelled(present):
@@ -386,68 +411,3 @@ class Duty:
         ended = self._clock()
         pause = max(self._every_s, (ended - begun) * (1 / self._share - 1))
         self._again = ended if is_left else ended + min(pause, max(self._every_s, self._longest_s))
-
-
-class Reports:
-    """Passes on what changed in the workers' reports to the progress that the index shows."""
-
-    def __init__(self, services: Services) -> None:
-        self._services = services
-        self._known: dict[str, Report] = {}
-
-    def take_up(self) -> None:
-        """Progress of the running tasks into the index."""
-        found = self._services.queue.reports()
-        changed = {task: report for task, report in found.items() if self._known.get(task) != report}
-        if changed:
-            self._services.index.live.set_progress({task: (r.done, r.total, r.message) for task, r in changed.items()})
-        self._known = found
-
-    def sweep(self, held: Collection[str]) -> None:
-        """Take away reports that were read before the leases were, and whose tasks nobody held then."""
-        gone = self._known.keys() - set(held)
-        if gone:
-            self._services.queue.forget_reports(gone)
-            for task in gone:
-                del self._known[task]
-
-
-class Marking:
-    """Keeps the mark of store and index in step, and finds that one of them is an older copy.
-
-    Every record that a user makes counts a change in the index. Store and index then get a new mark: an index that was
-    copied before has another one than the store, and is made anew.
-    """
-
-    def __init__(self, services: Services) -> None:
-        self._services = services
-        self._known: str | None = None
-        """The mark that the index had when it was last looked at."""
-
-    def agrees(self) -> bool:
-        """Whether the index is as old as the store, which is asked where the index has another mark than before."""
-        present = self._services.index.notes.marked()
-        if present.mark != self._known:
-            # Killed between the two, a controller leaves the store with the mark before.
-            if newest_mark(self._services.store) not in (present.mark, present.before):
-                return False
-            self._known = present.mark
-        return True
-
-    def advance(self, *, news: bool) -> None:
-        """A new mark if anything was changed since the last one.
-
-        Args:
-            news: whether workers made something.
-
-        Raises:
-            UnavailableError: a part is away; call it again.
-        """
-        present, changes = self._services.index.notes.marked(), self._services.index.notes.changes()
-        if changes == present.changes and not news:
-            return
-        fresh = next_mark(present.mark)
-        self._services.index.notes.set_marked(Marked(fresh, newest_mark(self._services.store), changes))
-        set_mark(self._services.store, fresh)
-        self._services.index.notes.set_marked(Marked(fresh, fresh, changes))
-        self._known = fresh
