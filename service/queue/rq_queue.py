@@ -190,7 +190,7 @@ class RqQueue:
         with _mapped():
             names = sorted(self.connection.smembers(WORKERS))
             found = self.connection.mget([_WORKER + name for name in names]) if names else []
-        return [beat for beat in map(entries.beat, found) if beat is not None]
+        return [beat for data in found if (beat := entries.read(WorkerBeat, data)) is not None]
 
     def publish(self, *events: Event) -> None:
         """Append events."""
@@ -210,7 +210,7 @@ class RqQueue:
         """The last report on each task."""
         with _mapped():
             found = self.connection.hgetall(REPORTS)
-        return {entries.text(task): entries.report(data) for task, data in found.items()}
+        return {entries.text(task): entries.read(Report, data) or Report() for task, data in found.items()}
 
     def forget_reports(self, task_ids: Collection[str]) -> None:
         """Take reports away whose tasks nobody holds."""

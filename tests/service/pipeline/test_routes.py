@@ -73,10 +73,10 @@ def test_a_task_asks_for_the_schema_of_the_newest_field_that_it_uses() -> None:
 
 def test_a_worker_that_does_not_say_what_it_can_is_given_no_task() -> None:
     told = asdict(beat())
-    assert entries.beat(json.dumps(told).encode()) == beat()
+    assert entries.read(WorkerBeat, json.dumps(told).encode()) == beat()
     for name in ("schemas", "revisions"):
         del told[name]
-    old = entries.beat(json.dumps(told).encode())
+    old = entries.read(WorkerBeat, json.dumps(told).encode())
     assert old is not None and Routes([old]).place(NEED).held
 
 
