@@ -35,7 +35,7 @@ from service.model.states import AssetKind
 from service.model.version import PACKAGE_VERSION
 from service.pipeline.backends import Services
 from service.pipeline.identity import identify_if_redis_answers
-from service.queue.address import redis_url
+from service.queue.connection import redis_url
 from service.settings import Settings
 
 _log = logging.getLogger("graspd.api")

@@ -10,8 +10,7 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, generate_la
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 
 from service.index.at_scrape import IndexNow
-from service.pipeline.series import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S
-from service.pipeline.tally import parse_field
+from service.pipeline.metrics import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S, parse_field
 from service.queue.port import QueueNow
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
@@ -64,11 +63,11 @@ class Snapshot:
             oldest = queue.oldest_s.get((lane, stage), 0.0)
             self._set("graspd_queue_oldest_task_seconds", lane, stage, value=oldest)
             self._set("graspd_tasks_running", lane, stage, value=queue.running.get((lane, stage), 0))
-        states = [pulse.state for pulse in queue.workers.values()]
+        states = [beat.state for beat, _ in queue.workers.values()]
         for state in ("checking", "idle", "busy", "stopping", "quarantined"):
             self._set("graspd_workers", state, value=states.count(state))
-        for name, pulse in queue.workers.items():
-            self._set("graspd_worker_lease_age_seconds", name, pulse.device, value=pulse.lease_age_s)
+        for name, (beat, age_s) in queue.workers.items():
+            self._set("graspd_worker_lease_age_seconds", name, beat.device, value=age_s)
         self._set("graspd_controller_up", value=float(is_kept))
 
     def add_index(self, index: IndexNow) -> None:

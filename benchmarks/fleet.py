@@ -36,8 +36,7 @@ from service.model.states import Lane, Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
 from service.pipeline.leading import PART
-from service.queue.lists import queue_name
-from service.queue.rq_keys import held_key
+from service.queue.lists import held_key, queue_name
 from service.queue.rq_queue import RqQueue
 from service.queue.streams import EVENTS
 from service.run.embedded import server_command

@@ -31,17 +31,15 @@ from service.model.clock import timestamp
 from service.model.messages import TaskMessage
 from service.model.states import Lane, Stage
 from service.model.version import PACKAGE_VERSION
-from service.queue.lists import queue_name
+from service.queue.lists import execution_keys, held_key, job_key, list_key, queue_name, rq_worker_key
 from service.queue.port import Event, EventKind, Report
-from service.queue.rates import beat_every_s, report_every_s
-from service.queue.reports import REPORTS
-from service.queue.rq_keys import execution_keys, held_key, job_key, list_key
-from service.queue.rq_keys import worker_key as rq_worker_key
-from service.queue.rq_queue import WORKERS, RqQueue, cancel_key, open_queue, worker_key
+from service.queue.rq_queue import REPORTS, WORKERS, RqQueue, cancel_key, open_queue, worker_key
 from service.queue.streams import put_event
 from service.settings import Settings
 from service.store.store import Store, open_store
 from tests.fakes import make_shard
+from worker.process.heartbeat import BEAT_S
+from worker.stages.context import REPORT_EVERY_S
 
 _TICK_S: Final = 0.02
 _QUEUES: Final = tuple(queue_name(lane, Stage.SYNTHESIZE) for lane in Lane)
@@ -69,7 +67,7 @@ class Fleet:
     def __init__(self, queue: RqQueue, store: Store, *, workers: int, task_s: float, lease_s: float) -> None:
         self._queue, self._store, self._connection = queue, store, queue.connection
         self._task_s, self._lease_s = task_s, lease_s
-        self._beat_s, self._report_s = beat_every_s(workers, lease_s), report_every_s(workers)
+        self._beat_s = min(BEAT_S, lease_s / 3)
         self._idle = deque(f"fake-{number:05d}" for number in range(workers))
         self._held: dict[str, Held] = {}
         self._ends: list[tuple[float, str]] = []
@@ -123,7 +121,7 @@ class Fleet:
         held = Held(self._idle.popleft(), message, queue, f"{job}:{uuid.uuid4().hex}", now, now + length)
         self._held[held.worker] = held
         heapq.heappush(self._ends, (held.ends, held.worker))
-        heapq.heappush(self._news, (now + random.random() * self._report_s, held.worker))
+        heapq.heappush(self._news, (now + random.random() * REPORT_EVERY_S, held.worker))
         execution, executions = execution_keys(held.entry)
         pipe.hset(execution, mapping={"id": held.entry, "last_heartbeat": time.time(), "worker_name": held.worker})
         pipe.expire(execution, LEASE_KEPT_S)
@@ -139,7 +137,6 @@ class Fleet:
             held = self._held.get(name)
             pipe.set(worker_key(name), json.dumps(_beat(name, held)), ex=max(2, round(self._lease_s)))
             pipe.sadd(WORKERS, name)
-            pipe.scard(WORKERS)
             if held is not None:
                 execution, executions = execution_keys(held.entry)
                 kept_until = {held.entry: time.time() + LEASE_KEPT_S}
@@ -160,8 +157,7 @@ class Fleet:
             if (held := self._held.get(name)) is not None:
                 report = Report(attempt=1, done=now - held.begun, total=self._task_s, message="pretending")
                 pipe.hset(REPORTS, held.message["task_id"], report.model_dump_json())
-                pipe.scard(WORKERS)
-                heapq.heappush(self._news, (now + self._report_s, name))
+                heapq.heappush(self._news, (now + REPORT_EVERY_S, name))
 
     def _say(self, pipe: Any, held: Held, kind: EventKind, **facts: Any) -> None:
         message = held.message

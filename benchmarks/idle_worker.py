@@ -16,8 +16,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from service.queue.address import redis_url
-from service.queue.connection import connect
+from service.queue.connection import connect, redis_url
 from service.queue.rq_queue import RqQueue
 from service.run.embedded import server_command
 from service.settings import Settings

@@ -30,11 +30,10 @@ from worker.grasps import GraspSet, joined
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners import Run, Wanted, synthesize
-from worker.pool.pool import Pool
+from worker.pool.pool import MODULES, Pool
 from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.judge import judge
 from worker.quality.table import measure
-from worker.together import MODULES
 
 #: Clock ticks and bytes as /proc tells them.
 _TICK_S: Final = 1 / os.sysconf("SC_CLK_TCK")

@@ -23,6 +23,7 @@ from service.model.messages import TaskMessage
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane, Stage
+from service.model.version import STAGE_REVISIONS
 from service.pipeline.backends import Services
 from service.store.library import publish_asset
 from service.store.manifests import ShardManifest, load_shard, publish_shard
@@ -185,13 +186,16 @@ def main() -> None:
     FAKE_POISON names a batch that kills its worker, FAKE_LEAK_MB is memory that each task keeps, FAKE_LOCK_S is how
     long each task holds the interpreter lock; while there is a file FAKE_HOLD no task ends, and while there is a file
     FAKE_BROKEN nothing works. With FAKE_DIE_UNTOLD the worker that puts the first shard is killed before it tells; a
-    file of that name says so. Of the options of `graspd worker` it takes `--burst` and `--idle`.
+    file of that name says so. FAKE_REVISION is the revision of synthesize that worker and engine make. Of the options
+    of `graspd worker` it takes `--burst` and `--idle`.
     """
     from service.cli import log_to_stderr
     from service.settings import Settings
     from worker.process import engine
     from worker.process.main import run_worker
 
+    if revision := os.environ.get("FAKE_REVISION"):
+        STAGE_REVISIONS["synthesize"] = int(revision)
     table = fake_stages()
     poison = os.environ.get("FAKE_POISON")
     leaked: list[bytes] = []

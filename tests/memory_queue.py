@@ -13,14 +13,13 @@ from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
 from service.queue.port import (
     Event,
-    Holder,
     Lease,
     Message,
     QueueNow,
     Report,
-    WorkerPulse,
     lane_order,
 )
+from service.queue.rq_queue import RqQueue
 
 
 @dataclass
@@ -34,8 +33,8 @@ class Delivery:
 
 
 @dataclass
-class MemoryQueue:
-    """`TaskQueue` without Redis. `take`, `beat` and `finish` are the worker's side."""
+class MemoryQueue(RqQueue):
+    """The queue without Redis. `take`, `beat` and `finish` are the worker's side."""
 
     clock: Callable[[], float] = time.monotonic
     _lanes: dict[Lane, list[Message]] = field(default_factory=lambda: {lane: [] for lane in Lane})
@@ -86,9 +85,9 @@ class MemoryQueue:
             Lease(held.message.task_id, held.message.attempt, held.key, str(held.beat)) for held in self._held.values()
         ]
 
-    def holder(self, lease: Lease) -> Holder:
+    def holder(self, lease: Lease) -> tuple[str, Message | None]:
         held = self._held.get(lease.key)
-        return Holder(held.worker, held.message) if held else Holder("", None)
+        return (held.worker, held.message) if held else ("", None)
 
     def release(self, lease: Lease) -> None:
         self._held.pop(lease.key, None)
@@ -104,9 +103,8 @@ class MemoryQueue:
             self.forget_reports([event.task_id for event in events if event.kind.ends_attempt])
             self._changed.notify_all()
 
-    def report(self, task_id: str, report: Report) -> float:
+    def report(self, task_id: str, report: Report) -> None:
         self._reports[task_id] = report
-        return 0.0
 
     def reports(self) -> dict[str, Report]:
         return dict(self._reports)
@@ -164,7 +162,7 @@ class MemoryQueue:
 
     def now(self, *, lease_s: float) -> QueueNow:
         running = Counter((Lane.BULK, held.message.stage) for held in self._held.values())
-        pulses = {name: WorkerPulse(beat.device, beat.state, 0.0) for name, beat in self._workers.items()}
+        pulses = {name: (beat, 0.0) for name, beat in self._workers.items()}
         return QueueNow(depth=self.depths(), running=running, workers=pulses)
 
     def count(self, amounts: Mapping[str, float]) -> None:

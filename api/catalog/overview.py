@@ -57,7 +57,7 @@ class Overview:
             Worker(
                 **worker.model_dump() | ({} if worker.task_id in seen else {"task_id": None}),
                 stage=Stage(doing[worker.task_id][0]) if worker.task_id in doing else None,
-                lease_age_s=round(pulses[worker.name].lease_age_s, 3) if worker.name in pulses else None,
+                lease_age_s=round(pulses[worker.name][1], 3) if worker.name in pulses else None,
             )
             for worker in known
         ]

@@ -25,8 +25,7 @@ from api.catalog.tags import Tags
 from api.catalog.usage import Usage
 from api.catalog.webhooks import Webhooks
 from service.pipeline.backends import Services
-from service.queue.address import redis_url
-from service.queue.connection import connect
+from service.queue.connection import connect, redis_url
 from service.store.store import Store
 
 MAX_LIMIT = 200

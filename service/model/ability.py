@@ -14,9 +14,6 @@ from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Stage
 from service.model.version import OLDEST_TASK_SCHEMA, STAGE_REVISIONS, TASK_SCHEMA
 
-#: What workers can do that do not say it: graspd 0.1.0 before they did.
-UNTOLD_SCHEMAS: Final = (2, 2)
-UNTOLD_REVISIONS: Final[Mapping[str, int]] = {"synthesize": 10, "scene": 2, "render": 3}
 #: The first schema with which messages carry a range.
 FIRST_SCHEMA: Final = 2
 
@@ -42,8 +39,6 @@ class Ability:
     """Oldest and newest schema that it reads."""
     revisions: Mapping[str, int]
     """Revision of each stage."""
-    looks_apart: bool = True
-    """Whether it takes what waits apart from the tasks that everybody can do."""
 
     def lacks(self, need: Need) -> str:
         """Why such a worker cannot do a task; "" if it can."""

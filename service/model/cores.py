@@ -50,7 +50,16 @@ def _quotas(root: Path) -> Iterator[float]:
                     yield from _ratio([word for file in files for word in _words(file)])
 
 
-def memory_limits(root: Path = ROOT) -> Iterator[int]:
+def available_memory(root: Path = ROOT) -> int:
+    """Memory for this process [bytes]: the machine's, or the limit of its control group where that is less.
+
+    Args:
+        root: the folder that holds `proc` and `sys`.
+    """
+    return min([os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), *_memory_limits(root)])
+
+
+def _memory_limits(root: Path) -> Iterator[int]:
     """Limits of memory [bytes] of this process's control group and of those it is in; none where there is none."""
     mount = root / "sys/fs/cgroup"
     for controllers, path in _groups(root / "proc/self/cgroup"):

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from service.model.ability import UNTOLD_REVISIONS, UNTOLD_SCHEMAS, Ability
+from service.model.ability import Ability
 from service.model.domain import Word
 from service.model.states import Stage
 
@@ -34,14 +34,12 @@ class WorkerBeat:
     seen: Annotated[str, Field(max_length=32)]
     reason: Annotated[str, Field(max_length=300)] = ""
     """Why it is in quarantine."""
-    schemas: tuple[Count, Count] | None = None
-    """Oldest and newest task message that it reads; None: it does not say."""
+    schemas: tuple[Count, Count] = (0, 0)
+    """Oldest and newest task message that it reads; graspd 0.1 does not say it, and its workers are given no task."""
     revisions: Annotated[dict[HostWord, Count], Field(max_length=16)] = field(default_factory=dict)
     """Revision that it makes of each stage."""
 
     @property
     def ability(self) -> Ability:
         """What it can do."""
-        if self.schemas is None:
-            return Ability(UNTOLD_SCHEMAS, UNTOLD_REVISIONS, looks_apart=False)
         return Ability(self.schemas, self.revisions)

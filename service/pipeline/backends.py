@@ -10,7 +10,7 @@ from service.store.store import Store, open_store
 
 if TYPE_CHECKING:
     from service.index.index import Index
-    from service.queue.port import TaskQueue
+    from service.queue.rq_queue import RqQueue
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Services:
     settings: Settings
     store: Store
     index: Index
-    queue: TaskQueue
+    queue: RqQueue
 
     @classmethod
     def open(cls, settings: Settings, *, patience: int = 3, make: bool = True, anew: bool = False) -> Self:

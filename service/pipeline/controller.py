@@ -15,19 +15,20 @@ from contextlib import contextmanager
 from typing import Final
 
 from service.heartbeat_file import HeartbeatFile
+from service.index.notes import Marked
 from service.index.queries.feed import ReadyTask
 from service.index.rebuild import complete_if_new, rebuild
 from service.model import names
 from service.model.ability import need_of
 from service.model.clock import timestamp
-from service.model.errors import BusyError, DamagedError, StoreUnavailable, UnavailableError
+from service.model.errors import BusyError, DamagedError, NotFoundError, StoreUnavailable, UnavailableError
 from service.model.planning import ingest_id, ingest_message
+from service.model.records import JobRecord
 from service.model.states import Lane
 from service.model.turns import Turns
 from service.model.worker_beat import WorkerBeat
 from service.pipeline.backends import Services
 from service.pipeline.datasets.rounds import DatasetRounds
-from service.pipeline.entering import Entering
 from service.pipeline.garbage_collector import GarbageCollector
 from service.pipeline.identity import identify
 from service.pipeline.indexer import Indexer
@@ -35,14 +36,13 @@ from service.pipeline.integrity_scan import IntegrityScan
 from service.pipeline.job_actions import HELD_S, queue_tasks
 from service.pipeline.leading import PART
 from service.pipeline.lease_reaper import LeaseReaper
-from service.pipeline.marking import Marking
-from service.pipeline.pace import Pace
-from service.pipeline.reports import Reports
 from service.pipeline.routes import Routes
 from service.pipeline.webhook_dispatcher import WebhookDispatcher
-from service.queue.port import Event, EventKind
+from service.queue.port import Event, EventKind, Report
 from service.store.library import publish_builtins, stored_assets
+from service.store.marks import newest_mark, next_mark, set_mark
 from service.store.packs import take_apart
+from service.store.records import read_record
 
 log = logging.getLogger(__name__)
 #: Events of one round: a second's work. Those behind them wait for the next round, which follows at once.
@@ -61,6 +61,8 @@ _COLLECT_EVERY_S: Final = 5.0
 _IDENTIFY_EVERY_S: Final = 30.0
 #: What a read of the store that is under way has to end, once the controller stops [s].
 _LAST_READ_S: Final = 3.0
+#: Least wait between two pieces of large jobs [s]: longer than SQLite lets a waiting writer sleep.
+_ENTERING_GAP_S: Final = 0.15
 
 
 class Controller:
@@ -72,7 +74,8 @@ class Controller:
         self._reaper = LeaseReaper(services, self._indexer, clock=clock)
         self._planner = DatasetRounds(services, clock=clock)
         self._garbage = GarbageCollector(services, clock=clock)
-        self._marking = Marking(services)
+        self._known: str | None = None
+        """Mark that the index had when it was last compared with the store's."""
         self._has_plans = False
         self._turns = Turns()
         self._backlog: list[tuple[str, Event]] = []
@@ -89,14 +92,26 @@ class Controller:
         self._workers = 0
         """Workers that were there when they were last counted."""
         self._clock = clock
-        self._reports = Reports(services)
+        self._reports: dict[str, Report] = {}
+        """How far tasks were when it was last passed on."""
         interval_s = services.settings.controller_interval_s
-        # Each lease is seen three times before it can be called lost.
-        self._looking = Pace(clock, interval_s, longest_s=services.settings.lease_s / 3)
-        self._feeding = Pace(clock, 0.0)
-        self._reporting = Pace(clock, min(_REPORTS_EVERY_S, interval_s), share=0.1)
-        self._counting = Pace(clock, _WORKERS_EVERY_S, share=0.1)
-        self._plan_again = self._collect_again = self._identify_again = -math.inf
+        self._entered = ""
+        """The large job whose next tasks were entered last."""
+        self._identify = Duty(clock, lambda: identify(services, holds_redis=True), _IDENTIFY_EVERY_S)
+        self._duties = [
+            Duty(clock, services.queue.tidy, _WORKERS_EVERY_S),
+            Duty(clock, self._mark, _WORKERS_EVERY_S),
+            Duty(clock, self._indexer.flush, _WORKERS_EVERY_S),
+            Duty(clock, self._look_after_workers, _WORKERS_EVERY_S, share=0.1),
+            # Each lease is seen three times before it can be called lost.
+            Duty(clock, self._look_after_queue, interval_s, longest_s=services.settings.lease_s / 3),
+            Duty(clock, self._feed_news, 0.0),
+            Duty(clock, self._pass_on_reports, min(_REPORTS_EVERY_S, interval_s), share=0.1),
+            # The index is free for at least as long as it was held.
+            Duty(clock, self._enter_large_job, _ENTERING_GAP_S, share=0.5),
+            Duty(clock, self._plan, interval_s),
+            Duty(clock, lambda: self._garbage.advance() or self._garbage.collect(), _COLLECT_EVERY_S),
+        ]
 
     def run(self, stop: threading.Event) -> None:
         """Rounds until told to stop. Where a part is away, waits longer and longer, and loses nothing."""
@@ -105,12 +120,8 @@ class Controller:
 
     @contextmanager
     def _beside(self, stop: threading.Event) -> Iterator[None]:
-        """What goes on beside the rounds: webhooks are told what ended, large jobs are entered, and the store is read
-        through, where the settings want it."""
-        duties = {
-            "webhooks": WebhookDispatcher(self._services, stop).run,
-            "entering": Entering(self._services, stop).run,
-        }
+        """What goes on beside the rounds: webhooks are told what ended; where settings want it, the store is read."""
+        duties = {"webhooks": WebhookDispatcher(self._services, stop).run}
         if self._services.settings.integrity_scan_mb_per_s:
             duties["integrity scan"] = IntegrityScan(self._services, stop).run
         threads = [threading.Thread(target=duty, name=name, daemon=True) for name, duty in duties.items()]
@@ -143,7 +154,7 @@ class Controller:
                 stop.wait(pause)
         if self._started:
             with _noted([]):
-                self._marking.advance(news=self._made)
+                self._mark()
 
     def round(self, *, wait_s: float = 0.0) -> None:
         """Index what came in, then look after queue, leases and workers.
@@ -152,48 +163,55 @@ class Controller:
             UnavailableError: a part is away; the round can be run again.
             BusyError: another service has taken over the store.
         """
-        if self._clock() >= self._identify_again:
-            identify(self._services, holds_redis=True)
-            self._identify_again = self._clock() + _IDENTIFY_EVERY_S
+        self._identify()
         self._see_to_the_index()
         away: list[UnavailableError] = []
         with _noted(away):
             self._index_events(0.0 if self._has_plans else min(wait_s, _REPORTS_EVERY_S))
-        now = self._clock()
-        if self._counting.is_due:
+        for duty in self._duties:
             with _noted(away):
-                self._services.queue.tidy()
-            with _noted(away):
-                self._marking.advance(news=self._made)
-                self._made = False
-            with _noted(away):
-                self._indexer.flush()
-                self._counting.run(self._look_after_workers)
-        if self._looking.is_due:
-            with _noted(away):
-                self._looking.run(self._look_after_queue)
-                self._news = False
-        elif self._news and self._feeding.is_due:
-            with _noted(away):
-                self._feeding.run(self._feed)
-                self._news = False
-        if self._reporting.is_due:
-            with _noted(away):
-                self._reporting.run(self._reports.take_up)
-        self._do_what_users_want(now, away)
+                duty()
         if away:
             raise away[0]
 
-    def _do_what_users_want(self, now: float, away: list[UnavailableError]) -> None:
-        """Plan datasets and collect garbage, a little of each."""
-        if self._has_plans or now >= self._plan_again:
-            with _noted(away):
-                self._has_plans = self._planner.advance()
-                self._plan_again = now + self._services.settings.controller_interval_s
-        if now >= self._collect_again:
-            with _noted(away):
-                is_left = self._garbage.advance() or self._garbage.collect()
-                self._collect_again = now if is_left else now + _COLLECT_EVERY_S
+    def _mark(self) -> None:
+        """Give index and store a new mark if users or workers changed anything: an index that was copied before has
+        another one than the store, and is made anew."""
+        notes = self._services.index.notes
+        present, changes = notes.marked(), notes.changes()
+        if changes != present.changes or self._made:
+            fresh = next_mark(present.mark)
+            notes.set_marked(Marked(fresh, newest_mark(self._services.store), changes))
+            set_mark(self._services.store, fresh)
+            notes.set_marked(Marked(fresh, fresh, changes))
+            self._known, self._made = fresh, False
+
+    def _pass_on_reports(self) -> None:
+        """What changed in the workers' reports to the progress that the index shows."""
+        found = self._services.queue.reports()
+        changed = {task: report for task, report in found.items() if self._reports.get(task) != report}
+        if changed:
+            self._services.index.live.set_progress({task: (r.done, r.total, r.message) for task, r in changed.items()})
+        self._reports = found
+
+    def _plan(self) -> bool:
+        self._has_plans = self._planner.advance()
+        return self._has_plans
+
+    def _enter_large_job(self) -> None:
+        """The next tasks of a job that has too many for one turn of the index's writers: others write in between.
+
+        Such jobs alternate. Killed at any moment, the successor goes on where a note in the index says.
+        """
+        if not (jobs := self._services.index.write.entering()):
+            return
+        self._entered = next((job for job in jobs if job > self._entered), jobs[0])
+        record = None
+        try:
+            record = read_record(JobRecord, self._services.store, names.job_record(self._entered))
+        except (NotFoundError, DamagedError) as error:
+            log.error("the rest of job %s is not entered: %s", self._entered, error)
+        self._services.index.write.enter_more(self._entered, record)
 
     def _look_after_workers(self) -> None:
         self._announce()
@@ -236,7 +254,10 @@ class Controller:
 
     def _is_stale(self) -> bool:
         """Whether the index, or the store, was exchanged for an older copy."""
-        if self._marking.agrees():
+        present = self._services.index.notes.marked()
+        # Killed between the two, a controller leaves the store with the mark before.
+        if present.mark == self._known or newest_mark(self._services.store) in (present.mark, present.before):
+            self._known = present.mark
             return False
         log.warning("index and store have different marks: one of them is an older copy")
         self._services.index.notes.set_incomplete()
@@ -279,13 +300,24 @@ class Controller:
         # Waiting tasks are read before leases: one that a worker takes in between is then seen as held.
         waiting = self._services.queue.waiting()
         leases = self._services.queue.leases()
-        self._reports.sweep({lease.task_id for lease in leases})
+        # Reports that were read before the leases were, and whose tasks nobody held then.
+        gone = self._reports.keys() - {lease.task_id for lease in leases}
+        self._services.queue.forget_reports(gone)
+        for task in gone:
+            del self._reports[task]
         lost = self._reaper.reap(leases)
         present = waiting | {lease.task_id for lease in leases if lease not in lost}
         if stray := self._services.index.feed.cancelled(present):
             self._services.queue.discard(stray)
         missing = {*self._reaper.find_missing(present), *(lease.task_id for lease in lost)}
         self._feed(present, missing)
+        self._news = False
+
+    def _feed_news(self) -> None:
+        """What became ready by what came in, without a wait."""
+        if self._news:
+            self._feed()
+            self._news = False
 
     def _feed(self, present: set[str] | None = None, missing: Collection[str] = ()) -> None:
         """Queue what is ready. Where nobody knows what is in the queue (`present`), the index's own marks say so, and
@@ -347,3 +379,35 @@ def _noted(away: list[UnavailableError]) -> Iterator[None]:
         away.append(error)
     except DamagedError as error:
         log.warning("%s", error)
+
+
+class Duty:
+    """What need not be done in every round: once in `every_s`, and no more than `share` of the time.
+
+    It is called in each, and where the work breaks off, or answers True for something left to do, also does it in the
+    next one.
+    """
+
+    def __init__(
+        self,
+        clock: Callable[[], float],
+        work: Callable[[], object],
+        every_s: float,
+        *,
+        share: float = 0.2,
+        longest_s: float = math.inf,
+    ) -> None:
+        """`longest_s` is the longest pause, whatever the share then is [s]."""
+        self._clock, self._work = clock, work
+        self._every_s, self._share, self._longest_s = every_s, share, longest_s
+        self._again = -math.inf
+
+    def __call__(self) -> None:
+        """Do it if it is due."""
+        begun = self._clock()
+        if begun < self._again:
+            return
+        is_left = self._work() is True
+        ended = self._clock()
+        pause = max(self._every_s, (ended - begun) * (1 / self._share - 1))
+        self._again = ended if is_left else ended + min(pause, max(self._every_s, self._longest_s))

@@ -24,8 +24,6 @@ from service.model.errors import InputError
 PATIENCE_S: Final = 10.0
 #: For looking the host up [s].
 LOOK_UP_S: Final = 5.0
-#: Public addresses that clouds answer their own machines at, about these machines.
-_METADATA: Final = frozenset({ipaddress.ip_address("168.63.129.16"), ipaddress.ip_address("192.0.0.192")})
 #: Of the answer no more is read than its status line, its headers and so many bytes.
 _READ_BYTES: Final = 1024
 #: Prefixes under which IPv4 addresses are reached: the well-known one, and those of a network's own.
@@ -81,7 +79,7 @@ def is_public(address: Address) -> bool:
             return is_public(inner)
         if address.is_site_local or address in _LOCAL_NAT64:
             return False
-    return address.is_global and not address.is_multicast and not address.is_reserved and address not in _METADATA
+    return address.is_global and not address.is_multicast and not address.is_reserved
 
 
 def reachable(host: str, port: int, allowed: Networks) -> list[str]:

@@ -22,7 +22,7 @@ from service.store.records import put_record, read_record
 
 if TYPE_CHECKING:
     from service.pipeline.backends import Services
-    from service.queue.port import Presence
+    from service.queue.rq_queue import RqQueue
     from service.store.store import Store
 
 _FILE: Final = "service.id"
@@ -139,7 +139,7 @@ def identify_if_redis_answers(services: Services, *, folder: Path | None = None,
         return identify(services, folder=folder, take_over=take_over, ask_redis=False)
 
 
-def check_queue(store: Store, queue: Presence) -> bool:
+def check_queue(store: Store, queue: RqQueue) -> bool:
     """For a process without an index: whether Redis says yet that it belongs to the service of the store.
 
     Raises:

@@ -17,7 +17,7 @@ from service.model.planning import backoff
 from service.model.records import AttemptRecord
 from service.model.states import AssetKind, Stage, State
 from service.pipeline.backends import Services
-from service.pipeline.tally import Tally
+from service.pipeline.metrics import Tally
 from service.queue.port import Event, EventKind
 from service.store.library import load_asset, load_check
 from service.store.manifests import ShardManifest, load_manifest
@@ -42,7 +42,7 @@ class Indexer:
         self._services = services
         self._told: OrderedDict[str, State] = OrderedDict()
         self._deferrals: dict[str, int] = {}
-        self._tally = Tally(services.queue)
+        self._tally = Tally(services.queue.count)
         self._readers = ThreadPoolExecutor(_READERS, thread_name_prefix="manifests")
 
     def apply(self, events: Sequence[Event]) -> list[int]:

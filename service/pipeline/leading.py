@@ -15,11 +15,13 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from service.heartbeat_file import HeartbeatFile
 from service.model.errors import QueueUnavailable
-from service.queue.port import Presence
+
+if TYPE_CHECKING:
+    from service.queue.rq_queue import RqQueue
 
 log = logging.getLogger(__name__)
 #: As what the controller that leads announces itself; an API of graspd 0.2 looks for the same name.
@@ -33,7 +35,7 @@ _LOOK_S: Final = 0.1
 class Leadership:
     """The lease that one process wants and holds."""
 
-    def __init__(self, queue: Presence, *, lease_s: float, alive: HeartbeatFile, name: str | None = None) -> None:
+    def __init__(self, queue: RqQueue, *, lease_s: float, alive: HeartbeatFile, name: str | None = None) -> None:
         """
         Args:
             queue: used by a thread of its own while the lease is held.

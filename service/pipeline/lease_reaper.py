@@ -16,7 +16,7 @@ from service.model.records import AttemptRecord
 from service.model.states import AssetKind, Stage
 from service.pipeline.backends import Services
 from service.pipeline.indexer import Indexer
-from service.queue.port import Holder, Lease
+from service.queue.port import Lease
 from service.store.manifests import load_manifest
 from service.store.packs import take_apart
 from service.store.records import put_record, read_record, task_attempts
@@ -52,7 +52,7 @@ class LeaseReaper:
             if silence <= lease_s:
                 beats[lease.key] = (lease.beat, silence)
             else:
-                self._lose(lease, self._services.queue.holder(lease))
+                self._lose(lease)
                 lost.append(lease)
         self._beats = beats
         return lost
@@ -133,12 +133,12 @@ class LeaseReaper:
         else:
             self._services.index.live.set_asset_waiting([digest], queued=False)
 
-    def _lose(self, lease: Lease, holder: Holder) -> None:
-        message = holder.message
-        log.warning("worker %s was lost with task %s (attempt %d)", holder.worker, lease.task_id, lease.attempt)
+    def _lose(self, lease: Lease) -> None:
+        worker, message = self._services.queue.holder(lease)
+        log.warning("worker %s was lost with task %s (attempt %d)", worker, lease.task_id, lease.attempt)
         try:
             if isinstance(message, TaskMessage):
-                self._lose_task(holder.worker, message)
+                self._lose_task(worker, message)
             elif isinstance(message, IngestMessage):
                 self._lose_check(message)
         except UnavailableError:

@@ -34,13 +34,11 @@ class Routes:
     def place(self, need: Need) -> Place:
         """Of a task.
 
-        What every worker of its stage can do goes to all of them, and what some can do to those. Where these do not
-        look apart, it goes to all, and the others hand it back. What none can do is held back. While there is no
-        worker, those of this version are expected.
+        What every worker of its stage can do goes to all of them, and what some can do to those. What none can do is
+        held back. While there is no worker, those of this version are expected.
         """
         here = self._here.get(need.stage) or [own_ability()]
         lacking = {one.lacks(need) for one in here} - {""}
-        able = [one for one in here if not one.lacks(need)]
-        if not able:
+        if all(one.lacks(need) for one in here):
             return Place(held=f"held back, no worker that is here can do it: {'; '.join(sorted(lacking))}")
-        return Place(apart=bool(lacking) and any(one.looks_apart for one in able))
+        return Place(apart=bool(lacking))

@@ -13,7 +13,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import zip_longest
 from typing import Final
 
@@ -74,12 +74,6 @@ class WebhookDispatcher:
             except Exception:
                 log.exception("a round of webhooks broke off")
         self._pool.shutdown(wait=False, cancel_futures=True)
-
-    def deliver(self, *, now: float | None = None) -> int:
-        """Start deliveries and wait for their ends; how many were tried."""
-        started = self.start_deliveries(now=now)
-        wait(started)
-        return len(started)
 
     def start_deliveries(self, *, now: float | None = None) -> list[Future[None]]:
         """Make deliveries of what is new, and begin those that are due and have room."""

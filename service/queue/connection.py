@@ -1,14 +1,20 @@
-"""A connection to Redis, without the queue: what a small process needs that must start quickly."""
+"""Where Redis answers, the one of the settings or the embedded one of the data folder, and a connection to it."""
 
 from __future__ import annotations
 
+import hashlib
+import os
+import tempfile
+from pathlib import Path
 from typing import Any, Final
+from urllib.parse import quote
 
 from redis import Redis
 from redis.backoff import ExponentialBackoff
 from redis.retry import Retry
 
 from service.model.errors import QueueUnavailable
+from service.settings import Settings
 
 _SOCKET_TIMEOUT_S: Final = 10.0
 _NETWORK: Final = {"socket_connect_timeout": 3.0, "socket_keepalive": True}
@@ -36,3 +42,39 @@ def connect(url: str, *, patience: int = 3, timeout_s: float = _SOCKET_TIMEOUT_S
             "the Redis URL (GRASPD_REDIS_URL) cannot be used; give redis://, rediss:// or unix://, and in a password "
             "%2F for /, %23 for #, %3F for ? and %40 for @"
         ) from None
+
+
+#: Longest path of a unix socket that Linux (108 bytes with the final zero) and macOS (104) both take.
+_MAX_SOCKET_PATH: Final = 100
+
+
+def redis_url(settings: Settings) -> str:
+    """The Redis of these settings: GRASPD_REDIS_URL, or else the one that `graspd up` starts for the data folder."""
+    if settings.redis_url is not None:
+        return settings.redis_url.get_secret_value()
+    secret = password(settings.data_dir)
+    return f"unix://{f':{secret}@' if secret else ''}{quote(str(socket_path(settings.data_dir)))}"
+
+
+def password(data_dir: Path) -> str:
+    """What the embedded Redis of a data folder asks for; "" if it listens on its private socket alone."""
+    try:
+        return password_file(data_dir).read_text().strip()
+    except OSError:
+        return ""
+
+
+def password_file(data_dir: Path) -> Path:
+    """Where the password of an embedded Redis is kept, readable by its user alone."""
+    return data_dir.resolve() / "redis" / "password"
+
+
+def socket_path(data_dir: Path) -> Path:
+    """Where the embedded Redis of a data folder listens: inside it, or where that path is too long, in a private
+    folder that follows from it."""
+    path = data_dir.resolve() / "redis" / "redis.sock"
+    if len(os.fsencode(path)) <= _MAX_SOCKET_PATH:
+        return path
+    name = hashlib.sha256(os.fsencode(path)).hexdigest()[:16]
+    base = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
+    return base / f"graspd-{os.getuid()}-{name}" / "redis.sock"

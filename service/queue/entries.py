@@ -10,7 +10,7 @@ import json
 import re
 import zlib
 from collections.abc import Iterable
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 from redis.exceptions import ResponseError
@@ -18,9 +18,10 @@ from redis.exceptions import ResponseError
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Stage
 from service.model.worker_beat import WorkerBeat
-from service.queue.port import Event, Message
+from service.queue.port import Event, Message, Report
 
-_BEAT: Final = TypeAdapter(WorkerBeat)
+Entry = TypeVar("Entry", WorkerBeat, Event, Report)
+_ADAPTERS: Final[dict[type, TypeAdapter[Any]]] = {kind: TypeAdapter(kind) for kind in (WorkerBeat, Event, Report)}
 _ATTEMPT: Final = re.compile(r"(.+)-([0-9]{1,9})")
 #: A message has a few kilobytes, whatever its few compressed bytes would unpack to.
 _MESSAGE_BYTES: Final = 1 << 20
@@ -65,18 +66,11 @@ def message(data: bytes | None) -> Message | None:
         return None
 
 
-def beat(data: bytes | None) -> WorkerBeat | None:
-    """What a worker says of itself; None if it is forged, or of a worker much newer or older than this."""
+def read(kind: type[Entry], data: bytes | None) -> Entry | None:
+    """What a worker says of itself, an event or a report; None if it is forged, or of a version much newer or older."""
     try:
-        return _BEAT.validate_json(data or b"")
-    except ValidationError:
-        return None
-
-
-def event(data: bytes | None) -> Event | None:
-    """An entry of the stream of events."""
-    try:
-        return Event.model_validate_json(data or b"")
+        found: Entry = _ADAPTERS[kind].validate_json(data or b"")
+        return found
     except ValidationError:
         return None
 

@@ -2,23 +2,32 @@
 
 While workers of two versions are there, a task that only some of them can do waits apart: in a list whose name ends in
 what it asks of a worker, `bulk-synthesize.2.10` for schema 2 and revision 10. Who cannot do it never looks there.
+
+Where RQ keeps what, RQ itself says. Its own readers clean up as they read, so what only looks reads keys.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from itertools import product
 from typing import Any, Final
 
 from redis.exceptions import ResponseError
+from rq import Queue, Worker
+from rq.executions import Execution, ExecutionRegistry
+from rq.job import Job
+from rq.registry import FailedJobRegistry, StartedJobRegistry
+from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
 from service.model.ability import FIRST_SCHEMA, Ability, Need
 from service.model.states import Lane, Stage
 from service.queue import entries
 from service.queue.port import lane_order
-from service.queue.rq_keys import LISTS, list_name
 
+#: Names of all lists that a task was ever put into, and of all workers.
+LISTS: Final[str] = Queue.redis_queues_keys
+RQ_WORKERS: Final[str] = Worker.redis_workers_keys
 #: Later stages first: a batch that was begun is finished before the next begins.
 _STAGE_ORDER: Final = (Stage.INGEST, Stage.RENDER, Stage.SCENE, Stage.SYNTHESIZE)
 #: Versions that can be told apart at once; a name beyond them is nobody's.
@@ -92,7 +101,55 @@ def _apart(lane: Lane, stage: Stage, ability: Ability | None) -> list[str]:
 
 def _needs(stage: Stage, ability: Ability) -> list[Need]:
     """What a worker can do of what may wait apart."""
-    if not ability.looks_apart:
-        return []
     revision = ability.revisions.get(stage.value, 0)
     return [Need(stage, schema, schema, revision) for schema in range(FIRST_SCHEMA, ability.schemas[1] + 1)]
+
+
+def list_key(name: str) -> str:
+    """List of waiting tasks."""
+    return f"{Queue.redis_queue_namespace_prefix}{name}"
+
+
+def list_name(key: str) -> str:
+    """Name of a list by its key."""
+    return key.removeprefix(Queue.redis_queue_namespace_prefix)
+
+
+def held_key(name: str) -> str:
+    """Leases of the tasks that were taken from a list."""
+    return str(StartedJobRegistry.key_template.format(name))
+
+
+def failed_key(name: str) -> str:
+    """Tasks of a list that RQ calls failed."""
+    return str(FailedJobRegistry.key_template.format(name))
+
+
+def job_key(job: str) -> str:
+    """What is known of a task and attempt."""
+    return f"{Job.redis_job_namespace_prefix}{job}"
+
+
+def rq_worker_key(name: str) -> str:
+    """What RQ knows of a worker."""
+    return f"{Worker.redis_worker_namespace_prefix}{name}"
+
+
+def workers_key(name: str) -> str:
+    """Workers that look into a list."""
+    return str(WORKERS_BY_QUEUE_KEY % name)
+
+
+def execution_keys(entry: str) -> tuple[str, str]:
+    """Of a lease: the execution that it is of, and all executions of its task."""
+    job, _, execution = entry.partition(":")
+    return Execution(execution, job, connection=None).key, str(ExecutionRegistry.key_template.format(job))
+
+
+def kinds(lists: list[str]) -> Iterator[tuple[str, str]]:
+    """Keys of lists, each with its type in Redis."""
+    for name in lists:
+        yield list_key(name), "list"
+        yield held_key(name), "zset"
+        yield failed_key(name), "zset"
+        yield workers_key(name), "set"

@@ -22,24 +22,38 @@ from rq.job import Job
 from rq.serializers import JSONSerializer
 
 from service.model.ability import need_of
+from service.model.clock import age_of
 from service.model.errors import QueueUnavailable
 from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
-from service.queue import entries, rq_keys
-from service.queue.address import redis_url
+from service.queue import entries
 from service.queue.allowed import TASK_FUNCTION, new_job
-from service.queue.at_scrape import read_queue
-from service.queue.connection import connect
-from service.queue.lists import known_lists, place_of, queue_name, without_takers
-from service.queue.port import Event, Holder, Lease, Message, QueueNow, Report
-from service.queue.reports import REPORTS, drop_reports, put_report, read_reports
-from service.queue.rq_keys import LISTS, execution_keys, held_key, job_key, list_key
+from service.queue.connection import connect, redis_url
+from service.queue.lists import (
+    LISTS,
+    RQ_WORKERS,
+    execution_keys,
+    failed_key,
+    held_key,
+    job_key,
+    kinds,
+    known_lists,
+    list_key,
+    place_of,
+    queue_name,
+    rq_worker_key,
+    without_takers,
+    workers_key,
+)
+from service.queue.port import Event, Lease, Message, Place, QueueNow, Report
 from service.queue.streams import EVENTS, EventReader, put_event, readable
 from service.settings import Settings
 
 WORKERS: Final = "graspd:workers"
 #: Lease of the controller that leads. A graspd of 0.2 takes and keeps the same one: so the two give way to each other.
 LEAD: Final = "graspd:lead:keeper"
+#: How far running tasks are: one field of a hash for each, so that what is late replaces what was not yet read.
+REPORTS: Final = "graspd:reports"
 #: Sums for Prometheus, a few hundred fields.
 METRICS: Final = "graspd:metrics"
 _SERVICE: Final = "graspd:service"
@@ -48,7 +62,11 @@ _WORKER: Final = b"graspd:worker:"
 
 
 class RqQueue:
-    """`TaskQueue` on Redis."""
+    """Tasks to workers and who holds which, events, who is there, and sums.
+
+    Every method raises QueueUnavailable when Redis is away. Nothing here is the truth: whatever is lost is queued again
+    from the index.
+    """
 
     def __init__(self, connection: Redis) -> None:
         self.connection: Any = connection
@@ -58,12 +76,22 @@ class RqQueue:
         """Locks of those who lead, or want to, through this connection."""
 
     def ping(self) -> float:
+        """Seconds a round trip takes."""
         start = time.perf_counter()
         with _mapped():
             self.connection.ping()
         return time.perf_counter() - start
 
     def enqueue(self, messages: Sequence[Message], lane: Lane, *, again: bool = False, apart: bool = False) -> int:
+        """Append tasks to a lane. A task (by id and attempt) that already waits or runs is not queued twice.
+
+        Args:
+            again: the caller has seen that the queue lost these tasks; what it still remembers of them is replaced.
+            apart: only some workers of the stage can do them, and only those see them.
+
+        Returns:
+            number of tasks added.
+        """
         stale = [cancel_key(message.task_id) for message in messages]
         if again:
             stale += [job_key(rq_id(message.task_id, message.attempt)) for message in messages]
@@ -81,6 +109,7 @@ class RqQueue:
         return added
 
     def discard(self, task_ids: Collection[str]) -> None:
+        """Take waiting tasks off the queue and tell the workers that run one of them to stop at the next launch."""
         wanted = set(task_ids)
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for task in wanted:
@@ -94,12 +123,14 @@ class RqQueue:
             pipe.execute()
 
     def waiting(self) -> set[str]:
+        """Ids of the tasks in the queue."""
         with _mapped(), self.connection.pipeline(transaction=True) as pipe:
             for key in self._list_keys():
                 pipe.lrange(key, 0, -1)
             return {entries.task_of(entries.text(job))[0] for jobs in pipe.execute() for job in jobs}
 
     def depths(self) -> dict[tuple[Lane, Stage], int]:
+        """Number of waiting tasks of each lane and stage."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             lists = known_lists(self.connection)
             for name in lists:
@@ -110,6 +141,7 @@ class RqQueue:
             return dict(depths)
 
     def clear_untaken(self, present: Collection[WorkerBeat]) -> None:
+        """Forget tasks that wait apart for workers of a kind that is gone. The controller then finds them missing."""
         abilities = [(stage, beat.ability) for beat in present for stage in beat.stages]
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for name in without_takers(known_lists(self.connection), abilities):
@@ -123,6 +155,7 @@ class RqQueue:
             pipe.execute()
 
     def leases(self) -> list[Lease]:
+        """Tasks held by workers, living or dead. Reading changes nothing."""
         # RQ's own readers clean up as they read, which moves lost tasks aside and runs callbacks; so the keys are read.
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             keys = [held_key(name) for name in known_lists(self.connection)]
@@ -131,13 +164,18 @@ class RqQueue:
             found = pipe.execute()
         return [_lease(key, entry, score) for key, held in zip(keys, found, strict=True) for entry, score in held]
 
-    def holder(self, lease: Lease) -> Holder:
+    def holder(self, lease: Lease) -> tuple[str, Message | None]:
+        """Which worker holds a lease, and what was asked of it; None if Redis no longer knows.
+
+        Only of one that is lost is this asked: reading all leases stays one round trip.
+        """
         job = entries.text(bytes.fromhex(lease.key.partition(" ")[2]).partition(b":")[0])
         with _mapped():
             worker, data = entries.fields(self.connection, job_key(job), "worker_name", "data")
-        return Holder(entries.text(worker), entries.message(data))
+        return entries.text(worker), entries.message(data)
 
     def release(self, lease: Lease) -> None:
+        """Forget a lease whose worker is lost; if it lives after all, it notices and stops."""
         key, _, digits = lease.key.partition(" ")
         entry = bytes.fromhex(digits)
         name = entries.text(entry)
@@ -148,12 +186,14 @@ class RqQueue:
             pipe.execute()
 
     def workers(self) -> list[WorkerBeat]:
+        """Workers that gave a sign of life within the last lease."""
         with _mapped():
             names = sorted(self.connection.smembers(WORKERS))
             found = self.connection.mget([_WORKER + name for name in names]) if names else []
-        return [beat for beat in map(entries.beat, found) if beat is not None]
+        return [beat for data in found if (beat := entries.read(WorkerBeat, data)) is not None]
 
     def publish(self, *events: Event) -> None:
+        """Append events."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for event in events:
                 put_event(pipe, event)
@@ -161,50 +201,64 @@ class RqQueue:
                     pipe.hdel(REPORTS, event.task_id)
             pipe.execute()
 
-    def report(self, task_id: str, report: Report) -> float:
+    def report(self, task_id: str, report: Report) -> None:
+        """Say how far a task is, in place of what was said before; gone with the event that ends the attempt."""
         with _mapped():
-            return put_report(self.connection, task_id, report, WORKERS)
+            self.connection.hset(REPORTS, task_id, report.model_dump_json())
 
     def reports(self) -> dict[str, Report]:
+        """The last report on each task."""
         with _mapped():
-            return read_reports(self.connection)
+            found = self.connection.hgetall(REPORTS)
+        return {entries.text(task): entries.read(Report, data) or Report() for task, data in found.items()}
 
     def forget_reports(self, task_ids: Collection[str]) -> None:
-        with _mapped():
-            drop_reports(self.connection, task_ids)
+        """Take reports away whose tasks nobody holds."""
+        if task_ids:
+            with _mapped():
+                self.connection.hdel(REPORTS, *task_ids)
 
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
+        """Next events for the controller, the oldest first; those never acknowledged come again to the next one."""
         with _mapped():
             return self._reader.read(limit=limit, wait_s=wait_s)
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
+        """Say that the events are in the index."""
         if event_ids:
             with _mapped():
                 self._reader.acknowledge(event_ids)
 
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
+        """Events after an id, for any number of readers. `"$"`: only what comes from now on; `"0"`:
+        all kept."""
         with _mapped():
             block = max(1, int(wait_s * 1000)) if wait_s > 0 else None
             return readable(self.connection.xread({EVENTS: after}, count=limit, block=block))
 
     def announce(self, part: str, seconds: float) -> None:
+        """Say that a part of the service (the controller) lives, for that long."""
         with _mapped():
             self.connection.set(_part_key(part), "1", px=int(seconds * 1000))
 
     def announced(self, part: str) -> bool:
+        """Whether a part said so."""
         with _mapped():
             return bool(self.connection.exists(_part_key(part)))
 
     def service(self) -> str | None:
+        """Identity of the service that this queue belongs to; None if none has it yet, or Redis was lost."""
         with _mapped():
             found = self.connection.get(_SERVICE)
         return None if found is None else entries.text(found)
 
     def set_service(self, identity: str, *, instead: bool = False) -> None:
+        """Say which service the queue belongs to, where nobody said it before or `instead` of that."""
         with _mapped():
             self.connection.set(_SERVICE, identity, nx=not instead)
 
     def lead(self, holder: str, seconds: float) -> bool:
+        """Lead the controllers for that long, or go on to; False: another one does."""
         with _mapped():
             new = self.connection.lock(LEAD, timeout=seconds, thread_local=False)
             lease = self._leases.setdefault(holder, new)
@@ -226,52 +280,78 @@ class RqQueue:
             return False
 
     def resign(self, holder: str) -> None:
+        """Lead no longer; nothing happens where this one does not."""
         with _mapped(), suppress(LockError):
             self.connection.lock(LEAD).do_release(holder)
 
     def now(self, *, lease_s: float) -> QueueNow:
-        with _mapped():
-            return read_queue(
-                self.connection,
-                {name: place_of(name) for name in known_lists(self.connection)},
-                workers_key=WORKERS,
-                worker_key=_WORKER,
-                lease_s=lease_s,
-                read_beat=entries.beat,
-            )
+        """Lengths, ages and workers for the metrics, at a cost that does not grow with the queue.
+
+        Args:
+            lease_s: how long a worker's registration outlives its beat [s].
+        """
+        beats = self.workers()
+        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+            lists = known_lists(self.connection)
+            for name in lists:
+                pipe.llen(list_key(name))
+                pipe.lindex(list_key(name), 0)
+                pipe.zcard(held_key(name))
+            found = pipe.execute()
+            for head in found[1::3]:
+                pipe.hget(job_key(entries.text(head)), "enqueued_at")
+            for beat in beats:
+                pipe.pttl(worker_key(beat.name))
+            # Under a name that anybody may have put there lies anything: that hides no other.
+            since = [None if isinstance(one, Exception) else one for one in pipe.execute(raise_on_error=False)]
+        depth, running, oldest = Counter[Place](), Counter[Place](), dict[Place, float]()
+        for place, waiting, held, when in zip(map(place_of, lists), found[0::3], found[2::3], since, strict=False):
+            depth[place] += waiting
+            running[place] += held
+            if (age := age_of(entries.text(when))) is not None:
+                oldest[place] = max(age, oldest.get(place, 0.0))
+        workers = {
+            beat.name: (beat, max(0.0, lease_s - (left_ms or 0) / 1000))
+            for beat, left_ms in zip(beats, since[len(lists) :], strict=True)
+        }
+        return QueueNow(depth, oldest, running, workers)
 
     def count(self, amounts: Mapping[str, float]) -> None:
+        """Add to sums that outlive this process."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for name, amount in amounts.items():
                 pipe.hincrbyfloat(METRICS, name, amount)
             pipe.execute()
 
     def counted(self) -> dict[str, float]:
+        """All those sums."""
         with _mapped():
             found = self.connection.hgetall(METRICS)
         return {entries.text(name): amount for name, raw in found.items() if (amount := _amount(raw)) is not None}
 
     def tidy(self) -> None:
+        """Throw away what dead workers and refused entries left behind."""
         # RQ's registries of workers and failures are emptied by its own maintenance, which is off.
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             entries.sweep(self.connection, _KINDS, (EVENTS,))
             lists = known_lists(self.connection)
-            entries.sweep(self.connection, rq_keys.kinds(lists))
+            entries.sweep(self.connection, kinds(lists))
             known = list(self.connection.smembers(WORKERS))
             for name in known:
                 pipe.exists(_WORKER + name)
             for name, lives in zip(known, pipe.execute(), strict=True):
                 if not lives:
-                    key = rq_keys.worker_key(entries.text(name))
+                    key = rq_worker_key(entries.text(name))
                     pipe.delete(key)
-                    for registry in (rq_keys.WORKERS, *map(rq_keys.workers_key, lists)):
+                    for registry in (RQ_WORKERS, *map(workers_key, lists)):
                         pipe.srem(registry, key)
                     pipe.srem(WORKERS, name)
             for queue in lists:
-                pipe.zremrangebyscore(rq_keys.failed_key(queue), 0, time.time())
+                pipe.zremrangebyscore(failed_key(queue), 0, time.time())
             pipe.execute()
 
     def close(self) -> None:
+        """Give the connections back."""
         self.connection.close()
 
     def _job(self, message: Message) -> Job:
@@ -318,13 +398,12 @@ def renew_lease(pipe: Any, job: Job, execution: Execution, ttl: int) -> None:
     pipe.zadd(registry.key, {execution.composite_key: time.time() + ttl}, xx=True)
 
 
-def list_worker(connection: Any, beat: Mapping[str, Any], lease_s: float) -> int:
-    """Register a worker for the length of a lease [s]; returns how many are listed."""
+def list_worker(connection: Any, beat: Mapping[str, Any], lease_s: float) -> None:
+    """Register a worker for the length of a lease [s]."""
     with connection.pipeline() as pipe:
         pipe.set(worker_key(beat["name"]), json.dumps(beat), ex=max(2, round(lease_s)))
         pipe.sadd(WORKERS, beat["name"])
-        pipe.scard(WORKERS)
-        return int(pipe.execute()[2])
+        pipe.execute()
 
 
 def unlist_worker(connection: Any, left: Event) -> None:
@@ -359,7 +438,7 @@ _KINDS: Final = (
     (METRICS, "hash"),
     (REPORTS, "hash"),
     (_SERVICE, "string"),
-    (rq_keys.WORKERS, "set"),
+    (RQ_WORKERS, "set"),
     (LISTS, "set"),
 )
 

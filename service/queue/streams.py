@@ -80,7 +80,7 @@ def _entries_of(reply: Any) -> Sequence[tuple[str, Event | None]]:
     """Id and event of each entry of a reply; an entry that was trimmed has no fields."""
     streams = reply.items() if isinstance(reply, dict) else reply or []
     return [
-        (event_id.decode(), entries.event(fields.get(b"e")) if fields else None)
+        (event_id.decode(), entries.read(Event, fields.get(b"e")) if fields else None)
         for _, found in streams
         for entry in found
         for event_id, fields in ([entry] if isinstance(entry, tuple) else entry)

@@ -9,6 +9,7 @@ import secrets
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -21,6 +22,8 @@ from service.run.processes import start_of
 log = logging.getLogger(__name__)
 #: Variable of a child by which a later `graspd up` knows it.
 _TOKEN: Final = "GRASPD_CHILD_TOKEN"
+#: Pause between two looks at whether a child ended [s].
+_WATCH_S: Final = 0.1
 _FIRST_PAUSE_S: Final = 0.2
 _LONGEST_PAUSE_S: Final = 10.0
 #: A child that lived this long was well: the next restart is quick again [s].
@@ -113,6 +116,24 @@ class Child:
             return nullcontext()
         file.parent.mkdir(parents=True, exist_ok=True)
         return file.open("ab")
+
+
+def keep_alive(children: Sequence[Child], stop: threading.Event) -> None:
+    """Start children, and again those that end, until told to stop."""
+    for child in children:
+        child.start()
+    while not stop.wait(_WATCH_S):
+        for child in children:
+            child.watch()
+
+
+def stop_children(children: Sequence[Child], grace_s: float) -> None:
+    """Stop children all at once; those that have not ended after so long are killed [s]."""
+    for child in children:
+        child.ask_to_stop()
+    deadline = time.monotonic() + grace_s
+    for child in children:
+        child.join(deadline)
 
 
 def end_leftovers(folder: Path) -> list[int]:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO, Final
 
 from service.model.errors import BusyError, QueueUnavailable
-from service.queue.address import password_file, socket_path
+from service.queue.connection import password_file, socket_path
 from service.run.joining import Joining
 from service.settings import Settings
 

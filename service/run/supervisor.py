@@ -22,18 +22,16 @@ from service.model.errors import BusyError, GraspdError, InputError, Unavailable
 from service.pipeline.backends import Services
 from service.pipeline.identity import identify_if_redis_answers, recorded
 from service.pipeline.leading import PART
-from service.queue.address import redis_url
-from service.queue.port import Presence
-from service.queue.rq_queue import open_queue
+from service.queue.connection import redis_url
+from service.queue.rq_queue import RqQueue, open_queue
 from service.run.address import forget_address, record_address
-from service.run.children import Child, end_leftovers
+from service.run.children import Child, end_leftovers, keep_alive, stop_children
 from service.run.embedded import find_server, give_up_log, lock_file, own_redis, server_command, set_log_aside
 from service.run.joining import Joining
 from service.settings import Settings
 from service.store.store import open_store
 
 log = logging.getLogger(__name__)
-_WATCH_S: Final = 0.1
 _PROBE_S: Final = 0.1
 #: Longest wait for a service to be ready: kernels compile at their first use, on a machine with much else to do [s].
 READY_S: Final = 1800.0
@@ -174,7 +172,7 @@ class Supervisor:
     def _starts(self) -> dict[str, int]:
         return {child.name: child.starts for child in list(self._children)}
 
-    def _missing(self, queue: Presence) -> list[str]:
+    def _missing(self, queue: RqQueue) -> list[str]:
         missing = []
         try:
             if not queue.announced(PART):
@@ -261,27 +259,14 @@ class Supervisor:
 
     def _run(self) -> None:
         try:
-            for child in self._children:
-                child.start()
-            while not self._stopping.wait(_WATCH_S):
-                for child in self._children:
-                    child.watch()
+            keep_alive(self._children, self._stopping)
         except Exception:
             log.exception("the supervisor stops because of an error")
         finally:
-            self._stop_children()
-
-    def _stop_children(self) -> None:
-        """Workers hand their tasks back while Redis and controller still take them."""
-        for some in (self._named("worker"), self._named("api", "controller"), self._named("redis")):
-            for child in some:
-                child.ask_to_stop()
-            deadline = time.monotonic() + self.settings.stop_grace_s
-            for child in some:
-                child.join(deadline)
-
-    def _named(self, *prefixes: str) -> list[Child]:
-        return [child for child in self._children if child.name.startswith(prefixes)]
+            # Workers hand their tasks back while Redis and controller still take them.
+            for some in ("worker", ("api", "controller"), "redis"):
+                named = [child for child in self._children if child.name.startswith(some)]
+                stop_children(named, self.settings.stop_grace_s)
 
     def _record(self, folder: Path) -> None:
         if self._joining is not None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import pytest
 
 from api.metrics import Metrics, Snapshot
-from service.pipeline.series import SERIES
-from service.queue.port import QueueNow, WorkerPulse
+from service.model.states import Stage
+from service.model.worker_beat import WorkerBeat
+from service.pipeline.metrics import SERIES
+from service.queue.port import QueueNow
 
 STATES = ("checking", "idle", "busy", "stopping", "quarantined")
 
@@ -14,8 +16,11 @@ STATES = ("checking", "idle", "busy", "stopping", "quarantined")
 def test_workers_are_counted_in_every_state_that_they_can_be_in() -> None:
     """An alert on workers in quarantine asks for this very series; none is 0 and not absent."""
     snapshot = Snapshot()
-    pulses = {str(i): WorkerPulse("cpu", state, 0.1) for i, state in enumerate(["idle", "quarantined", "quarantined"])}
-    snapshot.add_queue(QueueNow(workers=pulses), is_kept=True)
+    beats = [
+        WorkerBeat(str(i), "h", 1, "cpu", "CPU", tuple(Stage), "0", state, "", "", "")
+        for i, state in enumerate(["idle", "quarantined", "quarantined"])
+    ]
+    snapshot.add_queue(QueueNow(workers={beat.name: (beat, 0.1) for beat in beats}), is_kept=True)
     text = Metrics().render(snapshot).decode()
     assert all(state in SERIES["graspd_workers"].meaning for state in STATES)
     counts = {state: float(text.partition(f'graspd_workers{{state="{state}"}} ')[2].split()[0]) for state in STATES}

@@ -16,8 +16,7 @@ import pytest
 
 from api.access.keys import KeyFile, KeyLimits, Scope
 from service.pipeline.backends import Services
-from service.queue.address import redis_url
-from service.queue.connection import connect
+from service.queue.connection import connect, redis_url
 from service.queue.rq_queue import RqQueue
 from service.run.embedded import server_command
 from service.run.supervisor import Supervisor

@@ -10,8 +10,7 @@ import pytest
 
 from service.model.errors import QueueUnavailable
 from service.pipeline.backends import Services
-from service.queue.address import redis_url
-from service.queue.connection import connect
+from service.queue.connection import connect, redis_url
 from service.queue.rq_queue import RqQueue
 from service.run.embedded import server_command
 from service.settings import Settings

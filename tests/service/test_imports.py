@@ -22,7 +22,7 @@ HEAVY = {"warp", "trimesh", "mujoco", "scipy", "newton", "torch", "worker", "api
 
 
 def test_no_line_spells_a_key_of_rq() -> None:
-    """RQ itself says where it keeps what: `service.queue.rq_keys` asks it."""
+    """RQ itself says where it keeps what: `service.queue.lists` asks it."""
     root = Path(service.__file__).parents[1]
     files = [file for room in ("service", "worker", "api", "graspd") for file in (root / room).rglob("*.py")]
     assert [str(file) for file in files if re.search(r"""["']rq:""", file.read_text())] == []

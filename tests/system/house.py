@@ -12,7 +12,7 @@ from pathlib import Path
 
 from service.model.states import State
 from service.pipeline.backends import Services
-from service.queue.address import redis_url
+from service.queue.connection import redis_url
 from service.queue.rq_queue import RqQueue
 from service.run.embedded import server_command
 from service.settings import Settings

@@ -14,9 +14,9 @@ from service.model import names
 from service.model.errors import QueueUnavailable
 from service.model.states import State
 from service.pipeline.datasets import actions
-from service.pipeline.datasets.status import status
 from service.store.manifests import ShardManifest
 from service.store.records import read_record
+from tests.dataset_status import status
 from tests.service.pipeline.datasets.makers import add_asset, wanted
 from tests.system.conftest import System
 

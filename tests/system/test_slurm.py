@@ -16,7 +16,7 @@ from redis.exceptions import AuthenticationError
 from service.model.states import State
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
-from service.queue.address import redis_url
+from service.queue.connection import redis_url
 from service.run.joining import joining
 from service.run.supervisor import Supervisor
 from service.settings import Settings

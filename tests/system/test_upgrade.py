@@ -1,4 +1,4 @@
-"""A rolling upgrade: the service is of the next version, and workers of this and of the next one run side by side."""
+"""A rolling upgrade: the service is of the next version, and workers of 0.2 and of the next one run side by side."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from service.model.ability import UNTOLD_REVISIONS
 from service.model.states import State
 from service.model.version import STAGE_REVISIONS
 from service.pipeline import job_actions
@@ -19,12 +18,11 @@ from tests.conftest import REPOSITORY
 from tests.fakes import request
 from tests.system.house import House
 
-#: The last commit whose workers do not say what they can do.
-PREVIOUS = "5ac0e5f"
+#: The commit of graspd 0.2.
+PREVIOUS = "55f607e"
 #: Revisions of synthesize that it and the next version make.
-OLD, NEW = UNTOLD_REVISIONS["synthesize"], UNTOLD_REVISIONS["synthesize"] + 1
+OLD, NEW = 23, 24
 MAKES = "from service.model.version import STAGE_REVISIONS; STAGE_REVISIONS['synthesize'] = {};"
-FAKES = "import tests.fakes; tests.fakes.main()"
 
 
 @pytest.fixture
@@ -36,16 +34,16 @@ def house(tmp_path: Path) -> Iterator[House]:
 
 
 def older_worker(house: House, folder: Path) -> None:
-    """A worker of the previous revision from the history; of today's code where there is none."""
+    """A worker of 0.2 from the history; of today's code and the revision of 0.2 where there is none."""
     command = ["git", "archive", "--format=tar", PREVIOUS, "service", "worker", "tests"]
     found = subprocess.run(command, cwd=REPOSITORY, capture_output=True, check=False)
     if found.returncode == 0:
         with tarfile.open(fileobj=io.BytesIO(found.stdout)) as archive:
             archive.extractall(folder, filter="data")
-        # -P: not the code of the folder that the tests run in.
-        house.start("older", sys.executable, "-P", "-m", "tests.fakes", PYTHONPATH=str(folder))
+        # Neither it nor its children run the code of the folder that the tests run in.
+        house.start("older", sys.executable, "-m", "tests.fakes", PYTHONPATH=str(folder), PYTHONSAFEPATH="1")
     else:
-        house.start("older", sys.executable, "-c", MAKES.format(OLD) + FAKES)
+        house.start("older", sys.executable, "-m", "tests.fakes", FAKE_REVISION=str(OLD))
 
 
 @pytest.mark.slow
@@ -79,7 +77,7 @@ def test_each_version_of_worker_takes_what_it_can_and_the_controller_holds_back_
     assert [task.attempt for task in tasks] == [1] * 3
     assert all("held back" in str(task.message) for task in tasks)
 
-    house.start("next", sys.executable, "-c", MAKES.format(NEW) + FAKES)
+    house.start("next", sys.executable, "-m", "tests.fakes", FAKE_REVISION=str(NEW))
     late = submit(3, revision=OLD)
     house.until(lambda: state(after) is State.SUCCEEDED, "the next version's worker does what was planned for it")
     house.until(lambda: state(late) is State.SUCCEEDED, "the older one still does what is left for it")

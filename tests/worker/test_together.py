@@ -17,8 +17,7 @@ from worker.files.synthesis import synthesized
 from worker.hands.load import hand_from_path
 from worker.meeting import Meeting
 from worker.objects.prepare import object_from_path
-from worker.pool.modules import MODULES
-from worker.pool.pool import Pool
+from worker.pool.pool import MODULES, Pool
 from worker.run import Run
 from worker.together import certified_batches, distinct_batches
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import socket
+import sys
+import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -67,13 +70,37 @@ def worker(
 
 def _run_several(count: int, settings: Settings, stages: str | None) -> None:
     from service.run.commands import stop_on_signals
-    from worker.process.several import run_workers
 
     _parse_stages(stages)
     arguments = ["worker", "--device", settings.device, "--threads", str(settings.threads)]
     arguments += ["--join", settings.join, "--processes", str(settings.processes)]
     arguments += ["--data-dir", str(settings.data_dir), *(("--stages", stages) if stages else ())]
     run_workers(count, arguments, settings, stop_on_signals())
+
+
+def run_workers(
+    count: int,
+    arguments: Sequence[str],
+    settings: Settings,
+    stop: threading.Event,
+    *,
+    program: Sequence[str] = (sys.executable, "-m", "graspd"),
+) -> None:
+    """Keep `count` processes alive until told to stop; number k of them takes the k-th GPU, see `worker.engines.gpus`.
+
+    Args:
+        arguments: command line of each; their settings come from the environment as well.
+        settings: how long a worker may take to stop.
+        stop: set by whoever ends it all.
+    """
+    from service.run.children import Child, keep_alive, stop_children
+
+    of_each = [{"GRASPD_WORKER_NUMBER": str(number), "GRASPD_WORKERS_HERE": str(count)} for number in range(count)]
+    children = [Child(f"worker-{number}", (*program, *arguments), own, None) for number, own in enumerate(of_each)]
+    try:
+        keep_alive(children, stop)
+    finally:
+        stop_children(children, settings.stop_grace_s)
 
 
 def check_worker(settings: Settings) -> None:

@@ -33,9 +33,7 @@ from worker.objects.matter import as_asked
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import planner
-from worker.pool.modules import MODULES
-from worker.pool.pool import Pool
-from worker.pool.size import processes_at_once
+from worker.pool.pool import MODULES, Pool, processes_at_once
 from worker.quality.referee.limit import Limit
 from worker.run import FirstJudge, Progress, Run
 from worker.scenes.beside import scenes_of

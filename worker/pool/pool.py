@@ -2,7 +2,8 @@
 
 Threads share Python's lock: what holds it for a tenth of its time does not fill 16 cores. Processes are fresh ones and
 not forks: a CUDA context and the threads of an engine outlive no fork. They end with the process that started them,
-however it ends, for their socket closes with it.
+however it ends, for their pipe closes with it. The library's `ProcessPoolExecutor` would import the program of whoever
+calls `graspd.synthesize` once more in each of them.
 """
 
 from __future__ import annotations
@@ -10,26 +11,35 @@ from __future__ import annotations
 import logging
 import os
 import pickle
+import queue
 import subprocess
 import sys
 import threading
 import time
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from types import TracebackType
+from pathlib import Path
 from typing import Any, Final
 
+from service.model.cores import ROOT, available_cores, available_memory
 from service.model.errors import GraspdError, TaskCancelled
 from worker.pool.child import Order
 
 log = logging.getLogger(__name__)
+#: Modules whose work the processes do for a worker; named and not imported: a worker is there before its engine is.
+MODULES: Final = ("worker.quality.referee.judge", "worker.quality.table")
 #: What each process keeps of things that pieces of work share: two for a pair that is judged and measured.
 KEPT: Final = 8
+#: Memory that a process takes at the most, with the models of the pairs that it keeps [bytes]; see docs/performance.md.
+BYTES_PER_PROCESS: Final = 400 * 2**20
+#: Share of the machine's memory for them.
+MEMORY_SHARE: Final = 0.25
 #: Pause between two looks at whether to stop [s].
 _LOOK_S: Final = 0.1
 #: A process that goes on for so long with what nobody wants any more is ended [s].
@@ -45,30 +55,19 @@ class ProcessLost(GraspdError):
 
 
 @dataclass(eq=False)
-class _Asked:
+class _Request:
     """What one caller waits for."""
 
     work: Callable[[Any, Any], Any]
     key: str
     shared: Any
-    results: list[Any]
     done: Callable[[int], None]
-    left: int
-    error: Exception | None = None
     dropped_at: float | None = None
-    """When it was given up."""
-    ended: threading.Event = field(default_factory=threading.Event)
+    """When nobody waited for it any more."""
 
     @cached_property
     def pickled(self) -> bytes:
         return pickle.dumps(self.shared)
-
-
-@dataclass(frozen=True, eq=False)
-class _Piece:
-    asked: _Asked
-    number: int
-    part: Any
 
 
 class Pool:
@@ -76,18 +75,17 @@ class Pool:
 
     def __init__(self, processes: int, modules: Sequence[str] = ()) -> None:
         """`modules` are imported by each process while it waits for its first piece of work."""
-        self.processes, self._modules = processes, tuple(modules)
-        self._changed = threading.Condition()
-        self._waiting: deque[_Piece] = deque()
-        self._places: list[_Place] = []
-        self._closed = False
+        self.processes = processes
+        self._places = [_Place(modules) for _ in range(processes)]
+        self._idle: queue.SimpleQueue[_Place] = queue.SimpleQueue()
+        self._threads = ThreadPoolExecutor(processes, thread_name_prefix="pool")
+        self._changing = threading.Lock()
+        self._started = self._closed = False
 
     def __enter__(self) -> Pool:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @property
@@ -96,12 +94,13 @@ class Pool:
         return [place.process.pid for place in self._places if place.process is not None]
 
     def start(self) -> None:
-        """Begin to start the processes, if that was not done."""
-        with self._changed:
-            while not self._closed and len(self._places) < self.processes:
-                place = _Place(self._modules)
-                self._places.append(place)
-                threading.Thread(target=self._serve, args=(place,), name="pool", daemon=True).start()
+        """Start the processes, if that was not done."""
+        with self._changing:
+            for place in self._places if not (self._started or self._closed) else ():
+                with suppress(OSError):  # it is told to whoever needs the process
+                    place.start()
+                self._idle.put(place)
+            self._started = True
 
     def map(
         self,
@@ -126,67 +125,47 @@ class Pool:
         Raises:
             ProcessLost: a process ended over a part.
             TaskCancelled: `cancelled` answered True, or the pool was closed.
-            Exception: what the first part to fail raised; the others are given up.
+            Exception: what a part raised; the others are given up.
         """
-        if not parts:
-            return []
         self.start()
-        asked = _Asked(work, key, shared, [None] * len(parts), done, len(parts))
-        with self._changed:
-            self._waiting.extend(_Piece(asked, number, part) for number, part in enumerate(parts))
-            self._changed.notify_all()
-        while not asked.ended.wait(_LOOK_S):
-            if cancelled() or self._closed:
-                self._drop(asked)
-                raise TaskCancelled("stopped while other processes worked for it")
-        if asked.error is not None:
-            self._drop(asked)
-            raise asked.error
-        return asked.results
+        request = _Request(work, key, shared, done)
+        with self._changing:
+            wanted = () if self._closed else enumerate(parts)
+            futures = [self._threads.submit(self._do, request, number, part) for number, part in wanted]
+        try:
+            while True:
+                _, left = wait(futures, _LOOK_S, FIRST_EXCEPTION)
+                if self._closed or (left and cancelled()):
+                    raise TaskCancelled("stopped while other processes worked for it")
+                for future in futures:
+                    if future.done() and (error := future.exception()) is not None:
+                        raise error
+                if not left:
+                    return [future.result() for future in futures]
+        finally:
+            request.dropped_at = time.monotonic()
+            for future in futures:
+                future.cancel()
 
     def close(self) -> None:
         """End all processes; who waits for work is told that it was cancelled."""
-        with self._changed:
+        with self._changing:
             self._closed = True
-            self._changed.notify_all()
+        self._threads.shutdown(wait=False, cancel_futures=True)
         for place in self._places:
             place.end()
 
-    def _drop(self, asked: _Asked) -> None:
-        with self._changed:
-            asked.dropped_at = time.monotonic()
-            self._waiting = deque(piece for piece in self._waiting if piece.asked is not asked)
-
-    def _serve(self, place: _Place) -> None:
-        with suppress(OSError):  # it is told to whoever needs the process
-            place.start()
-        while True:
-            with self._changed:
-                while not self._closed and not self._waiting:
-                    self._changed.wait()
-                if self._closed:
-                    break
-                piece = self._waiting.popleft()
-            try:
-                self._end(piece, place.do(piece))
-            except Exception as error:
-                self._fail(piece.asked, error)
-        place.end()
-
-    def _end(self, piece: _Piece, result: Any) -> None:
-        asked = piece.asked
-        if asked.dropped_at is None:
-            asked.done(piece.number)
-        with self._changed:
-            asked.results[piece.number] = result
-            asked.left -= 1
-            if not asked.left:
-                asked.ended.set()
-
-    def _fail(self, asked: _Asked, error: Exception) -> None:
-        with self._changed:
-            asked.error = asked.error or error
-            asked.ended.set()
+    def _do(self, request: _Request, number: int, part: Any) -> Any:
+        place = self._idle.get()
+        try:
+            made = place.do(request, part)
+        finally:
+            self._idle.put(place)
+            if self._closed:
+                place.end()
+        if request.dropped_at is None:
+            request.done(number)
+        return made
 
 
 class _Place:
@@ -201,27 +180,22 @@ class _Place:
     def start(self) -> None:
         """A fresh process. Raises OSError."""
         self._kept.clear()
-        self._connection, theirs = Pipe()
-        with theirs:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "worker.pool.child", str(theirs.fileno()), *self._modules],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                pass_fds=(theirs.fileno(),),
-                env={**os.environ, **_NO_GPU},
-                start_new_session=True,  # Ctrl-C in the terminal is for the parent alone
-            )
+        self._connection, self.process = start_child(
+            [sys.executable, "-m", "worker.pool.child", *self._modules],
+            stdout=subprocess.DEVNULL,
+            env={**os.environ, **_NO_GPU},
+        )
 
-    def do(self, piece: _Piece) -> Any:
+    def do(self, request: _Request, part: Any) -> Any:
         """The result of a piece of work; raises ProcessLost, or what the work raised."""
         try:
             if self._is_gone():
                 self._stop()
                 self.start()
             assert self._connection is not None
-            self._connection.send_bytes(pickle.dumps(self._order(piece)))
+            self._connection.send_bytes(pickle.dumps(self._order(request, part)))
             while not self._connection.poll(_LOOK_S):
-                if (since := piece.asked.dropped_at) is not None and time.monotonic() - since > _PATIENCE_S:
+                if (since := request.dropped_at) is not None and time.monotonic() - since > _PATIENCE_S:
                     log.warning("a process does not end what was given up; it is killed")
                     self._stop()
                     raise TaskCancelled("stopped")
@@ -241,30 +215,66 @@ class _Place:
             return True
         return self._connection.poll()
 
-    def _order(self, piece: _Piece) -> Order:
-        asked, forget = piece.asked, list[str]()
-        known = asked.key in self._kept
-        self._kept[asked.key] = None
-        self._kept.move_to_end(asked.key)
+    def _order(self, request: _Request, part: Any) -> Order:
+        forget = list[str]()
+        known = request.key in self._kept
+        self._kept[request.key] = None
+        self._kept.move_to_end(request.key)
         while len(self._kept) > KEPT:
             forget.append(self._kept.popitem(last=False)[0])
-        return Order(asked.work, asked.key, None if known else asked.pickled, tuple(forget), piece.part)
+        return Order(request.work, request.key, None if known else request.pickled, tuple(forget), part)
 
     def _stop(self) -> str:
         """End the process if it runs; how it ended."""
         process, self.process = self.process, None
         if self._connection is not None:
             self._connection.close()
-        if process is None:
-            return "it could not be started"
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(_LOOK_S)
-        process.kill()
-        code = process.wait()
-        return f"signal {-code}" if code < 0 else f"exit code {code}"
+        return "it could not be started" if process is None else end_child(process, _LOOK_S)
 
     def end(self) -> None:
         """Kill the process, if there is one: it holds nothing that could be lost."""
         if (process := self.process) is not None:
-            process.kill()
-            process.wait()
+            end_child(process, 0.0)
+
+
+def start_child(command: Sequence[str], **options: Any) -> tuple[Connection, subprocess.Popen[bytes]]:
+    """A fresh process and a pipe to it, whose other end is the last argument of its command line. Raises OSError."""
+    ours, theirs = Pipe()
+    with theirs:
+        process = subprocess.Popen(
+            [*command, str(theirs.fileno())],
+            stdin=subprocess.DEVNULL,
+            pass_fds=(theirs.fileno(),),
+            start_new_session=True,  # Ctrl-C in the terminal is for the parent alone
+            **options,
+        )
+    return ours, process
+
+
+def end_child(process: subprocess.Popen[bytes], patience_s: float) -> str:
+    """How a process ended; one that has not after so long is killed [s]."""
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(patience_s)
+    process.kill()
+    code = process.wait()
+    return f"signal {-code}" if code < 0 else f"exit code {code}"
+
+
+def processes_at_once(device: str, wanted: int, *, threads: int = 0, workers: int = 1, root: Path = ROOT) -> int:
+    """Processes that judge and measure; 1: the worker's own, with threads.
+
+    Where nobody says, a worker on a GPU has one for each core but its own, as far as a quarter of the memory goes. On a
+    CPU the planner takes the same cores at other times, and threads do.
+
+    Args:
+        device: Warp device of the planner.
+        wanted: so many; 0: nobody says.
+        threads: CPU threads of the worker; 0: one for each core.
+        workers: of this machine, which share its cores and its memory.
+        root: the folder that holds `proc` and `sys`.
+    """
+    if wanted or not device.startswith("cuda"):
+        return wanted or 1
+    room = int(MEMORY_SHARE * available_memory(root) / workers / BYTES_PER_PROCESS)
+    cores = min(threads or available_cores(root), max(1, available_cores(root) // workers))
+    return max(1, min(cores - 1, room))

@@ -8,13 +8,13 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from service.model.states import Stage
+from worker.pool.pool import end_child, start_child
 from worker.stages.context import StopReason
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class Link:
         try:
             return self._connection.recv() if self._connection.poll(wait_s) else None
         except (EOFError, OSError):
-            raise EngineLost(f"the engine ended ({self._code()})") from None
+            raise EngineLost(f"the engine ended ({self._end()})") from None
 
     @property
     def is_stopped(self) -> bool:
@@ -72,20 +72,11 @@ class Link:
     def close(self) -> None:
         """End the engine: in good order if it does so soon."""
         self.say("end", StopReason.SHUTDOWN)
-        if self._process is not None:
-            with suppress(subprocess.TimeoutExpired):
-                self._process.wait(_END_S)
-            self._process.kill()
-            self._process.wait()
+        self._end()
         self._connection.close()
 
-    def _code(self) -> str:
-        if self._process is None:
-            return "its thread broke off"
-        with suppress(subprocess.TimeoutExpired):
-            code = self._process.wait(_END_S)
-            return f"signal {-code}" if code < 0 else f"exit code {code}"
-        return "it does not say why"
+    def _end(self) -> str:
+        return "its thread broke off" if self._process is None else end_child(self._process, _END_S)
 
 
 StartEngine = Callable[[Setup], Link]
@@ -98,14 +89,7 @@ def start_engine(setup: Setup, program: Sequence[str] = (sys.executable, "-m", "
 
     Call it from the main thread: the kernel ties a child to the thread that starts it.
     """
-    ours, theirs = Pipe()
-    with theirs:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "service.run.launch", str(os.getpid()), *program, str(theirs.fileno())],
-            stdin=subprocess.DEVNULL,
-            pass_fds=(theirs.fileno(),),
-            start_new_session=True,  # Ctrl-C in the terminal is for the worker alone
-        )
+    ours, process = start_child([sys.executable, "-m", "service.run.launch", str(os.getpid()), *program])
     link = Link(ours, process)
     # The values alone: the library that reads settings takes 8 MiB of a process.
     values: Any = SimpleNamespace(**dict(setup.settings), resolved_store_url=setup.settings.resolved_store_url)

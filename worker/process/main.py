@@ -34,7 +34,7 @@ from service.model.states import Stage
 from service.model.version import PACKAGE_VERSION
 from service.model.worker_beat import WorkerBeat
 from service.queue import allowed
-from service.queue.address import redis_url
+from service.queue.connection import redis_url
 from service.queue.lists import queue_names
 from service.queue.port import Event
 from service.queue.rq_queue import RqQueue, lease_state, open_queue, renew_lease
@@ -166,7 +166,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             self._publish(about)
         else:
             with suppress(QueueUnavailable):
-                self._engine.say("report every", self._queue.report(*about))
+                self._queue.report(*about)
 
     def _publish(self, event: Event) -> None:
         try:

@@ -5,18 +5,18 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 from service.model.errors import TaskCancelled
-from worker.pool.pool import Pool
-from worker.run import FirstJudge, Run
+from worker.run import ALONE, Run
 
 if TYPE_CHECKING:
     from service.store.store import Store
 
-#: Pause between two reports where nobody asks for another [s]: enough for a smooth bar.
-_REPORT_EVERY_S: Final = 0.25
+#: Least time between two reports [s]: as often as the controller passes them on.
+REPORT_EVERY_S: Final = 0.5
 
 
 class StopReason(StrEnum):
@@ -34,22 +34,15 @@ class TaskContext:
     def __init__(
         self,
         store: Store,
+        run: Run = ALONE,
         *,
-        device: str = "cpu",
-        threads: int = 0,
-        first_judge: FirstJudge = "auto",
-        pool: Pool | None = None,
         join: int = 1,
-        tell: Callable[[float, float, str], float | None] | None = None,
+        tell: Callable[[float, float, str], None] | None = None,
     ) -> None:
-        """`join` is how many batches one launch plans; `tell` takes done, total and a message, and may answer when it
-        wants to hear more [s]."""
-        self.store = store
-        self.device = device
-        self.threads = threads
-        self.first_judge: FirstJudge = first_judge
-        self.pool = pool
-        self.join = join
+        """`join` is how many batches one launch plans; `tell` takes done, total and a message."""
+        self.store, self.device, self.join = store, run.device, join
+        self.run = replace(run, progress=self.progress, cancelled=self.cancelled)
+        """What the engine room needs to know of the task."""
         self._tell = tell
         self._tell_again = 0.0
         self._stop = threading.Event()
@@ -59,15 +52,8 @@ class TaskContext:
         """Say how far the task is; most calls are dropped so that few are sent."""
         now = time.monotonic()
         if self._tell is not None and now >= self._tell_again:
-            self._tell_again = now + _REPORT_EVERY_S
-            self._tell_again = now + (self._tell(done, total, message) or _REPORT_EVERY_S)
-
-    @property
-    def run(self) -> Run:
-        """What the engine room needs to know of the task."""
-        return Run(
-            self.device, self.threads, self.progress, self.cancelled, first_judge=self.first_judge, pool=self.pool
-        )
+            self._tell_again = now + REPORT_EVERY_S
+            self._tell(done, total, message)
 
     def cancelled(self) -> bool:
         """Whether to stop at the next launch."""

@@ -19,7 +19,6 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.index.database import connect_postgres
 from service.model.errors import GraspdError
 from service.model.finding import Finding, bad, good, skipped, warning
-from service.queue.rates import beat_every_s
 from service.queue.rq_queue import open_queue
 from service.run.doctor.machine import local_store
 from service.run.doctor.redis_server import connection, is_there
@@ -60,7 +59,7 @@ def _offsets(settings: Settings) -> Iterator[tuple[str, float]]:
         with suppress(GraspdError), closing(open_queue(settings, patience=0)) as queue:
             beats = queue.workers()
             # A beat that was given just now and one that is due are as good: what lies outside is the clock.
-            due = beat_every_s(len(beats), settings.lease_s) + settings.lease_s
+            due = 4 / 3 * settings.lease_s
             ages = {beat.host: _now() - _seconds(beat.seen) for beat in beats}
             yield from ((host, -age if age < 0 else min(0.0, due - age)) for host, age in ages.items())
     if settings.index_url is not None and make_url(settings.resolved_index_url).get_backend_name() == "postgresql":

@@ -18,7 +18,7 @@ from packaging.specifiers import SpecifierSet
 from packaging.version import Version
 
 from service import user_cache
-from service.model.cores import available_cores, memory_limits
+from service.model.cores import available_cores, available_memory
 from service.model.finding import Finding, bad, good, warning
 from service.model.version import PACKAGE_VERSION
 from service.settings import Settings
@@ -205,8 +205,7 @@ def limits(*, files: int | None = None, memory: int | None = None) -> Finding:
     name = "limits"
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[0] if files is None else files
     files = 2**31 if files == resource.RLIM_INFINITY else files
-    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    memory = min([whole, *memory_limits()]) if memory is None else memory
+    memory = available_memory() if memory is None else memory
     line = f"{available_cores()} cores, {memory / _GIB:.1f} GiB of memory, {files} open files"
     if memory < _MEMORY_LOW:
         return warning(name, f"{line}: a worker takes up to 2 GiB", "give the container, job or machine more memory")

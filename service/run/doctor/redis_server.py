@@ -14,8 +14,7 @@ from redis.exceptions import RedisError
 
 from service.model.errors import QueueUnavailable
 from service.model.finding import Finding, bad, good, skipped, warning
-from service.queue.address import redis_url, socket_path
-from service.queue.connection import connect
+from service.queue.connection import connect, redis_url, socket_path
 from service.run.embedded import find_server
 from service.settings import Settings
 

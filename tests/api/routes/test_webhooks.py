@@ -8,6 +8,7 @@ import json
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import wait
 from typing import Any
 
 import pytest
@@ -53,7 +54,13 @@ class Ear:
 
     def round(self, later_s: float = 0.0) -> int:
         self.dispatcher.tell_datasets()
-        return self.dispatcher.deliver(now=time.time() + later_s)
+        return self.deliver(now=time.time() + later_s)
+
+    def deliver(self, *, now: float | None = None) -> int:
+        """Starts deliveries and waits for their ends; how many were tried."""
+        started = self.dispatcher.start_deliveries(now=now)
+        wait(started)
+        return len(started)
 
 
 @pytest.fixture
@@ -120,8 +127,8 @@ def test_what_is_not_taken_is_tried_again_with_longer_waits_and_then_given_up(
     end_a_job(services)
     ear.answer = Answer(500, "answered 500")
     assert ear.round() == 1 and ear.round() == 0
-    for wait in WAITS_S:
-        assert ear.round(wait + 1) == 1
+    for pause in WAITS_S:
+        assert ear.round(pause + 1) == 1
     assert ear.round(10 * WAITS_S[-1]) == 0
     (log,) = http.get(f"/v1/webhooks/{hook['id']}/deliveries").json()
     assert (log["state"], log["attempts"], log["status"]) == ("failed", len(WAITS_S) + 1, 500)
@@ -277,7 +284,7 @@ def test_a_burst_of_ends_is_told_without_a_pause_between_them(
     hooks(services, 1, "a", "good")
     for number in range(20):
         end_jobs_of(services, "a", str(number))
-    ear.dispatcher.deliver()
+    ear.deliver()
     thread = threading.Thread(target=ear.dispatcher.run)
     thread.start()
     try:
@@ -306,7 +313,7 @@ def test_addresses_that_failed_leave_half_of_the_room_to_the_others(services: Se
     hooks(services, AT_ONCE, "a", "dead")
     end_jobs_of(services, "a")
     ear.let_go.set()
-    assert ear.dispatcher.deliver() == AT_ONCE
+    assert ear.deliver() == AT_ONCE
     ear.let_go.clear()
     try:
         started = ear.dispatcher.start_deliveries(now=time.time() + WAITS_S[0] + 1)

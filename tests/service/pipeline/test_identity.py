@@ -12,14 +12,14 @@ from service.model.errors import BusyError
 from service.pipeline.backends import Services
 from service.pipeline.controller import Controller
 from service.pipeline.identity import check_queue, identify, service_ids
-from service.queue.port import TaskQueue
+from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from service.store.store import Store, open_store
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 
 
-def service(folder: Path, *, store: Store | None = None, queue: TaskQueue | None = None, **more: str) -> Services:
+def service(folder: Path, *, store: Store | None = None, queue: RqQueue | None = None, **more: str) -> Services:
     """A service with an index of its own; store and Redis may be shared."""
     if store is not None:
         more["store_url"] = store.url

@@ -23,6 +23,7 @@ from tests.damage import cut, flip, overwrite, remove
 from tests.fakes import fake_stages, request
 from tests.service.pipeline.on_store import parts_on
 from worker.process.runner import Runner
+from worker.run import Run
 from worker.stages.context import TaskContext
 
 SHARDS = 6
@@ -53,7 +54,7 @@ def work_off(services: Services, *, device: str = "cpu", seed: int = 0) -> list[
         # The name of a device is all that these stages see of it.
         runner = Runner(fake_stages(), worker="w", publish=services.queue.publish, check_device=lambda device: None)
         raw = delivery.message.model_dump(mode="json", by_alias=True)
-        outcome = runner.run(raw, TaskContext(services.store, device=device))
+        outcome = runner.run(raw, TaskContext(services.store, Run(device)))
         services.queue.finish(delivery)  # type: ignore[attr-defined]
         assert outcome is not None
         services.queue.publish(outcome)

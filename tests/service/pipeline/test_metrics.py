@@ -18,8 +18,7 @@ from service.model.messages import TaskMessage
 from service.model.states import Lane, Stage, State
 from service.pipeline.backends import Services
 from service.pipeline.job_actions import submit
-from service.pipeline.series import SERIES
-from service.pipeline.tally import MOST_KINDS, OTHER_KIND, Tally, parse_field
+from service.pipeline.metrics import MOST_KINDS, OTHER_KIND, SERIES, Tally, parse_field
 from service.queue.rq_queue import WORKERS, RqQueue, worker_key
 from tests.conftest import REPOSITORY
 from tests.fakes import make_shard, message_for, request
@@ -102,8 +101,8 @@ def test_depth_age_and_workers_are_told_from_redis(rq_queue: RqQueue) -> None:
     assert found.depth[place] == 2
     assert 0 <= found.oldest_s[place] < 60
     assert set(found.workers) == {"w1"}
-    assert found.workers["w1"].state == "busy"
-    assert 200.0 <= found.workers["w1"].lease_age_s < 400.0
+    assert found.workers["w1"][0].state == "busy"
+    assert 200.0 <= found.workers["w1"][1] < 400.0
 
 
 def test_the_cost_of_a_look_does_not_grow_with_the_queue(rq_queue: RqQueue) -> None:
@@ -131,7 +130,7 @@ def test_forged_entries_in_redis_do_not_break_the_metrics(rq_queue: RqQueue) -> 
 
 def test_sums_outlive_the_process_that_counts(rq_queue: RqQueue) -> None:
     for _ in range(2):
-        tally = Tally(rq_queue)
+        tally = Tally(rq_queue.count)
         tally.ended(State.SUCCEEDED)
         tally.flush()
         tally.flush()
@@ -140,7 +139,7 @@ def test_sums_outlive_the_process_that_counts(rq_queue: RqQueue) -> None:
 
 def test_a_shard_counts_its_grasps_and_its_seconds(services: Services) -> None:
     sums = Sums()
-    tally = Tally(sums)
+    tally = Tally(sums.count)
     manifest = make_shard(services.store, message_for())
     tally.made([manifest])
     tally.flush()
@@ -152,7 +151,7 @@ def test_a_shard_counts_its_grasps_and_its_seconds(services: Services) -> None:
 
 def test_error_names_cannot_become_series_without_end() -> None:
     sums = Sums()
-    tally = Tally(sums)
+    tally = Tally(sums.count)
     for number in range(3 * MOST_KINDS):
         tally.failed("scene", f"Error{number}")
     tally.flush()

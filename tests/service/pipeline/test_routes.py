@@ -14,7 +14,7 @@ from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
 from service.pipeline.routes import Place, Routes
 from service.queue import entries
-from service.queue.lists import is_apart, known_lists, queue_name, queue_names
+from service.queue.lists import known_lists, queue_name, queue_names
 from service.queue.rq_queue import RqQueue
 from tests.fakes import message_for, request
 
@@ -24,15 +24,14 @@ NEED = Need(Stage.SYNTHESIZE, OWN.schemas[0], OWN.schemas[1], REVISION)
 
 
 def beat(
-    *, schemas: tuple[int, int] | None = OWN.schemas, revision: int = REVISION, stage: Stage = Stage.SYNTHESIZE
+    *, schemas: tuple[int, int] = OWN.schemas, revision: int = REVISION, stage: Stage = Stage.SYNTHESIZE
 ) -> WorkerBeat:
     now = "2026-01-01T00:00:00.000Z"
-    revisions = {**OWN.revisions, "synthesize": revision} if schemas else {}
+    revisions = {**OWN.revisions, "synthesize": revision}
     return WorkerBeat("w", "h", 1, "cpu", "CPU", (stage,), "0", "idle", "", now, now, "", schemas, revisions)
 
 
 NEXT = beat(revision=REVISION + 1)
-UNTOLD = beat(schemas=None)
 
 
 @pytest.mark.parametrize(
@@ -45,9 +44,6 @@ UNTOLD = beat(schemas=None)
         ([beat(), beat(schemas=(9, 9))], NEED, Place(apart=True)),
         ([beat(schemas=(2, 9)), beat(schemas=(2, 2))], replace(NEED, schema=3, newest=9), Place(apart=True)),
         ([beat(schemas=(4, 9))], replace(NEED, schema=2, newest=5), Place()),
-        # One that does not say what it can looks only where everybody does.
-        ([UNTOLD, NEXT], replace(NEED, revision=10), Place()),
-        ([UNTOLD, NEXT], replace(NEED, revision=REVISION + 1), Place(apart=True)),
     ],
 )  # fmt: skip
 def test_a_task_goes_where_those_look_who_can_do_it(present: list[WorkerBeat], need: Need, place: Place) -> None:
@@ -59,7 +55,7 @@ def test_a_task_goes_where_those_look_who_can_do_it(present: list[WorkerBeat], n
     [
         ([NEXT], NEED, f"revision {REVISION} of synthesize is needed, and revision {REVISION + 1} is made"),
         ([], replace(NEED, revision=1), "revision 1 of synthesize is needed"),
-        ([UNTOLD], replace(NEED, schema=3, newest=3), "schema 3 of tasks is needed, and 2 is the newest known"),
+        ([beat(schemas=(2, 2))], replace(NEED, schema=3, newest=3), "schema 3 of tasks is needed, and 2 is the newest"),
         ([beat(schemas=(5, 6))], replace(NEED, newest=4), "schema 4 of tasks is the newest it may have"),
     ],
 )  # fmt: skip
@@ -75,20 +71,19 @@ def test_a_task_asks_for_the_schema_of_the_newest_field_that_it_uses() -> None:
     assert isinstance(request(), JobRequest)
 
 
-def test_a_beat_without_abilities_is_one_of_the_version_before_they_were_told() -> None:
+def test_a_worker_that_does_not_say_what_it_can_is_given_no_task() -> None:
     told = asdict(beat())
-    assert entries.beat(json.dumps(told).encode()) == beat()
+    assert entries.read(WorkerBeat, json.dumps(told).encode()) == beat()
     for name in ("schemas", "revisions"):
         del told[name]
-    old = entries.beat(json.dumps(told).encode())
-    assert old is not None and not old.ability.looks_apart and old.ability.schemas == (2, 2)
+    old = entries.read(WorkerBeat, json.dumps(told).encode())
+    assert old is not None and Routes([old]).place(NEED).held
 
 
 def test_a_worker_looks_apart_only_for_what_it_can_do() -> None:
     names = queue_names([Stage.SYNTHESIZE], ability=OWN)
     apart = [f"interactive-synthesize.{schema}.{REVISION}" for schema in range(FIRST_SCHEMA, OWN.schemas[1] + 1)]
     assert names[: len(apart) + 1] == [*apart, "interactive-synthesize"]
-    assert not any(is_apart(name) for name in queue_names([Stage.SYNTHESIZE], ability=UNTOLD.ability))
 
 
 def test_tasks_that_wait_apart_are_seen_and_leave_with_those_who_take_them(rq_queue: RqQueue) -> None:

@@ -12,7 +12,7 @@ from service.model.errors import SceneError
 from service.model.states import AssetKind
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
-from service.pipeline.scene_check import check_scene
+from service.pipeline.job_actions import check_scene
 from service.store.library import load_asset
 from tests.fakes import request
 

@@ -26,8 +26,7 @@ from service.pipeline import job_actions
 from service.pipeline.backends import Services
 from service.pipeline.indexer import Indexer
 from service.pipeline.lease_reaper import LeaseReaper
-from service.queue.lists import queue_name
-from service.queue.rq_keys import held_key
+from service.queue.lists import held_key, queue_name
 from service.queue.rq_queue import RqQueue, cancel_key, rq_id
 from tests.conftest import REPOSITORY
 from tests.fakes import request

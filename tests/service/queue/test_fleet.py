@@ -8,9 +8,7 @@ from service.model.clock import timestamp
 from service.model.states import Lane, Stage
 from service.queue.lists import queue_name
 from service.queue.port import Event, EventKind, Report
-from service.queue.rates import beat_every_s, report_every_s
-from service.queue.reports import REPORTS
-from service.queue.rq_queue import RqQueue
+from service.queue.rq_queue import REPORTS, RqQueue
 from tests.fakes import message_for
 from tests.memory_queue import MemoryQueue
 
@@ -67,20 +65,6 @@ def test_a_report_replaces_the_last_one_and_goes_with_the_attempt(queue: MemoryQ
 def test_a_report_that_cannot_be_read_says_nothing(rq_queue: RqQueue, data: bytes) -> None:
     rq_queue.connection.hset(REPORTS, "a", data)
     assert rq_queue.reports() == {"a": Report()}
-
-
-@pytest.mark.parametrize("workers", [1, 64, 512, 4096, 100_000])
-def test_reports_and_beats_of_all_workers_stay_within_what_is_served(workers: int) -> None:
-    assert workers / report_every_s(workers) <= 500.0
-    assert report_every_s(1) <= 0.25, "one worker fills a smooth bar"
-    assert beat_every_s(workers, lease_s=6.0) <= 2.0, "three beats fit a lease, whatever the fleet"
-    assert beat_every_s(4096, lease_s=20.0) > beat_every_s(64, lease_s=20.0)
-
-
-def test_a_worker_learns_from_redis_when_to_report_again(rq_queue: RqQueue) -> None:
-    assert rq_queue.report("a", Report()) == 0.25
-    rq_queue.connection.sadd("graspd:workers", *map(str, range(4096)))
-    assert rq_queue.report("a", Report()) > 8.0
 
 
 def test_unreadable_events_stay_nobodys_work(rq_queue: RqQueue) -> None:

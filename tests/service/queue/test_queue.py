@@ -16,7 +16,7 @@ from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
 from service.queue.lists import queue_names
-from service.queue.port import BULK_EVERY, Counters, Event, EventKind, Holder, TaskQueue
+from service.queue.port import BULK_EVERY, Event, EventKind
 from service.queue.rq_queue import LEAD, RqQueue, lease_state, list_worker, renew_lease, worker_key
 from tests.fakes import request
 from tests.memory_queue import MemoryQueue
@@ -129,7 +129,7 @@ def beat_of(name: str) -> WorkerBeat:
 
 
 @pytest.fixture(params=["memory", "redis"])
-def sides(request: pytest.FixtureRequest) -> tuple[TaskQueue, Worker]:
+def sides(request: pytest.FixtureRequest) -> tuple[RqQueue, Worker]:
     """A queue and a worker's side of it."""
     if request.param == "memory":
         queue = MemoryQueue()
@@ -139,7 +139,7 @@ def sides(request: pytest.FixtureRequest) -> tuple[TaskQueue, Worker]:
     return redis, Worker(side.take, side.beat, side.finish)
 
 
-def test_tasks_come_out_as_they_went_in(sides: tuple[TaskQueue, Worker]) -> None:
+def test_tasks_come_out_as_they_went_in(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
     assert queue.enqueue([task("a"), task("b")], Lane.BULK) == 2
     assert queue.waiting() == {"a", "b"}
@@ -149,7 +149,7 @@ def test_tasks_come_out_as_they_went_in(sides: tuple[TaskQueue, Worker]) -> None
     assert worker.take() == task("b")
 
 
-def test_interactive_tasks_go_before_bulk_but_do_not_starve_it(sides: tuple[TaskQueue, Worker]) -> None:
+def test_interactive_tasks_go_before_bulk_but_do_not_starve_it(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
     queue.enqueue([task(f"bulk{i}") for i in range(20)], Lane.BULK)
     queue.enqueue([task(f"urgent{i}") for i in range(20)], Lane.INTERACTIVE)
@@ -162,7 +162,7 @@ def test_interactive_tasks_go_before_bulk_but_do_not_starve_it(sides: tuple[Task
     assert taken == 3 * [*["urgent"] * (BULK_EVERY - 1), "bulk"]
 
 
-def test_bulk_runs_at_full_rate_while_nothing_is_urgent(sides: tuple[TaskQueue, Worker]) -> None:
+def test_bulk_runs_at_full_rate_while_nothing_is_urgent(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
     queue.enqueue([task(f"bulk{i}") for i in range(2 * BULK_EVERY)], Lane.BULK)
     for number in range(2 * BULK_EVERY):
@@ -171,7 +171,7 @@ def test_bulk_runs_at_full_rate_while_nothing_is_urgent(sides: tuple[TaskQueue, 
     assert worker.take() is None
 
 
-def test_a_waiting_task_is_not_queued_twice(sides: tuple[TaskQueue, Worker]) -> None:
+def test_a_waiting_task_is_not_queued_twice(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
     queue.enqueue([task("a")], Lane.BULK)
     assert queue.enqueue([task("a")], Lane.BULK) == 0
@@ -180,26 +180,26 @@ def test_a_waiting_task_is_not_queued_twice(sides: tuple[TaskQueue, Worker]) -> 
     assert worker.take() is None
 
 
-def test_the_next_attempt_of_a_task_is_another_entry(sides: tuple[TaskQueue, Worker]) -> None:
+def test_the_next_attempt_of_a_task_is_another_entry(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
     queue.enqueue([task("a")], Lane.BULK)
     worker.take()
     assert queue.enqueue([task("a", attempt=2)], Lane.BULK) == 1
 
 
-def test_a_lease_says_who_holds_which_attempt_of_what(sides: tuple[TaskQueue, Worker]) -> None:
+def test_a_lease_says_who_holds_which_attempt_of_what(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
     queue.enqueue([task("a", attempt=2)], Lane.BULK)
     worker.take()
     (lease,) = queue.leases()
     assert (lease.task_id, lease.attempt) == ("a", 2)
-    assert queue.holder(lease) == Holder("w", task("a", attempt=2))
+    assert queue.holder(lease) == ("w", task("a", attempt=2))
     assert queue.waiting() == set()
     worker.finish()
     assert queue.leases() == []
 
 
-def test_a_lease_changes_with_each_sign_of_life_and_not_by_reading(sides: tuple[TaskQueue, Worker]) -> None:
+def test_a_lease_changes_with_each_sign_of_life_and_not_by_reading(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
     queue.enqueue([task("a")], Lane.BULK)
     worker.take()
@@ -209,7 +209,7 @@ def test_a_lease_changes_with_each_sign_of_life_and_not_by_reading(sides: tuple[
     assert queue.leases()[0].beat != first
 
 
-def test_a_worker_whose_lease_was_released_notices(sides: tuple[TaskQueue, Worker]) -> None:
+def test_a_worker_whose_lease_was_released_notices(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
     queue.enqueue([task("a")], Lane.BULK)
     worker.take()
@@ -219,7 +219,7 @@ def test_a_worker_whose_lease_was_released_notices(sides: tuple[TaskQueue, Worke
     assert queue.leases() == [], "a late sign of life does not bring the lease back"
 
 
-def test_a_discarded_task_never_starts(sides: tuple[TaskQueue, Worker]) -> None:
+def test_a_discarded_task_never_starts(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
     queue.enqueue([task("a"), task("b")], Lane.BULK)
     queue.discard(["a"])
@@ -227,7 +227,7 @@ def test_a_discarded_task_never_starts(sides: tuple[TaskQueue, Worker]) -> None:
     assert worker.take() == task("b")
 
 
-def test_a_discarded_running_task_is_told_to_stop(sides: tuple[TaskQueue, Worker]) -> None:
+def test_a_discarded_running_task_is_told_to_stop(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
     queue.enqueue([task("a")], Lane.BULK)
     worker.take()
@@ -235,7 +235,7 @@ def test_a_discarded_running_task_is_told_to_stop(sides: tuple[TaskQueue, Worker
     assert worker.beat() is StopReason.CANCELLED
 
 
-def test_a_task_queued_again_after_it_was_discarded_runs(sides: tuple[TaskQueue, Worker]) -> None:
+def test_a_task_queued_again_after_it_was_discarded_runs(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
     queue.discard(["a"])
     queue.enqueue([task("a")], Lane.BULK)
@@ -243,7 +243,7 @@ def test_a_task_queued_again_after_it_was_discarded_runs(sides: tuple[TaskQueue,
     assert worker.beat() is None
 
 
-def test_events_come_once_in_order_and_again_if_not_acknowledged(sides: tuple[TaskQueue, Worker]) -> None:
+def test_events_come_once_in_order_and_again_if_not_acknowledged(sides: tuple[RqQueue, Worker]) -> None:
     queue, _ = sides
     for name in "abc":
         queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), task_id=name))
@@ -256,7 +256,7 @@ def test_events_come_once_in_order_and_again_if_not_acknowledged(sides: tuple[Ta
     assert [event.task_id for _, event in restarted.consume(limit=9, wait_s=0)] == ["b", "c"]
 
 
-def _restarted(queue: TaskQueue) -> TaskQueue:
+def _restarted(queue: RqQueue) -> RqQueue:
     """The queue as a new controller process finds it."""
     if isinstance(queue, MemoryQueue):
         queue.restart_consumer()
@@ -265,7 +265,7 @@ def _restarted(queue: TaskQueue) -> TaskQueue:
     return RqQueue(queue.connection)
 
 
-def test_any_number_of_readers_follow_the_stream(sides: tuple[TaskQueue, Worker]) -> None:
+def test_any_number_of_readers_follow_the_stream(sides: tuple[RqQueue, Worker]) -> None:
     queue, _ = sides
     queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id="j", message="queued"))
     ((first_id, first),) = queue.tail("0", limit=9, wait_s=0)
@@ -276,14 +276,14 @@ def test_any_number_of_readers_follow_the_stream(sides: tuple[TaskQueue, Worker]
     assert len(queue.tail("0", limit=9, wait_s=0)) == 2
 
 
-def test_a_check_travels_like_any_task(sides: tuple[TaskQueue, Worker]) -> None:
+def test_a_check_travels_like_any_task(sides: tuple[RqQueue, Worker]) -> None:
     queue, _ = sides
     message = IngestMessage(schema_=1, task_id="i", kind="hand", name="h", digest=DIGEST)
     queue.enqueue([message], Lane.INTERACTIVE)
     assert queue.depths()[Lane.INTERACTIVE, Stage.INGEST] == 1
 
 
-def test_a_part_is_there_as_long_as_it_says_so(sides: tuple[TaskQueue, Worker]) -> None:
+def test_a_part_is_there_as_long_as_it_says_so(sides: tuple[RqQueue, Worker]) -> None:
     queue, _ = sides
     assert not queue.announced("controller")
     queue.announce("controller", 600)
@@ -292,7 +292,7 @@ def test_a_part_is_there_as_long_as_it_says_so(sides: tuple[TaskQueue, Worker]) 
     assert queue.announced("controller")
 
 
-def test_of_those_who_want_to_lead_one_does_until_it_is_silent_or_resigns(sides: tuple[TaskQueue, Worker]) -> None:
+def test_of_those_who_want_to_lead_one_does_until_it_is_silent_or_resigns(sides: tuple[RqQueue, Worker]) -> None:
     queue, _ = sides
 
     assert queue.lead("a", 600)
@@ -328,14 +328,14 @@ def test_a_lease_that_is_none_keeps_nobody_from_leading(rq_queue: RqQueue, forge
     assert rq_queue.lead("a", 600)
 
 
-def test_sums_add_up_and_each_name_has_its_own(sides: tuple[TaskQueue, Worker]) -> None:
-    counters: Counters = sides[0]
+def test_sums_add_up_and_each_name_has_its_own(sides: tuple[RqQueue, Worker]) -> None:
+    counters, _ = sides
     counters.count({"a": 1.5, "b": 2.0})
     counters.count({"a": 1.0})
     assert counters.counted() == {"a": 2.5, "b": 2.0}
 
 
-def test_what_waits_is_told_by_lane_and_stage(sides: tuple[TaskQueue, Worker]) -> None:
+def test_what_waits_is_told_by_lane_and_stage(sides: tuple[RqQueue, Worker]) -> None:
     queue, _ = sides
     queue.enqueue([task("x"), task("y"), task("z", stage=Stage.RENDER)], Lane.BULK)
     shown = queue.now(lease_s=6.0)

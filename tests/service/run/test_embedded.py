@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from service.model.errors import BusyError, QueueUnavailable
-from service.queue.address import redis_url, socket_path
-from service.queue.connection import connect
+from service.queue.connection import connect, redis_url, socket_path
 from service.queue.rq_queue import RqQueue
 from service.run import embedded
 from service.run.children import Child

@@ -14,8 +14,7 @@ import pytest
 from service.model.errors import TaskCancelled
 from tests.waiting import until
 from tests.worker.pool import works
-from worker.pool.pool import KEPT, Pool, ProcessLost
-from worker.pool.size import BYTES_PER_PROCESS, MEMORY_SHARE, processes_at_once
+from worker.pool.pool import BYTES_PER_PROCESS, KEPT, MEMORY_SHARE, Pool, ProcessLost, processes_at_once
 
 
 @pytest.fixture(scope="module")

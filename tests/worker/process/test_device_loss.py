@@ -22,6 +22,7 @@ from worker.engines.cuda_errors import DeviceLost
 from worker.pool.pool import ProcessLost
 from worker.process import engine, main
 from worker.process.runner import Runner
+from worker.run import Run
 from worker.stages.context import TaskContext
 
 
@@ -41,7 +42,7 @@ def garbled(message: TaskMessage, context: TaskContext) -> Any:
 
 def run(store: Store, message: TaskMessage, stage: Any, check: Any = broken) -> tuple[Event | None, Runner]:
     runner = Runner({Stage.SYNTHESIZE: stage}, worker="w", publish=lambda event: None, check_device=check)
-    return runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(store, device="cuda:0")), runner
+    return runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(store, Run("cuda:0"))), runner
 
 
 @pytest.mark.parametrize("stage", [fake_synthesize, garbled])

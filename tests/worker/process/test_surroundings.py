@@ -11,8 +11,8 @@ from service.settings import Settings
 from service.store.store import open_store
 from tests.worker.pool import works
 from worker.engines.devices import Device
-from worker.process import surroundings
-from worker.process.surroundings import Surroundings
+from worker.process import engine
+from worker.process.engine import Surroundings
 
 
 def of(folder: Path, processes: int) -> Surroundings:
@@ -23,7 +23,7 @@ def of(folder: Path, processes: int) -> Surroundings:
 def test_tasks_that_make_grasps_share_the_processes_of_their_worker(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(surroundings, "MODULES", ())  # these need none of the engine
+    monkeypatch.setattr(engine, "MODULES", ())  # these need none of the engine
     worker = of(tmp_path, 2)
     try:
         assert [worker.pool(stage) for stage in Stage if stage is not Stage.SYNTHESIZE] == [None] * (len(Stage) - 1)

@@ -33,6 +33,7 @@ from worker.planners.learned import known
 from worker.planners.learned.seeds import table_height
 from worker.planners.registry import of_this_machine
 from worker.process.runner import Runner
+from worker.run import Run
 from worker.scenes.kinds import supports_of
 from worker.stages import assets, ingest, scene, synthesize
 from worker.stages.context import TaskContext
@@ -78,7 +79,7 @@ def end_of(store: Store, job: JobRecord) -> tuple[EventKind, str]:
     runner = Runner({Stage.SCENE: scene.run, Stage.SYNTHESIZE: synthesize.run}, worker="w", publish=lambda event: None)  # type: ignore[arg-type]
     for task in plan(job):
         message = message_of(job, task, attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
-        event = runner.run(message, TaskContext(store, threads=2))
+        event = runner.run(message, TaskContext(store, Run(threads=2)))
         assert event is not None
         if event.kind is not EventKind.FINISHED:
             break

@@ -25,6 +25,7 @@ from service.store.store import Store, open_store
 from worker import certified
 from worker.planners import NoPlace
 from worker.process.runner import Runner
+from worker.run import Run
 from worker.stages import scene, synthesize
 from worker.stages.context import StopReason, TaskContext
 from worker.stages.ranges import base_rows, batches_of
@@ -59,7 +60,7 @@ def made(store: Store, span: int, **request: Any) -> tuple[JobRecord, list[tuple
     found = []
     for task in plan(job):
         message = message_of(job, task, attempt=1, max_attempt=3)
-        event = runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(store, threads=2))
+        event = runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(store, Run(threads=2)))
         assert event is not None and event.kind is EventKind.FINISHED, event
         found.append(
             (task.stage, load_shard(store, task.stage, task.output), load_manifest(store, task.stage, task.output))
@@ -136,7 +137,7 @@ def test_a_range_tells_how_far_it_is_and_stops_where_it_is_told_to() -> None:
 
     for stops_at in (0, 1):
         told.clear()
-        context = TaskContext(store, threads=2, tell=tell)
+        context = TaskContext(store, Run(threads=2), tell=tell)
         if stops_at:
             with pytest.raises(TaskCancelled):
                 synthesize.run(message, context)

@@ -33,6 +33,7 @@ from worker.files.synthesis import synthesized
 from worker.process.runner import Runner
 from worker.rendering import Extras
 from worker.rendering import render as pictures
+from worker.run import Run
 from worker.stages import render, scene, synthesize
 from worker.stages.assets import object_of
 from worker.stages.context import TaskContext
@@ -79,7 +80,7 @@ class Bench:
         runner = Runner(STAGES, worker="w", publish=lambda event: None)  # type: ignore[arg-type]
         for task in plan(self.job):
             message = message_of(self.job, task, attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
-            event = runner.run(message, TaskContext(self.store, threads=2))
+            event = runner.run(message, TaskContext(self.store, Run(threads=2)))
             assert event is not None
             if event.kind is not EventKind.FINISHED:
                 break

@@ -15,9 +15,9 @@ from service.pipeline import job_actions
 from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.rounds import DatasetRounds
-from service.pipeline.datasets.status import status
 from service.store.records import job_events
 from service.store.store import open_store
+from tests.dataset_status import status
 from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import add_asset, fail, finish, jobs_of, wanted
 

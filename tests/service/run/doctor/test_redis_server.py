@@ -10,8 +10,7 @@ import pytest
 from redis import Redis
 
 from service.model.finding import Condition
-from service.queue.address import redis_url
-from service.queue.connection import connect
+from service.queue.connection import connect, redis_url
 from service.queue.rq_queue import RqQueue
 from service.run.doctor.redis_server import persistence, redis
 from service.run.embedded import find_server, server_command

@@ -10,7 +10,7 @@ from pathlib import Path
 from service.settings import Settings
 from tests.system.conftest import alive
 from tests.waiting import until
-from worker.process.several import run_workers
+from worker.commands.worker import run_workers
 
 #: Notes its pid under its number and waits.
 PROGRAM = (
