@@ -45,7 +45,7 @@ browser: $(STAMP) ## Chromium and Playwright for the dashboard's tests (Debian, 
 	command -v chromium > /dev/null || { apt-get update -qq && apt-get install -qq -y --no-install-recommends chromium; }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,browser]'
 
-screenshots: $(STAMP) ## the dashboard's pages of a real service, for docs/dashboard.md (needs make browser)
+screenshots: $(STAMP) ## the dashboard's pages of a real service, for docs/how-to/dashboard.md (needs make browser)
 	$(BIN)/python -m tests.browser.screenshots
 
 docs: $(STAMP) ## rewrite the tables in the docs that follow from the code
@@ -63,7 +63,7 @@ gpu-check: $(STAMP) ## every kernel compiled for CUDA: registers, stack, spills 
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,gpu-check]'
 	$(BIN)/python -m benchmarks.gpu_check $(foreach arch,$(ARCH),--arch $(arch))
 
-dist: $(STAMP) ## wheel and sdist in dist/, the same bytes from the same sources; see docs/release.md
+dist: $(STAMP) ## wheel and sdist in dist/, the same bytes from the same sources; see docs/how-to/release.md
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,release]'
 	$(BIN)/python docker/dist.py dist
 
@@ -71,7 +71,7 @@ pins: $(STAMP) ## versions and hashes that the images install: those of .venv (a
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,postgres,otel,gpu]'
 	$(BIN)/python docker/pin.py
 
-licences: $(STAMP) ## licences of what graspd runs with, into docs/licences.md
+licences: $(STAMP) ## licences of what graspd runs with, into docs/reference/licences.md
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,arm]'
 	$(BIN)/python docker/licences.py
 

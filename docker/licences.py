@@ -1,6 +1,6 @@
 """Licences of all packages that graspd may run with, from what is installed here: `python docker/licences.py`.
 
-Writes docs/licences.md. Exit code 1 and a line for each package whose licence is not known, or none that is accepted.
+Writes docs/reference/licences.md. Exit code 1 and a line for each package whose licence is unknown or not accepted.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Final
 sys.path.insert(0, str(Path(__file__).parent))
 import pin
 
-PAGE: Final = pin.ROOT / "docs" / "licences.md"
+PAGE: Final = pin.ROOT / "docs" / "reference" / "licences.md"
 #: Extras that a user runs with; tools of developers are not shipped.
 EXTRAS: Final = (*pin.EXTRAS, "embedded", "usd", "pandas", "parquet", "arm", "view")
 #: Permissive ones, and of the others those that bind changes of the package itself alone.

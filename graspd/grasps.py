@@ -61,7 +61,7 @@ class Grasp:
     valid: bool
     """Whether it is valid, see `Grasps.is_valid`."""
     metrics: dict[str, float]
-    """Value of each metric of docs/metrics.md, swept ones at a contact threshold of 5 mm."""
+    """Value of each metric of docs/reference/metrics.md, swept ones at a contact threshold of 5 mm."""
 
     def __repr__(self) -> str:
         x, y, z = self.hand_pose[:3]
@@ -73,7 +73,7 @@ class Grasp:
 class Grasps:
     """N grasps of one hand; the order is that of the file, or of `top`.
 
-    Columns have the names, shapes, units and frames of docs/dataset.md.
+    Columns have the names, shapes, units and frames of docs/reference/dataset.md.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class Grasps:
 
     @property
     def attributes(self) -> dict[str, Attribute]:
-        """What the file says of all of them: method, fidelity, seed, digests (docs/dataset.md)."""
+        """What the file says of all of them: method, fidelity, seed, digests (docs/reference/dataset.md)."""
         return dict(self._attributes)
 
     @property
@@ -148,7 +148,7 @@ class Grasps:
 
     @property
     def outcomes(self) -> dict[str, int]:
-        """Tries that were not kept, by what became of them (docs/quality.md)."""
+        """Tries that were not kept, by what became of them (docs/explanation/quality.md)."""
         return {name: int(count) for name, count in json.loads(str(self._attributes.get("outcomes", "{}"))).items()}
 
     # Postures.
@@ -213,7 +213,7 @@ class Grasps:
         return [metric.name for metric in GRASP_METRICS if metric.path in self._columns]
 
     def metric(self, name: str, *, threshold_m: float = INDEX_THRESHOLD_M) -> Array:
-        """(N,) a metric of docs/metrics.md; nan where it is not known.
+        """(N,) a metric of docs/reference/metrics.md; nan where it is not known.
 
         Args:
             name: such as epsilon or contact_area_cm2.
@@ -230,11 +230,11 @@ class Grasps:
 
     @property
     def columns(self) -> dict[str, Array]:
-        """All columns by their names in docs/dataset.md, and `object` (N,): the object's name."""
+        """All columns by their names in docs/reference/dataset.md, and `object` (N,): the object's name."""
         return dict(self._columns)
 
     def column(self, path: str) -> Array:
-        """A column of docs/dataset.md, such as quality/verdict_margin; InputError if the file has none."""
+        """A column of docs/reference/dataset.md, such as quality/verdict_margin; InputError if the file has none."""
         if path not in self._columns:
             raise InputError(f"these grasps have no column {path!r}; they have {', '.join(sorted(self._columns))}")
         return self._columns[path]

@@ -1,4 +1,4 @@
-"""Datasets as samples for training: `Shards`, `Grasps`, `Pictures`, `Clouds` of files or a store (docs/exchange.md)."""
+"""Datasets as samples for training: `Shards`, `Grasps`, `Pictures`, `Clouds` (docs/how-to/exchange.md)."""
 
 from typing import Any
 

@@ -59,7 +59,7 @@ def synthesize(
         hand: a URDF, a ZIP with one, or the name of a built-in hand.
         object: a mesh (STL, OBJ, PLY, GLB, OFF) or the name of a built-in object.
         count: grasps wanted, 1 to 1,000,000; fewer come back where the budget of tries ends first.
-        scene: where they are used: free, table, bin, shelf, or a JSON or YAML file (docs/scenes.md).
+        scene: where they are used: free, table, bin, shelf, or a JSON or YAML file (docs/how-to/scenes.md).
         scenes: scenes that they are shared out to, 1 to 4096.
         faces: drawn: as drops fall; all: a scene for each stable face.
         touch: distance that fingertips keep from supports [mm]: 2 as the rest of the hand; 0, the default: they may
@@ -69,7 +69,7 @@ def synthesize(
         budget: grasps tried for each one wanted, at most.
         min_distance: no two grasps are nearer [m]: mean distance of the same points of the hand, in the object's frame.
         referee: level at which MuJoCo judges; none: nobody, and grasps are sound at best.
-        robust: share of models around the nominal one that a grasp must hold in to count (docs/quality.md).
+        robust: share of models around the nominal one that a grasp must hold in to count (docs/explanation/quality.md).
         robust_models: how many such models; 0: 8 where a share is wanted, else none.
         method: the planner.
         options: its own options, such as {"steps": 20000} or, of learned, {"network": "net.npz"}.

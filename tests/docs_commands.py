@@ -37,8 +37,7 @@ REPOSITORY: Final = Path(__file__).resolve().parent.parent
 DOCS: Final = REPOSITORY / "docs"
 PAGES: Final = (
     *(REPOSITORY / name for name in ("README.md", "CONTRIBUTING.md")),
-    *sorted(DOCS.glob("*.md")),
-    *sorted((DOCS / "exchange").glob("*.md")),
+    *sorted(page for page in DOCS.rglob("*.md") if not {"results", "adr"} & set(page.relative_to(DOCS).parts)),
 )
 LIMIT_S: Final = 3600.0
 #: What came, a file for each page, and which pages ended well.

@@ -14,9 +14,13 @@ from benchmarks.results.manifest import DOCS, INDEX, REPOSITORY, load, staleness
 from benchmarks.results.studies import STUDIES
 from service.model.version import STAGE_REVISIONS
 
-PAGES: Final = (REPOSITORY / "README.md", *sorted(DOCS.glob("*.md")))
+#: All pages but those that the studies themselves write.
+PAGES: Final = (
+    REPOSITORY / "README.md",
+    *sorted(page for page in DOCS.rglob("*.md") if not page.is_relative_to(DOCS / "results")),
+)
 _BLOCK: Final = re.compile(r"(<!-- (results/[^ ]+) -->\n).*?(<!-- /\2 -->)", re.DOTALL)
-_CITED: Final = re.compile(r"(?:\]\(|src=\")(?:\.\./)?(?:docs/)?((?:results|images)/[^)#\"]+)")
+_CITED: Final = re.compile(r"(?:\]\(|src=\")(?:\.\./)*(?:docs/)?((?:results|images)/[^)#\"]+)")
 
 
 def index(records: Mapping[str, dict[str, Any]]) -> str:

@@ -1,4 +1,4 @@
-"""Every series of `/metrics`. The table in docs/metrics.md is written from this list, and the list is all there is."""
+"""Every series of `/metrics`; the table in docs/reference/metrics.md is written from this list."""
 
 from __future__ import annotations
 

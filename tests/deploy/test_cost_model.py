@@ -1,4 +1,4 @@
-"""The cost model: by hand on small numbers, and in step with docs/scaling.md."""
+"""The cost model: by hand on small numbers, and in step with docs/explanation/scaling.md."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.fakes import request
 from tests.service.conftest import services  # noqa: F401
 from tests.service.index.test_index import run_all
 
-PAGE = (REPOSITORY / "docs" / "scaling.md").read_text()
+PAGE = (REPOSITORY / "docs" / "explanation" / "scaling.md").read_text()
 ONE_OF_EACH = Measured(
     core_s_per_grasp=1.0,
     core_s_per_scene=10.0,
@@ -106,7 +106,7 @@ def test_every_input_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_every_page_gives_a_million_grasps_the_same_cost() -> None:
     hours = f"{estimate(Work(grasps=1_000_000), Measured(), Prices()).core_hours:,.0f}"
-    pages = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+    pages = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
     cited = {
         (page.name, number)
         for page in pages

@@ -1,4 +1,4 @@
-"""The steps of docs/operations.md, run as they stand there."""
+"""The steps of docs/how-to/operations.md, run as they stand there."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from typing import Final
 
 from service.model.cores import ROOT, available_cores, memory_limits
 
-#: Memory that a process takes at the most, with the models of the pairs that it keeps [bytes]; see docs/performance.md.
+#: Most memory of a process, with the models of the pairs that it keeps [bytes]; see docs/explanation/performance.md.
 BYTES_PER_PROCESS: Final = 400 * 2**20
 #: Share of the machine's memory for them.
 MEMORY_SHARE: Final = 0.25

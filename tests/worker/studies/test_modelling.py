@@ -25,7 +25,7 @@ from worker.run import Run
 from worker.scenes import drop
 from worker.simulation.reference import Contacts, World, direct
 
-PAGE = (REPOSITORY / "docs" / "modelling.md").read_text()
+PAGE = (REPOSITORY / "docs" / "explanation" / "modelling.md").read_text()
 #: Each table of the study by its title.
 MEASURED = dict(
     re.findall(r"^(\w+)\n\n((?:\|.*\n)+)", (REPOSITORY / "docs" / "results" / "modelling.md").read_text(), re.MULTILINE)
