@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 # Tests wait for processes a fifth of their time: three at once keep two cores busy.
 JOBS ?= 3
 
-.PHONY: results docs-commands dist gpu-check help install demo test test-slow test-containers check format browser screenshots docs pins licences audit clean
+.PHONY: results docs-commands dist gpu-check help install demo test test-slow test-containers check format browser screenshots docs docs-site pins licences audit clean
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-15s %s\n", $$1, $$2}'
 
@@ -51,6 +51,10 @@ screenshots: $(STAMP) ## the dashboard's pages of a real service, for docs/how-t
 docs: $(STAMP) ## rewrite the tables in the docs that follow from the code
 	$(BIN)/python -m service.docs
 	$(BIN)/python -m benchmarks.results --pages
+
+docs-site: $(STAMP) ## the documentation as a site in build/site, with search; warnings are errors
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 docs-commands: $(STAMP) ## the commands that README and docs print, run as printed (hours, resumable; PAGE=name.md: one page)
 	$(BIN)/python -m tests.docs_commands $(PAGE)
