@@ -74,6 +74,7 @@ NOT_RUN: Final = (
         "has a place that the reader fills in",
     ),
     (r"python src/|dexlearn\.train|cp -r", "needs the sources of another project"),
+    *(() if find_spec("torch") else ((r"train_grasp_predictor|network=my_hand|proposed\.h5", "needs torch"),)),
     (r"^pip |\bjq\b|benchmarks\.gallery", "needs packages or programs from elsewhere"),
     (r"cuda|--join\b|on_gpu|gpu-check", "needs a GPU, or its tools"),
     (
