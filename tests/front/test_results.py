@@ -120,7 +120,8 @@ def test_a_figure_of_older_algorithms_is_shown_as_stale() -> None:
     study = BY_NAME["robust"]
     record = load(DOCS)["robust"] | {"stage_revisions": STAGE_REVISIONS | {"synthesize": 1}}
     assert staleness(study, record) == "of synthesize 1"
-    assert "| **stale**: of synthesize 1 |" in page.index({"robust": record})
+    assert "| older: synthesize |" in page.index({"robust": record})
+    assert "| current |" in page.index({"robust": record | {"stage_revisions": dict(STAGE_REVISIONS)}})
     assert staleness(study, record | {"stage_revisions": dict(STAGE_REVISIONS)}) == ""
 
 
