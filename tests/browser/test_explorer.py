@@ -1,4 +1,4 @@
-"""The API explorer: drawn under the policy of the service, from the service alone; a request that it sends is answered."""
+"""The API explorer: drawn under the policy of the service, from it alone; a request that it sends is answered."""
 
 from __future__ import annotations
 
