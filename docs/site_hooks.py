@@ -39,6 +39,8 @@ def on_files(files: Files, *, config: Any) -> Files:
 def on_page_markdown(markdown: str, *, page: Any, files: Files, **_: Any) -> str:
     """Links as the site has them: pages from outside at their place, other files outside `docs/` as plain text."""
     place = page.file.src_uri
+    if place.startswith(("results/", "adr/")):
+        page.meta.setdefault("search", {"boost": 0.2})  # figures answer few questions by themselves
     source = _INSIDE.get(place, f"docs/{place}")
 
     def of_site(link: str) -> str | None:
