@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 # Tests wait for processes a fifth of their time: three at once keep two cores busy.
 JOBS ?= 3
 
-.PHONY: results docs-commands dist gpu-check help install demo test test-slow test-containers check format browser screenshots docs pins licences audit clean
+.PHONY: results docs-commands dist gpu-check help install demo test test-slow test-containers check format browser screenshots docs docs-site pins licences audit clean
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-15s %s\n", $$1, $$2}'
 
@@ -45,12 +45,16 @@ browser: $(STAMP) ## Chromium and Playwright for the dashboard's tests (Debian, 
 	command -v chromium > /dev/null || { apt-get update -qq && apt-get install -qq -y --no-install-recommends chromium; }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,browser]'
 
-screenshots: $(STAMP) ## the dashboard's pages of a real service, for docs/dashboard.md (needs make browser)
+screenshots: $(STAMP) ## the dashboard's pages of a real service, for docs/how-to/dashboard.md (needs make browser)
 	$(BIN)/python -m tests.browser.screenshots
 
 docs: $(STAMP) ## rewrite the tables in the docs that follow from the code
 	$(BIN)/python -m service.docs
 	$(BIN)/python -m benchmarks.results --pages
+
+docs-site: $(STAMP) ## the documentation as a site in build/site, with search; warnings are errors
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 docs-commands: $(STAMP) ## the commands that README and docs print, run as printed (hours, resumable; PAGE=name.md: one page)
 	$(BIN)/python -m tests.docs_commands $(PAGE)
@@ -63,7 +67,7 @@ gpu-check: $(STAMP) ## every kernel compiled for CUDA: registers, stack, spills 
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,gpu-check]'
 	$(BIN)/python -m benchmarks.gpu_check $(foreach arch,$(ARCH),--arch $(arch))
 
-dist: $(STAMP) ## wheel and sdist in dist/, the same bytes from the same sources; see docs/release.md
+dist: $(STAMP) ## wheel and sdist in dist/, the same bytes from the same sources; see docs/how-to/release.md
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,release]'
 	$(BIN)/python docker/dist.py dist
 
@@ -71,7 +75,7 @@ pins: $(STAMP) ## versions and hashes that the images install: those of .venv (a
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,postgres,otel,gpu]'
 	$(BIN)/python docker/pin.py
 
-licences: $(STAMP) ## licences of what graspd runs with, into docs/licences.md
+licences: $(STAMP) ## licences of what graspd runs with, into docs/reference/licences.md
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,arm]'
 	$(BIN)/python docker/licences.py
 

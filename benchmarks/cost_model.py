@@ -3,8 +3,9 @@
 usage: python -m benchmarks.cost_model [--grasps 1000000] [--grasps 100000000] [--days 7] [--scenes 2] [--views 3]
                                        [--core-hour 0.04] [--from-data DIR] [--json]
 
-`docs/scaling.md` has the formulas, where each input comes from, and what the model leaves out. Prices are examples to
-be replaced by your own; nothing here is anybody's offer. `--from-data` measures the sizes in a data folder of yours.
+`docs/explanation/scaling.md` has the formulas, where each input comes from, and what the model leaves out. Prices are
+examples to be replaced by your own; nothing here is anybody's offer. `--from-data` measures the sizes in a data folder
+of yours.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class Work:
 
 @dataclass(frozen=True)
 class Measured:
-    """Inputs that were measured; `docs/scaling.md` says with which commands."""
+    """Inputs that were measured; `docs/explanation/scaling.md` says with which commands."""
 
     core_s_per_grasp: float = 0.194
     """A worker's time on one core for a valid grasp, standard fidelity: plan, judge, postures, quality [core s]."""

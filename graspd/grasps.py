@@ -61,7 +61,7 @@ class Grasp:
     valid: bool
     """Whether it is valid, see `Grasps.is_valid`."""
     metrics: dict[str, float]
-    """Value of each metric of docs/metrics.md, swept ones at a contact threshold of 5 mm."""
+    """Value of each metric, swept ones at a contact threshold of 5 mm."""
 
     def __repr__(self) -> str:
         x, y, z = self.hand_pose[:3]
@@ -71,9 +71,9 @@ class Grasp:
 
 
 class Grasps:
-    """N grasps of one hand; the order is that of the file, or of `top`.
+    """N grasps of one hand, in the order of the file or of `top`.
 
-    Columns have the names, shapes, units and frames of docs/dataset.md.
+    Columns have the names, shapes, units and frames of docs/reference/dataset.md.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class Grasps:
     @overload
     def __getitem__(self, rows: slice | Rows) -> Grasps: ...
     def __getitem__(self, rows: Any) -> Any:
-        """One grasp by its number; some of them by a slice, a mask (N,) or numbers."""
+        """Return one grasp by number, or several by a slice, a mask (N,) or numbers."""
         if isinstance(rows, int | np.integer):
             if not -len(self) <= rows < len(self):
                 raise IndexError(f"there is no grasp {rows}; of {len(self)} the last is {len(self) - 1}")
@@ -137,74 +137,74 @@ class Grasps:
 
     @property
     def attributes(self) -> dict[str, Attribute]:
-        """What the file says of all of them: method, fidelity, seed, digests (docs/dataset.md)."""
+        """Attributes of the file: method, fidelity, seed, digests (docs/reference/dataset.md)."""
         return dict(self._attributes)
 
     @property
     def reason(self) -> str | None:
-        """Why there are fewer of them than were asked for, in a sentence; None where there are not."""
+        """Why there are fewer than asked for, in a sentence; None if there are not."""
         said = self._attributes.get("reason")
         return None if said is None else str(said)
 
     @property
     def outcomes(self) -> dict[str, int]:
-        """Tries that were not kept, by what became of them (docs/quality.md)."""
+        """Counts of the candidates that were dropped, by outcome (docs/explanation/quality.md)."""
         return {name: int(count) for name, count in json.loads(str(self._attributes.get("outcomes", "{}"))).items()}
 
     # Postures.
 
     @property
     def hand_pose(self) -> Floats:
-        """(N, 7) pose of the hand's root link at contact, in the object frame: x y z [m], quaternion w x y z."""
+        """(N, 7) root link at contact, in the object frame: x y z [m], unit quaternion w x y z."""
         return self.column("grasp/hand_pose")
 
     @property
     def joint_positions(self) -> Floats:
-        """(N, J) joints at contact [rad or m]."""
+        """(N, J) joint positions at contact [rad or m], order in `joint_names`."""
         return self.column("grasp/joint_positions")
 
     @property
     def pregrasp(self) -> Postures:
-        """The open hand before contact."""
+        """Postures before contact, fingers clear of the object."""
         return Postures(self.column("pregrasp/hand_pose"), self.column("pregrasp/joint_positions"))
 
     @property
     def squeeze(self) -> Postures:
-        """The commanded posture that presses on the object."""
+        """Commanded postures that press on the object."""
         return Postures(self.column("squeeze/hand_pose"), self.column("squeeze/joint_positions"))
 
     @property
     def approach(self) -> Floats:
-        """(N, W, 7) root poses of the open hand from its standoff to the pregrasp; grasps planned in a scene only."""
+        """(N, W, 7) root poses from the standoff to the pregrasp; only of grasps planned in a scene."""
         return self.column("grasp/approach")
 
     @property
     def lift(self) -> Postures:
-        """The squeezing hand 10 cm higher; grasps planned in a scene only."""
+        """Squeeze postures raised by 10 cm; only of grasps planned in a scene."""
         return Postures(self.column("grasp/lift"), self.column("squeeze/joint_positions"))
 
     # Where they are used.
 
     @property
     def object_pose(self) -> Floats:
-        """(N, 7) pose of the object in each grasp's scene, z up; grasps planned in a scene only."""
+        """(N, 7) object in each grasp's scene, z up; only of grasps planned in a scene."""
         return self.column("scene/object_pose")[self.column(_INDEX)]
 
     @property
     def hand_pose_in_scene(self) -> Floats:
-        """(N, 7) `hand_pose` in each grasp's scene frame, z up; grasps planned in a scene only."""
+        """(N, 7) `hand_pose` in each grasp's scene, z up; only of grasps planned in a scene."""
         return compose(self.object_pose, self.hand_pose)
 
     # Quality.
 
     @property
     def is_valid(self) -> NDArray[np.bool_]:
-        """(N,) sound, and a referee judged that it holds; in a scene: that it lifts."""
+        """(N,) feasible, and held by the validator; in a scene: lifted."""
         return standing.valid(self._columns)
 
     @property
     def is_sound(self) -> NDArray[np.bool_]:
-        """(N,) passed the geometric gate."""
+        """(N,) feasible: within the limits of penetration and contact."""
         return standing.sound(self._columns)
 
     @property
@@ -213,11 +213,11 @@ class Grasps:
         return [metric.name for metric in GRASP_METRICS if metric.path in self._columns]
 
     def metric(self, name: str, *, threshold_m: float = INDEX_THRESHOLD_M) -> Array:
-        """(N,) a metric of docs/metrics.md; nan where it is not known.
+        """Return a metric (N,); nan where it was not measured.
 
         Args:
-            name: such as epsilon or contact_area_cm2.
-            threshold_m: hand surface nearer than this is in contact; the nearest threshold of the file is taken [m].
+            name: one of `metrics`, such as epsilon or contact_area_cm2.
+            threshold_m: contact threshold [m]; the nearest one of the file is taken.
 
         Raises:
             InputError: the file has no such metric.
@@ -230,11 +230,15 @@ class Grasps:
 
     @property
     def columns(self) -> dict[str, Array]:
-        """All columns by their names in docs/dataset.md, and `object` (N,): the object's name."""
+        """All columns by name (docs/reference/dataset.md), and `object` (N,): the object's name."""
         return dict(self._columns)
 
     def column(self, path: str) -> Array:
-        """A column of docs/dataset.md, such as quality/verdict_margin; InputError if the file has none."""
+        """Return a column of docs/reference/dataset.md, such as quality/verdict_margin.
+
+        Raises:
+            InputError: the file has no such column.
+        """
         if path not in self._columns:
             raise InputError(f"these grasps have no column {path!r}; they have {', '.join(sorted(self._columns))}")
         return self._columns[path]
@@ -242,15 +246,18 @@ class Grasps:
     # Choosing.
 
     def valid(self) -> Grasps:
-        """The valid ones."""
+        """Select the valid grasps."""
         return self[self.is_valid]
 
     def where(self, rows: Rows | Callable[[Grasps], Rows]) -> Grasps:
-        """Those of a mask (N,) or of row numbers, given or made: `where(lambda g: g.metric("epsilon") > 0.3)`."""
+        """Select by a mask (N,) or row numbers, or a function that makes them.
+
+        Example: `grasps.where(lambda g: g.metric("epsilon") > 0.3)`.
+        """
         return self[np.asarray(rows(self) if callable(rows) else rows)]
 
     def top(self, metric: str, count: int) -> Grasps:
-        """The best by a metric, the best first; those whose metric is not known are left out.
+        """Select the best by a metric, best first; grasps without a value are left out.
 
         Raises:
             InputError: the file has no such metric, or `count` is negative.
@@ -264,7 +271,7 @@ class Grasps:
     # Shown.
 
     def to_pandas(self) -> Any:
-        """A `pandas.DataFrame` with a row for each grasp.
+        """Return a `pandas.DataFrame` with a row for each grasp.
 
         Columns: `object`, `valid`; `x y z` [m] and the unit quaternion `qw qx qy qz` of `hand_pose` in the object
         frame; each joint by its name [rad or m]; each metric by its name, swept ones at a contact threshold of 5 mm;
@@ -279,7 +286,7 @@ class Grasps:
         return frame_of(self)
 
     def view(self, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
-        """Serve them to a browser, as `graspd view` does, until `close()` of what is returned; its `url` is where.
+        """Serve the grasps in 3D to a browser until `close()` of the result; `url` is its address.
 
         Args:
             host: address to serve on; whoever reaches it sees the grasps.
@@ -297,7 +304,7 @@ class Grasps:
     # Files.
 
     def shard(self) -> Shard:
-        """They as a base shard, as it is saved.
+        """Return the grasps as a base shard, as `save` writes it.
 
         Raises:
             InputError: they are of several objects.
@@ -314,7 +321,7 @@ class Grasps:
         return Shard("base", said, columns, self._path)
 
     def save(self, path: str | Path) -> Path:
-        """Write them as one file that every command and `graspd.open` reads.
+        """Write one file that every command and `graspd.open` reads.
 
         Raises:
             InputError: they are of several objects, or the file cannot be written.
@@ -349,17 +356,18 @@ def open(
     job: str | None = None,
     dataset: str | None = None,
 ) -> Grasps:
-    """The grasps of a file, of several, of a folder (searched whole), or of a job or dataset in a store.
+    """Read the grasps of files, of a folder with its subfolders, or of a job or dataset in a store.
 
     Args:
         source: a path, several, or the URL of a store (`file://`, `s3://`, `gs://`, `az://`).
-        hand: which hand's, where there are several: joints of two hands do not fit into one array.
+        hand: name of the hand, where there are several; one `Grasps` holds one hand.
         job: id of a job in the store.
-        dataset: name of a dataset in the store: its newest snapshot.
+        dataset: name of a dataset in the store; its newest snapshot is read.
 
     Raises:
-        InputError: no file of grasps, or of several hands; NotFoundError: no such file, job or dataset.
-        DamagedShard: a file is not what its checksum says.
+        InputError: no file of grasps, or files of several hands.
+        NotFoundError: no such file, job or dataset.
+        DamagedError: a file does not match its checksum.
     """
     shards = open_shards(source, job=job, dataset=dataset)
     return joined([read_shard(shards.path(file), kind="base") for file in _of_hand(shards, hand).of("base")])

@@ -1,4 +1,4 @@
-"""Datasets as samples for training: `Shards`, `Grasps`, `Pictures`, `Clouds` of files or a store (docs/exchange.md)."""
+"""Datasets as samples for training: `Shards`, `Grasps`, `Pictures`, `Clouds` (docs/how-to/exchange.md)."""
 
 from typing import Any
 
@@ -19,10 +19,12 @@ __all__ = [
 
 
 def hand_surface(shard: Any, rows: Any) -> Any:
-    """(K, H, 3) points on the hand's surface in grasps of a base shard, in the object's frame [m]: for graspness.
+    """Return points (K, H, 3) on the hand's surface in grasps of a base shard, in the object's frame [m].
+
+    Used as `hand_surface` of `Pictures.clouds` for graspness.
 
     Raises:
-        NotFoundError: the hand that the shard was made with is not here.
+        NotFoundError: the shard's hand is not found.
     """
     from worker.files.hand_surface import hand_surface as found  # loads the hands' reader
 

@@ -44,11 +44,11 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Give the connection back."""
+        """Close the connection."""
         self._http.close()
 
     def submit(self, hand: str, object: str, **options: Any) -> Job:
-        """Submit a job: the same request gives the same job.
+        """Submit a job; the same request is the same job.
 
         Args:
             hand: name of a hand that the service knows.
@@ -56,7 +56,8 @@ class Client:
             options: `grasps`, `scene`, `fidelity`, `seed` and the other fields of POST /v1/jobs.
 
         Raises:
-            InputError: an option that there is not, or that cannot be used; NotFoundError: unknown hand or object.
+            InputError: an unknown option, or a value out of range.
+            NotFoundError: unknown hand or object.
             UnavailableError: the service does not answer.
         """
         try:
@@ -66,17 +67,25 @@ class Client:
         return Job(self._http, self._http.submit(request))
 
     def job(self, job_id: str) -> Job:
-        """A job by its id; NotFoundError if there is none."""
+        """Return a job by its id.
+
+        Raises:
+            NotFoundError: there is none.
+        """
         return Job(self._http, self._http.job(job_id))
 
     def shard(self, shard_id: str) -> Grasps:
-        """The grasps of a base shard by its id; NotFoundError if there is none."""
+        """Return the grasps of a base shard by its id.
+
+        Raises:
+            NotFoundError: there is none.
+        """
         file = b"".join(self._http.fetch(path_of("shards", shard_id, "file")))
         return joined([read_shard(file, kind="base", name=shard_id[:12])])
 
 
 class Job:
-    """One hand on one object, in work or ended."""
+    """A job of the service: grasps of one hand on one object."""
 
     def __init__(self, http: HttpClient, said: JobDetail) -> None:
         self._http, self._said = http, said
@@ -86,7 +95,7 @@ class Job:
 
     @property
     def id(self) -> str:
-        """Its id."""
+        """Id of the job."""
         return self._said.id
 
     @property
@@ -101,17 +110,17 @@ class Job:
 
     @property
     def state(self) -> str:
-        """queued, running, succeeded, failed or cancelled, when it was last asked for."""
+        """queued, running, succeeded, failed or cancelled, as of the last request."""
         return str(self._said.state)
 
     def wait(self, progress: Callable[[float], None] | None = None) -> Self:
-        """Wait until it has ended.
+        """Wait until the job has ended.
 
         Args:
             progress: called with the share that is done, 0 to 1.
 
         Raises:
-            TaskError: it failed or was cancelled; what it made until then can still be fetched.
+            TaskError: it failed or was cancelled; finished grasps can still be fetched.
         """
         self._said = self._http.wait(
             self.id, on_progress=(lambda job: progress(float(job.progress))) if progress else None
@@ -122,7 +131,11 @@ class Job:
         return self
 
     def grasps(self) -> Grasps:
-        """What it has made by now; InputError if that is nothing yet."""
+        """Fetch the grasps made so far.
+
+        Raises:
+            InputError: there are none yet.
+        """
         self._said = self._http.job(self.id)
         base = [shard for shard in self._said.shards if shard.kind == "base"]
         if not base:
@@ -131,6 +144,6 @@ class Job:
         return joined([read_shard(b"".join(self._http.fetch(one.file)), name=one.id[:12]) for one in ordered])
 
     def cancel(self) -> Self:
-        """Stop it; what is written stays."""
+        """Cancel the job; finished shards stay."""
         self._said = self._http.cancel(self.id)
         return self

@@ -51,51 +51,51 @@ def synthesize(
     join: int | Literal["auto"] = "auto",
     progress: Callable[[float], None] | None = None,
 ) -> Grasps:
-    """Grasps of a hand on an object, judged and measured as by `graspd synth`: the same seed gives the same ones.
+    """Plan, validate and measure grasps of a hand on an object, as `graspd synth` does.
 
-    The first call of a process builds or loads kernels.
+    The same seed gives the same grasps. The first call of a process compiles or loads kernels.
 
     Args:
         hand: a URDF, a ZIP with one, or the name of a built-in hand.
         object: a mesh (STL, OBJ, PLY, GLB, OFF) or the name of a built-in object.
-        count: grasps wanted, 1 to 1,000,000; fewer come back where the budget of tries ends first.
-        scene: where they are used: free, table, bin, shelf, or a JSON or YAML file (docs/scenes.md).
-        scenes: scenes that they are shared out to, 1 to 4096.
-        faces: drawn: as drops fall; all: a scene for each stable face.
+        count: grasps wanted, 1 to 1,000,000; fewer if the budget ends first.
+        scene: free, table, bin, shelf, or a JSON or YAML file (docs/how-to/scenes.md).
+        scenes: number of scenes over which the grasps are distributed, 1 to 4096.
+        faces: drawn: rest poses as drops end; all: a scene for each stable face.
         touch: distance that fingertips keep from supports [mm]: 2 as the rest of the hand; 0, the default: they may
             touch; down to -1: they may press into it.
-        beside: up to eight other objects, files or names, that are dropped around it.
-        want: valid: that many valid grasps; raw: of any kind.
-        budget: grasps tried for each one wanted, at most.
+        beside: up to eight other objects, files or names, dropped around it.
+        want: valid: `count` valid grasps; raw: `count` candidates.
+        budget: candidates for each grasp wanted, at most.
         min_distance: no two grasps are nearer [m]: mean distance of the same points of the hand, in the object's frame.
-        referee: level at which MuJoCo judges; none: nobody, and grasps are sound at best.
-        robust: share of models around the nominal one that a grasp must hold in to count (docs/quality.md).
-        robust_models: how many such models; 0: 8 where a share is wanted, else none.
+        referee: level of the validation in MuJoCo; none: no validation, no valid grasps.
+        robust: share of perturbed models in which a grasp must hold to count (docs/explanation/quality.md).
+        robust_models: number of such models; 0: 8 if a share is wanted, else none.
         method: the planner.
         options: its own options, such as {"steps": 20000} or, of learned, {"network": "net.npz"}.
         fidelity: draft, standard or fine.
-        seed: with hand, object and options all that decides the result.
+        seed: decides the result, together with hand, object and options.
         friction: Coulomb coefficient of the quality metrics.
         mass: of the object [kg]; by default its own, 0.1 kg where its file says none.
         density: of the object [kg/m^3], in place of the mass.
         object_friction: Coulomb coefficient of contacts in simulation; by default the object's own, else 0.6.
-        payload: whether the heaviest mass that each valid grasp lifts is measured (`quality/payload_kg`).
-        min_payload: mass that a grasp must lift to count [kg]; 0: none is wanted.
-        shake: whether each valid grasp, lifted, is shaken (`quality/shake_margin`); goes with a scene.
-        units: of the mesh: m, cm, mm or in; guessed if not given.
+        payload: measure the heaviest mass that each valid grasp lifts (`quality/payload_kg`).
+        min_payload: mass that a grasp must lift to count [kg]; 0: any.
+        shake: shake each lifted valid grasp (`quality/shake_margin`); needs a scene.
+        units: of the mesh: m, cm, mm or in; default: metres.
         scale_to: longest side of the object [m].
         device: cpu, cuda:0 or auto.
         threads: CPU threads; 0: one per core.
-        join: batches of 32 grasps that are planned in one launch; auto: as many as a GPU needs to be busy, 1 on a CPU.
-            The grasps are the same.
-        progress: called with the share that is done, 0 to 1.
+        join: batches of 32 candidates planned in one launch; auto: as many as fill a GPU, 1 on a CPU. Grasps do not
+            depend on it.
+        progress: called with the finished share, 0 to 1.
 
     Returns:
-        at most `count` grasps: poses in the object frame [m], joints [rad or m]; `reason` says why there are fewer.
+        Grasps: at most `count`; poses in the object frame [m], joints [rad or m]. `reason` says why there are fewer.
 
     Raises:
-        InputError: something of it cannot be used (MeshError, HandError: a file); says what, and the mend.
-        ImportError: this install has no engine: pip install 'graspd[worker]'.
+        InputError: an argument cannot be used (MeshError, HandError: a file), with the fix.
+        ImportError: the engine is not installed (`graspd[worker]`).
     """
     try:
         from service.store.asset_options import object_options

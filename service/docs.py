@@ -55,7 +55,7 @@ PARTS: Final[dict[str, Callable[[], str]]] = {
     "settings": settings_table,
     "metrics": series_table,
 }
-PAGES: Final = ("docs/settings.md", "docs/dataset.md", "docs/metrics.md")
+PAGES: Final = ("docs/reference/settings.md", "docs/reference/dataset.md", "docs/reference/metrics.md")
 
 
 def renewed(text: str) -> str:

@@ -37,8 +37,7 @@ REPOSITORY: Final = Path(__file__).resolve().parent.parent
 DOCS: Final = REPOSITORY / "docs"
 PAGES: Final = (
     *(REPOSITORY / name for name in ("README.md", "CONTRIBUTING.md")),
-    *sorted(DOCS.glob("*.md")),
-    *sorted((DOCS / "exchange").glob("*.md")),
+    *sorted(page for page in DOCS.rglob("*.md") if not {"results", "adr"} & set(page.relative_to(DOCS).parts)),
 )
 LIMIT_S: Final = 3600.0
 #: What came, a file for each page, and which pages ended well.
@@ -75,6 +74,7 @@ NOT_RUN: Final = (
         "has a place that the reader fills in",
     ),
     (r"python src/|dexlearn\.train|cp -r", "needs the sources of another project"),
+    *(() if find_spec("torch") else ((r"train_grasp_predictor|network=my_hand|proposed\.h5", "needs torch"),)),
     (r"^pip |\bjq\b|benchmarks\.gallery", "needs packages or programs from elsewhere"),
     (r"cuda|--join\b|on_gpu|gpu-check", "needs a GPU, or its tools"),
     (

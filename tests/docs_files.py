@@ -119,7 +119,7 @@ def _for_datasets(text: str, folder: Path, graspd: Graspd) -> None:
 def _for_million(text: str, folder: Path, graspd: Graspd) -> None:
     """Sources of the objects, as the page of datasets prints them, and those of the pilot's."""
     del text, graspd
-    datasets = (REPOSITORY / "docs" / "datasets.md").read_text()
+    datasets = (REPOSITORY / "docs" / "how-to" / "datasets.md").read_text()
     (folder / "assets.json").write_text(_printed(datasets, '```json\n{"objects"'))
     # Licences of objects that the small datasets lack would be refused.
     (folder / "docs" / "results" / "pilot" / "assets.json").write_text('{"objects": {"*": {"licence": "CC-BY-4.0"}}}')

@@ -67,6 +67,12 @@ async def watch(request: Request, overview: OverviewOf) -> AsyncIterable[ServerS
         yield event
 
 
+@router.get("/docs", dependencies=[Depends(may_read)])
+def explorer(request: Request) -> HTMLResponse:
+    """Every route, to look at and to try."""
+    return render(request, "explorer.html")
+
+
 @router.get("/problems")
 @router.get("/problems/{slug}")
 def problem_types(request: Request, slug: str = "") -> HTMLResponse:

@@ -1,1 +1,1 @@
-"""What graspd leaves out, priced: what modelling it would cost and what it would change (docs/modelling.md)."""
+"""What graspd leaves out, priced: the cost of modelling it and what it would change (docs/explanation/modelling.md)."""

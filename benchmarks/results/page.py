@@ -12,41 +12,53 @@ from typing import Any, Final
 
 from benchmarks.results.manifest import DOCS, INDEX, REPOSITORY, load, staleness
 from benchmarks.results.studies import STUDIES
-from service.model.version import STAGE_REVISIONS
 
-PAGES: Final = (REPOSITORY / "README.md", *sorted(DOCS.glob("*.md")))
+#: All pages but those that the studies themselves write.
+PAGES: Final = (
+    REPOSITORY / "README.md",
+    *sorted(page for page in DOCS.rglob("*.md") if not page.is_relative_to(DOCS / "results")),
+)
 _BLOCK: Final = re.compile(r"(<!-- (results/[^ ]+) -->\n).*?(<!-- /\2 -->)", re.DOTALL)
-_CITED: Final = re.compile(r"(?:\]\(|src=\")(?:\.\./)?(?:docs/)?((?:results|images)/[^)#\"]+)")
+_CITED: Final = re.compile(r"(?:\]\(|src=\")(?:\.\./)*(?:docs/)?((?:results|images)/[^)#\"]+)")
 
 
 def index(records: Mapping[str, dict[str, Any]]) -> str:
     """The page of all studies: files, date, revision, and whether today's algorithms would give the same."""
-    revisions = ", ".join(f"{stage} {number}" for stage, number in STAGE_REVISIONS.items())
     lines = [
-        "# Where the figures come from",
+        "# Where figures come from",
         "",
         "`make results DATA=DIR` makes every file here and in `docs/images` again, study by study (`SOURCES=DIR`, "
-        "`BEFORE=DIR` for those that need them; `QUICK=1` for little ones in `results-quick/`); what is recorded and "
-        "still holds is not run again. `python -m benchmarks.results --list` has the commands. Raw numbers (JSON, "
-        "CSV, SVG, checksums) stand beside the pages and are not in git; `--again --only NAME` makes those of a study.",
+        "`BEFORE=DIR` where a study needs them; `QUICK=1`: small runs in `results-quick/`). Recorded files that still "
+        "hold are kept. `python -m benchmarks.results --list` has the commands. Raw numbers (JSON, CSV, SVG) "
+        "are not in git; `--again --only NAME` makes those of a study.",
         "",
-        f"**Fresh** figures are of the algorithms of today ({revisions}); what follows from none of them has a dash. "
-        "What was made before the [manifest](MANIFEST.json) was kept has the commit that brought it: it is of that "
-        "revision or an earlier one.",
+        "*Older* figures were measured before the algorithms of the named stages changed: today's may differ. A dash: "
+        "the study depends on no stage. Date, version and commit are those of the run ([manifest](MANIFEST.json)); *or "
+        "earlier* marks files from before the manifest was kept.",
         "",
-        "| study | what | files | date | revision | of today's algorithms |",
-        "| --- | --- | --- | --- | --- | --- |",
+        "| study | what | files | date | version | commit | state |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     for study in STUDIES:
         record = records.get(study.name)
         if record is None:
-            lines.append(f"| {study.name} | {study.about} |  |  |  | {staleness(study, record)} |")
+            lines.append(f"| {study.name} | {study.about} |  |  |  |  | {staleness(study, record)} |")
             continue
-        old = staleness(study, record)
-        state = f"**stale**: {old}" if old else "fresh" if study.stages else "-"
+        older = re.findall(r"([a-z]+) (?:\d+|None)", staleness(study, record))
+        state = (
+            f"older: {', '.join(older)}" if older else staleness(study, record) or ("current" if study.stages else "-")
+        )
         by = record["revision"] + ("" if record["told_by"] == "run" else " or earlier")
-        lines.append(f"| {study.name} | {study.about} | {_files(record)} | {record['date'] or ''} | {by} | {state} |")
+        cells = (study.name, study.about, _files(record), record["date"] or "", _version(record), by, state)
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def _version(record: Mapping[str, Any]) -> str:
+    """graspd's among the versions that a record tells; empty where it tells none."""
+    told = record["versions"]
+    found = re.search(r"[\d.]+", told.get("graspd", "") if isinstance(told, dict) else told or "")
+    return found[0] if found else ""
 
 
 def _files(record: Mapping[str, Any]) -> str:
@@ -57,7 +69,8 @@ def _files(record: Mapping[str, Any]) -> str:
     shown = []
     for folder, paths in by_folder.items():
         if len(paths) > 4:
-            shown.append(f"[{folder}/]({_from_here(folder)}): {len(paths)} files")
+            page = next((path for path in paths if path.endswith(".md")), folder)
+            shown.append(f"[{folder}/]({_from_here(page)}): {len(paths)} files")
         else:
             shown += [f"[{Path(path).name}]({_from_here(path)})" for path in paths]
     return ", ".join(shown)

@@ -116,7 +116,7 @@ class Study:
 def main(
     shards: Annotated[str, Option(help="Shards of grasps planned on tables, with views: a folder, a store.")],
     meshes: Annotated[Path, Option(help="Folder with the objects' meshes, OBJECT/clean.stl.")],
-    held_out: Annotated[str, Option(help="Objects to evaluate on, with commas; none of them is trained on.")],
+    held_out: Annotated[str, Option(help="Objects to evaluate on, with commas; none of them is trained on.")] = "",
     hand: Annotated[str, Option(help="URDF or built-in hand of the data.")] = "barrett",
     free: Annotated[str, Option(help="Shards of valid grasps of free objects, to be put on tables and filtered.")] = "",
     peer: Annotated[str, Option(help="The same of the graspit baseline.")] = "",
@@ -125,6 +125,7 @@ def main(
     steps: Annotated[int, Option(help="Training steps of each network.")] = 3000,
     seeds: Annotated[int, Option(help="Networks trained on each source.")] = 3,
     ablations: Annotated[bool, Option(help="Other sizes and choices of the data besides.")] = False,
+    plain: Annotated[bool, Option("--plain", help="The first network alone: minutes instead of hours.")] = False,
     threads: Annotated[int, Option(help="Threads of torch.")] = 1,
     output: Annotated[Path, Option("--output", "-o", help="JSON of all scores; what it has is kept.")] = Path(
         "predictor.json"
@@ -141,14 +142,14 @@ def main(
         return open_shards(where).only(hands=[model.name])
 
     others = {name: opened(where) for name, where in ((FREE, free), (PEER, peer), (sources.FAILED, raw)) if where}
-    study = Study(model, opened(shards), others, meshes, held_out.split(","), grasps)
+    study = Study(model, opened(shards), others, meshes, [name for name in held_out.split(",") if name], grasps)
     rows: list[Row] = json.loads(output.read_text()) if output.exists() else []
     drawn: dict[str, dict[str, Any]] = {}
     exams = study.exams()
     wanted = study.makers() | (study.ablations() if ablations else {})
     shown = {*study.makers(), ACROSS, NEAREST}
     for source, seed, facts, proposer in _proposers(
-        study, wanted, rows, seeds=seeds, steps=steps, network=network, ablations=ablations
+        study, wanted, rows, seeds=seeds, steps=steps, network=network, ablations=ablations, plain=plain
     ):
         for exam, row, ready, lifted in examined(model, exams, proposer, seed=seed, epsilon=source in shown):
             rows.append({"hand": model.name, "source": source, "seed": seed, **facts, **row})
@@ -170,6 +171,7 @@ def _proposers(
     steps: int,
     network: Path | None,
     ablations: bool,
+    plain: bool,
 ) -> Iterator[tuple[str, int, Row, Proposer]]:
     """Each source and seed that `rows` do not have: what is known of it, and what proposes."""
     done = {(row["hand"], row["source"], row["seed"]) for row in rows}
@@ -181,7 +183,7 @@ def _proposers(
             continue
         given = [make(obj) for obj in study.objects]
         lessons, judged = Lessons.of(study.pictures_for(source), given), None
-        controls = _without(study, given) if source == sources.SCENES else {}
+        controls = _without(study, given) if source == sources.SCENES and not plain else {}
         facts: Row = {"grasps": sum(map(len, given)), "views": len(lessons)}
         for seed in missing:
             trained = train(lessons, steps=steps, seed=seed)
@@ -189,7 +191,7 @@ def _proposers(
             if network is not None and source == sources.SCENES and seed == 0:
                 save(made, network)
             told = facts | {"loss": trained.loss}
-            if source not in main:
+            if plain or source not in main:
                 yield source, seed, told, _by(made, (SPREAD,))
                 continue
             by = _by(made, SPREADS)
@@ -257,8 +259,9 @@ def _as_file(hand: HandModel, trained: Trained, about: str) -> ProposalNetwork:
 
 def _line(source: str, seed: int, facts: Row, rows: Sequence[Row]) -> str:
     mine = [row for row in rows if (row["source"], row["seed"]) == (source, seed)]
-    means = {kind: np.mean([row["lift"] for row in mine if row["kind"] == kind]) for kind in (OBJECT, FACE)}
-    return f"{source} {seed}: {facts}; lift " + ", ".join(f"{kind} {value:.2f}" for kind, value in means.items())
+    lifts = {kind: [row["lift"] for row in mine if row["kind"] == kind] for kind in (OBJECT, FACE)}
+    means = ", ".join(f"{kind} {np.mean(shares):.2f}" for kind, shares in lifts.items() if shares)
+    return f"{source} {seed}: {facts}; lift {means}"
 
 
 if __name__ == "__main__":

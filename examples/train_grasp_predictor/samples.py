@@ -59,7 +59,7 @@ def sights(shards: Shards, *, noise: str) -> list[Sight]:
 
     Args:
         shards: base and views shards of grasps that were planned in scenes.
-        noise: of the depth camera; see docs/clouds.md.
+        noise: of the depth camera; see docs/how-to/clouds.md.
     """
     clouds = Pictures(shards, valid=False).clouds(POINTS, noise=noise, frame="table")
     found = []

@@ -182,7 +182,9 @@ class JobOptions(Model):
         | Annotated[float, Field(allow_inf_nan=False)]
         | Annotated[str, Field(max_length=80)],
     ] = Field(
-        default_factory=dict, max_length=16, description="the method's own options, such as steps; see docs/planners.md"
+        default_factory=dict,
+        max_length=16,
+        description="the method's own options, such as steps; see docs/how-to/planners.md",
     )
     target: str = Field(
         "",

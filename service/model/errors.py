@@ -23,7 +23,7 @@
         ├── TaskCancelled
         └── TaskRefused           unknown schema or function: never retried
 
-A message is one line that names what is wrong and the mend. `exit_code` and `status` are the one table from errors to
+A message is one line that names what is wrong and the fix. `exit_code` and `status` are the one table from errors to
 exit codes and HTTP statuses; `slug` names the problem type (RFC 9457).
 """
 
@@ -41,7 +41,7 @@ _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
 class GraspdError(Exception):
-    """Base of all errors that graspd reports to its user; its text is one line without secrets, whatever it quotes."""
+    """Base of all errors that graspd raises on purpose; its text is one line without secrets."""
 
     slug: ClassVar[str] = "internal"
     status: ClassVar[int] = 500

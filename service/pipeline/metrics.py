@@ -1,6 +1,6 @@
 """Every series of `/metrics`, and what the controller counts of them as it indexes.
 
-`docs/metrics.md` has a table of them. The sums lie in one hash in Redis, so every API process shows the same.
+`docs/reference/metrics.md` has a table of them. The sums lie in one hash in Redis, so every API process shows the same.
 
 They start from zero when Redis is lost, which Prometheus takes for a restart; an event that comes twice counts twice.
 """

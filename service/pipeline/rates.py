@@ -79,8 +79,8 @@ SCALED_SPREAD: Final = (0.5, 2.0)
 #: Interval of a stored rate on an unknown machine: ten times as long was seen on a small one that others used too.
 STORED_SPREAD: Final = (1 / 3, 10.0)
 #: Where the stored numbers come from: CPU times and sizes of graspd 0.1, for a worker with two cores that is busy nine
-#: tenths of its time. docs/scaling.md has them.
-ORIGIN: Final = "stored default: 2 CPU cores, docs/scaling.md"
+#: tenths of its time. docs/explanation/scaling.md has them.
+ORIGIN: Final = "stored default: 2 CPU cores, docs/explanation/scaling.md"
 #: Seconds per grasp tried, with postures, quality and verdict; valid yield of standard (its first matrix: 1,785
 #: of 2,542 tries), which stands for the others too.
 STORED: Final[dict[str, tuple[float, float]]] = {

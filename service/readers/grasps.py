@@ -39,7 +39,7 @@ _KEPT: Final = 256
 class Grasps(Sequence[dict[str, Any]]):
     """Grasps of base shards. `grasps[i]` is a dictionary of the columns' rows with `hand`, `object`, `shard_id`, `row`.
 
-    Columns have the names, units and frames of docs/dataset.md. Swept metrics have one value for each contact
+    Columns have the names, units and frames of docs/reference/dataset.md. Swept metrics have one value for each contact
     threshold of the shard.
     """
 
@@ -65,7 +65,7 @@ class Grasps(Sequence[dict[str, Any]]):
             InputError: an unknown column, or a mask of another length.
         """
         if unknown := set(columns) - set(SCHEMAS["base"]):
-            raise InputError(f"base shards have no column {sorted(unknown)[0]!r}; docs/dataset.md lists them")
+            raise InputError(f"base shards have no column {sorted(unknown)[0]!r}; docs/reference/dataset.md lists them")
         self.shards, self.columns = shards, tuple(columns)
         self._valid, self._unjudged, self._where = valid, unjudged, where
         self._files = shards.of("base")

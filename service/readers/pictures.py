@@ -100,9 +100,11 @@ class Pictures(Sequence[dict[str, Any]]):
             NotFoundError: the scene or base shard of a views shard is not among the shards.
         """
         if unknown := set(columns) - set(SCHEMAS["views"]):
-            raise InputError(f"views shards have no column {sorted(unknown)[0]!r}; docs/dataset.md lists them")
+            raise InputError(
+                f"views shards have no column {sorted(unknown)[0]!r}; docs/reference/dataset.md lists them"
+            )
         if unknown := set(grasp_quality) - set(SCHEMAS["base"]):
-            raise InputError(f"base shards have no column {sorted(unknown)[0]!r}; docs/dataset.md lists them")
+            raise InputError(f"base shards have no column {sorted(unknown)[0]!r}; docs/reference/dataset.md lists them")
         self.shards, self.columns, self._quality = shards, tuple(columns), tuple(grasp_quality)
         self._which = {"clear": clear, "valid": valid, "unjudged": unjudged}
         self._scenes: OrderedDict[str, Scenes] = OrderedDict()

@@ -8,6 +8,7 @@ from starlette.testclient import TestClient
 from typer.core import TyperGroup
 
 import graspd.cli
+from tests.conftest import REPOSITORY
 
 
 def operations(http: TestClient) -> dict[str, dict[str, object]]:
@@ -29,6 +30,11 @@ def test_everything_below_v1_declares_that_a_key_may_be_needed(http: TestClient)
         if "/v1/" in name and "401" not in operation["responses"]  # type: ignore[operator]
     ]
     assert missing == []
+
+
+def test_the_page_of_the_api_lists_every_route(http: TestClient) -> None:
+    page = (REPOSITORY / "docs" / "reference" / "http.md").read_text()
+    assert [path for path in http.get("/openapi.json").json()["paths"] if f"`{path}`" not in page] == []
 
 
 def test_no_reference_in_the_document_is_open(http: TestClient) -> None:

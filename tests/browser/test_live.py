@@ -82,6 +82,7 @@ def places(services: Services) -> list[str]:
         f"/grasps/{shard}/0",
         "/hands",
         "/hands/shadow",
+        "/docs",
         "/workers",
         "/chart",
         "/stability",

@@ -69,7 +69,7 @@ def look_for_engine() -> None:
             raise NoEngine(f"the base image {image} did not come within 15 minutes") from None
         if done.returncode:
             why = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
-            raise NoEngine(f"the base image {image} is neither here nor to be had ({why}); see docs/install.md")
+            raise NoEngine(f"the base image {image} is neither here nor to be had ({why}); see docs/how-to/install.md")
 
 
 @dataclass

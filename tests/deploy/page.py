@@ -1,4 +1,4 @@
-"""Blocks of docs/operations.md and docs/install.md that are marked as tried, and how to run them."""
+"""Blocks of docs/how-to/operations.md and docs/how-to/install.md that are marked as tried, and how to run them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Final
 
 from tests.conftest import REPOSITORY
 
-TEXT: Final = "\n".join((REPOSITORY / "docs" / page).read_text() for page in ("install.md", "operations.md"))
+TEXT: Final = "\n".join((REPOSITORY / "docs" / "how-to" / page).read_text() for page in ("install.md", "operations.md"))
 _TRIED: Final = re.compile(r"<!-- tried: ([\w-]+) -->\n```sh\n(.*?)```", re.DOTALL)
 
 

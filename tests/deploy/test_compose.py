@@ -130,7 +130,7 @@ def test_the_example_names_what_the_file_asks_for() -> None:
     assert {name for name in asked - example if name not in SETTINGS and name not in {"AWS_REGION"}} == set()
 
 
-@pytest.mark.parametrize("page", ["docker-compose.yml", ".env.example", "README.md", "docs/install.md"])
+@pytest.mark.parametrize("page", ["docker-compose.yml", ".env.example", "README.md", "docs/how-to/install.md"])
 def test_profiles_are_named_in_one_place(page: str) -> None:
     """`docker compose --profile cpu` would drop those that COMPOSE_PROFILES in .env asks for."""
     assert "--profile " not in (REPOSITORY / page).read_text()

@@ -193,7 +193,7 @@ def test_no_secret_is_written_down() -> None:
 def test_every_reference_to_a_secret_is_one_that_the_docs_make() -> None:
     text = yaml.safe_dump_all(documents())
     named = set(re.findall(r"(graspd-(?:redis|index|store|keys))\b", text))
-    page = (REPOSITORY / "docs" / "install.md").read_text()
+    page = (REPOSITORY / "docs" / "how-to" / "install.md").read_text()
     assert named == {name for name in named if f"secret generic {name}" in page}
 
 

@@ -1,4 +1,4 @@
-"""Every package that graspd may run with has a licence that is known and accepted, and docs/licences.md names it."""
+"""Every package that graspd may run with has a known and accepted licence, listed in docs/reference/licences.md."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from tests.docs_commands import Line
 FOLDER = REPOSITORY / "docker" / "monitoring"
 RULES = [rule for group in yaml.safe_load((FOLDER / "alerts.yaml").read_text())["groups"] for rule in group["rules"]]
 PANELS = [one for one in json.loads((FOLDER / "grafana.json").read_text())["panels"] if one["type"] != "row"]
-PAGE = (REPOSITORY / "docs" / "metrics.md").read_text()
+PAGE = (REPOSITORY / "docs" / "reference" / "metrics.md").read_text()
 #: Labels that Prometheus adds, and that of the bounds of a histogram.
 ADDED = {"instance", "job", "le"}
 

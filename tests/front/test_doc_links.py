@@ -18,6 +18,9 @@ PAGES = sorted(
     )
     if page.is_file()
 )
+#: Sources whose comments, messages and help name pages.
+SOURCES = ("api", "benchmarks", "docker", "examples", "graspd", "service", "worker")
+_NAMED = re.compile(r"(?<![\w/.])(?:docs|README|CONTRIBUTING|ARCHITECTURE|SECURITY)[\w/-]*\.md\b")
 _CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.DOTALL | re.MULTILINE)
 _LINK = re.compile(r"\]\(([^()\s]+)\)|(?:src|href)=\"([^\"]+)\"")
 
@@ -48,3 +51,15 @@ def test_links_of_a_page_lead_somewhere(page: Path) -> None:
         if not target.exists() or (anchor and target.suffix == ".md" and anchor not in anchors(target)):
             dead.append(link)
     assert dead == []
+
+
+@pytest.mark.parametrize("room", SOURCES)
+def test_pages_that_sources_name_exist(room: str) -> None:
+    files = [
+        file
+        for file in (REPOSITORY / room).rglob("*")
+        if file.suffix in {".py", ".sh", ".toml", ".yaml", ".yml", ".sbatch", ".html", ".ipynb"}
+    ]
+    assert files
+    named = {(str(file.relative_to(REPOSITORY)), page) for file in files for page in _NAMED.findall(file.read_text())}
+    assert {(file, page) for file, page in named if not (REPOSITORY / page).is_file()} == set()

@@ -1,8 +1,9 @@
-"""docs/python.md, the notebook and what of docs/hands.md needs a service, run as they are printed, beside one."""
+"""docs/reference/python.md, the notebook and what of docs/how-to/hands.md needs a service, run as printed."""
 
 from __future__ import annotations
 
 import html
+import inspect
 import json
 import os
 import re
@@ -42,11 +43,25 @@ def run(code: str, environment: dict[str, str], folder: Path) -> str:
 
 
 def test_the_page_runs_as_it_is_printed(environment: dict[str, str], tmp_path: Path) -> None:
-    blocks = re.findall(r"```python\n(.*?)```", (REPOSITORY / "docs" / "python.md").read_text(), re.DOTALL)
+    blocks = re.findall(
+        r"```python\n(.*?)```", (REPOSITORY / "docs" / "reference" / "python.md").read_text(), re.DOTALL
+    )
     said = run("\n".join(blocks), environment, tmp_path)
     assert "<8 grasps of allegro on mug, 8 valid>" in said
     assert "<8 grasps of barrett on mug, 8 valid>" in said
     assert "no_such_file.stl" in said
+
+
+def test_every_public_name_has_a_docstring_whose_first_line_is_short() -> None:
+    named = {name: getattr(graspd, name) for name in graspd.__all__ if not name.startswith("_")}
+    for name, value in list(named.items()):
+        if inspect.isclass(value):
+            named |= {f"{name}.{part}": one for part, one in vars(value).items() if not part.startswith("_")}
+    told = {
+        name: inspect.getdoc(value) or "" for name, value in named.items() if callable(value) or hasattr(value, "fget")
+    }
+    assert len(told) > 40
+    assert {name: text for name, text in told.items() if not 0 < len(text.partition("\n")[0]) <= 100} == {}
 
 
 def test_the_code_on_the_pages_of_the_dashboard_runs(environment: dict[str, str], tmp_path: Path) -> None:
@@ -79,7 +94,7 @@ def test_the_notebook_runs(environment: dict[str, str], tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_hand_is_added_corrected_and_used_as_the_page_says(environment: dict[str, str], tmp_path: Path) -> None:
     write_my_hand(tmp_path)
-    page = (REPOSITORY / "docs" / "hands.md").read_text()
+    page = (REPOSITORY / "docs" / "how-to" / "hands.md").read_text()
     lines = "".join(re.findall(r"```sh\n(.*?)```", page, re.DOTALL)).replace("\\\n", " ").splitlines()
     for line in lines:
         program, *arguments = shlex.split(line, comments=True) or ["", ""]

@@ -58,4 +58,4 @@ def test_a_check_that_does_not_exist_is_the_callers_mistake() -> None:
 
 @pytest.mark.parametrize("check", [check.name for check in all_checks(Settings())])
 def test_operations_tells_every_check(check: str) -> None:
-    assert f"| `{check}` |" in (REPOSITORY / "docs" / "operations.md").read_text()
+    assert f"| `{check}` |" in (REPOSITORY / "docs" / "how-to" / "operations.md").read_text()

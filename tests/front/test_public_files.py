@@ -72,6 +72,16 @@ def test_contributing_is_short() -> None:
     assert len((REPOSITORY / "CONTRIBUTING.md").read_text().split()) <= 700
 
 
+def test_the_documentation_stays_short() -> None:
+    pages = [page for page in REPOSITORY.rglob("*.md") if not {".venv", "build", "node_modules"} & set(page.parts)]
+    words = {
+        page: len(page.read_text().split()) for page in pages if REPOSITORY / "docs" / "results" not in page.parents
+    }
+    assert words[REPOSITORY / "README.md"] <= 900
+    assert sum(words.values()) <= 45_000
+    assert len((REPOSITORY / "ARCHITECTURE.md").read_text().splitlines()) <= 300
+
+
 def test_a_citation_names_the_last_release() -> None:
     cited = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
     assert cited["version"] == PACKAGE_VERSION

@@ -39,7 +39,7 @@ def clouds(
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same clouds.")] = 0,
     json: JsonFlag = False,
 ) -> None:
-    """Write the pictures of a dataset as point clouds with their grasps: docs/clouds.md.
+    """Write the pictures of a dataset as point clouds with their grasps: docs/how-to/clouds.md.
 
     Who reads with graspd needs no files: `Pictures(shards).clouds()` makes the same when it is asked for.
     """

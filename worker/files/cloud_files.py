@@ -22,8 +22,8 @@ _WORDS = ("hand", "object", "shard_id", "base_id")
 def write_clouds(clouds: Clouds, folder: Path, said: Mapping[str, Any]) -> dict[str, int]:
     """Write all clouds: `clouds-NNNNN.npz`, and `clouds.json`, which says how they were made.
 
-    An npz has the keys of a sample (docs/clouds.md) stacked over its C clouds. What has a row for each grasp stands in
-    one array for all of them, cloud by cloud; `grasp/count` (C,) says how many rows each cloud has.
+    An npz has the keys of a sample (docs/how-to/clouds.md) stacked over its C clouds. What has a row for each grasp
+    stands in one array for all of them, cloud by cloud; `grasp/count` (C,) says how many rows each cloud has.
 
     Args:
         said: what `clouds.json` says besides the numbers.

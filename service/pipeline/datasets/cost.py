@@ -30,7 +30,7 @@ from service.pipeline.datasets.spec import MAX_CELLS, Matrix
 from service.pipeline.rates import Machine, Rate, Rates, StageRate, picture_rate, scene_rate, tries
 
 WORKERS: Final = (1, 8, 64)
-#: A task in the queue and the events it sends back, both ways (docs/scaling.md) [bytes].
+#: A task in the queue and the events it sends back, both ways (docs/explanation/scaling.md) [bytes].
 _MESSAGE_BYTES: Final = 19_500
 #: An object of unknown size: a scan of 5000 faces as STL [bytes].
 _ASSET_BYTES: Final = 250_000

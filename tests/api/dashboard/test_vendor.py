@@ -13,7 +13,7 @@ from api.dashboard.rendering import STATIC
 FOLDERS = (STATIC / "vendor", Path(__file__).parents[2] / "browser" / "vendor")
 #: What is bundled comes with the list of its parts.
 SOURCES = {"three-entry.mjs"}
-PERMISSIVE = {"MIT", "0BSD", "OFL-1.1"}
+PERMISSIVE = {"MIT", "0BSD", "OFL-1.1", "Apache-2.0"}
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=["served", "for tests"])

@@ -8,7 +8,7 @@ from service.model.domain import AUDITS, BATCH_SIZE
 from tests.fakes import request
 
 #: The letter takes 6 pushes of 2 s and 0.8 s of closing, 3,200 steps of MuJoCo; a valid grasp has cost some 450 steps
-#: by the certificate, which are a third of its time (docs/performance.md).
+#: by the certificate, which are a third of its time (docs/explanation/performance.md).
 STEPS_OF_AN_AUDIT, STEPS_OF_A_GRASP = 3200, 3 * 450
 
 

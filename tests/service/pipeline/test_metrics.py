@@ -160,7 +160,7 @@ def test_error_names_cannot_become_series_without_end() -> None:
 
 
 def test_the_page_of_metrics_asks_only_for_series_that_exist() -> None:
-    text = (REPOSITORY / "docs" / "metrics.md").read_text()
+    text = (REPOSITORY / "docs" / "reference" / "metrics.md").read_text()
     questions = text[text.index("```promql") :]
     named = {name.removesuffix("_bucket") for name in re.findall(r"graspd_[a-z_]+", questions)}
     assert named <= set(SERIES)

@@ -1,4 +1,4 @@
-"""docs/clouds.md does what it prints."""
+"""docs/how-to/clouds.md does what it prints."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_the_page_runs_as_it_is_printed(tmp_path: Path, monkeypatch: pytest.Monk
     (tmp_path / "demo-out").mkdir()
     box_scenes.write(tmp_path / "demo-out" / "shards")
     monkeypatch.chdir(tmp_path)
-    page = (REPOSITORY / "docs" / "clouds.md").read_text()
+    page = (REPOSITORY / "docs" / "how-to" / "clouds.md").read_text()
     said: dict[str, Any] = {}
     for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
         if "torch" not in block or find_spec("torch") is not None:

@@ -1,4 +1,4 @@
-"""Files that the commands of docs/hands.md name, as a reader would have them."""
+"""Files that the commands of docs/how-to/hands.md name, as a reader would have them."""
 
 from __future__ import annotations
 

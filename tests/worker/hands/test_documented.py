@@ -1,4 +1,4 @@
-"""Every `graspd hands check` of docs/hands.md does what it says; tests/front/test_docs.py runs what needs a service."""
+"""Every `graspd hands check` of docs/how-to/hands.md does what it says; tests/front/test_docs.py has the rest."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from worker.run import Run
 from worker.stages import hand_self_test
 from worker.stages.hand_self_test import SelfTest
 
-PAGE = (REPOSITORY / "docs" / "hands.md").read_text()
+PAGE = (REPOSITORY / "docs" / "how-to" / "hands.md").read_text()
 BLOCKS = "".join(re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)).replace("\\\n", " ")
 LINES = [line for line in BLOCKS.splitlines() if line.strip()]
 COMMANDS = [line for line in LINES if line.startswith("graspd hands check ")]

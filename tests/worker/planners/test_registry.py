@@ -71,7 +71,7 @@ def test_an_entry_point_that_is_no_method_is_named_in_the_error(monkeypatch: pyt
 
 
 def documented_example() -> str:
-    page = (Path(__file__).parents[3] / "docs" / "planners.md").read_text()
+    page = (Path(__file__).parents[3] / "docs" / "how-to" / "planners.md").read_text()
     return page.split("```python\n", 1)[1].split("```", 1)[0]
 
 
@@ -95,7 +95,7 @@ def test_the_documented_package_runs_as_a_method(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", sorted(PLANNERS))
 def test_the_page_names_every_method_with_all_its_options_and_defaults(name: str) -> None:
-    page = (Path(__file__).parents[3] / "docs" / "planners.md").read_text()
+    page = (Path(__file__).parents[3] / "docs" / "how-to" / "planners.md").read_text()
     row = next(line for line in page.splitlines() if line.startswith(f"| `{name}` | "))
     for option, field in method(name).options.model_fields.items():
         assert f"`{option}` ({'required' if field.is_required() else format(field.default, 'g')}" in row

@@ -1,4 +1,4 @@
-"""docs/robots.md: every command on it works as it stands."""
+"""docs/how-to/robots.md: every command on it works as it stands."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.worker.robots.arms import write_arm
 from tests.worker.robots.shards import run
 from worker.files.robot_export import ALIASES, FORMATS
 
-PAGE = (REPOSITORY / "docs" / "robots.md").read_text()
+PAGE = (REPOSITORY / "docs" / "how-to" / "robots.md").read_text()
 
 
 def commands() -> list[list[str]]:

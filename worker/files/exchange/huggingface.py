@@ -4,7 +4,7 @@
     pictures/{train,test}-00000.parquet   a picture a row: colour, depth, labels, camera, grasps in its frame
     README.md                             says which files are which
 
-Columns, units and frames are those of `GRASPS` and `PICTURES`; docs/exchange/huggingface.md is the reference.
+Columns, units and frames are those of `GRASPS` and `PICTURES`; docs/how-to/exchange/huggingface.md is the reference.
 """
 
 from __future__ import annotations
@@ -209,7 +209,10 @@ def _card(splits: list[str], *, seen: bool) -> str:
         for table in (["grasps", "pictures"] if seen else ["grasps"])
     ]
     head = f"---\nconfigs: {json.dumps(tables)}\n---\n\n"
-    return head + "# Grasps made with graspd\n\nColumns, units and frames: docs/exchange/huggingface.md of graspd.\n"
+    return (
+        head
+        + "# Grasps made with graspd\n\nColumns, units and frames: docs/how-to/exchange/huggingface.md of graspd.\n"
+    )
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Imported]:

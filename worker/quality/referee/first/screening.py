@@ -65,7 +65,7 @@ def first_terms(hand: HandModel, level: str, run: Run) -> list[Any]:
     """The terms of the first judge where it takes part in verdicts of a level, for `verdict_key`; else none.
 
     Grippers have none: their flat pads touch in an area, and how the engines spread contacts over it differs. Hands
-    with tendons have none: on a tenth of Shadow's grasps the engines differ (docs/first-judge.md).
+    with tendons have none: on a tenth of Shadow's grasps the engines differ (docs/explanation/quality.md).
 
     Raises:
         InputError: it is insisted on, and not installed.

@@ -1,0 +1,69 @@
+"""Hooks of MkDocs: pages outside `docs/` join the site, and links to other files of the repository become plain text.
+
+GitHub renders the same Markdown without them: README.md, CONTRIBUTING.md and their like stay where a forge looks.
+"""
+
+from __future__ import annotations
+
+import os
+import posixpath
+import re
+from pathlib import Path
+from typing import Any, Final
+
+from mkdocs.structure.files import File, Files
+
+ROOT: Final = Path(__file__).resolve().parents[1]
+#: Pages of the repository by their place in the site.
+OUTSIDE: Final = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "project/contributing.md",
+    "ARCHITECTURE.md": "project/architecture.md",
+    "SECURITY.md": "project/security.md",
+    "CODE_OF_CONDUCT.md": "project/conduct.md",
+    "CHANGELOG.md": "project/changelog.md",
+    "examples/train_grasp_predictor/README.md": "how-to/example-network.md",
+}
+_INSIDE: Final = {place: source for source, place in OUTSIDE.items()}
+_CODE: Final = re.compile(r"(^```.*?^```)", re.DOTALL | re.MULTILINE)
+_LINK: Final = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)|(src|href)=\"([^\"]+)\"")
+
+
+def on_files(files: Files, *, config: Any) -> Files:
+    """Add the pages from outside."""
+    for source, place in OUTSIDE.items():
+        files.append(File.generated(config, place, content=(ROOT / source).read_text()))
+    return files
+
+
+def on_page_markdown(markdown: str, *, page: Any, files: Files, **_: Any) -> str:
+    """Links as the site has them: pages from outside at their place, other files outside `docs/` as plain text."""
+    place = page.file.src_uri
+    if place.startswith(("results/", "adr/")):
+        page.meta.setdefault("search", {"boost": 0.2})  # figures answer few questions by themselves
+    source = _INSIDE.get(place, f"docs/{place}")
+
+    def of_site(link: str) -> str | None:
+        """The link in the site; None where its target is not there."""
+        if re.match(r"[a-z]+:|#", link):
+            return link
+        path, mark, anchor = link.partition("#")
+        target = posixpath.normpath(posixpath.join(posixpath.dirname(source), path))
+        inside = OUTSIDE.get(target) or target.removeprefix("docs/")
+        if (ROOT / target).is_dir() and f"{target}/README.md" in OUTSIDE:
+            inside = OUTSIDE[f"{target}/README.md"]
+        elif (ROOT / target).is_dir() and files.get_file_from_path(f"{inside}/README.md"):
+            inside = f"{inside}/README.md"
+        if files.get_file_from_path(inside) is None:
+            return None
+        return os.path.relpath(inside, posixpath.dirname(place) or ".") + mark + anchor
+
+    def mended(found: re.Match[str]) -> str:
+        if found[4]:
+            return f'{found[4]}="{of_site(found[5]) or found[5]}"'
+        text = _LINK.sub(mended, found[2])
+        link = of_site(found[3])
+        return f"{found[1]}[{text}]({link})" if link else text
+
+    parts = _CODE.split(markdown)
+    return "".join(part if number % 2 else _LINK.sub(mended, part) for number, part in enumerate(parts))
