@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from service.index.views import AttemptView, GraspView, Judged, ShardView, StageProgress, TagView, WorkerView
+from service.model.base import TagName
 from service.model.diversity import CELLS
 from service.model.domain import Digest, JobRequest
-from service.model.labels import TagName
-from service.model.metric_fields import OfferedName, filters, means, with_fields
+from service.model.metrics import OfferedName, filters, means, with_fields
 from service.model.records import Choice
 from service.model.robust import WORDS
 from service.model.scene_spec import Box, HalfSpace, SceneKind

@@ -8,7 +8,7 @@ import typer
 
 from service import tracing
 from service.cli import keep_private, load_settings, log_to_stderr, reporting_errors
-from service.model.imports import imports
+from service.model.libraries import imports
 
 app = typer.Typer(add_completion=False)
 

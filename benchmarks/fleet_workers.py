@@ -26,11 +26,11 @@ from typing import Any, Final
 from rq.defaults import DEFAULT_WORKER_TTL as LEASE_KEPT_S
 
 from service.model import names
-from service.model.ability import own_ability
 from service.model.clock import timestamp
 from service.model.messages import TaskMessage
 from service.model.states import Lane, Stage
 from service.model.version import PACKAGE_VERSION
+from service.model.workers import own_ability
 from service.queue.lists import queue_name
 from service.queue.port import Event, EventKind, Report
 from service.queue.rates import beat_every_s, report_every_s

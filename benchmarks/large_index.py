@@ -21,8 +21,7 @@ import numpy as np
 from sqlalchemy import Connection, Table
 
 from service.index.bulk import upsert
-from service.index.changes.rows import attempt_row, job_row, shard_row, task_rows
-from service.index.changes.states import settle
+from service.index.changes.rows import attempt_row, job_row, settle, shard_row, task_rows
 from service.index.index import Index
 from service.index.tables import attempts, grasps, jobs, metadata, shards, tasks
 from service.model import names
@@ -248,7 +247,7 @@ def _copy(connection: Connection, table: Table, rows: Sequence[dict[str, Any]]) 
             copy.write_row([p(row[name]) if (p := process[name]) else row[name] for name in columns])
 
 
-class _without_indexes:  # noqa: N801
+class _without_indexes:
     """A table without its secondary indexes for a while: they are made anew at the end, which is much quicker."""
 
     def __init__(self, connection: Connection, table: Table) -> None:

@@ -17,7 +17,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 from graspd import shadows
-from service.model.imports import imports
+from service.model.libraries import imports
 
 if TYPE_CHECKING:
     from graspd.grasps import Grasp, Grasps, Postures, open

@@ -14,9 +14,9 @@ from pydantic import ValidationError
 from typer.core import TyperCommand, TyperGroup
 
 from service.cli import at_the_door
-from service.model.imports import imports, own_process
-from service.model.refusals import words
-from service.model.suggestions import did_you_mean
+from service.model.base import words
+from service.model.errors import did_you_mean
+from service.model.libraries import imports, own_process
 from service.model.version import PACKAGE_VERSION
 
 #: Command, module of its group, panel of the overview, help.

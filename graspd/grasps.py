@@ -16,9 +16,8 @@ from service.model.errors import InputError
 from service.model.metrics import GRASP_METRICS, GraspMetric
 from service.model.transforms import compose
 from service.readers.files import Shards, open_shards
-from service.store import standing
-from service.store.attributes import Attribute
-from service.store.columns import SCHEMAS
+from service.store import validity
+from service.store.columns import SCHEMAS, Attribute
 from service.store.manifests import INDEX_THRESHOLD_M
 from service.store.shards import Shard, read_shard, write_shard
 
@@ -200,12 +199,12 @@ class Grasps:
     @property
     def is_valid(self) -> NDArray[np.bool_]:
         """(N,) sound, and a referee judged that it holds; in a scene: that it lifts."""
-        return standing.valid(self._columns)
+        return validity.valid(self._columns)
 
     @property
     def is_sound(self) -> NDArray[np.bool_]:
         """(N,) passed the geometric gate."""
-        return standing.sound(self._columns)
+        return validity.sound(self._columns)
 
     @property
     def metrics(self) -> list[str]:

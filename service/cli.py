@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, ParamSpec, 
 import typer
 from pydantic import BaseModel, ValidationError
 
-from service.model.errors import GraspdError, InputError
-from service.model.redaction import without_secrets
-from service.model.refusals import refusal
+from service.model.base import refusal
+from service.model.errors import GraspdError, InputError, without_secrets
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from service.model.redaction import without_secrets
+from service.model.errors import without_secrets
 
 if TYPE_CHECKING:
     from service.settings import Settings

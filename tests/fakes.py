@@ -24,9 +24,9 @@ from service.model.planning import message_of, plan
 from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane, Stage
 from service.pipeline.backends import Services
+from service.store.integrity import put_document
 from service.store.library import publish_asset
 from service.store.manifests import ShardManifest, load_shard, publish_shard
-from service.store.seals import put_document
 from service.store.store import Store
 from worker.process.engine import Engine
 from worker.process.fitness import Check

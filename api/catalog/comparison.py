@@ -8,9 +8,9 @@ from typing import Any, Final
 
 from api.catalog.datasets import Datasets
 from api.catalog.grasps import MEAN_METRICS
-from service.index.dataset_views import CellView, DatasetView
-from service.index.filters import GraspFilter, Metric
+from service.index.queries.grasps import GraspFilter, Metric
 from service.index.queries.statistics import Distribution
+from service.index.views import CellView, DatasetView
 from service.pipeline.backends import Services
 
 #: Cells of a dataset that are compared one by one: nobody reads more rows.

@@ -10,9 +10,8 @@ import logging
 from api.access.auth import caller, caller_id, must_own, project_scope
 from api.access.quotas import Quotas
 from api.access.unfinished import DATASET_PREFIX
-from service.index.dataset_views import CellView, DatasetView, ObjectSetView, SnapshotView
-from service.index.views import MatrixCell, Page
-from service.model.dataset_records import Snapshot
+from service.index.views import CellView, DatasetView, MatrixCell, ObjectSetView, Page, SnapshotView
+from service.model.records import Snapshot
 from service.model.states import State
 from service.pipeline import deletion
 from service.pipeline.backends import Services
@@ -21,7 +20,7 @@ from service.pipeline.datasets.cost import estimate
 from service.pipeline.datasets.estimate import Estimate
 from service.pipeline.datasets.spec import DatasetRequest, Matrix
 from service.pipeline.fidelity_choice import Resolver
-from service.store.datasets import load_snapshot
+from service.store.records import load_snapshot
 
 log = logging.getLogger(__name__)
 

@@ -23,8 +23,7 @@ from service.model.errors import InputError, LimitError
 from service.model.tags import Grasp, by_shard
 from service.pipeline.backends import Services
 from service.store.integrity import read_checked
-from service.store.shards import read_shard
-from service.store.subsets import part_of_shard, place_of
+from service.store.shards import part_of_shard, place_of, read_shard
 
 Format = Literal["csv", "json", "zip"]
 MEDIA_TYPES: Final[dict[Format, str]] = {"csv": "text/csv", "json": "application/json", "zip": "application/zip"}
@@ -63,7 +62,7 @@ class GraspExports:
             LimitError: a ZIP of grasps of more than `MOST_SHARDS` shards.
             DamagedShard: a shard is not what its checksum says.
         """
-        file = TemporaryFile()  # noqa: SIM115 (it is closed once it is sent)
+        file = TemporaryFile()
         try:
             {"csv": self._csv, "json": self._json, "zip": self._zip}[format](file, places, said)
             size = file.tell()

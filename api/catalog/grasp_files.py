@@ -13,7 +13,7 @@ from api.models import GraspDetail, GraspScene, Neighbour, Posture, Push, Waypoi
 from service.index.views import GraspView, ShardView
 from service.model.errors import InputError, NotFoundError
 from service.model.metrics import GRASP_METRICS
-from service.model.scene_kinds import supports_in
+from service.model.scene_spec import supports_in
 from service.readers.ways import scene_spec_of, stop_places, way_of
 from service.store.columns import SCHEMAS
 from service.store.integrity import read_checked

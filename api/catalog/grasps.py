@@ -8,7 +8,7 @@ from typing import Final
 from api.access.auth import project_scope
 from api.catalog.grasp_files import GraspFiles
 from api.models import Diversity, GraspDetail, GraspQuery, Histogram, JobDetail
-from service.index.filters import GraspFilter, GraspSort, Metric
+from service.index.queries.grasps import GraspFilter, GraspSort, Metric
 from service.index.queries.statistics import Kinds
 from service.index.views import GraspView, JobView, Page
 from service.model.diversity import CELLS, GraspType, entropy_bits, evenness

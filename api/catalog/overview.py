@@ -14,8 +14,8 @@ from api.catalog.health import Probes
 from api.catalog.jobs import Jobs
 from api.metrics import Snapshot
 from api.models import Health, Part, Worker
-from service.index.at_scrape import read_index
-from service.index.damage import Damage
+from service.index.notes import Damage
+from service.index.queries.overview import read_index
 from service.index.views import FailureGroup, Stats, TaskView
 from service.model.digests import digest_json
 from service.model.errors import NotFoundError, UnavailableError

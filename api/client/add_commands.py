@@ -45,8 +45,7 @@ from service.store.asset_options import (
     sizes_of,
 )
 from service.store.assets import pack
-from service.store.hand_files import files_of_hand
-from service.store.hand_main import SUFFIXES, hand_name
+from service.store.hand_files import SUFFIXES, files_of_hand, hand_name
 from service.store.object_sets import files_of_set
 
 NameOption = Annotated[str | None, typer.Option("--name", help="Name to give it; default: the file's.")]

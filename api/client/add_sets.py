@@ -16,9 +16,9 @@ from api.uploads import name_of_upload
 from service.cli import emit
 from service.model.errors import InputError
 from service.model.states import AssetKind
+from service.store.descriptions import json_object
 from service.store.asset_summary import verdict_line
 from service.store.assets import pack
-from service.store.descriptions import json_object
 from service.store.object_sets import SUFFIXES, Objects
 
 

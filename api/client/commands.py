@@ -30,7 +30,7 @@ from service.cli import JsonFlag, emit, plain_console, plain_table, reporting_er
 from service.model.diversity import MIN_DISTANCE_M
 from service.model.domain import AUDITS, NETWORK_METHODS, JobRequest
 from service.model.errors import InputError
-from service.model.scene_options import scene_option
+from service.model.scene_spec import scene_option
 from service.model.states import AssetKind, State
 from service.store.asset_options import (
     DensityOption,

@@ -18,10 +18,9 @@ from api.client.job_options import validated, with_job_options
 from api.client.reports import UrlOption, YesOption, confirm, open_client, restore, say_deleted
 from api.formatting import count, minute, percent, size
 from service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
-from service.index.dataset_views import DatasetView
-from service.model.errors import InputError, TaskError
+from service.index.views import DatasetView
+from service.model.errors import InputError, TaskError, did_you_mean, one_of
 from service.model.states import AssetKind, State
-from service.model.suggestions import did_you_mean, one_of
 from service.pipeline.datasets.estimate import Estimate
 from service.pipeline.datasets.export import FORMATS
 from service.pipeline.datasets.spec import DatasetRequest, Matrix

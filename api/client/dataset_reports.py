@@ -12,8 +12,7 @@ from rich.text import Text
 from api.client.client import Client
 from api.formatting import count, duration, metric, percent, size, valid_yield
 from service.cli import plain_table
-from service.index.dataset_views import CellView, DatasetView
-from service.index.views import Judged
+from service.index.views import CellView, DatasetView, Judged
 from service.model.domain import JobOptions
 from service.model.states import State
 from service.pipeline.datasets.estimate import Estimate

@@ -13,10 +13,10 @@ import typer
 from pydantic import Field, model_validator
 
 from api.client.job_options import pairs, validated
+from service.model.base import why
 from service.model.domain import JobOptions, Name
 from service.model.errors import InputError
-from service.model.refusals import why
-from service.model.scene_options import known_name, scene_option
+from service.model.scene_spec import known_name, scene_option
 
 SpecOption = Annotated[
     Path | None, typer.Option("--spec", help="TOML or JSON file that says it; options go over what it says.")

@@ -12,10 +12,10 @@ import typer
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from service.model.base import words
 from service.model.domain import JobOptions
 from service.model.errors import InputError
 from service.model.fidelity import OFFERED
-from service.model.refusals import words
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 

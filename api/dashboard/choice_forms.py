@@ -18,8 +18,8 @@ from api.dashboard.forms import first_message
 from api.models import GraspName, GraspQuery, Selection
 from api.routes.dependencies import ExportsOf, TagsOf, may_read, may_submit
 from api.routes.grasps import exported
+from service.model.base import TagName
 from service.model.errors import InputError
-from service.model.labels import TagName
 
 _MAX_FIELDS: Final = 400
 #: Longest query of a list that a form gives back.

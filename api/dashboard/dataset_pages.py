@@ -22,7 +22,7 @@ from api.dashboard.form_uploads import asset_choices
 from api.dashboard.forms import first_message
 from api.dashboard.rendering import render
 from api.routes.dependencies import AssetsOf, DatasetsOf, JobsOf, may_read, may_submit
-from service.index.dataset_views import CellView
+from service.index.views import CellView
 from service.model.domain import JobRequest
 from service.model.errors import ConflictError, InputError
 from service.model.fidelity import OFFERED

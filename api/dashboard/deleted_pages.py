@@ -10,7 +10,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from api.dashboard.rendering import render
 from api.routes.dependencies import DatasetsOf, DeletionsOf, JobsOf, TagsOf, may_read, may_submit
 from service.model.errors import InputError
-from service.store.deletions import What
+from service.store.records import What
 
 router = APIRouter(include_in_schema=False)
 

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from api.access.auth import project_scope
 from service.index.index import Index
-from service.index.queries.costs import BatchCost, Costs
+from service.index.queries.usage import BatchCost, Costs
 from service.model.errors import GraspdError
 from service.model.fidelity import OFFERED
 from service.model.projects import ProjectScope

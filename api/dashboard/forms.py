@@ -16,9 +16,9 @@ from api.dashboard.expected import listed
 from api.dashboard.form_uploads import FILE_FIELDS, UNITS, Chosen, choices, chosen, refusal_of
 from api.dashboard.rendering import render
 from api.routes.dependencies import AssetsOf, JobsOf, may_read, may_submit
+from service.model.base import refusal, words
 from service.model.domain import JobRequest
 from service.model.errors import InputError
-from service.model.refusals import refusal, words
 from service.model.states import AssetKind
 
 router = APIRouter(include_in_schema=False)

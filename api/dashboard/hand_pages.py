@@ -20,7 +20,7 @@ from service.index.views import AssetView
 from service.model.errors import ConflictError, InputError, NotFoundError
 from service.model.states import AssetKind
 from service.store.asset_summary import hand_line, limit_line, self_test_line
-from service.store.hand_corrections import MAX_ENTRIES, HandFacts
+from service.store.descriptions import MAX_ENTRIES, HandFacts
 
 PAGE_SIZE: Final = 50
 #: A check takes seconds.

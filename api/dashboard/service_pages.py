@@ -15,8 +15,7 @@ from api.dashboard.figures import charts, stability, tradeoff
 from api.dashboard.rendering import render
 from api.models import STAGE_LABELS
 from api.routes.dependencies import DatasetsOf, JobsOf, OverviewOf, StoreOf, may_read
-from service.index.dataset_views import DatasetView
-from service.index.views import WorkerView
+from service.index.views import DatasetView, WorkerView
 from service.model.errors import UnavailableError
 from service.model.states import State
 

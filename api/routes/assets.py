@@ -23,7 +23,7 @@ from service.index.views import AssetView, Page
 from service.model.domain import Name
 from service.model.errors import InputError, RateError
 from service.model.states import AssetKind
-from service.store.hand_corrections import HandCorrections
+from service.store.descriptions import HandCorrections
 
 _GLB: Final = "model/gltf-binary"
 #: Uploads being unpacked and packed in this process; each may hold one file of its size in memory.

@@ -12,10 +12,9 @@ from starlette.types import Receive, Scope, Send
 from api.problems import ApiError, responses
 from api.routes.dependencies import Cursor, DatasetsOf, Limit, may_read, may_submit
 from api.routes.paging import link_next
-from service.index.dataset_views import CellView, DatasetView, ObjectSetView, SnapshotView
-from service.index.views import Page
-from service.model.dataset_records import Snapshot
+from service.index.views import CellView, DatasetView, ObjectSetView, Page, SnapshotView
 from service.model.domain import Name
+from service.model.records import Snapshot
 from service.model.states import State
 from service.pipeline.datasets.estimate import Estimate
 from service.pipeline.datasets.spec import DatasetRequest, Matrix, Names

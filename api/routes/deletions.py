@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, Path
 from api.catalog.deletions import DeletionView
 from api.problems import responses
 from api.routes.dependencies import DeletionsOf, may_read, may_submit
-from service.store.deletions import What
+from service.store.records import What
 
 router = APIRouter(tags=["deletions"])
 

@@ -11,7 +11,7 @@ from api.routes.dependencies import AssetsOf, may_submit
 from api.routes.long_requests import Turns
 from service.index.views import AssetView
 from service.model.domain import Name
-from service.store.hand_corrections import HandCorrections
+from service.store.descriptions import HandCorrections
 
 router = APIRouter(prefix="/v1/hands", tags=["hands"])
 

@@ -12,25 +12,28 @@ from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
-from service.model.base import Model
+from service.model.base import DIGEST, Model
+from service.model.base import Digest as Digest
+from service.model.base import Name as Name
+from service.model.base import Word as Word
 from service.model.diversity import MIN_DISTANCE_M
 from service.model.fidelity import AUTO, Fidelity, resolve_fidelity
-from service.model.labels import DIGEST
-from service.model.labels import Digest as Digest
-from service.model.labels import Name as Name
-from service.model.labels import Word as Word
 from service.model.matter import FRICTION, MASS_KG, MOST_KG, Density, Friction, Mass
 from service.model.projects import Project
 from service.model.robust import MODELS, MOST_MODELS
-from service.model.scene_kinds import has_table
-from service.model.scene_options import (
+from service.model.scene_spec import (
+    LEAST_TOUCH,
+    MOST_NEIGHBOURS,
+    MOST_TOUCH,
+    TOUCH,
     BesideOption,
     NamedNeighbour,
     SceneDocument,
     SceneOption,
+    SceneSpec,
+    has_table,
     scene_of,
 )
-from service.model.scene_spec import LEAST_TOUCH, MOST_NEIGHBOURS, MOST_TOUCH, TOUCH, SceneSpec
 from service.model.states import AssetKind
 
 #: Grasps of a batch: the unit of seeds and of the planner's launches.

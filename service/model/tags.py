@@ -7,9 +7,9 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
+from service.model.base import TagName
 from service.model.digests import digest_json
 from service.model.domain import Digest
-from service.model.labels import TagName
 from service.model.projects import Project
 from service.model.records import Record
 

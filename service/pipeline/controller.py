@@ -18,13 +18,11 @@ from service.heartbeat_file import HeartbeatFile
 from service.index.queries.feed import ReadyTask
 from service.index.rebuild import complete_if_new, rebuild
 from service.model import names
-from service.model.ability import need_of
 from service.model.clock import timestamp
 from service.model.errors import BusyError, DamagedError, StoreUnavailable, UnavailableError
-from service.model.planning import ingest_id, ingest_message
+from service.model.planning import Turns, ingest_id, ingest_message
 from service.model.states import Lane
-from service.model.turns import Turns
-from service.model.worker_beat import WorkerBeat
+from service.model.workers import WorkerBeat, need_of
 from service.pipeline.backends import Services
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.entering import Entering

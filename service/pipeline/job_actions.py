@@ -13,7 +13,6 @@ from service.index.queries.feed import ReadyTask
 from service.index.views import JobView
 from service.logs import bound
 from service.model import names
-from service.model.ability import need_of
 from service.model.clock import timestamp
 from service.model.digests import job_id
 from service.model.domain import JobRequest
@@ -23,6 +22,7 @@ from service.model.planning import lane_of, message_of
 from service.model.projects import EVERYTHING, ProjectScope
 from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane, State
+from service.model.workers import need_of
 from service.pipeline.backends import Services
 from service.pipeline.fidelity_choice import Resolver
 from service.pipeline.ranges import TaskRanges
@@ -31,8 +31,7 @@ from service.pipeline.routes import Routes
 from service.pipeline.scene_check import check_scene
 from service.pipeline.usable import usable, with_neighbours, with_network
 from service.queue.port import Event, EventKind
-from service.store.deletions import refuse_pending
-from service.store.records import add_job_event, job_events, put_record, read_record
+from service.store.records import add_job_event, job_events, put_record, read_record, refuse_pending
 
 log = logging.getLogger(__name__)
 #: Wait before it is looked again whether a worker can do what was held back [s].

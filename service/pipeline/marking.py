@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from service.index.notes import Marked
 from service.pipeline.backends import Services
-from service.store.marks import newest_mark, next_mark, set_mark
+from service.store.records import newest_mark, next_mark, set_mark
 
 
 class Marking:

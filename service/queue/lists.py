@@ -13,8 +13,8 @@ from typing import Any, Final
 
 from redis.exceptions import ResponseError
 
-from service.model.ability import FIRST_SCHEMA, Ability, Need
 from service.model.states import Lane, Stage
+from service.model.workers import FIRST_SCHEMA, Ability, Need
 from service.queue import entries
 from service.queue.port import lane_order
 from service.queue.rq_keys import LISTS, list_name

@@ -21,10 +21,9 @@ from rq.executions import Execution
 from rq.job import Job
 from rq.serializers import JSONSerializer
 
-from service.model.ability import need_of
 from service.model.errors import QueueUnavailable
 from service.model.states import Lane, Stage
-from service.model.worker_beat import WorkerBeat
+from service.model.workers import WorkerBeat, need_of
 from service.queue import entries, rq_keys
 from service.queue.address import redis_url
 from service.queue.allowed import TASK_FUNCTION, new_job

@@ -25,10 +25,9 @@ from service.pipeline.leading import PART
 from service.queue.address import redis_url
 from service.queue.port import Presence
 from service.queue.rq_queue import open_queue
-from service.run.address import forget_address, record_address
+from service.run.address import Joining, forget_address, record_address
 from service.run.children import Child, end_leftovers
 from service.run.embedded import find_server, give_up_log, lock_file, own_redis, server_command, set_log_aside
-from service.run.joining import Joining
 from service.settings import Settings
 from service.store.store import open_store
 

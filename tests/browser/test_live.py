@@ -17,8 +17,7 @@ from service.pipeline import deletion, tagging
 from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
-from service.store.records import read_record
-from service.store.study_records import publish
+from service.store.records import publish, read_record
 from tests.api.dashboard.test_stability_page import a_record
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
 from tests.planning import plan_all
@@ -260,7 +259,7 @@ def test_every_page_reads_without_javascript(address: str, page: Any, places: li
     texts = {path: _text_of(context.new_page(), path) for path in places}
     context.close()
     assert all(len(text) > 40 for text in texts.values())
-    of: Callable[[str], str] = lambda start: next(text for path, text in texts.items() if path.startswith(start))  # noqa: E731
+    of: Callable[[str], str] = lambda start: next(text for path, text in texts.items() if path.startswith(start))
     assert "Penetration" in of("/grasps/")
     assert "allegro × mug" in of("/grasps")
     assert "kitchen" in of("/datasets")

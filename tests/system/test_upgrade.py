@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from service.model.ability import UNTOLD_REVISIONS
 from service.model.states import State
 from service.model.version import STAGE_REVISIONS
+from service.model.workers import UNTOLD_REVISIONS
 from service.pipeline import job_actions
 from tests.conftest import REPOSITORY
 from tests.fakes import request

@@ -12,16 +12,15 @@ from typing import Any, Final
 import numpy as np
 from pydantic_core import from_json
 
-from service.model.dataset_records import DatasetRecord, Snapshot, job_of
 from service.model.errors import InputError, NotFoundError
 from service.model.planning import plan
+from service.model.records import DatasetRecord, Snapshot, job_of
 from service.model.states import AssetKind
 from service.model.version import PACKAGE_VERSION
 from service.readers import Shards, open_shards
 from service.store.assets import builtin_asset, builtin_files, builtin_names
-from service.store.datasets import load_dataset, newest_snapshot
 from service.store.library import load_asset, load_asset_files, load_check
-from service.store.records import parse_record, task_attempts
+from service.store.records import load_dataset, newest_snapshot, parse_record, task_attempts
 from service.store.shards import open_shard
 from service.store.store import Store
 

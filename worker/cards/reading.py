@@ -15,7 +15,7 @@ from service.model import names
 from service.model.errors import NotFoundError
 from service.model.metrics import GRASP_METRICS
 from service.readers import ShardFile
-from service.store import standing
+from service.store import validity
 from service.store.manifests import ShardManifest, load_manifest
 from service.store.shards import json_attribute, open_shard, read_column
 from worker.cards.contents import Contents
@@ -27,7 +27,7 @@ COLUMNS: Final[dict[str, tuple[str, ...]]] = {
         "grasp/joint_positions",
         "quality/thresholds_m",
         *(metric.path for metric in GRASP_METRICS),
-        *standing.COLUMNS,
+        *validity.COLUMNS,
         "quality/audit",
         "quality/lift_hard",
     ),

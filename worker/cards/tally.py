@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from service.model.metrics import GRASP_METRICS
 from service.model.transforms import quat_rotate
-from service.store import standing
+from service.store import validity
 from service.store.manifests import INDEX_THRESHOLD_M
 from worker.cards.contents import AssetFacts, Contents, Pair
 from worker.cards.directions import ELEVATION_BINS, elevations
@@ -233,12 +233,12 @@ def _note(tally: Tally, cell: CellTally, piece: Piece) -> None:
 def _add_base(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts) -> Array:
     """Add a base shard; returns its mask (N,) of valid grasps."""
     columns = piece.columns
-    valid = standing.valid(columns)
+    valid = validity.valid(columns)
     cell.grasps += piece.rows
     cell.valid += int(valid.sum())
     tried = int(piece.said.get("tried", piece.rows))
     cell.tried += tried
-    if standing.judged(columns).any() or (not piece.rows and piece.said.get("verdict_level", "none") != "none"):
+    if validity.judged(columns).any() or (not piece.rows and piece.said.get("verdict_level", "none") != "none"):
         cell.judged += tried
     cell.rejected.update({str(why): int(count) for why, count in dict(piece.info.get("rejected", {})).items()})
     if (audit := columns.get("quality/audit")) is not None:

@@ -10,9 +10,8 @@ import typer
 
 from service.cli import JsonFlag, emit, reporting_errors
 from service.model.cores import available_cores
-from service.model.errors import InputError
+from service.model.errors import InputError, one_of
 from service.model.fidelity import FIDELITIES, OFFERED, Fidelity
-from service.model.suggestions import one_of
 from worker.engines.devices import Device
 
 app = typer.Typer()

@@ -15,11 +15,10 @@ from typing import Annotated, Any
 import typer
 
 from service.cli import JsonFlag, emit, load_settings, reporting_errors
-from service.model.errors import InputError
+from service.model.errors import InputError, one_of
 from service.model.fidelity import FIDELITIES, OFFERED
 from service.model.robust import MODELS
 from service.model.scene_spec import SceneSpec, parse_scene
-from service.model.suggestions import one_of
 from worker.engines.devices import Device
 from worker.run import Run
 
@@ -217,8 +216,8 @@ def _things(objects: Sequence[str]) -> list[Any]:
 
 
 def _publish(result: dict[str, Any], data_dir: Path | None) -> None:
+    from service.store.records import kind_of, publish
     from service.store.store import open_store
-    from service.store.study_records import kind_of, publish
 
     key = publish(open_store(load_settings(data_dir=data_dir).resolved_store_url), kind_of(result), result)
     _say(f"published as {key}")

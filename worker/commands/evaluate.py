@@ -12,9 +12,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 
 from service.cli import JsonFlag, emit, plain_console, reporting_errors
-from service.model.errors import InputError
+from service.model.errors import InputError, one_of
 from service.model.robust import MEANINGS, MOST_MODELS
-from service.model.suggestions import one_of
 from worker.files.cases import expand, load_case
 from worker.files.evaluate import Protocol, combine, evaluate
 from worker.files.robust_copies import copy_paths, write_copy

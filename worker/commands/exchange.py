@@ -10,9 +10,8 @@ import numpy as np
 import typer
 
 from service.cli import JsonFlag, emit, reporting_errors
-from service.model.errors import InputError
-from service.model.suggestions import one_of
-from service.store import standing
+from service.model.errors import InputError, one_of
+from service.store import validity
 from service.store.shards import read_shard
 from worker.files.choice import EveryOption, UnjudgedOption, choose
 from worker.files.exchange.opening import opened
@@ -225,9 +224,9 @@ def _compared(one: dict[str, Any]) -> str:
 
 def _summary(file: Path) -> dict[str, Any]:
     shard = read_shard(file, kind="base")
-    valid, sound = standing.valid(shard.arrays), standing.sound(shard.arrays)
+    valid, sound = validity.valid(shard.arrays), validity.sound(shard.arrays)
     said = np.asarray(shard.arrays.get("quality/published", np.full(len(valid), -1)))
-    both = (said >= 0) & standing.judged(shard.arrays)
+    both = (said >= 0) & validity.judged(shard.arrays)
     agree = float((said == shard.arrays["quality/success"])[both].mean()) if both.any() else None
     return {
         "file": str(file),

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from service.model.scene_kinds import supports_in
-from service.model.scene_spec import SceneSpec
+from service.model.scene_spec import SceneSpec, supports_in
 from service.readers.ways import Waypoint, scene_spec_of, way_of, wrists_of
 from service.store.shards import Shard
 from worker.files.of_shard import neighbours_of_shard

@@ -14,10 +14,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from service.cli import JsonFlag, emit, plain_console, reporting_errors, write_output
 from service.model.errors import InputError
-from service.model.scene_kinds import supports_in
+from service.model.scene_spec import supports_in
 from service.model.transforms import compose
 from service.readers.ways import scene_spec_of, wrists_of
-from service.store import standing
+from service.store import validity
 from service.store.shards import Shard, read_shard, write_shard
 from worker.commands.grasp_animation import GraspAnimation
 from worker.commands.grasp_sheet import GraspSheet
@@ -195,8 +195,8 @@ def _scenes(path: Path) -> Shard:
 
 def _drawn_in(base: Shard, hand: str | None) -> DrawnHand | None:
     """The best valid grasp of each scene that grasps were planned in; where nobody judged, the best sound one."""
-    judged = standing.valid(base.arrays).any()
-    rows = best_in_scenes(base.arrays, standing.chosen(base.arrays, unjudged=not judged))
+    judged = validity.valid(base.arrays).any()
+    rows = best_in_scenes(base.arrays, validity.chosen(base.arrays, unjudged=not judged))
     if not len(base["grasp/hand_pose"]):
         return None
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from service.cli import JsonFlag, emit, reporting_errors, write_output
-from service.store.attributes import Attribute
+from service.store.columns import Attribute
 from service.store.shards import read_shard, write_shard
 from worker.files.base_attributes import wrist_attributes
 from worker.files.of_shard import (

@@ -13,9 +13,8 @@ import typer
 
 from service.cli import JsonFlag, emit, load_settings, reporting_errors
 from service.model.clock import timestamp
-from service.model.errors import InputError
-from service.model.stability import Stability, from_json
-from service.model.suggestions import one_of
+from service.model.errors import InputError, one_of
+from service.model.studies import Stability, from_json
 from service.model.version import PACKAGE_VERSION
 
 app = typer.Typer()
@@ -109,8 +108,8 @@ def _joined(parts: list[Stability]) -> Stability:
 
 
 def _publish(found: Stability, data_dir: Path | None) -> str:
+    from service.store.records import STABILITY, publish
     from service.store.store import open_store
-    from service.store.study_records import STABILITY, publish
 
     store = open_store(load_settings(data_dir=data_dir).resolved_store_url)
     key = publish(store, STABILITY, found.as_json())

@@ -22,14 +22,13 @@ from service.cli import (
     told_to_stop,
     write_output,
 )
+from service.model.base import refusal
 from service.model.diversity import CELLS, MIN_DISTANCE_M
 from service.model.domain import JobOptions
-from service.model.errors import InputError, TaskCancelled
+from service.model.errors import InputError, TaskCancelled, one_of
 from service.model.fidelity import FIDELITIES
-from service.model.refusals import refusal
 from service.model.robust import MODELS
 from service.model.scene_spec import MOST_SCENES, parse_scene
-from service.model.suggestions import one_of
 from service.store.asset_options import (
     AllowOpenOption,
     CompoundOption,

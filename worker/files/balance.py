@@ -9,10 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError
-from service.model.suggestions import one_of
+from service.model.errors import InputError, one_of
 from service.model.transforms import quat_conjugate, quat_rotate
-from service.store import standing
+from service.store import validity
 from service.store.shards import Shard
 from worker.files.of_shard import hand_of_shard
 from worker.grasps import Posture
@@ -51,7 +50,7 @@ class Balance:
             InputError: a shard does not tell the kind.
         """
         kinds = self._kinds(shards)
-        wanted = np.concatenate([standing.valid(shard.arrays) for shard in shards])
+        wanted = np.concatenate([validity.valid(shard.arrays) for shard in shards])
         if self.min_distance > 0 and wanted.any():
             wanted[np.flatnonzero(wanted)[~self._apart(shards, wanted)]] = False
         _, kind = np.unique(kinds, axis=0, return_inverse=True)

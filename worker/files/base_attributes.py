@@ -1,4 +1,4 @@
-"""What a base shard says at its root of the grasps in it; `service.store.attributes` has the schema."""
+"""What a base shard says at its root of the grasps in it; `service.store.columns` has the schema."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from service.model.domain import JobOptions
-from service.store.attributes import Attribute
+from service.store.columns import Attribute
 from service.store.shards import json_attribute
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

@@ -9,7 +9,7 @@ import typer
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.store import standing
+from service.store import validity
 from service.store.shards import Shard
 
 UnjudgedOption = Annotated[
@@ -30,7 +30,7 @@ def choose(base: Shard, *, unjudged: bool = False, every: bool = False) -> tuple
     if every:
         mask, word = np.ones(count, bool), "grasps of any kind"
     else:
-        mask = standing.chosen(base.arrays, unjudged=unjudged)
+        mask = validity.chosen(base.arrays, unjudged=unjudged)
         word = "sound grasps that nobody judged" if unjudged else "valid grasps"
     if not mask.any():
         raise InputError(f"{base.path or 'the shard'} holds no {word}; {_there_are(base, count)}")
@@ -38,8 +38,8 @@ def choose(base: Shard, *, unjudged: bool = False, every: bool = False) -> tuple
 
 
 def _there_are(base: Shard, count: int) -> str:
-    waiting = int(standing.chosen(base.arrays, unjudged=True).sum())
-    valid = int(standing.valid(base.arrays).sum())
+    waiting = int(validity.chosen(base.arrays, unjudged=True).sum())
+    valid = int(validity.valid(base.arrays).sum())
     if waiting:
         return f"{waiting} of its {count} are sound and were judged by nobody: take them with --unjudged"
     if valid:

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic_core import from_json
 
 from service.readers import Shards
-from service.store import standing
+from service.store import validity
 from service.store.shards import Shard
 from worker.files.subsets import base_shards
 
@@ -55,7 +55,7 @@ class _Side:
         rows = np.hstack([shard["grasp/hand_pose"], shard["grasp/joint_positions"]]).astype(float)
         rounded = np.round(rows, _DIGITS) + 0.0  # no minus zero
         self.grasps.setdefault(pair, Counter()).update(row.tobytes() for row in rounded)
-        self.valid[pair] += int(standing.valid(shard.arrays).sum())
+        self.valid[pair] += int(validity.valid(shard.arrays).sum())
         for name in _SETTINGS:
             if (value := said.get(name)) not in (None, ""):
                 self.settings.setdefault(name, set()).add(_short(name, value))

@@ -15,7 +15,7 @@ from service.model.errors import ConflictError, InputError
 from service.model.matter import FRICTION, MASS_KG
 from service.model.states import AssetKind
 from service.readers.ways import scene_spec_of
-from service.store.attributes import Attribute
+from service.store.columns import Attribute
 from service.store.shards import Shard
 from worker.files.origin import Found, Sought, at, find, options_of
 from worker.grasps import Columns

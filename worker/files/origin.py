@@ -16,7 +16,7 @@ from service.model.digests import digest_files, digest_variant
 from service.model.errors import GraspdError, NotFoundError
 from service.model.states import AssetKind
 from service.store.assets import builtin_files, builtin_names
-from service.store.attributes import Attribute
+from service.store.columns import Attribute
 from service.store.library import load_asset_files
 from service.store.shards import json_attribute
 from service.store.store import open_store

@@ -9,8 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError
-from service.model.suggestions import one_of
+from service.model.errors import InputError, one_of
 from service.model.transforms import IDENTITY_POSE
 from service.store.shards import Shard, read_shard
 from worker.files.cases import load_case

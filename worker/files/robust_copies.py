@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from service.model.errors import InputError
-from service.store.shards import json_attribute, read_shard, write_shard
-from service.store.subsets import carried
+from service.store.shards import carried, json_attribute, read_shard, write_shard
 from worker.quality.referee.robust import Robustness
 
 

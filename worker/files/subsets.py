@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from service.cli import load_settings
 from service.model.errors import InputError, NotFoundError
 from service.readers import Shards, open_shards
-from service.store.shards import Shard, read_shard
+from service.store.shards import Shard, part_of_shard, place_of, read_shard
 from service.store.store import open_store
-from service.store.subsets import part_of_shard, place_of
 
 #: From the base shards of one hand on one object to the mask (N,) of each.
 Chooser = Callable[[list[Shard]], list[NDArray[np.bool_]]]

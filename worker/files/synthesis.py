@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from service.model.diversity import CELLS, GraspType, entropy_bits
 from service.model.domain import BATCH_SIZE, SHAKE_NEEDS_A_SCENE, JobOptions
-from service.model.errors import InputError, TaskCancelled
+from service.model.errors import InputError, TaskCancelled, did_you_mean, one_of
 from service.model.fidelity import FIDELITIES, Fidelity
 from service.model.outcomes import shortfall, totals
 from service.model.scene_spec import MOST_SCENES, SceneSpec
-from service.model.suggestions import did_you_mean, one_of
-from service.store.attributes import Attribute
+from service.store.columns import Attribute
 from service.store.shards import json_attribute
 from worker.certified import Certified, certified_grasps
 from worker.engines.devices import Device

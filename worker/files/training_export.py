@@ -8,12 +8,11 @@ from typing import Final
 
 import numpy as np
 
-from service.model.errors import InputError
-from service.model.suggestions import one_of
+from service.model.errors import InputError, one_of
 from service.readers import Pictures, Shards, open_shards
-from service.readers.cloud_views import COLUMNS
+from service.readers.clouds import COLUMNS
 from service.readers.depth_noise import noise_of
-from service.store import standing
+from service.store import validity
 from service.store.shards import Shard, read_shard
 from worker.files.cases import load_case
 from worker.files.choice import choose
@@ -102,7 +101,7 @@ def _chosen(shard: Shard, format_: str, wishes: TrainingWishes) -> np.ndarray:
     """(N,) grasps that go into the export. A format that labels grasps gets good ones and bad ones."""
     if format_ not in LABELLED:
         return choose(shard, unjudged=wishes.unjudged, every=wishes.every)[0]
-    judged = standing.judged(shard.arrays)
+    judged = validity.judged(shard.arrays)
     if wishes.unjudged or not judged.any():
         raise InputError(
             f"{format_} says of each grasp whether it holds; judge them first: graspd synth without --referee none"

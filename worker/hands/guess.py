@@ -8,8 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from service.model.errors import HandError
-from service.model.suggestions import did_you_mean
+from service.model.errors import HandError, did_you_mean
 from service.model.transforms import IDENTITY_POSE, apply, compose, quat_rotate
 from worker.hands.closing import carriers, closing_by_limits, closing_by_tips, posture, tips
 from worker.hands.jaws import MAX_DOFS, Jaws, closing_by_geometry, find_jaws, sign_of, slides

@@ -11,13 +11,11 @@ from typing import Any
 import numpy as np
 
 from service.model.digests import digest_files, digest_variant
-from service.model.errors import HandError, InputError, NotFoundError
+from service.model.errors import HandError, InputError, NotFoundError, did_you_mean
 from service.model.states import AssetKind
-from service.model.suggestions import did_you_mean
 from service.model.transforms import compose
 from service.store.assets import builtin_files, builtin_names, unpack_file, without_common_folder
-from service.store.hand_files import files_of_hand
-from service.store.hand_main import hand_name, main_of
+from service.store.hand_files import files_of_hand, hand_name, main_of
 from worker.hands import collisions, guess, primitives
 from worker.hands.collisions import resting_neighbours
 from worker.hands.drive import with_drive

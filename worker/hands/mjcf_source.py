@@ -14,7 +14,7 @@ from pathlib import PurePosixPath
 from typing import Final
 
 from service.model.errors import HandError, LimitError
-from service.store.mesh_names import one_like
+from service.store.mesh_files import one_like
 from worker.hands.xml_tree import parse_xml
 from worker.objects.stand_ins import refuse_stand_in
 

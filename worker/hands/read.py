@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from service.model.errors import HandError
-from service.store.hand_main import format_of
+from service.store.hand_files import format_of
 from worker.hands.robot import Robot
 from worker.hands.urdf import read_urdf
 from worker.hands.xacro import expand

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from service.model.errors import HandError, InputError
-from service.store.mesh_names import one_like, read_reference
+from service.store.mesh_files import one_like, read_reference
 
 
 def find_mesh(filename: str, files: Mapping[str, bytes], base: str, link: str) -> str:

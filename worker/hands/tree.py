@@ -9,8 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from service.model.errors import HandError
-from service.model.suggestions import did_you_mean
+from service.model.errors import HandError, did_you_mean
 from service.model.transforms import IDENTITY_POSE, compose, quat_from_axis_angle
 from worker.hands.model import Floats, JointType
 from worker.hands.options import HandOptions

@@ -15,7 +15,7 @@ import numpy as np
 
 from service.model.errors import InputError
 from service.model.transforms import Floats, apply
-from service.store.mesh_looks import MAX_NAMES, beside, looks_of
+from service.store.mesh_files import MAX_NAMES, beside, looks_of
 from worker.hands.primitives import tessellate
 from worker.hands.references import find_mesh
 from worker.hands.robot import Ints, Shape

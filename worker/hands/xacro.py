@@ -17,7 +17,7 @@ from pathlib import PurePosixPath
 from typing import Final
 
 from service.model.errors import HandError
-from service.store.hand_main import text_of
+from service.store.hand_files import text_of
 from worker.hands.urdf import MAX_BYTES
 
 #: Largest hands on arms take a tenth of it [s].

@@ -10,7 +10,7 @@ from defusedxml import ElementTree as SafeTree
 from defusedxml.common import DefusedXmlException
 
 from service.model.errors import HandError, LimitError
-from service.store.hand_main import text_of
+from service.store.hand_files import text_of
 
 _PREFIX: Final = re.compile(r"[<\s/]([A-Za-z_][\w.-]{0,40}):[A-Za-z_]")
 _FIRST: Final = re.compile(r"<[A-Za-z_][\w:.-]*")

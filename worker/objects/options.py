@@ -8,9 +8,9 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from service.model.base import refusal
 from service.model.errors import MeshError
 from service.model.matter import Density, Friction, Mass
-from service.model.refusals import refusal
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 #: Keys that decide how heavy and how slippery the object is, and not its shape.

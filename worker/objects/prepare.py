@@ -18,10 +18,9 @@ import numpy as np
 
 from service import user_cache
 from service.model.digests import digest_files, digest_json, digest_variant
-from service.model.errors import MeshError, NotFoundError
+from service.model.errors import MeshError, NotFoundError, did_you_mean
 from service.model.libraries import version_of
 from service.model.states import AssetKind
-from service.model.suggestions import did_you_mean
 from service.store.assets import builtin_files, builtin_names, unpack_file
 from worker.objects.formats import READERS, read_mesh
 from worker.objects.mass import mass_properties

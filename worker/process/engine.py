@@ -22,7 +22,7 @@ from typing import Any
 
 from service import logs, tracing
 from service.model.errors import BusyError, InputError, TaskRefused, UnavailableError
-from service.model.imports import own_process
+from service.model.libraries import own_process
 from service.model.states import Stage
 from service.pipeline.identity import check_service
 from service.queue.port import Report

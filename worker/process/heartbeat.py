@@ -13,7 +13,7 @@ from redis.exceptions import RedisError
 
 from service.heartbeat_file import HeartbeatFile
 from service.model.clock import timestamp
-from service.model.worker_beat import WorkerBeat
+from service.model.workers import WorkerBeat
 from service.queue.connection import connect
 from service.queue.port import Event, EventKind
 from service.queue.rates import beat_every_s

@@ -14,7 +14,6 @@ from pydantic import ValidationError
 
 from service import logs, tracing
 from service.model import names
-from service.model.ability import need_of, own_ability
 from service.model.clock import timestamp
 from service.model.errors import (
     DamagedError,
@@ -28,6 +27,7 @@ from service.model.errors import (
 from service.model.messages import IngestMessage, Origin, TaskMessage
 from service.model.records import AttemptRecord
 from service.model.states import Stage
+from service.model.workers import need_of, own_ability
 from service.queue.port import Event, EventKind, Message
 from service.store.manifests import ShardManifest, load_manifest, publish_shard, shard_exists
 from service.store.records import put_record

@@ -16,7 +16,7 @@ import numpy as np
 
 from service.model.domain import JobRequest
 from service.model.errors import GraspdError
-from service.model.imports import imports
+from service.model.libraries import imports
 from service.model.states import Stage
 
 if TYPE_CHECKING:

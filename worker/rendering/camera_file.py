@@ -9,8 +9,8 @@ from typing import Annotated, Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
+from service.model.base import refusal
 from service.model.errors import InputError
-from service.model.refusals import refusal
 from worker.rendering.cameras import Floats, look_at
 
 #: Rotations of a file may be off by this: six digits are usual in JSON written by hand.

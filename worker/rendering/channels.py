@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.domain import EXTRA_CHANNELS
-from service.model.errors import InputError
+from service.model.errors import InputError, did_you_mean
 from service.model.pinhole import pixel_rays
-from service.model.suggestions import did_you_mean
 from worker.rendering.annotate import OBJECT
 from worker.rendering.cameras import Floats
 

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import SceneError
-from service.model.scene_kinds import BIN_SIZE, SHELF_SIZE, supports_in
-from service.model.scene_spec import MOST_TOUCH, Box, SceneSpec
+from service.model.scene_spec import BIN_SIZE, MOST_TOUCH, SHELF_SIZE, Box, SceneSpec, supports_in
 from service.model.transforms import compose, quat_from_axis_angle, quat_rotate
 from worker.grasps import moved
 from worker.objects.model import ObjectModel

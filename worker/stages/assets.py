@@ -17,11 +17,10 @@ from service.model.errors import DamagedError, MeshError, NotFoundError
 from service.model.messages import TaskMessage
 from service.model.states import AssetKind
 from service.model.version import STAGE_REVISIONS
-from service.store.attributes import Attribute
+from service.store.columns import Attribute
+from service.store.integrity import get_sealed, put_sealed
 from service.store.library import load_asset_files
-from service.store.network_check import network_bytes
-from service.store.network_file import ProposalNetwork, from_bytes
-from service.store.seals import get_sealed, put_sealed
+from service.store.network_file import ProposalNetwork, from_bytes, network_bytes
 from service.store.store import Store
 from worker.files.of_shard import NEIGHBOUR_FACE_ERROR_M
 from worker.hands.load import load_hand

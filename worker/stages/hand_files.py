@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from service.model import names
 from service.model.states import AssetKind
-from service.store.hand_main import format_of
+from service.store.hand_files import format_of
+from service.store.integrity import get_document, put_document
 from service.store.library import load_asset_files
-from service.store.seals import get_document, put_document
 from service.store.store import Store
 from worker.hands.load import main_file
 from worker.hands.options import parse_options

@@ -12,7 +12,7 @@ from service.model import names
 from service.model.fidelity import Fidelity
 from service.model.states import AssetKind
 from service.store.assets import builtin_files, builtin_names
-from service.store.seals import put_sealed
+from service.store.integrity import put_sealed
 from service.store.store import Store
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel

@@ -14,7 +14,7 @@ from service.model.digests import digest_json
 from service.model.messages import TaskMessage
 from service.model.names import SHARD_KINDS
 from service.model.version import PACKAGE_VERSION
-from service.store.attributes import Attribute
+from service.store.columns import Attribute
 from service.store.manifests import ShardManifest, manifest_of
 from service.store.shards import check_columns, json_attribute, write_shard
 from worker.stages.context import TaskContext

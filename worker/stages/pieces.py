@@ -8,7 +8,7 @@ from pathlib import Path
 
 from service.model import names
 from service.model.errors import DamagedError, NotFoundError
-from service.store.seals import get_sealed, put_sealed
+from service.store.integrity import get_sealed, put_sealed
 from service.store.store import Store
 from service.user_cache import write_whole
 from worker.objects.model import ObjectModel

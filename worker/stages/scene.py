@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from service.model.errors import MeshError, SceneError
 from service.model.messages import TaskMessage
 from service.model.states import Stage
-from service.store.attributes import Attribute
+from service.store.columns import Attribute
 from service.store.shards import Shard, json_attribute
 from worker.files.base_attributes import wrist_attributes
 from worker.grasps import Posture

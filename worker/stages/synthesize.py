@@ -15,7 +15,7 @@ from service.model.errors import InputError, LoadError, SceneError
 from service.model.messages import TaskMessage
 from service.model.outcomes import told, totals
 from service.model.states import Stage
-from service.store.attributes import Attribute
+from service.store.columns import Attribute
 from worker.certified import Certified
 from worker.files.base_attributes import base_attributes
 from worker.planners import NoPlace, planner

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.scene_kinds import supports_in
-from service.model.scene_spec import SceneSpec
+from service.model.scene_spec import SceneSpec, supports_in
 from service.model.transforms import IDENTITY_POSE, quat_rotate
 from service.readers.ways import point_at, scene_spec_of, stop_places, way_of, wrists_of
 from service.store.shards import Shard

@@ -6,8 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from service.index.dataset_views import CellView, DatasetView
-from service.index.views import MatrixCell
+from service.index.views import CellView, DatasetView, MatrixCell
 from service.model.states import State
 
 #: Steps of the colour scale; the style sheet has a class for each.

@@ -7,19 +7,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from service.model.errors import DamagedError
-from service.model.stability import (
-    OUTCOMES,
-    MapCell,
-    Outcome,
-    Stability,
-    StabilityMap,
-    between,
-    counts,
-    from_json,
-    tick,
-)
+from service.model.studies import OUTCOMES, MapCell, Outcome, Stability, StabilityMap, between, counts, from_json, tick
+from service.store.records import STABILITY, latest
 from service.store.store import Store
-from service.store.study_records import STABILITY, latest
 
 #: Width and height of a cell with its gap, as the style sheet has them [px]: lines are drawn over the cells.
 PITCH: Final = (40, 30)

@@ -12,11 +12,11 @@ from typing import Any, Final
 
 from pydantic import BaseModel, ConfigDict
 
-from service.model.charts import FILTERED
 from service.model.errors import DamagedError
 from service.model.scene_spec import SceneSpec
+from service.model.studies import FILTERED
+from service.store.records import CHARTS, latest, scene_kinds
 from service.store.store import Store
-from service.store.study_records import CHARTS, latest, scene_kinds
 
 WIDTH: Final = 860
 HEIGHT: Final = 420

@@ -9,15 +9,13 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, and_, case, or_, select, tuple_
 
 from service.index.database import Database, chunks
-from service.index.dataset_views import ObjectSetView
 from service.index.project_scope import nearest_asset, seen_assets, seen_sets
 from service.index.queries import cursors
 from service.index.tables import assets, object_sets
-from service.index.views import AssetView, Page
-from service.model.errors import NotFoundError
+from service.index.views import AssetView, ObjectSetView, Page
+from service.model.errors import SEARCHED, NotFoundError, known_names
 from service.model.projects import EVERYTHING, ProjectScope
 from service.model.states import AssetKind
-from service.model.suggestions import SEARCHED, known_names
 
 
 @dataclass(frozen=True)

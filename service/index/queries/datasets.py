@@ -10,20 +10,18 @@ from typing import Any, Final
 from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, literal, select, tuple_
 
 from service.index.database import Database
-from service.index.dataset_views import CellView, DatasetView, SnapshotView
 from service.index.project_scope import seen_datasets
 from service.index.queries import cursors
-from service.index.queries.outcomes import outcomes_of
+from service.index.queries.jobs import outcomes_of
 from service.index.tables import attempts, dataset_cells, dataset_snapshots, datasets, jobs, shards, tasks
-from service.index.views import Page
-from service.model.dataset_records import SnapshotShard
+from service.index.views import CellView, DatasetView, Page, SnapshotView
 from service.model.domain import JobOptions
-from service.model.errors import NotFoundError
+from service.model.errors import SEARCHED, NotFoundError, known_names
 from service.model.outcomes import shortfall
 from service.model.planning import job_state, ranges_of, stages_of
 from service.model.projects import EVERYTHING, ProjectScope
+from service.model.records import SnapshotShard
 from service.model.states import Stage, State
-from service.model.suggestions import SEARCHED, known_names
 
 _SHARE: Final[ColumnElement[float]] = case(
     (tasks.c.state == State.SUCCEEDED.value, 1.0),

@@ -1,21 +1,24 @@
-"""Queries on jobs, tasks and attempts."""
+"""Queries on jobs, tasks and attempts.
+
+What became of the candidates of jobs, from the manifests of their shards.
+"""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Connection, Float, and_, case, cast, func, select, tuple_
 
 from service.index.database import Database, chunks
 from service.index.project_scope import seen_jobs, seen_tasks
 from service.index.queries import cursors
-from service.index.queries.outcomes import outcomes_of
 from service.index.tables import attempts, jobs, shards, tasks
 from service.index.views import AttemptView, JobView, Page, StageProgress, TaskView
 from service.model.errors import NotFoundError
+from service.model.outcomes import totals
 from service.model.planning import ranges_of
 from service.model.projects import EVERYTHING, ProjectScope
 from service.model.states import Stage, State
@@ -215,3 +218,18 @@ def _task_view(row: Any) -> TaskView:
         seconds=row["seconds"],
         finished=row["finished"],
     )
+
+
+#: Shards that are read at most: enough to say why, and a page stays quick.
+MOST_SHARDS: Final = 1000
+
+
+def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool]) -> dict[str, int]:
+    """Candidates that were not kept, by outcome, in the first `MOST_SHARDS` shards of the jobs whose tasks fit."""
+    query = (
+        select(shards.c.manifest["info"]["outcomes"])
+        .join(tasks, tasks.c.shard_id == shards.c.id)
+        .where(of_jobs, tasks.c.stage == Stage.SYNTHESIZE.value)
+        .limit(MOST_SHARDS)
+    )
+    return totals(one for one in connection.scalars(query) if isinstance(one, dict))

@@ -7,7 +7,7 @@ from starlette.testclient import TestClient
 
 from api.catalog.comparison import Comparisons, Pair
 from api.catalog.datasets import Datasets
-from service.index.filters import GraspFilter
+from service.index.queries.grasps import GraspFilter
 from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest

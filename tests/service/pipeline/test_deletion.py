@@ -19,8 +19,8 @@ from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.deletion import delete_asset, delete_dataset, delete_job, restore
 from service.pipeline.garbage_collector import GarbageCollector
-from service.store.deletions import deletions, pending
 from service.store.library import publish_asset
+from service.store.records import deletions, pending
 from tests.fakes import OBJECT_FILES, make_shard, request
 from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import fail

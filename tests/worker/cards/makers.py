@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from service.model import names
 from service.model.clock import timestamp
-from service.model.dataset_records import Snapshot
 from service.model.planning import message_of, plan
-from service.model.records import AttemptRecord, JobRecord
+from service.model.records import AttemptRecord, JobRecord, Snapshot
 from service.model.states import Stage
 from service.pipeline.backends import Services
 from service.pipeline.datasets import actions

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from graspd.cli import build
 from service.model.states import AssetKind
 from service.store.assets import builtin_names
-from service.store.hand_corrections import HandCorrections, corrected, facts_of
+from service.store.descriptions import HandCorrections, corrected, facts_of
 from tests.worker.hands.grippers import gripper
 from tests.worker.hands.urdfs import BOX, joint, link, robot
 from worker.hands.load import files_from_path, hand_from_path, load_hand

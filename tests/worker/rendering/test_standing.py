@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.scene_kinds import supports_in
-from service.model.scene_spec import Box, HalfSpace, SceneSpec
+from service.model.scene_spec import Box, HalfSpace, SceneSpec, supports_in
 from service.model.transforms import quat_rotate
 from tests.worker.models import object_from_mesh
 from worker.rendering import Extras, render

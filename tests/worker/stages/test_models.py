@@ -13,7 +13,7 @@ from service.model import names
 from service.model.states import AssetKind
 from service.model.transforms import IDENTITY_POSE, apply
 from service.store.assets import builtin_files, builtin_model, builtin_names
-from service.store.seals import sealed
+from service.store.integrity import sealed
 from service.store.store import open_store
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path

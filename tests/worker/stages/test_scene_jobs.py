@@ -18,7 +18,7 @@ from service.model.domain import JobRequest
 from service.model.errors import TaskRefused
 from service.model.planning import message_of, plan
 from service.model.records import AttemptRecord, JobRecord
-from service.model.scene_kinds import supports_in
+from service.model.scene_spec import supports_in
 from service.model.states import AssetKind, Lane, Stage
 from service.queue.port import EventKind
 from service.readers import Grasps, Pictures, open_shards

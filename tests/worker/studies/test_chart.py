@@ -12,8 +12,8 @@ import pytest
 from typer.testing import CliRunner
 
 from service.model.fidelity import FIDELITIES
+from service.store.records import latest
 from service.store.store import open_store
-from service.store.study_records import latest
 from worker.commands.chart import app
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path

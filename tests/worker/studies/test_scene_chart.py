@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from service.model.charts import FILTERED, IN_SCENE
 from service.model.scene_spec import SceneSpec
+from service.model.studies import FILTERED, IN_SCENE
 from service.pipeline.fidelity_choice import cheapest
+from service.store.records import latest
 from service.store.store import open_store
-from service.store.study_records import latest
 from worker.commands.chart import app
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path

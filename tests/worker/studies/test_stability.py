@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 from service.model.domain import JobRequest
 from service.model.errors import MeshError
 from service.model.fidelity import FIDELITIES
-from service.model.stability import MapCell, Stability, StabilityMap, from_json, graded
+from service.model.studies import MapCell, Stability, StabilityMap, from_json, graded
+from service.store.records import latest
 from service.store.store import open_store
-from service.store.study_records import latest
 from worker.certified import certified_grasps
 from worker.commands.stability import STUDIES, app
 from worker.engines import backend

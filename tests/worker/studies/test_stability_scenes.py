@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from graspd.cli import build
 from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
-from service.model.stability import MapCell, Stability, StabilityMap, from_json
+from service.model.studies import MapCell, Stability, StabilityMap, from_json
 from tests.worker.simulation.test_surroundings import mujoco_room
 from worker.certified import Certified
 from worker.commands.stability import app

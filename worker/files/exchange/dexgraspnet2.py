@@ -31,11 +31,11 @@ import numpy as np
 import scipy.io
 from numpy.typing import NDArray
 
+from service.model.base import why
 from service.model.errors import InputError
-from service.model.refusals import why
 from service.model.transforms import apply, compose, invert, pose_from_matrix, pose_to_matrix
 from service.readers import DepthNoise, Pictures
-from service.readers.cloud_views import CloudView
+from service.readers.clouds import CloudView
 from worker.files.exchange.dexgraspnet2_graspness import SceneGraspness, surface_samples
 from worker.files.exchange.imported import Imported, completed, joints_by_name, verdicts
 from worker.files.exchange.lots import Look, Lot, by_scene, looks

@@ -23,7 +23,7 @@ from service import parquet
 from service.model.errors import InputError
 from service.model.transforms import IDENTITY_POSE
 from service.readers import DepthNoise, Pictures
-from service.readers.cloud_views import CloudView
+from service.readers.clouds import CloudView
 from service.readers.ways import scene_spec_of
 from service.store.manifests import INDEX_THRESHOLD_M
 from worker.files.exchange.bench_scene import placed_of

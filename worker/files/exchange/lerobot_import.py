@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service import parquet
+from service.model.base import why
 from service.model.errors import InputError
-from service.model.refusals import why
 from service.model.transforms import POSE_PARTS, compose, invert
 from worker.files.exchange.bench_scene import placed_of
 from worker.files.exchange.imported import Imported, joints_by_name, verdicts

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from service.model.transforms import compose, invert, pose_from_matrix
 from service.readers import DepthNoise, Pictures
-from service.readers.cloud_views import CloudView
+from service.readers.clouds import CloudView
 from service.store.shards import Shard
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel

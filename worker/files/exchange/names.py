@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from service.model.fitting_names import fitted
+from service.model.names import fitted
 
 
 def plain_name(name: str) -> str:

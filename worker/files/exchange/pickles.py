@@ -12,8 +12,8 @@ from typing import Any, BinaryIO, Final
 
 import numpy as np
 
+from service.model.base import why
 from service.model.errors import InputError
-from service.model.refusals import why
 
 _HARMLESS: Final = {
     ("numpy", "ndarray"),

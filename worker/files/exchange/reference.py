@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from pydantic_core import from_json
 
+from service.model.base import why
 from service.model.errors import InputError
-from service.model.refusals import why
 from service.model.transforms import pose_from_matrix
 from worker.files.exchange.imported import Imported, completed, joints_by_name
 from worker.files.exchange.objects import scaled_object

@@ -11,7 +11,7 @@ from service.model.domain import JobRequest
 from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
 from service.model.states import AssetKind
-from service.store.attributes import Attribute
+from service.store.columns import Attribute
 from service.store.shards import json_attribute, write_shard
 from worker.certified import scored
 from worker.files.base_attributes import base_attributes

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from service.model.transforms import Floats
-from service.store.mesh_looks import MAX_NAMES, reference_of
+from service.store.mesh_files import MAX_NAMES, reference_of
 from worker.objects.formats.pictures import UNREADABLE, mean_colour
 
 #: Materials that a library may have.

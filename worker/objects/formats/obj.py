@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from service.model.errors import MeshError
-from service.store.mesh_looks import MAX_NAMES
+from service.store.mesh_files import MAX_NAMES
 from worker.objects.formats import mtl
 from worker.objects.formats.mtl import Nearby, nothing_nearby
 from worker.objects.formats.polygons import triangulate

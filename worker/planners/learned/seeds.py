@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from service.model.errors import SceneError
 from service.model.fidelity import Fidelity
-from service.model.scene_kinds import UPRIGHT
+from service.model.scene_spec import UPRIGHT
 from service.model.transforms import compose, invert, quat_conjugate, quat_rotate
 from worker.planners.fast_graspd.scene_starts import ROOM, clear_scene_starts
 from worker.planners.fast_graspd.starts import CLEAR, Probe

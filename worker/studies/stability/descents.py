@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.fidelity import FIDELITIES, Fidelity
-from service.model.stability import MapCell, StabilityMap, graded, reachable, short
+from service.model.studies import MapCell, StabilityMap, graded, reachable, short
 from service.model.transforms import quat_rotate
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.model.stability import MapCell, StabilityMap, graded, reachable
+from service.model.studies import MapCell, StabilityMap, graded, reachable
 from worker.simulation import reference
 from worker.simulation.kernels import contact
 from worker.simulation.model import initial_motions

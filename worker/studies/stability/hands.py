@@ -14,8 +14,8 @@ import numpy as np
 
 from service.model.digests import digest_files
 from service.model.errors import GraspdError
-from service.model.stability import MapCell, StabilityMap, reachable
 from service.model.states import AssetKind
+from service.model.studies import MapCell, StabilityMap, reachable
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
 from worker.run import ALONE, Run

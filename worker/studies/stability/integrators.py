@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.stability import MapCell, StabilityMap, graded, reachable, short
+from service.model.studies import MapCell, StabilityMap, graded, reachable, short
 from worker.simulation import reference
 from worker.simulation.model import LossOptions
 from worker.simulation.reference import Contacts, World

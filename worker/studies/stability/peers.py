@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from service.model.stability import StabilityMap, reachable
+from service.model.studies import StabilityMap, reachable
 from worker.hands.model import HandModel
 from worker.run import ALONE, Run
 from worker.studies.stability.shapes import BOUNDS, FAMILIES, MEASURE, SHOWS, shape_cell

@@ -12,7 +12,7 @@ from service.model.domain import JobRequest
 from service.model.errors import GraspdError
 from service.model.fidelity import FIDELITIES
 from service.model.scene_spec import Box, HalfSpace, SceneSpec
-from service.model.stability import MapCell, Outcome, StabilityMap, reachable
+from service.model.studies import MapCell, Outcome, StabilityMap, reachable
 from service.model.transforms import quat_rotate
 from worker.certified import Certified, certified_grasps
 from worker.hands.kinematics import body_poses

@@ -11,8 +11,8 @@ import trimesh
 from service.model.digests import digest_files
 from service.model.domain import JobRequest
 from service.model.errors import GraspdError
-from service.model.stability import MapCell, Outcome, StabilityMap, reachable
 from service.model.states import AssetKind
+from service.model.studies import MapCell, Outcome, StabilityMap, reachable
 from worker.certified import certified_grasps
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

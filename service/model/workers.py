@@ -1,4 +1,6 @@
-"""What a worker must be able to do for a task, and what it says that it can: versions that work side by side.
+"""What a living worker says about itself; the queue carries it, the index keeps it.
+
+What a worker must be able to do for a task, and what it says that it can: versions that work side by side.
 
 A message carries a range of schemas: from the oldest that can say what it says to the newest whose meaning its writer
 knew. A worker reads a range too, and makes one revision of each stage.
@@ -7,16 +9,58 @@ knew. A worker reads a range too, and makes one revision of each stage.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, field
+from typing import Annotated, Final
 
+from pydantic import Field
+
+from service.model.domain import Word
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Stage
 from service.model.version import OLDEST_TASK_SCHEMA, STAGE_REVISIONS, TASK_SCHEMA
 
+#: Anybody who writes to Redis may say anything: what is read from there is as long and as large as ours can be.
+HostWord = Annotated[str, Field(max_length=300)]
+
+Count = Annotated[int, Field(ge=0, lt=2**31)]
+
+
+@dataclass(frozen=True)
+class WorkerBeat:
+    """What a living worker says about itself."""
+
+    name: HostWord
+    host: HostWord
+    pid: Count
+    device: HostWord
+    device_name: HostWord
+    stages: tuple[Stage, ...]
+    version: Annotated[str, Field(max_length=64)]
+    state: Annotated[str, Field(max_length=32)]
+    """checking, idle, busy, stopping or quarantined."""
+    task_id: Word
+    started: Annotated[str, Field(max_length=32)]
+    seen: Annotated[str, Field(max_length=32)]
+    reason: Annotated[str, Field(max_length=300)] = ""
+    """Why it is in quarantine."""
+    schemas: tuple[Count, Count] | None = None
+    """Oldest and newest task message that it reads; None: it does not say."""
+    revisions: Annotated[dict[HostWord, Count], Field(max_length=16)] = field(default_factory=dict)
+    """Revision that it makes of each stage."""
+
+    @property
+    def ability(self) -> Ability:
+        """What it can do."""
+        if self.schemas is None:
+            return Ability(UNTOLD_SCHEMAS, UNTOLD_REVISIONS, looks_apart=False)
+        return Ability(self.schemas, self.revisions)
+
+
 #: What workers can do that do not say it: graspd 0.1.0 before they did.
 UNTOLD_SCHEMAS: Final = (2, 2)
+
 UNTOLD_REVISIONS: Final[Mapping[str, int]] = {"synthesize": 10, "scene": 2, "render": 3}
+
 #: The first schema with which messages carry a range.
 FIRST_SCHEMA: Final = 2
 
