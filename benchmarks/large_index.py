@@ -247,7 +247,7 @@ def _copy(connection: Connection, table: Table, rows: Sequence[dict[str, Any]]) 
             copy.write_row([p(row[name]) if (p := process[name]) else row[name] for name in columns])
 
 
-class _without_indexes:
+class _without_indexes:  # noqa: N801
     """A table without its secondary indexes for a while: they are made anew at the end, which is much quicker."""
 
     def __init__(self, connection: Connection, table: Table) -> None:

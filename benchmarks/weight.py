@@ -25,7 +25,7 @@ from packaging.requirements import Requirement
 
 REPOSITORY: Final = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(REPOSITORY / "docker"))
-import pin
+import pin  # noqa: E402
 
 EXTRAS: Final = ("", "api", "worker", "all", "dev")
 LARGEST: Final = 6

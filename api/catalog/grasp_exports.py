@@ -62,7 +62,7 @@ class GraspExports:
             LimitError: a ZIP of grasps of more than `MOST_SHARDS` shards.
             DamagedShard: a shard is not what its checksum says.
         """
-        file = TemporaryFile()
+        file = TemporaryFile()  # noqa: SIM115 (it is closed once it is sent)
         try:
             {"csv": self._csv, "json": self._json, "zip": self._zip}[format](file, places, said)
             size = file.tell()

@@ -14,7 +14,7 @@ import httpx
 from httpx_sse import EventSource
 from pydantic import BaseModel, TypeAdapter
 
-from api.hosts import is_loopback
+from api.formatting import is_loopback
 from api.models import GraspQuery, Health, Job, JobDetail, Shard
 from service.index.views import AssetView, CellView, DatasetView, GraspView, ObjectSetView, Page, SnapshotView
 from service.model.domain import JobRequest

@@ -21,8 +21,8 @@ from api.routes.assets import store_upload
 from service.index.views import AssetView
 from service.model.errors import GraspdError, InputError
 from service.model.states import AssetKind
-from service.store.descriptions import json_object
 from service.store.assets import asset_json
+from service.store.descriptions import json_object
 
 _CHECK_WAIT_S: Final = 15.0
 UNITS: Final = (("m", "metres"), ("mm", "millimetres"), ("cm", "centimetres"), ("in", "inches"))

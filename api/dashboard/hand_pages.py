@@ -13,9 +13,8 @@ from starlette.datastructures import FormData
 from api.catalog.assets import Assets
 from api.dashboard.forms import first_message
 from api.dashboard.rendering import render
-from api.routes.assets import store_correction
+from api.routes.assets import CorrectionRequest, store_correction
 from api.routes.dependencies import AssetsOf, may_read, may_submit
-from api.routes.hand_corrections import CorrectionRequest
 from service.index.views import AssetView
 from service.model.errors import ConflictError, InputError, NotFoundError
 from service.model.states import AssetKind

@@ -10,8 +10,7 @@ from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
 from api.problems import ApiError, responses
-from api.routes.dependencies import Cursor, DatasetsOf, Limit, may_read, may_submit
-from api.routes.paging import link_next
+from api.routes.dependencies import Cursor, DatasetsOf, Limit, link_next, may_read, may_submit
 from service.index.views import CellView, DatasetView, ObjectSetView, Page, SnapshotView
 from service.model.domain import Name
 from service.model.records import Snapshot

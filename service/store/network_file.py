@@ -27,8 +27,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from service.model.base import Digest, Name, refusal
 from service.model.digests import digest_bytes
 from service.model.errors import InputError, LimitError
-from service.store.descriptions import json_object, parse_description
 from service.store.assets import asset_json
+from service.store.descriptions import json_object, parse_description
 
 SCHEMA: Final = "graspd/proposals@1"
 

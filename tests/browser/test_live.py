@@ -259,7 +259,7 @@ def test_every_page_reads_without_javascript(address: str, page: Any, places: li
     texts = {path: _text_of(context.new_page(), path) for path in places}
     context.close()
     assert all(len(text) > 40 for text in texts.values())
-    of: Callable[[str], str] = lambda start: next(text for path, text in texts.items() if path.startswith(start))
+    of: Callable[[str], str] = lambda start: next(text for path, text in texts.items() if path.startswith(start))  # noqa: E731
     assert "Penetration" in of("/grasps/")
     assert "allegro × mug" in of("/grasps")
     assert "kitchen" in of("/datasets")

@@ -75,7 +75,7 @@ def test_preemption_a_lost_node_and_a_time_limit_lose_nothing(tmp_path: Path, sl
             shared, GRASPD=str(fakes), FAKE_SECONDS="0.2", FAKE_HOLD=str(hold), GRASPD_LEASE_S="2", IDLE_S="2"
         )
         first, second, third = slurm.sbatch(SLURM / "worker.sbatch", slow, array=3)
-        busy = lambda: len(system.services.index.jobs.tasks(job=job, state=State.RUNNING).items)
+        busy = lambda: len(system.services.index.jobs.tasks(job=job, state=State.RUNNING).items)  # noqa: E731
         system.until(lambda: busy() == 3, f"three busy workers\n{slurm.logs()}")
         slurm.preempt(second, grace_s=PATIENCE_S)
         assert slurm.reach_time_limit(first, notice_s=PATIENCE_S), slurm.logs()

@@ -111,7 +111,7 @@ def _expand(given: dict[str, Any]) -> str:
 
     xacro.parse, xacro.safe_eval = parse, evaluate
     xacro.open = lambda path, *_: io.StringIO(text_of(path))
-    pattern_of = lambda pattern: [f"{_TOP}/{n}" for n in fnmatch.filter(texts, named(pattern))]
+    pattern_of = lambda pattern: [f"{_TOP}/{n}" for n in fnmatch.filter(texts, named(pattern))]  # noqa: E731
     xacro.glob = SimpleNamespace(glob=pattern_of)
     substitution_args._eval, substitution_args._eval_find = substitute, find
     substitution_args._eval_env = substitution_args._eval_dict["env"] = environment

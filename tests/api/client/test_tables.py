@@ -11,7 +11,7 @@ import pytest
 from rich.progress import Progress
 from typer.testing import CliRunner
 
-from api.client.watching import JobDisplay
+from api.client.reports import JobDisplay
 from graspd.cli import build
 from service.cli import plain_console, plain_table
 from service.model.domain import JobOptions

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from starlette.testclient import TestClient
 
-from api.catalog.grasp_files import OUTCOMES, judged_by
+from api.catalog.grasps import OUTCOMES, judged_by
 from service.model.robust import MEANINGS, Axis
 from service.pipeline.backends import Services
 from service.store.shards import Shard, read_shard

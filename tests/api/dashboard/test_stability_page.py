@@ -7,7 +7,7 @@ import math
 import pytest
 from starlette.testclient import TestClient
 
-from api.dashboard.figures.stability import PITCH, draw
+from api.dashboard.figures import PITCH, draw
 from service.model.studies import MapCell, Outcome, Stability, StabilityMap
 from service.pipeline.backends import Services
 from service.store.records import publish

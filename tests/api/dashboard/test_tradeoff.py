@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
-from api.dashboard.figures.tradeoff import HEIGHT, WIDTH, Measured, draw, pareto
+from api.dashboard.tradeoff import HEIGHT, WIDTH, Measured, draw, pareto
 from service.model.scene_spec import SceneSpec
 from service.model.studies import FILTERED, IN_SCENE
 from service.pipeline.backends import Services

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from api.client.dataset_specs import read_spec
+from api.client.job_options import read_spec
 from service.model.errors import InputError
 from service.readers.ways import scene_spec_of
 from service.store.shards import Shard
