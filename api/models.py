@@ -10,7 +10,7 @@ from service.index.views import AttemptView, GraspView, Judged, ShardView, Stage
 from service.model.base import TagName
 from service.model.diversity import CELLS
 from service.model.domain import Digest, JobRequest
-from service.model.metrics import OfferedName, filters, means, with_fields
+from service.model.metric_fields import OfferedName, filters, means, with_fields
 from service.model.records import Choice
 from service.model.robust import WORDS
 from service.model.scene_spec import Box, HalfSpace, SceneKind

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from service.cli import write_output
 from service.model.errors import InputError
 from service.model.metrics import GRASP_METRICS, GraspMetric
-from service.model.transforms import compose
+from service.model.transforms import Floats, compose
 from service.readers.files import Shards, open_shards
 from service.store import validity
 from service.store.columns import SCHEMAS, Attribute
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from worker.viewing.viewer import Viewer
 
 Array = NDArray[Any]
-Floats = NDArray[np.float64]
 #: Rows to keep: a mask (N,), row numbers, or a function that makes either from the grasps.
 Rows = NDArray[Any] | Sequence[int] | Sequence[bool]
 

@@ -1,4 +1,4 @@
-"""The dashboard as a whole: its pages put together, the stream that moves them, the meaning of problem types, the session.
+"""The dashboard as a whole: its pages, the stream that moves them, the meaning of problem types, the session.
 
 Sign in with a key: the browser gets a signed cookie that ends with the key.
 """

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, computed_field
 
 from service.model.domain import JobOptions, JobRequest
-from service.model.metrics import values, with_fields
+from service.model.metric_fields import values, with_fields
 from service.model.outcomes import shortfall
 from service.model.records import Choice
 from service.model.states import AssetKind, Lane, Stage, State

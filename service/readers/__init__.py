@@ -36,7 +36,7 @@ _LIVES_IN: Final = {
     "ShardFile": "files",
     "Shards": "files",
     "open_shards": "files",
-    "prefetched": "prefetch",
+    "prefetched": "cache",
 }
 
 __all__ = [

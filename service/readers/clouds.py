@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from service.model import transforms
 from service.model.errors import InputError
 from service.model.pinhole import back_project, fitted_normals, surface_normals
+from service.model.transforms import Floats
 from service.readers.depth_noise import DepthNoise, incidence, noise_of
 from service.readers.pictures import Pictures, Place, Scenes
 from service.store.shards import Shard
 
 Array = NDArray[Any]
 
-Floats = NDArray[np.float64]
 
 Ints = NDArray[np.intp]
 

@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError, one_of
 from service.model.pinhole import EDGE, back_project, surface_normals
+from service.model.transforms import Floats
 
-Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 

@@ -12,16 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.metrics import GRASP_METRICS
-from service.model.transforms import quat_rotate
+from service.model.transforms import Floats, quat_rotate
 from service.store import validity
 from service.store.manifests import INDEX_THRESHOLD_M
 from worker.cards.contents import AssetFacts, Contents, Pair
 from worker.cards.directions import ELEVATION_BINS, elevations
 from worker.cards.reading import Piece
 from worker.grasps import Posture
-
-Floats = NDArray[np.float64]
-
 
 #: Bins between a joint's limits.
 BINS: Final = 200

@@ -18,8 +18,6 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.simulation.surroundings import Placed
 
-Floats = NDArray[np.float64]
-
 #: JSON files beside shards that hold no grasps.
 BESIDE_SHARDS: Final = ("snapshot.json", "subset.json", "card.json")
 

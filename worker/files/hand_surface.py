@@ -8,11 +8,11 @@ import numpy as np
 from cachetools import LRUCache, cached
 from numpy.typing import NDArray
 
-from service.model.transforms import apply
+from service.model.transforms import Floats, apply
 from service.store.shards import Shard
 from worker.files.of_shard import hand_of_shard
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 from worker.hands.surface import sample_surface
 
 #: Points on a hand: some 5 mm apart on one as large as a man's.

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from service.model.transforms import Floats
 from worker.hands.load import main_file
-from worker.hands.model import Floats
 from worker.hands.options import parse_options
 from worker.hands.read import read_robot
 from worker.hands.tree import build_tree

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import quat_rotate
+from service.model.transforms import Floats, quat_rotate
 
 if TYPE_CHECKING:
     from worker.hands.model import ConvexPiece
 
-Floats = NDArray[np.float64]
 
 #: Two triangles whose normals have at least this cosine are one flat face: 0.1 degrees.
 COPLANAR: Final = 1 - 1.5e-6

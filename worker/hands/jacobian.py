@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import cross, quat_rotate
-from worker.hands.model import Floats, HandModel, JointType
+from service.model.transforms import Floats, cross, quat_rotate
+from worker.hands.model import HandModel, JointType
 
 
 def ancestors(hand: HandModel) -> NDArray[np.bool_]:

@@ -15,9 +15,9 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, apply, quat_rotate
+from service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel, JointType, SurfacePoints
+from worker.hands.model import HandModel, JointType, SurfacePoints
 from worker.hands.surface import sample_surface
 
 Ints = NDArray[np.intp]

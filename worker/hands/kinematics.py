@@ -7,8 +7,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import compose, quat_from_axis_angle
-from worker.hands.model import Floats, HandModel, JointType
+from service.model.transforms import Floats, compose, quat_from_axis_angle
+from worker.hands.model import HandModel, JointType
 
 
 def body_poses(hand: HandModel, hand_pose: Floats, joint_positions: Floats) -> Floats:

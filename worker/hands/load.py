@@ -13,14 +13,14 @@ import numpy as np
 from service.model.digests import digest_files, digest_variant
 from service.model.errors import HandError, InputError, NotFoundError, did_you_mean
 from service.model.states import AssetKind
-from service.model.transforms import compose
+from service.model.transforms import Floats, compose
 from service.store.assets import builtin_files, builtin_names, unpack_file, without_common_folder
 from service.store.hand_files import files_of_hand, hand_name, main_of
 from worker.hands import collisions, guess, primitives
 from worker.hands.collisions import resting_neighbours
 from worker.hands.drive import with_drive
 from worker.hands.guess import complete
-from worker.hands.model import ConvexPiece, Drag, Floats, HandModel, PalmFrame
+from worker.hands.model import ConvexPiece, Drag, HandModel, PalmFrame
 from worker.hands.mounting import mounting_tree
 from worker.hands.options import DEFAULT_EFFORT, DEFAULT_STIFFNESS, HandOptions, parse_options
 from worker.hands.primitives import volume

@@ -14,8 +14,8 @@ from typing import Final
 
 import numpy as np
 
-from service.model.transforms import IDENTITY_POSE, compose, invert
-from worker.hands.model import Floats, HandModel
+from service.model.transforms import IDENTITY_POSE, Floats, compose, invert
+from worker.hands.model import HandModel
 from worker.hands.options import HandOptions
 from worker.hands.robot import Joint, Robot, chain_to
 from worker.hands.tree import LEAST_RANGE, Drive, Tree, joint_motion

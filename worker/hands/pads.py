@@ -8,10 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, quat_conjugate, quat_rotate, spread_directions
+from service.model.transforms import IDENTITY_POSE, Floats, quat_conjugate, quat_rotate, spread_directions
 from worker.hands.jaws import jaws_of
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 from worker.hands.surface import sample_surface
 
 #: Share of a fingertip's speed, and so of its length, within which its points are its pad.

@@ -16,10 +16,10 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from service.model import transforms
-from service.model.transforms import IDENTITY_POSE, quat_rotate
+from service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
 from worker.hands import closing, kinematics, oppositions, primitives, surface
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel, SurfacePoints
+from worker.hands.model import HandModel, SurfacePoints
 from worker.hands.oppositions import Oppositions, climbed, opposed_finger, random_postures
 from worker.hands.surface import farthest_points, sample_surface
 from worker.objects.kept_arrays import arrays_kept_or_made

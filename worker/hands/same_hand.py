@@ -11,9 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import IDENTITY_POSE, apply, compose, invert, quat_from_axis_angle, quat_from_matrix
+from service.model.transforms import (
+    IDENTITY_POSE,
+    Floats,
+    apply,
+    compose,
+    invert,
+    quat_from_axis_angle,
+    quat_from_matrix,
+)
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 
 #: Random postures in which two models are compared.
 POSTURES: Final = 200

@@ -18,11 +18,11 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from service.model import transforms
-from service.model.transforms import IDENTITY_POSE, quat_rotate
+from service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
 from worker.hands import jacobian, kinematics, oppositions, primitives, surface
 from worker.hands.jacobian import generalized_forces
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel, SurfacePoints
+from worker.hands.model import HandModel, SurfacePoints
 from worker.hands.oppositions import Oppositions, oppositions_of
 from worker.hands.surface import sample_surface
 from worker.objects.kept_arrays import arrays_kept_or_made

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from service.model import transforms
 from service.model.errors import HandError
-from service.model.transforms import IDENTITY_POSE, apply, invert, quat_rotate
+from service.model.transforms import IDENTITY_POSE, Floats, apply, invert, quat_rotate
 from worker.hands import kinematics, primitives
 from worker.hands.kinematics import body_poses
-from worker.hands.model import ConvexPiece, Floats, HandModel, SurfacePoints
+from worker.hands.model import ConvexPiece, HandModel, SurfacePoints
 from worker.objects.content import content_of
 from worker.objects.kept_arrays import arrays_kept_or_made
 

@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 
 from service.model.errors import HandError, did_you_mean
-from service.model.transforms import IDENTITY_POSE, compose, quat_from_axis_angle
-from worker.hands.model import Floats, JointType
+from service.model.transforms import IDENTITY_POSE, Floats, compose, quat_from_axis_angle
+from worker.hands.model import JointType
 from worker.hands.options import HandOptions
 from worker.hands.robot import MAX_LENGTH_M, UNLIMITED_M, Joint, Mimic, Robot, chain_to
 from worker.hands.roots import pick_root

@@ -10,11 +10,9 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.objects.model import ObjectModel
-
-Floats = NDArray[np.float64]
 
 #: Pairs of points, and quantiles of their distances that are kept.
 PAIRS: Final = 40_000

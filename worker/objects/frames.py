@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from service.model.transforms import quat_rotate
+from service.model.transforms import Floats, quat_rotate
 from worker.grasps import moved
-
-Floats = NDArray[np.float64]
 
 #: Digits of the longest extent to which coordinates are rounded, so that no sliver collapses; and the fewest of them in
 #: which a mesh of decimals is looked for.

@@ -8,10 +8,11 @@ import manifold3d
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.objects import solid, topology
 from worker.objects.distance import MeshDistance, cut, surface_points
 from worker.objects.mass import signed_volume
-from worker.objects.topology import Floats, Indices
+from worker.objects.topology import Indices
 
 Mesh = tuple[Floats, Indices]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.objects.model import Floats
+from service.model.transforms import Floats
 
 Ints = NDArray[np.int32] | NDArray[np.int64]
 

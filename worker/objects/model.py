@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from service.model.errors import MeshError
 from service.model.matter import FRICTION, MASS_KG, MOST_KG
+from service.model.transforms import Floats
 from worker.objects.content import TOLD_IF_SET, content_of
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from worker.objects.model import Floats, Ints
+from service.model.transforms import Floats
+from worker.objects.model import Ints
 
 #: Faces that meet at a larger angle [deg] keep their own normals: averaging over an edge rounds a cylinder's rim by
 #: millimetres (research: the largest single effect on grasp quality).

@@ -21,10 +21,11 @@ from service.model.digests import digest_files, digest_json, digest_variant
 from service.model.errors import MeshError, NotFoundError, did_you_mean
 from service.model.libraries import version_of
 from service.model.states import AssetKind
+from service.model.transforms import Floats
 from service.store.assets import builtin_files, builtin_names, unpack_file
 from worker.objects.formats import READERS, read_mesh
 from worker.objects.mass import mass_properties
-from worker.objects.model import Floats, Ints, ObjectModel
+from worker.objects.model import Ints, ObjectModel
 from worker.objects.normals import corner_normals
 from worker.objects.options import OF_MATTER, ObjectOptions, parse_options
 from worker.objects.packed import from_bytes, to_bytes

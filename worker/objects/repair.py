@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from service.model.errors import MeshError
+from service.model.transforms import Floats
 from worker.grasps import on_grid
 from worker.objects import solid, topology
 from worker.objects.distance import MeshDistance, surface_points
@@ -20,7 +21,7 @@ from worker.objects.frames import Centred, centred
 from worker.objects.intersections import crossings, untangle
 from worker.objects.mass import signed_volume
 from worker.objects.options import UNITS, ObjectOptions
-from worker.objects.topology import Floats, Indices
+from worker.objects.topology import Indices
 
 MAX_EXTENT_M: Final = 3.0
 MIN_EXTENT_M: Final = 1e-3

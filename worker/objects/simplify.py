@@ -7,10 +7,11 @@ from typing import Final
 
 import numpy as np
 
+from service.model.transforms import Floats
 from worker.objects import solid, topology
 from worker.objects.distance import MeshDistance, deviation, surface_points
 from worker.objects.mass import signed_volume
-from worker.objects.topology import Floats, Indices
+from worker.objects.topology import Indices
 
 Mesh = tuple[Floats, Indices]
 

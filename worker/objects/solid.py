@@ -7,7 +7,8 @@ from typing import Any, Final
 import manifold3d
 import numpy as np
 
-from worker.objects.topology import Floats, Indices, parts_of_graph
+from service.model.transforms import Floats
+from worker.objects.topology import Indices, parts_of_graph
 
 #: A gap exceeds its bound by more than this share of it: coordinates of files are rounded.
 _ROUNDING: Final = 1e-3

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.rendering.cameras import Cameras, Floats
+from service.model.transforms import Floats
+from worker.rendering.cameras import Cameras
 
 BACKGROUND, TABLE, OBJECT = 0, 1, 2
 

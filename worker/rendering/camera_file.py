@@ -11,7 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError,
 
 from service.model.base import refusal
 from service.model.errors import InputError
-from worker.rendering.cameras import Floats, look_at
+from service.model.transforms import Floats
+from worker.rendering.cameras import look_at
 
 #: Rotations of a file may be off by this: six digits are usual in JSON written by hand.
 ROTATION_ERROR: Final = 1e-5

@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.model.errors import InputError
 from service.model.pinhole import pixel_rays
-
-Floats = NDArray[np.float64]
+from service.model.transforms import Floats
 
 FIELD_OF_VIEW: Final = np.radians(40.0)
 BASELINE_M: Final = 0.06

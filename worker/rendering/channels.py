@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from service.model.domain import EXTRA_CHANNELS
 from service.model.errors import InputError, did_you_mean
 from service.model.pinhole import pixel_rays
+from service.model.transforms import Floats
 from worker.rendering.annotate import OBJECT
-from worker.rendering.cameras import Floats
 
 ALL: Final = "all"
 

@@ -12,8 +12,9 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from service.model.colours import hexadecimal, linear
+from service.model.transforms import Floats
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 from worker.hands.robot import Ints
 from worker.hands.visuals import NO_VISUALS, VisualMesh
 from worker.objects.normals import corner_normals

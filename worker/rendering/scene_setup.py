@@ -16,8 +16,8 @@ from cachetools import LRUCache
 from service.model.colours import Colour, hexadecimal, linear
 from service.model.scene_spec import Box as BoxSupport
 from service.model.scene_spec import HalfSpace
-from service.model.transforms import apply
-from worker.objects.model import Floats, ObjectModel
+from service.model.transforms import Floats, apply
+from worker.objects.model import ObjectModel
 from worker.rendering.camera_file import SAMPLED, GivenCameras
 from worker.rendering.cameras import intrinsics, narrow_field, sample_hemisphere, stereo_pair
 from worker.rendering.hands import DrawnHand

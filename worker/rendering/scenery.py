@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.rendering.cameras import Floats
+from service.model.transforms import Floats
 from worker.rendering.kernels.shading import PLAIN
 
 

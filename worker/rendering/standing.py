@@ -9,8 +9,7 @@ import numpy as np
 
 from service.model.scene_spec import Box as BoxSupport
 from service.model.scene_spec import HalfSpace
-from service.model.transforms import compose, invert, quat_from_axis_angle, quat_rotate
-from worker.objects.model import Floats
+from service.model.transforms import Floats, compose, invert, quat_from_axis_angle, quat_rotate
 from worker.rendering.scenery import Box
 
 Supports = Sequence[HalfSpace | BoxSupport]

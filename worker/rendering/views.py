@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import apply
+from service.model.transforms import Floats, apply
 from worker.objects.frames import to_centre
-from worker.objects.model import Floats, ObjectModel
+from worker.objects.model import ObjectModel
 from worker.rendering.annotate import box_corners, in_camera, loose_boxes, tight_boxes
 from worker.rendering.camera_file import SAMPLED, GivenCameras
 from worker.rendering.cameras import BASELINE_M, Cameras

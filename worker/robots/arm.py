@@ -10,9 +10,10 @@ import numpy as np
 from service.model.digests import digest_files
 from service.model.errors import InputError
 from service.model.states import AssetKind
+from service.model.transforms import Floats
 from worker.hands.collisions import resting_neighbours
 from worker.hands.load import body_model, files_from_path, main_file
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 from worker.hands.options import HandOptions, parse_options
 from worker.hands.read import read_robot
 from worker.hands.robot import FREE, MOVING, Robot, chain_to

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import IDENTITY_POSE, compose
+from service.model.transforms import IDENTITY_POSE, Floats, compose
 from worker.grasps import GraspSet, Posture
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.robots.frames import ToolFrame
 from worker.scenes.way import plan_free_way

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from service.model.errors import InputError
-from worker.hands.model import Floats
+from service.model.transforms import Floats
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.robots.arm import Arm
 from worker.robots.execution import Executions

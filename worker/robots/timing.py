@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import slerp
-from worker.hands.model import Floats, HandModel, JointType
+from service.model.transforms import Floats, slerp
+from worker.hands.model import HandModel, JointType
 from worker.robots.execution import PHASES, POSTURES, Executions
 
 #: Velocity of a joint whose description states none [rad/s, m/s].

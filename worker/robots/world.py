@@ -9,8 +9,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.engines.mujoco_warnings import ARENA
-from worker.hands.model import Floats, HandModel, JointType
+from worker.hands.model import HandModel, JointType
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.model import add_shape
 from worker.robots.arm import Arm

@@ -10,10 +10,10 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 from cachetools import LRUCache
-from numpy.typing import NDArray
 
 from service.model.errors import MeshError, SceneError
 from service.model.scene_spec import SceneSpec
+from service.model.transforms import Floats
 from worker.objects.convex import union_volume
 from worker.objects.frames import to_centre, to_file
 from worker.objects.model import ObjectModel
@@ -23,8 +23,6 @@ from worker.scenes.laid import lay_beside
 from worker.scenes.neighbours import drop_together
 from worker.simulation.outer import outer_solid
 from worker.simulation.surroundings import Neighbour, Obstacle, Scenes
-
-Floats = NDArray[np.float64]
 
 #: Convex pieces of a neighbour at most: no hand is put into a neighbour's hollow, so hollows may be filled.
 MOST_PIECES: Final = 8

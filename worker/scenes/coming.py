@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import quat_rotate
+from service.model.transforms import Floats, quat_rotate
 from worker.grasps import Posture
 from worker.quality.contact import finger_of_body
 from worker.quality.probe import Probe
@@ -16,8 +16,6 @@ from worker.scenes.clearance import MARGIN_M
 from worker.simulation.mounting import wrist_room
 from worker.simulation.obstacles import obstacle_room
 from worker.simulation.surroundings import STANDOFF_M, Placed
-
-Floats = NDArray[np.float64]
 
 #: On its way the hand's points stay this far from the object [m], if they can at least so far: between points that are
 #: looked at, and where the object's convex pieces stand out, it is nearer.

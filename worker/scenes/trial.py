@@ -9,8 +9,8 @@ from functools import partial
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -24,8 +24,6 @@ from worker.run import Run
 from worker.scenes.verdicts import lift_level
 from worker.scenes.way import plan_way
 from worker.simulation.surroundings import Placed
-
-Floats = NDArray[np.float64]
 
 #: Added to the score of a hand that would lift but cannot come: worse than any that can and lets the object fall, since
 #: most of these come freely, better than what is lost.

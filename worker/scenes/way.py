@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, quat_from_axis_angle, quat_rotate
+from service.model.transforms import IDENTITY_POSE, Floats, quat_from_axis_angle, quat_rotate
 from worker.grasps import GraspSet, Posture, moved
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -27,8 +27,6 @@ from worker.scenes.coming import LOOKS, OBJECT_MARGIN_M, WAYPOINTS, come_open
 from worker.simulation.mounting import mounting_room
 from worker.simulation.obstacles import obstacle_room
 from worker.simulation.surroundings import RISE_M, STANDOFF_M, Placed, Surroundings
-
-Floats = NDArray[np.float64]
 
 _POINTS: Final = 600
 #: Around a free object: tilts of the retreat from the palm's own direction [rad], each to so many sides.

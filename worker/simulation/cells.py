@@ -8,10 +8,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.objects.model import ObjectModel
 from worker.simulation.kernels import nearest
-
-Floats = NDArray[np.float64]
 
 
 def faces_of(obj: ObjectModel) -> Any:

@@ -12,10 +12,11 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.simulation.device import joint_units, to_wxyz, to_xyzw
 from worker.simulation.kernels import contact, packing, penalties
 from worker.simulation.model import MAX_DILATION, REFERENCE_POINTS, Model
-from worker.simulation.state import Floats, HandState, Schedule, still_schedule
+from worker.simulation.state import HandState, Schedule, still_schedule
 
 
 class Tables:

@@ -9,14 +9,13 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.hands.jaws import slides
 from worker.hands.model import ConvexPiece, HandModel
 from worker.objects.model import ObjectModel
 from worker.simulation.cells import faces_of
 from worker.simulation.grids import add_grid
 from worker.simulation.kernels import kinematics, nearest, pieces, surface
-
-Floats = NDArray[np.float64]
 
 #: Kernels' numbers for `ConvexPiece.kind`.
 _KINDS: Final = {"box": 0, "sphere": 1, "cylinder": 2, "capsule": 3, "hull": 4}

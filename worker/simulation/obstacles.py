@@ -12,7 +12,7 @@ import warp as wp
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import quat_rotate
+from service.model.transforms import Floats, quat_rotate
 from worker.grasps import Posture
 from worker.hands.features import HandFeatures
 from worker.hands.kinematics import body_poses
@@ -24,8 +24,6 @@ from worker.simulation.kernels import solids as solid_kernels
 from worker.simulation.launches import launch
 from worker.simulation.posed import PosedBodies
 from worker.simulation.surroundings import CLEAR_M, Obstacle, Surroundings
-
-Floats = NDArray[np.float64]
 
 #: Distance that a hand keeps from obstacles [m]: twice what a scene's certificate asks, for the way is swept in steps.
 MARGIN_M: Final = 0.004

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import MeshError
+from service.model.transforms import Floats
 from worker.hands.features import convex_edges
 from worker.simulation.surroundings import Obstacle
-
-Floats = NDArray[np.float64]
 
 #: Faces of a solid at most, and what it may stand out from its piece before it needs more [m].
 MOST_PLANES: Final = 48

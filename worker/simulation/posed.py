@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 from cachetools import LRUCache
-from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.hands.model import HandModel, JointType
 from worker.simulation.device import to_xyzw
 from worker.simulation.kernels import chain as kernels
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,9 @@ from typing import Any, Final
 import numpy as np
 
 from service.model.colours import Colour, linear
+from service.model.transforms import Floats
 from worker.hands.check import model_facts
-from worker.hands.model import Floats, HandModel, JointType
+from worker.hands.model import HandModel, JointType
 from worker.hands.pads import pads_of
 from worker.hands.robot import Ints
 from worker.hands.surface import sample_surface

@@ -10,10 +10,10 @@ import numpy as np
 from PIL import Image
 
 from service.model.fidelity import FIDELITIES
-from service.model.transforms import apply
+from service.model.transforms import Floats, apply
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners import Wanted, synthesize
 from worker.rendering.camera_file import GivenCameras

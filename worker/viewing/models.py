@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.scene_spec import Box, HalfSpace
+from service.model.transforms import Floats
 from service.readers.ways import Waypoint
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.probe import Probe, probe_of
 from worker.rendering.hands import drawn_parts, drawn_poses, without_visuals

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec, supports_in
-from service.model.transforms import IDENTITY_POSE, quat_rotate
+from service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
 from service.readers.ways import point_at, scene_spec_of, stop_places, way_of, wrists_of
 from service.store.shards import Shard
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.rendering.standing import seen_share
 from worker.scenes.neighbours import Neighbours

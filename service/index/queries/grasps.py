@@ -46,7 +46,8 @@ from service.index.tables import dataset_cells, grasps, jobs, shards, tagged, ta
 from service.index.views import GraspView, Page
 from service.model.base import Model
 from service.model.errors import InputError, NotFoundError
-from service.model.metrics import SortedName, indexed
+from service.model.metric_fields import SortedName
+from service.model.metrics import indexed
 from service.model.projects import EVERYTHING, ProjectScope
 from service.model.states import Stage
 from service.model.tags import Grasp

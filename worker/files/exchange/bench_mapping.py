@@ -9,15 +9,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic_core import from_json
 
 from service.model.errors import InputError
-from service.model.transforms import IDENTITY_POSE, compose, invert
+from service.model.transforms import IDENTITY_POSE, Floats, compose, invert
 from worker.files.exchange.bench_hand import body_names
 from worker.hands.model import HandModel
-
-Floats = NDArray[np.float64]
 
 #: Folder of the grasps of an experiment; the mapping lies beside it.
 GRASPS: Final = "graspdata"

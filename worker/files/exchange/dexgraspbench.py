@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import IDENTITY_POSE, compose, invert
+from service.model.transforms import IDENTITY_POSE, Floats, compose, invert
 from worker.files.exchange.bench_hand import joint_order, write_hand
 from worker.files.exchange.bench_mapping import GRASPS, HandMapping, link_names, mapping_of, of_the_benchmark
 from worker.files.exchange.bench_object import SCALE, write_object, write_table
@@ -41,7 +40,6 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.simulation.surroundings import Placed
 
-Floats = NDArray[np.float64]
 Row = dict[str, Any]
 
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from service.model.base import why
 from service.model.errors import InputError
-from service.model.transforms import apply, compose, invert, pose_from_matrix, pose_to_matrix
+from service.model.transforms import Floats, apply, compose, invert, pose_from_matrix, pose_to_matrix
 from service.readers import DepthNoise, Pictures
 from service.readers.clouds import CloudView
 from worker.files.exchange.dexgraspnet2_graspness import SceneGraspness, surface_samples
@@ -48,7 +48,6 @@ from worker.hands.model import HandModel
 from worker.rendering.annotate import OBJECT
 from worker.rendering.export import export_png
 
-Floats = NDArray[np.float64]
 CAMERA: Final = "realsense"
 #: Views of a scene, among which its loader draws.
 VIEWS: Final = 256

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import apply, pose_from_matrix, pose_to_matrix, quat_from_matrix
+from service.model.transforms import Floats, apply, pose_from_matrix, pose_to_matrix, quat_from_matrix
 from service.store import validity
 from worker.files.exchange.imported import Imported, completed, joints_by_name
 from worker.files.exchange.lots import Lot
@@ -44,7 +44,6 @@ from worker.planners.fast_graspd.selection import posture_of
 from worker.planners.peers import ground_of
 from worker.simulation.state import HandState
 
-Floats = NDArray[np.float64]
 MEMBER: Final = "grasps.json"
 INDEX: Final = "uuid_index.json"
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")

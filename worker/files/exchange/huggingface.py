@@ -21,7 +21,7 @@ from PIL import Image
 
 from service import parquet
 from service.model.errors import InputError
-from service.model.transforms import IDENTITY_POSE
+from service.model.transforms import IDENTITY_POSE, Floats
 from service.readers import DepthNoise, Pictures
 from service.readers.clouds import CloudView
 from service.readers.ways import scene_spec_of
@@ -34,8 +34,6 @@ from worker.files.exchange.written import Written
 from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
 from worker.rendering.export import PNG_STEP_M
-
-Floats = NDArray[np.float64]
 
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 #: Kinds of scenes that a grasp may be planned in, as a row tells them.

@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
+from service.model.transforms import Floats
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.postures import pregrasp, squeeze
 from worker.simulation.surroundings import Placed
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

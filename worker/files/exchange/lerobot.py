@@ -22,14 +22,12 @@ from numpy.typing import NDArray
 
 from service import parquet
 from service.model.errors import InputError
-from service.model.transforms import POSE_PARTS, compose
+from service.model.transforms import POSE_PARTS, Floats, compose
 from service.readers import Pictures
 from service.readers.ways import way_of
 from worker.files.exchange.huggingface import png
 from worker.files.exchange.lots import Look, Lot, by_scene, looks
 from worker.files.exchange.written import Written
-
-Floats = NDArray[np.float64]
 
 VERSION: Final = "v3.0"
 FPS: Final = 10

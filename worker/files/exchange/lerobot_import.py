@@ -12,15 +12,13 @@ from numpy.typing import NDArray
 from service import parquet
 from service.model.base import why
 from service.model.errors import InputError
-from service.model.transforms import POSE_PARTS, compose, invert
+from service.model.transforms import POSE_PARTS, Floats, compose, invert
 from worker.files.exchange.bench_scene import placed_of
 from worker.files.exchange.imported import Imported, joints_by_name, verdicts
 from worker.files.exchange.lerobot import ACTION, EPISODE, OBJECT, STATE, VERDICT, task_of
 from worker.files.exchange.objects import scaled_object
 from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
-
-Floats = NDArray[np.float64]
 
 #: Postures that end a way: pregrasp, grasp, squeeze, lift.
 _STOPS = 4

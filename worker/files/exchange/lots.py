@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import compose, invert, pose_from_matrix
+from service.model.transforms import Floats, compose, invert, pose_from_matrix
 from service.readers import DepthNoise, Pictures
 from service.readers.clouds import CloudView
 from service.store.shards import Shard
@@ -18,8 +18,6 @@ from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.simulation.surroundings import Placed
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,16 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
+from service.model.transforms import Floats, quat_from_axis_angle, quat_from_matrix, quat_multiply
 from worker.files.exchange.imported import Imported, completed
 from worker.files.exchange.objects import scaled_object
 from worker.grasps import Posture
 from worker.hands.load import hand_from_path
-
-Floats = NDArray[np.float64]
 
 
 def read(path: Path, *, hand: str, obj: str, robot: str, object_name: str) -> list[Imported]:

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import LimitError
+from service.model.transforms import Floats
 from worker.objects.formats.soup import check_face_count
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 #: The triangulator takes up to 2 ns times the square of the corners: the squares of a file's re-entrant polygons.

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, apply
+from service.model.transforms import IDENTITY_POSE, Floats, apply
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.planners.dfc import kernels
@@ -24,7 +24,6 @@ from worker.simulation.model import Model
 from worker.simulation.record import add_poses, add_root_gradient
 from worker.simulation.state import HandState
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 #: Places that may become contacts, on each link and on the palm.

@@ -20,8 +20,6 @@ from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.across import STEEP, Crossings, crossings_of, room_beside
 from worker.simulation.surroundings import CLEAR_M, Surroundings
 
-Floats = NDArray[np.float64]
-
 #: A gap that is wider is as good as this, and how exactly others are told [m].
 WIDEST_M: Final = 0.064
 EXACT_M: Final = 0.0005

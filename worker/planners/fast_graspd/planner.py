@@ -16,6 +16,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from service.model.integers import distinct_values
+from service.model.transforms import Floats
 from worker.grasps import GraspSet, joined
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -50,7 +51,6 @@ from worker.simulation.projection import Projection, ProjectionOptions
 from worker.simulation.state import HandState
 from worker.simulation.surroundings import Placed
 
-Floats = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 #: Iterations between two looks at cancellation.

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.robust import MODELS, Axis
+from service.model.transforms import Floats
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -30,8 +31,6 @@ from worker.quality.referee.variant import Variant, dealt, draw
 from worker.quality.referee.varied import Models
 from worker.run import ALONE, Run
 from worker.simulation.surroundings import Placed
-
-Floats = NDArray[np.float64]
 
 NOT_JUDGED: Final = -1
 #: Shares are wanted to this: 0.9 of 10 models is 9 of them.

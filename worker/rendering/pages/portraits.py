@@ -13,10 +13,10 @@ from PIL import Image, ImageDraw
 
 from service.model.colours import hexadecimal
 from service.model.errors import InputError
-from service.model.transforms import IDENTITY_POSE, apply, compose, quat_from_matrix
+from service.model.transforms import IDENTITY_POSE, Floats, apply, compose, quat_from_matrix
 from worker.hands.closing import posture
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 from worker.hands.pads import pads_of
 from worker.objects.model import ObjectModel
 from worker.objects.normals import corner_normals

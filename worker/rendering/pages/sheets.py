@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from service.model.transforms import Floats
 from worker.rendering.annotate import OBJECT, TABLE
-from worker.rendering.cameras import Floats
 from worker.rendering.pages import typography as type_
 
 MARGIN: Final = 40

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from service.model.colours import hexadecimal
 from service.model.scene_spec import HalfSpace
-from service.model.transforms import IDENTITY_POSE, apply, compose
+from service.model.transforms import IDENTITY_POSE, Floats, apply, compose
 from service.readers.ways import Waypoint
 from worker.grasps import moved
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.objects.frames import to_centre
-from worker.objects.model import Floats, ObjectModel
+from worker.objects.model import ObjectModel
 from worker.rendering.cameras import intrinsics, look_at
 from worker.rendering.hands import drawn_bodies, drawn_parts, drawn_poses
 from worker.rendering.pages.pictures import (

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from service.model.transforms import compose, invert
+from service.model.transforms import Floats, compose, invert
 from worker.files.exchange.names import plain_name, prim_names
 from worker.hands.description import Description
-from worker.hands.model import Floats
 from worker.robots.arm import Arm
 from worker.robots.execution import Executions
 from worker.robots.timing import Path, Trajectory

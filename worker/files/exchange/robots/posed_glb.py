@@ -7,9 +7,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from service.model.transforms import Floats
 from worker.files.exchange.robots.bundle import Bundle
 from worker.files.exchange.robots.solids import Solid, hand_meshes, object_mesh, support_meshes
-from worker.hands.model import Floats
 from worker.objects.glb_document import Document, plain
 from worker.robots.execution import posed_bodies
 

@@ -7,8 +7,9 @@ from typing import Final
 
 import numpy as np
 
+from service.model.transforms import Floats
 from worker.files.exchange.names import plain_name
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 from worker.hands.primitives import hull
 from worker.hands.robot import Ints
 from worker.objects.normals import corner_normals

@@ -12,12 +12,11 @@ from typing import Any, Final
 import numpy as np
 
 from service.model.errors import InputError
-from service.model.transforms import pose_to_matrix
+from service.model.transforms import Floats, pose_to_matrix
 from worker.files.exchange.names import prim_names
 from worker.files.exchange.robots.bundle import Bundle
 from worker.files.exchange.robots.solids import Solid, hand_meshes, object_mesh, support_meshes
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats
 from worker.robots.execution import Executions, posed_bodies
 from worker.robots.timing import Trajectory
 
