@@ -22,7 +22,7 @@ from service.store.manifests import INDEX_THRESHOLD_M
 from service.store.shards import Shard, read_shard, write_shard
 
 if TYPE_CHECKING:
-    from worker.viewing.viewer import Viewer
+    from worker.viewing import Viewer
 
 Array = NDArray[Any]
 #: Rows to keep: a mask (N,), row numbers, or a function that makes either from the grasps.

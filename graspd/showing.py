@@ -14,7 +14,7 @@ from service.model.transforms import POSE_PARTS
 
 if TYPE_CHECKING:
     from graspd.grasps import Grasps
-    from worker.viewing.viewer import Viewer
+    from worker.viewing import Viewer
 
 #: Grasps of a notebook's picture, edge of each [px], and the time after which tracing stops [s].
 PICTURED: Final = 4
@@ -77,7 +77,7 @@ def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:
     """A viewer that serves; see `Grasps.view`."""
     try:
         from worker.files.of_shard import hand_of_shard, neighbours_of_shard, object_of_shard
-        from worker.viewing.viewer import Shown, Viewer, missing
+        from worker.viewing import Shown, Viewer, missing
     except ModuleNotFoundError as error:
         raise ImportError(f"view needs {error.name}; run pip install 'graspd[worker,view]'") from error
     if said := missing():

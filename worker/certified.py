@@ -46,8 +46,7 @@ from worker.quality.referee.shake import shake_margins
 from worker.quality.table import measure
 from worker.rounds import ROUND_STRIDE, Arrays, Round, enough, lanes_of, next_round, taken
 from worker.run import ALONE, Run
-from worker.scenes.trial import trial_on
-from worker.scenes.verdicts import lift_level, scene_verdicts
+from worker.scenes.trial import lift_level, scene_verdicts, trial_on
 from worker.side_by_side import side_by_side
 from worker.simulation.surroundings import Placed, Scenes
 

@@ -120,7 +120,7 @@ def _package(path: Path) -> Path:
 def _named_by(path: Path, root: Path) -> set[str]:
     """Names of the files below the root that a description, and what it includes, may mean.
 
-    `worker.hands.references.find_mesh` and `worker.hands.mjcf_source` choose among them.
+    `worker.hands.visuals.find_mesh` and `worker.hands.mjcf_source` choose among them.
     """
     seen, waiting = {path}, [path]
     bases, folders, references = set(), {""}, set()

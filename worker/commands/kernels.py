@@ -10,7 +10,7 @@ import typer
 
 from service.cli import JsonFlag, emit, reporting_errors
 
-app = typer.Typer()
+app = typer.Typer(add_completion=False)
 
 
 @app.command(epilog="graspd admin kernels ./kernels --arch 90")

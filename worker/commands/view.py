@@ -29,7 +29,7 @@ def view(
     object: Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")] = None,
 ) -> None:
     """Show grasps in 3D in the browser: hand, object, scene, contacts, and the way as a slider. Ends with Ctrl-C."""
-    from worker.viewing.viewer import Shown, Viewer, missing
+    from worker.viewing import Shown, Viewer, missing
 
     if said := missing():
         raise InputError(said)

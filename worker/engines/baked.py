@@ -3,6 +3,8 @@
 A folder of such kernels is laid out as Warp's cache is, VERSION/MODULE/FILE. Names of files hold what they are good
 for: the digest of the module's source and options, the GPU's architecture, or the instructions of the CPU that they
 were compiled on. What does not fit a machine is not found there and compiled as ever.
+
+Names of compiled kernels, for what is kept of their results.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import tempfile
 from collections.abc import Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Final
 
 import warp as wp
@@ -23,6 +26,7 @@ log = logging.getLogger(__name__)
 
 #: Names the folder of kernels that were compiled ahead.
 VARIABLE: Final = "GRASPD_KERNELS"
+
 #: A100, H100 and H200, B200.
 ARCHITECTURES: Final = (80, 90, 100)
 
@@ -84,3 +88,15 @@ def _copied(source: Path, target: Path) -> bool:
     shutil.copyfile(source, partial)
     Path(partial).replace(target)
     return True
+
+
+def binary_name(module: ModuleType) -> str:
+    """What the kernels of a module are compiled to on this CPU: a digest of their sources, of all they call and of how
+    they are compiled, and the name that Warp gives the file, which tells the instructions that the CPU has.
+
+    Two processes in which it is the same run the same instructions.
+    """
+    known = wp.get_module(module.__name__)
+    # A launch on the CPU has blocks of one thread.
+    name = known._get_compile_output_name(wp.get_device("cpu"), block_dim=1)
+    return f"{wp.config.version} {known.get_module_hash(1).hex()} {name}"

@@ -28,8 +28,8 @@ from worker.files.origin import remembered
 from worker.grasps import joined_columns
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
-from worker.objects.matter import as_asked
 from worker.objects.model import ObjectModel
+from worker.objects.options import as_asked
 from worker.objects.prepare import object_from_path
 from worker.planners import planner
 from worker.pool.modules import MODULES

@@ -1,9 +1,12 @@
-"""A hand from its files: its description, meshes, and what is said of it in `asset.json` or `hand.json`."""
+"""A hand from its files: its description, meshes, and what is said of it in `asset.json` or `hand.json`.
+
+Gains and limits of joints for which nobody states any, where the unit of a revolute joint would be absurd.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -18,11 +21,18 @@ from service.store.assets import builtin_files, builtin_names, unpack_file, with
 from service.store.hand_files import files_of_hand, hand_name, main_of
 from worker.hands import collisions, guess, primitives
 from worker.hands.collisions import resting_neighbours
-from worker.hands.drive import with_drive
 from worker.hands.guess import complete
+from worker.hands.jaws import jaws_of, slides
 from worker.hands.model import ConvexPiece, Drag, HandModel, PalmFrame
 from worker.hands.mounting import mounting_tree
-from worker.hands.options import DEFAULT_EFFORT, DEFAULT_STIFFNESS, HandOptions, parse_options
+from worker.hands.options import (
+    DEFAULT_EFFORT,
+    DEFAULT_FORCE,
+    DEFAULT_LINEAR_STIFFNESS,
+    DEFAULT_STIFFNESS,
+    HandOptions,
+    parse_options,
+)
 from worker.hands.primitives import volume
 from worker.hands.read import read_robot
 from worker.hands.robot import Robot, chain_to
@@ -284,3 +294,29 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
 
 
 __all__ = ["files_from_path", "hand_from_path", "load_hand"]
+
+
+def with_drive(hand: HandModel, stated: Collection[str], assumed: Sequence[str]) -> HandModel:
+    """The hand with the defaults of sliding joints and of jaws instead of those of revolute joints.
+
+    A dof that moves pads by v [m/rad or 1] along their line gets the gain k v^2, summed over the pads, and the limit
+    f v: at each pad that is k [N/m] and f [N], however the dof is geared to it.
+
+    Args:
+        hand: the hand with its palm and closing.
+        stated: dofs whose position gain somebody states: it stays.
+        assumed: dofs whose limit of torque or force nobody states.
+    """
+    slide, jaws = slides(hand), jaws_of(hand)
+    if jaws is None and not slide.any():
+        return hand
+    gain = np.where(slide, DEFAULT_LINEAR_STIFFNESS, hand.stiffness)
+    limit = np.where(slide, DEFAULT_FORCE, hand.effort)
+    if jaws is not None:
+        half = jaws.speed[len(jaws.speed) // 2]
+        moves = np.abs(half).sum(axis=1) > 0
+        gain = np.where(moves, DEFAULT_LINEAR_STIFFNESS * (half**2).sum(axis=1), gain)
+        limit = np.where(moves, DEFAULT_FORCE * np.abs(half).sum(axis=1), limit)
+    keeps = np.array([dof in stated for dof in hand.dof_names])
+    free = np.array([dof in assumed for dof in hand.dof_names])
+    return replace(hand, stiffness=np.where(keeps, hand.stiffness, gain), effort=np.where(free, limit, hand.effort))

@@ -15,7 +15,7 @@ from typing import Final
 
 from service.model.errors import HandError, LimitError
 from service.store.mesh_files import one_like
-from worker.hands.xml_tree import parse_xml
+from worker.hands.urdf import parse_xml
 from worker.objects.stand_ins import refuse_stand_in
 
 MAX_BYTES: Final = 8 * 2**20

@@ -25,7 +25,7 @@ from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.selection import posture_of
 from worker.planners.fast_graspd.starts import sample_starts
 from worker.quality.postures import pregrasp, squeeze
-from worker.simulation.state import HandState
+from worker.simulation.data import HandState
 
 T = TypeVar("T")
 

@@ -31,7 +31,7 @@ from service.model.workers import need_of, own_ability
 from service.queue.port import Event, EventKind, Message
 from service.store.manifests import ShardManifest, load_manifest, publish_shard, shard_exists
 from service.store.records import put_record
-from worker.engines.cuda_errors import DeviceLost, check_device
+from worker.engines.devices import DeviceLost, check_device
 from worker.pool.pool import ProcessLost
 from worker.process.fitness import Fitness, first_loss
 from worker.stages.context import StopReason, TaskContext

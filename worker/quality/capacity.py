@@ -15,7 +15,7 @@ import numpy as np
 from service.model.matter import ACCELERATION
 from service.model.transforms import Floats, cross
 from worker.grasps import Posture
-from worker.hands.jacobian import generalized_forces
+from worker.hands.kinematics import generalized_forces
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.contact import choose_contacts

@@ -15,7 +15,7 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from service.model.transforms import Floats, compose, quat_to_matrix
-from worker.engines.binaries import binary_name
+from worker.engines.baked import binary_name
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel, SurfacePoints

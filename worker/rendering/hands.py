@@ -17,7 +17,7 @@ from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.hands.robot import Ints
 from worker.hands.visuals import NO_VISUALS, VisualMesh
-from worker.objects.normals import corner_normals
+from worker.objects.mesh_geometry import corner_normals
 from worker.rendering.scenery import Look, Solid
 
 _HAND: Final = Look(hexadecimal("#59636e"), roughness=0.42, metalness=0.35)

@@ -13,8 +13,7 @@ from service.model.transforms import Floats
 from worker.hands.jaws import slides
 from worker.hands.model import ConvexPiece, HandModel
 from worker.objects.model import ObjectModel
-from worker.simulation.cells import faces_of
-from worker.simulation.grids import add_grid
+from worker.simulation.grids import add_grid, faces_of
 from worker.simulation.kernels import kinematics, nearest, pieces, surface
 
 #: Kernels' numbers for `ConvexPiece.kind`.

@@ -25,9 +25,9 @@ from service.store.store import Store
 from worker.files.of_shard import NEIGHBOUR_FACE_ERROR_M
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
-from worker.objects import packed
-from worker.objects.matter import as_asked
+from worker.objects import prepare
 from worker.objects.model import ObjectModel
+from worker.objects.options import as_asked
 from worker.objects.prepare import load_object
 from worker.planners.learned.known import keep
 from worker.stages.hand_files import load_hand_files
@@ -130,14 +130,14 @@ def prepared_object(store: Store, digest: str, *, name: str, face_error_m: float
     """
     key = names.object_prepared(digest, _address(face_error_m))
     try:
-        return packed.from_bytes(get_sealed(store, key), name=name, digest=digest)
+        return prepare.from_bytes(get_sealed(store, key), name=name, digest=digest)
     except NotFoundError:
         pass
     except (DamagedError, ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
         # What cannot be read is made again; it cannot be replaced, and costs no more than it did without a store.
         return _load(store, digest, name=name, face_error_m=face_error_m)
     obj = _load(store, digest, name=name, face_error_m=face_error_m)
-    put_sealed(store, key, packed.to_bytes(obj))
+    put_sealed(store, key, prepare.to_bytes(obj))
     return obj
 
 

@@ -21,8 +21,8 @@ from worker.hands.robot import Ints
 from worker.hands.surface import sample_surface
 from worker.hands.visuals import VisualMesh, lighter
 from worker.objects.glb_document import Document, plain
+from worker.objects.mesh_geometry import corner_normals
 from worker.objects.model import ObjectModel
-from worker.objects.normals import corner_normals
 
 #: Points on the hand from which a viewer measures its distance to the object.
 SURFACE_POINTS: Final = 3000

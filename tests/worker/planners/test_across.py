@@ -26,8 +26,8 @@ from worker.planners.fast_graspd.scene_starts import REACHING, clear_scene_start
 from worker.planners.fast_graspd.selection import posture_of
 from worker.planners.fast_graspd.starts import CLEAR, start_generator
 from worker.planners.fast_graspd.withdrawal import hindrance
+from worker.simulation.data import HandState
 from worker.simulation.obstacles import MARGIN_M, DeviceObstacles, body_room
-from worker.simulation.state import HandState
 from worker.simulation.surroundings import Obstacle, Scenes, Surroundings
 
 UP = np.array([0.0, 0, 1])

@@ -27,8 +27,8 @@ from worker.hands.model import HandModel
 from worker.objects.prepare import object_from_path
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.run import ALONE
+from worker.simulation.data import HandState
 from worker.simulation.model import LossOptions
-from worker.simulation.state import HandState
 from worker.studies.stability import descents, gradients, integrators, report, shapes, studies
 from worker.studies.stability.report import markdown, write
 

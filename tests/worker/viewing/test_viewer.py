@@ -63,7 +63,7 @@ SCENE = json_attribute(SceneSpec(kind="bin").model_dump(mode="json"))
 
 @pytest.fixture(scope="module")
 def viewer(block) -> Iterator:
-    from worker.viewing.viewer import Shown, Viewer
+    from worker.viewing import Shown, Viewer
 
     said = {"hand": "two fingers", "object": "block", "scene": SCENE}
     made = Viewer(Shown(Shard("base", said, arrays(2)), HAND, block), port=0)
@@ -128,7 +128,7 @@ def test_only_valid_grasps_are_shown_where_that_is_chosen(viewer):
 
 
 def test_what_a_grasp_lifts_and_whether_it_survives_the_shake_is_told() -> None:
-    from worker.viewing.viewer import _figures
+    from worker.viewing import _figures
 
     found = {"quality/payload_kg": np.array([np.nan, 0.8, 1.5]), "quality/shake_margin": np.array([np.nan, 0.2, 1.0])}
     shard = Shard("base", {}, {**arrays(2), **found})
@@ -208,7 +208,7 @@ def test_the_file_that_is_no_shard_is_one_line(tmp_path: Path):
 
 
 def test_links_above_the_root_are_drawn_at_the_angles_of_the_wrist_of_each_grasp(block) -> None:
-    from worker.viewing.viewer import Shown, Viewer
+    from worker.viewing import Shown, Viewer
 
     # A copy of the hand behind its root serves as a forearm with two wrist joints.
     forearm, mounted = HAND, replace(HAND, mounting=HAND)
@@ -234,7 +234,7 @@ def test_links_above_the_root_are_drawn_at_the_angles_of_the_wrist_of_each_grasp
 
 
 def test_collision_shapes_take_the_place_of_what_the_hand_looks_like(block) -> None:
-    from worker.viewing.viewer import Shown, Viewer
+    from worker.viewing import Shown, Viewer
 
     seen = '<visual><geometry><sphere radius="0.03"/></geometry></visual>'
     hand = load_hand(

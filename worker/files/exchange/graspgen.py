@@ -42,7 +42,7 @@ from worker.planners.autograsp import kernels
 from worker.planners.autograsp.closing import Closer
 from worker.planners.fast_graspd.selection import posture_of
 from worker.planners.peers import ground_of
-from worker.simulation.state import HandState
+from worker.simulation.data import HandState
 
 MEMBER: Final = "grasps.json"
 INDEX: Final = "uuid_index.json"

@@ -48,7 +48,7 @@ def held_out(kinds: Mapping[str, str], share: float) -> frozenset[str]:
     """Objects that a network is tested on: `share` of them, at least one and not all, by the order of a hash.
 
     Args:
-        kinds: of each object by name what kind it is, see `worker.objects.families`. One kind comes to one side.
+        kinds: of each object by name what kind it is, see `worker.files.training_export`. One kind comes to one side.
 
     Returns:
         names; of a single kind none, for there is nothing to hold out.

@@ -18,7 +18,7 @@ from worker.files.base_attributes import base_attributes
 from worker.files.exchange.imported import Imported, Origin
 from worker.files.exchange.names import plain_name
 from worker.files.exchange.objects import mesh_file
-from worker.objects.matter import as_asked
+from worker.objects.options import as_asked
 from worker.objects.prepare import files_from_path
 from worker.run import ALONE, Run
 

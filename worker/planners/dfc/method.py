@@ -21,7 +21,7 @@ from worker.planners.peers import grasp_set, ground_of, joined
 from worker.planners.port import Method, Options, Planner, Wanted
 from worker.planners.threads import Steps, cut, run_parts
 from worker.run import Run
-from worker.simulation.state import HandState
+from worker.simulation.data import HandState
 
 #: Force closure, distance and penetration that the source lets pass.
 PASSES: Final = (0.3, 0.005, 0.001)

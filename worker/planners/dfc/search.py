@@ -17,12 +17,11 @@ from worker.planners.dfc.schedule import CONTACTS, SELF_GAP_M
 from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.inner_surface import inside_points
 from worker.planners.threads import Steps
-from worker.simulation.data import Data
+from worker.simulation.data import Data, HandState
 from worker.simulation.kernels import optimizers
 from worker.simulation.launches import Launches
 from worker.simulation.model import Model
 from worker.simulation.record import add_poses, add_root_gradient
-from worker.simulation.state import HandState
 
 Ints = NDArray[np.int32]
 

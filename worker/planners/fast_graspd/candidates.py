@@ -15,7 +15,7 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.selection import posture_of, ranked
 from worker.quality.postures import normal_force, pregrasp, squeeze
-from worker.simulation.state import HandState
+from worker.simulation.data import HandState
 from worker.simulation.surroundings import Placed
 
 #: Hands of each grasp that are seated and tried before the next are: seating costs half of a trial.

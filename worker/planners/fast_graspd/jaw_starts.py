@@ -17,7 +17,7 @@ from worker.hands.model import HandModel
 from worker.objects.antipodal import Pairs
 from worker.objects.model import ObjectModel
 from worker.planners.fitting import fitting_pairs
-from worker.simulation.state import HandState
+from worker.simulation.data import HandState
 
 #: Room between each pad and the object [m]: least and most.
 ROOM_M: Final = (0.002, 0.005)

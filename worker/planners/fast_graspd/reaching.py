@@ -24,11 +24,11 @@ from worker.hands.spans import Size, spans_of, widest_span
 from worker.hands.surface import sample_surface
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.across import ALIKE_M, BESIDE_M, NOISE, ROOM_M, crossings_of, frames
+from worker.simulation.data import HandState
 from worker.simulation.device import to_wxyz, to_xyzw
 from worker.simulation.kernels import reaching as kernels
 from worker.simulation.launches import launch
 from worker.simulation.model import Model
-from worker.simulation.state import HandState
 
 #: Draws of one start, and how often the simulation looks at one that is clear by its balls.
 DRAWS: Final = 512

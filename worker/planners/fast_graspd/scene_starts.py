@@ -21,9 +21,9 @@ from worker.planners.fast_graspd.across import NEAR_M, Openings, Reaches, across
 from worker.planners.fast_graspd.selection import posture_of
 from worker.planners.fast_graspd.starts import CLEAR, POSTURE_NOISE, TILT, Probe
 from worker.planners.port import NoPlace
+from worker.simulation.data import HandState
 from worker.simulation.model import Model
 from worker.simulation.mounting import mounting_lack
-from worker.simulation.state import HandState
 from worker.simulation.surroundings import STANDOFF_M, Placed, Surroundings
 
 #: Distance from obstacles that a start has besides the margin it keeps later [m].

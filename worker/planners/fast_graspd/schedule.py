@@ -8,9 +8,9 @@ import numpy as np
 
 from service.model.fidelity import Fidelity
 from service.model.transforms import Floats
+from worker.simulation.data import Schedule
 from worker.simulation.model import LossOptions
 from worker.simulation.projection import ProjectionOptions
-from worker.simulation.state import Schedule
 
 #: Rates of Adam: translation [m], rotation [rad], joints [rad].
 COARSE_RATES: Final = (2e-3, 2e-2, 4e-2)

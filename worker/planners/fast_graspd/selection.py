@@ -12,7 +12,7 @@ from worker.grasps import Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.postures import hold_forces
-from worker.simulation.state import HandState
+from worker.simulation.data import HandState
 
 #: Coulomb coefficient with which contacts must balance: less than any test uses, so that what balances has a reserve.
 FRICTION: Final = 0.3

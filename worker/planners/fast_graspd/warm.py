@@ -9,8 +9,8 @@ import numpy as np
 
 from service.model.fidelity import Fidelity
 from service.model.transforms import Floats
+from worker.simulation.data import HandState
 from worker.simulation.model import Model
-from worker.simulation.state import HandState
 from worker.simulation.surroundings import Placed
 
 

@@ -15,9 +15,9 @@ from service.model.transforms import Floats, quat_rotate
 from worker.planners.fast_graspd.selection import posture_of
 from worker.planners.fast_graspd.starts import Probe
 from worker.quality.contact import finger_of_body
+from worker.simulation.data import HandState
 from worker.simulation.model import Model
 from worker.simulation.mounting import mounting_lack
-from worker.simulation.state import HandState
 from worker.simulation.surroundings import RISE_M, Placed, Surroundings
 
 #: Shares of their range by which fingers have opened, and how far the hand has moved back [m].

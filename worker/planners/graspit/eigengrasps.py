@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.transforms import Floats
-from worker.hands.jacobian import ancestors
+from worker.hands.kinematics import ancestors
 from worker.hands.model import HandModel
 
 #: Weights of a finger's first, second and later closing joints in the human hand's eigengrasps.

@@ -18,8 +18,8 @@ from worker.planners.fast_graspd.scene_starts import ROOM, clear_scene_starts
 from worker.planners.fast_graspd.starts import CLEAR, Probe
 from worker.planners.learned.network import ProposalNetwork, cloud_inputs, conditions, decode, flow
 from worker.planners.learned.sight import Seen
+from worker.simulation.data import HandState
 from worker.simulation.model import Model
-from worker.simulation.state import HandState
 from worker.simulation.surroundings import UP, Obstacle, Placed
 
 #: Steps back along the way in while something touches [m].

@@ -18,9 +18,8 @@ from worker.hands.closing import posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.hands.pads import pads_of
+from worker.objects.mesh_geometry import corner_normals, from_manifold
 from worker.objects.model import ObjectModel
-from worker.objects.normals import corner_normals
-from worker.objects.solid import from_manifold
 from worker.rendering.cameras import intrinsics
 from worker.rendering.hands import drawn_bodies, hand_looks, hand_solids, without_visuals
 from worker.rendering.pages import typography

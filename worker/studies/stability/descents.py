@@ -17,10 +17,9 @@ from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.schedule import AROUND, coarse_schedule, fine_schedule
 from worker.planners.fast_graspd.selection import merits
 from worker.planners.fast_graspd.starts import sample_starts
-from worker.simulation.data import Data
+from worker.simulation.data import Data, HandState, Schedule
 from worker.simulation.projection import Projection
 from worker.simulation.record import record_iteration
-from worker.simulation.state import HandState, Schedule
 
 Say = Callable[[str], None]
 

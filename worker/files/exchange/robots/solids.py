@@ -12,7 +12,7 @@ from worker.files.exchange.names import plain_name
 from worker.hands.model import HandModel
 from worker.hands.primitives import hull
 from worker.hands.robot import Ints
-from worker.objects.normals import corner_normals
+from worker.objects.mesh_geometry import corner_normals
 from worker.rendering.hands import drawn_bodies, hand_parts
 from worker.robots.execution import Executions
 from worker.simulation.surroundings import Obstacle

@@ -1,15 +1,20 @@
-"""PLY, ASCII and binary of both byte orders: positions and polygons; all other properties are stepped over."""
+"""PLY, ASCII and binary of both byte orders: positions and polygons; all other properties are stepped over.
+
+STL, binary and ASCII. A binary file is known by its length: its header may well begin with "solid".
+
+OFF: the counts, the vertices, the polygons; colours, normals and texture coordinates are passed over.
+"""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 
 from service.model.errors import MeshError
-from worker.objects.formats.polygons import triangulate
-from worker.objects.formats.soup import Soup, check_face_count
+from worker.objects.formats.soup import Soup, check_face_count, triangulate
 
 _TYPES = {
     "char": "i1",
@@ -29,6 +34,7 @@ _TYPES = {
     "double": "f8",
     "float64": "f8",
 }
+
 _MAX_ELEMENTS = 16
 
 
@@ -46,7 +52,7 @@ class _Element:
     properties: list[_Property] = field(default_factory=list)
 
 
-def read(data: bytes) -> Soup:
+def read_ply(data: bytes) -> Soup:
     """Vertices x y z and the polygons of `vertex_indices`."""
     found = re.search(rb"[\r\n]end_header", data[:65536])
     if not data.startswith(b"ply") or found is None:
@@ -190,3 +196,87 @@ class _Binary:
         values = np.frombuffer(self._body, dtype, count=count, offset=self._at)
         self._at += dtype.itemsize * count
         return values
+
+
+_HEADER = 84
+
+_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+_FACET = re.compile(rb"\bfacet\s", re.IGNORECASE)
+
+_LOOP = re.compile(rb"\bouter\s+loop\b", re.IGNORECASE)
+
+_VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
+
+
+def read_stl(data: bytes) -> Soup:
+    """Triangles of an STL file; each has its own three vertices."""
+    if len(data) >= _HEADER and len(data) == _HEADER + _RECORD.itemsize * _promised(data):
+        return _binary(data, _promised(data))
+    if b"\0" not in data[:1024] and (_FACET.search(data) or b"endsolid" in data[-1024:].lower()):
+        return _ascii(data)
+    if len(data) < _HEADER:
+        raise MeshError(f"{len(data)} bytes are too few for an STL file; it is truncated")
+    if b"\0" not in data[:1024]:
+        raise MeshError("neither binary STL nor text with facets; export the mesh again")
+    held = (len(data) - _HEADER) / _RECORD.itemsize
+    if _promised(data) > held:
+        raise MeshError(f"truncated: the header promises {_promised(data)} faces, the file holds {int(held)}")
+    # Some exporters append their own data: what the header promises is all there.
+    return _binary(data, _promised(data))
+
+
+def _promised(data: bytes) -> int:
+    return int.from_bytes(data[80:84], "little")
+
+
+def _binary(data: bytes, count: int) -> Soup:
+    check_face_count(count)
+    records = np.frombuffer(data, _RECORD, count=count, offset=_HEADER)
+    return _soup(records["corners"].reshape(-1, 3).astype(float))
+
+
+def _ascii(data: bytes) -> Soup:
+    rows = _VERTEX.findall(data)
+    check_face_count(len(rows) // 3)
+    if len(rows) % 3:
+        raise MeshError("truncated: the last facet has fewer than three vertices")
+    if (loops := len(_LOOP.findall(data))) and 3 * loops != len(rows):
+        raise MeshError("facets of more than three vertices; triangulate the mesh and export it again")
+    return _soup(np.array(rows, dtype="S32").astype(float).reshape(-1, 3))
+
+
+def _soup(corners: np.ndarray) -> Soup:
+    return Soup(corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3))
+
+
+#: The word may have the counts glued to it (ModelNet40), and letters before it for what vertices have besides.
+_HEAD: Final = re.compile(rb"(?:ST)?C?N?(4?n?)OFF(?![A-Z])(\s*BINARY)?", re.IGNORECASE)
+
+
+def read_off(data: bytes) -> Soup:
+    """Triangles of the polygons of an OFF file."""
+    lines = [line for raw in data.splitlines() if (line := raw.partition(b"#")[0].strip())]
+    head = _HEAD.match(lines[0]) if lines else None
+    if head is None:
+        raise MeshError("an OFF file begins with the word OFF")
+    if head[1] or head[2]:
+        raise MeshError(f"OFF of the kind {head[0].decode()} is not read; export plain OFF in text")
+    lines[0] = lines[0][head.end() :].strip()
+    rows = [line.split() for line in lines if line]
+    if not rows or len(rows[0]) < 2:
+        raise MeshError("truncated: the counts of vertices and faces are missing")
+    vertex_count, face_count = int(rows[0][0]), int(rows[0][1])
+    check_face_count(face_count)
+    if min(vertex_count, face_count) < 0 or vertex_count + face_count > len(rows) - 1:
+        raise MeshError(f"truncated: {vertex_count} vertices and {face_count} faces are promised, not all are there")
+    vertices = np.array([row[:3] for row in rows[1 : 1 + vertex_count]], dtype="S40").astype(float).reshape(-1, 3)
+    counts: list[int] = []
+    corners: list[int] = []
+    for row in rows[1 + vertex_count : 1 + vertex_count + face_count]:
+        count = int(row[0])
+        if count < 0 or count > len(row) - 1:
+            raise MeshError(f"face {len(counts)} promises {count} corners and has {len(row) - 1}")
+        counts.append(count)
+        corners += map(int, row[1 : 1 + count])
+    return Soup(vertices, triangulate(vertices, np.array(counts, dtype=np.int64), np.array(corners, dtype=np.int64)))
