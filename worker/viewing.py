@@ -26,7 +26,7 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.probe import Probe, probe_of
 from worker.rendering.hands import drawn_parts, drawn_poses, without_visuals
-from worker.rendering.standing import seen_share
+from worker.rendering.scenery import seen_share
 from worker.scenes.neighbours import Neighbours
 
 #: Points of the hand whose distance from the object is shown, where it is less than this [m].

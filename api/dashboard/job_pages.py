@@ -69,6 +69,9 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
     )
 
 
+Channel = Literal["rgb", "depth", "segmentation", "rgb_hand"]
+
+
 @router.get("/shards/{shard_id}/pictures/{index}.png", dependencies=[Depends(may_read)])
 def picture(
     request: Request,
@@ -104,8 +107,6 @@ def _pictures(job: JobDetail) -> list[dict[str, Any]]:
         for index in range(shard.count)
     ]
 
-
-Channel = Literal["rgb", "depth", "segmentation", "rgb_hand"]
 
 #: A views shard of 48 pictures is a few megabytes; a page asks for several pictures of the same one.
 _KEPT_SHARDS: Final = 2

@@ -128,7 +128,7 @@ class HandCorrections(_Said):
 
 
 class HandFacts(BaseModel):
-    """What the model of a hand tells of it (`worker.stages.glb`)."""
+    """What the model of a hand tells of it (`worker.stages.models`)."""
 
     model_config = ConfigDict(frozen=True)
 

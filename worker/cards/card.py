@@ -16,11 +16,10 @@ from service.model.errors import InputError
 from service.pipeline.datasets.export import path_of
 from service.readers import ShardFile, Shards
 from service.store.shards import open_shard
-from worker.cards.contents import Contents
+from worker.cards.contents import Contents, Piece, pieces
 from worker.cards.numbers import numbers
 from worker.cards.page import page
 from worker.cards.plots import draw
-from worker.cards.reading import Piece, pieces
 from worker.cards.tally import tally_of
 from worker.rendering.pages import typography
 

@@ -16,8 +16,7 @@ from service.model.metrics import GRASP_METRICS
 from service.model.states import AssetKind
 from service.model.version import PACKAGE_VERSION
 from worker.cards.contents import AssetFacts, Contents
-from worker.cards.directions import ELEVATION_BINS, ENOUGH, cell_counts
-from worker.cards.tally import CellTally, Tally
+from worker.cards.tally import ELEVATION_BINS, ENOUGH, CellTally, Tally, cell_counts
 from worker.grasps import Posture
 from worker.quality.diversity import explained_variance
 from worker.quality.intervals import wilson

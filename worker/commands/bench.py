@@ -37,7 +37,7 @@ def bench(
     from worker.hands.load import hand_from_path
     from worker.objects.prepare import object_from_path
     from worker.studies.bench import bench as measure
-    from worker.studies.report import table, write
+    from worker.studies.bench import table, write
 
     resolved = Device(device).resolve()
     result = measure(

@@ -72,7 +72,7 @@ def chart(
 ) -> None:
     """Speed against accuracy: every method and fidelity on the same hands and objects, judged by MuJoCo."""
     from worker.hands.load import hand_from_path
-    from worker.studies.chart.settings import settings_of
+    from worker.studies.chart.chart import settings_of
     from worker.studies.chart.sweeps import sweep as turn
     from worker.studies.chart.sweeps import turns
 

@@ -12,7 +12,7 @@ from service.cli import JsonFlag, emit, reporting_errors, write_output
 from service.store.columns import Attribute
 from service.store.shards import read_shard, write_shard
 from worker.files.base_attributes import wrist_attributes
-from worker.files.of_shard import (
+from worker.files.provenance import (
     INHERITED,
     NEIGHBOUR_FACE_ERROR_M,
     beside_attributes,

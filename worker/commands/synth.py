@@ -43,7 +43,7 @@ from service.store.asset_options import (
     object_options,
 )
 from service.store.shards import write_shard
-from worker.files.of_shard import id_of_columns
+from worker.files.provenance import id_of_columns
 from worker.files.synthesis import chosen_fidelity, synthesized
 from worker.planners import PLANNERS
 from worker.planners.registry import of_this_machine, parsed_options

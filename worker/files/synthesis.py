@@ -23,8 +23,7 @@ from worker.certified import Certified, certified_grasps
 from worker.engines.devices import Device
 from worker.engines.joins import batches_at_once, parse_join
 from worker.files.base_attributes import base_attributes, wrist_attributes
-from worker.files.of_shard import NEIGHBOUR_FACE_ERROR_M, beside_attributes
-from worker.files.origin import remembered
+from worker.files.provenance import NEIGHBOUR_FACE_ERROR_M, beside_attributes, remembered
 from worker.grasps import joined_columns
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel

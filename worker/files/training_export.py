@@ -23,10 +23,8 @@ from service.readers.depth_noise import noise_of
 from service.store import validity
 from service.store.shards import Shard, read_shard
 from worker.files.cases import load_case
-from worker.files.choice import choose
-from worker.files.exchange.lots import Lot, held_out
-from worker.files.exchange.names import plain_name
-from worker.files.exchange.written import Written
+from worker.files.exchange.lots import Lot, Written, held_out, plain_name
+from worker.files.subsets import choose
 from worker.objects.model import ObjectModel
 
 FORMATS: Final = ("dexlearn", "dexgraspnet2", "graspgen", "huggingface", "lerobot")

@@ -34,12 +34,12 @@ from worker.hands.options import (
     parse_options,
 )
 from worker.hands.primitives import volume
-from worker.hands.read import read_robot
 from worker.hands.robot import Robot, chain_to
 from worker.hands.shapes import Hulls, make_pieces
 from worker.hands.tendons import tendons_of
 from worker.hands.tree import Tree, build_tree, joint_type
 from worker.hands.visuals import PlacedShape, Visuals
+from worker.hands.xacro import read_robot
 from worker.objects.kept_arrays import recalling
 from worker.run import ALONE, Run
 

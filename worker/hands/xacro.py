@@ -2,6 +2,8 @@
 
 Xacro's expressions are Python. The child is given all files of the hand in memory, and then gives up what it could do
 harm with: see `worker.hands.xacro_child`.
+
+A robot from its description, whatever format that is in.
 """
 
 from __future__ import annotations
@@ -17,14 +19,19 @@ from pathlib import PurePosixPath
 from typing import Final
 
 from service.model.errors import HandError
-from service.store.hand_files import text_of
-from worker.hands.urdf import MAX_BYTES
+from service.store.hand_files import format_of, text_of
+from worker.hands.robot import Robot
+from worker.hands.urdf import MAX_BYTES, read_urdf
+from worker.objects.stand_ins import refuse_stand_in
 
 #: Largest hands on arms take a tenth of it [s].
 CPU_LIMIT_S: Final = 10
+
 MEMORY_LIMIT_BYTES: Final = 2**30
+
 #: The limit above ends what computes; this one a child that waits, on however busy a machine [s].
 _WALL_LIMIT_S: Final = 1800.0
+
 #: What an expansion may read; meshes are only named.
 _READ: Final = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
 
@@ -73,3 +80,26 @@ def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) 
     if error:
         raise HandError(f"{main}: {error}")
     return str(urdf).encode()
+
+
+def read_robot(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str] | None = None) -> Robot:
+    """Checked contents of the description called `main` among a hand's files; its root element tells the format.
+
+    Args:
+        files: all files of the hand.
+        main: the description.
+        arguments: values of a xacro file's arguments.
+
+    Raises:
+        HandError, LimitError: see the readers.
+    """
+    refuse_stand_in(main, files[main], HandError)
+    match format_of(main, files[main]):
+        case "mjcf":
+            from worker.hands.mjcf import read_mjcf
+
+            return read_mjcf(files, main)
+        case "xacro":
+            return read_urdf(expand(files, main, arguments or {}), main)
+        case _:
+            return read_urdf(files[main], main)

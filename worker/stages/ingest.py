@@ -52,7 +52,7 @@ def run(message: IngestMessage, context: TaskContext) -> None:
 
 def _files(message: IngestMessage, context: TaskContext) -> dict[str, bytes]:
     if message.kind is AssetKind.HAND:
-        from worker.stages.hand_files import load_hand_files
+        from worker.stages.assets import load_hand_files
 
         # What cannot be expanded is refused by the check, which says why.
         with contextlib.suppress(HandError):

@@ -16,9 +16,8 @@ from worker.rendering import Extras, render
 from worker.rendering.hands import DrawnHand
 from worker.rendering.pages.sheets import best_in_scenes
 from worker.scenes.neighbours import Neighbours
-from worker.stages.assets import beside_attributes, hand_of, neighbours_of, object_of
+from worker.stages.assets import beside_attributes, hand_of, input_of, neighbours_of, object_of
 from worker.stages.context import TaskContext
-from worker.stages.inputs import input_of
 from worker.stages.output import Output, batch_seed
 
 

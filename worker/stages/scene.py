@@ -17,9 +17,8 @@ from worker.grasps import Posture
 from worker.scenes import drop, transfer
 from worker.scenes.beside import scenes_of
 from worker.scenes.clearance import count_rejections
-from worker.stages.assets import beside_attributes, hand_of, neighbours_of, object_of
+from worker.stages.assets import beside_attributes, hand_of, input_of, neighbours_of, object_of
 from worker.stages.context import TaskContext
-from worker.stages.inputs import input_of
 from worker.stages.output import Output, batch_seed
 from worker.stages.ranges import base_rows, batches_of, joined
 

@@ -22,11 +22,9 @@ from worker.planners import NoPlace, planner
 from worker.scenes.beside import neighbour_of
 from worker.scenes.kinds import supports_of
 from worker.simulation.surroundings import Scenes
-from worker.stages.assets import beside_attributes, hand_of, keep_network, neighbours_of, object_of
+from worker.stages.assets import beside_attributes, hand_of, input_of, keep_network, neighbours_of, object_of, pieces_of
 from worker.stages.context import TaskContext
-from worker.stages.inputs import input_of
 from worker.stages.output import Output
-from worker.stages.pieces import pieces_of
 from worker.stages.ranges import joined, sizes_of
 from worker.together import certified_batches
 

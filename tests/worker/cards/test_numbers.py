@@ -16,10 +16,9 @@ from service.store.manifests import load_manifest
 from service.store.shards import read_shard
 from tests.worker.cards.conftest import Case, case
 from tests.worker.cards.makers import SECONDS, STILL_HAND, STILL_JOINT, Array
-from worker.cards.directions import cell_counts, elevations
 from worker.cards.findings import findings
 from worker.cards.numbers import share
-from worker.cards.tally import JointUse
+from worker.cards.tally import JointUse, cell_counts, elevations
 
 
 def changed(tmp_path: Path, change: Any, **options: Any) -> Case:

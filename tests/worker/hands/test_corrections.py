@@ -18,7 +18,7 @@ from tests.worker.hands.urdfs import BOX, joint, link, robot
 from worker.hands.load import files_from_path, hand_from_path, load_hand
 from worker.hands.model import HandModel
 from worker.hands.pads import pads_of
-from worker.stages.glb import hand_glb
+from worker.stages.models import hand_glb
 
 CLAW = robot(
     link("palm", BOX), link("a", BOX), link("b", BOX), link("c", BOX), link("mount", ""), link("tip", ""),

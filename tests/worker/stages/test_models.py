@@ -18,8 +18,7 @@ from service.store.store import open_store
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
-from worker.stages.glb import hand_glb, object_glb
-from worker.stages.models import model_of, publish_model
+from worker.stages.models import hand_glb, model_of, object_glb, publish_model
 
 #: Positions are single precision: half a micrometre at half a metre.
 TOLERANCE_M = 5e-7

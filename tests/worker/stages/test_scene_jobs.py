@@ -28,7 +28,7 @@ from service.store.manifests import load_manifest, load_shard
 from service.store.records import put_record, read_record
 from service.store.shards import Shard
 from service.store.store import Store, open_store
-from worker.files.of_shard import placed_of_shard
+from worker.files.provenance import placed_of_shard
 from worker.files.synthesis import synthesized
 from worker.process.runner import Runner
 from worker.rendering import Extras

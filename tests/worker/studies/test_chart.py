@@ -18,8 +18,8 @@ from worker.commands.chart import app
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.run import Run
+from worker.studies.chart.chart import settings_of
 from worker.studies.chart.report import markdown
-from worker.studies.chart.settings import settings_of
 from worker.studies.chart.statistics import first_valid, pareto, summed
 from worker.studies.chart.sweeps import Turn, _make, asking_each, turns
 

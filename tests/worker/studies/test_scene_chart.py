@@ -23,10 +23,9 @@ from worker.objects.prepare import object_from_path
 from worker.quality.intervals import wilson
 from worker.run import Run
 from worker.studies.chart import scenes
-from worker.studies.chart.chart import Thing
+from worker.studies.chart.chart import Thing, settings_of
 from worker.studies.chart.scene_report import markdown
 from worker.studies.chart.scenes import figures, summed
-from worker.studies.chart.settings import settings_of
 
 TABLE = SceneSpec(kind="table", faces="all")
 ARGUMENTS = ("--scene", "table", "--quick", "--methods", "fast_graspd,autograsp", "--hands", "barrett")

@@ -156,7 +156,7 @@ def test_a_grasp_in_a_bin_has_five_supports_around_it_and_they_can_be_hidden(vie
 
 
 def test_without_viser_one_line_says_how_to_install_it(tmp_path, monkeypatch):
-    from worker.commands.view import app
+    from worker.commands.render import app
 
     monkeypatch.setitem(sys.modules, "viser", None)
     result = CliRunner().invoke(app, [str(tmp_path / "grasps.h5")])
@@ -198,7 +198,7 @@ def test_the_command_tells_its_address_and_ends_with_ctrl_c(tmp_path):
 
 
 def test_the_file_that_is_no_shard_is_one_line(tmp_path: Path):
-    from worker.commands.view import app
+    from worker.commands.render import app
 
     file = tmp_path / "grasps.h5"
     file.write_text("nothing")

@@ -18,8 +18,15 @@ import numpy as np
 
 from service.model.errors import InputError
 from service.model.transforms import IDENTITY_POSE, Floats, compose, invert
-from worker.files.exchange.bench_hand import joint_order, write_hand
-from worker.files.exchange.bench_mapping import GRASPS, HandMapping, link_names, mapping_of, of_the_benchmark
+from worker.files.exchange.bench_hand import (
+    GRASPS,
+    HandMapping,
+    joint_order,
+    link_names,
+    mapping_of,
+    of_the_benchmark,
+    write_hand,
+)
 from worker.files.exchange.bench_object import SCALE, write_object, write_table
 from worker.files.exchange.bench_scene import (
     TABLETOP,
@@ -31,7 +38,7 @@ from worker.files.exchange.bench_scene import (
     with_way,
 )
 from worker.files.exchange.imported import Imported
-from worker.files.exchange.names import plain_name
+from worker.files.exchange.lots import plain_name
 from worker.files.exchange.objects import scaled_object
 from worker.files.exchange.pickles import load_npy
 from worker.grasps import GraspSet, Posture

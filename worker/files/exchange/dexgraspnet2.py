@@ -38,10 +38,8 @@ from service.readers import DepthNoise, Pictures
 from service.readers.clouds import CloudView
 from worker.files.exchange.dexgraspnet2_graspness import SceneGraspness, surface_samples
 from worker.files.exchange.imported import Imported, completed, joints_by_name, verdicts
-from worker.files.exchange.lots import Look, Lot, by_scene, looks
-from worker.files.exchange.names import plain_name
+from worker.files.exchange.lots import Look, Lot, Written, by_scene, looks, plain_name
 from worker.files.exchange.objects import scaled_object
-from worker.files.exchange.written import Written
 from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel

@@ -28,10 +28,8 @@ from service.model.errors import InputError
 from service.model.transforms import Floats, apply, pose_from_matrix, pose_to_matrix, quat_from_matrix
 from service.store import validity
 from worker.files.exchange.imported import Imported, completed, joints_by_name
-from worker.files.exchange.lots import Lot
-from worker.files.exchange.names import plain_name
+from worker.files.exchange.lots import Lot, Written, plain_name
 from worker.files.exchange.objects import mesh_file, scaled_object
-from worker.files.exchange.written import Written
 from worker.grasps import GraspSet, Posture
 from worker.hands.jaws import jaws_of
 from worker.hands.kinematics import body_poses

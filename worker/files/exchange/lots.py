@@ -1,15 +1,22 @@
-"""What goes into an export for training: grasps of many shards, the pictures of their scenes, and who is held out."""
+"""What goes into an export for training: grasps of many shards, the pictures of their scenes, and who is held out.
+
+What came of an export, for the user.
+
+Names as files and formats allow them, one rule for each.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.names import fitted
 from service.model.transforms import Floats, compose, invert, pose_from_matrix
 from service.readers import DepthNoise, Pictures
 from service.readers.clouds import CloudView
@@ -106,3 +113,34 @@ def by_scene(found: Sequence[Look]) -> dict[tuple[str, int], list[Look]]:
     for look in found:
         scenes.setdefault((look.shard, look.scene), []).append(look)
     return scenes
+
+
+@dataclass
+class Written:
+    """What came of an export."""
+
+    counts: dict[str, Any]
+    notes: list[str] = field(default_factory=list)
+    """Lines for the user: what was assumed, what was left out and why."""
+
+
+def plain_name(name: str) -> str:
+    """A name fit for files and addresses; a long one is cut, which the log tells."""
+    return fitted(re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "unnamed")
+
+
+def prim_name(name: str) -> str:
+    """A name that USD allows for a prim: ASCII letters, digits and underscores, no digit first."""
+    plain = re.sub(r"[^A-Za-z0-9_]+", "_", name) or "_"
+    return f"_{plain}" if plain[0].isdigit() else plain
+
+
+def prim_names(names: Sequence[str]) -> list[str]:
+    """Names of prims with one parent: no two are the same, later ones are numbered."""
+    found: list[str] = []
+    for name in map(prim_name, names):
+        number = 1
+        while (one := name if number == 1 else f"{name}_{number}") in found:
+            number += 1
+        found.append(one)
+    return found

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from service.model.transforms import Floats
 from service.store.shards import Shard
-from worker.files.exchange.names import prim_name
+from worker.files.exchange.lots import prim_name
 from worker.rendering.annotate import BACKGROUND, OBJECT, TABLE
 from worker.rendering.export import export_images
 

@@ -16,7 +16,7 @@ from service.store.shards import json_attribute, write_shard
 from worker.certified import scored
 from worker.files.base_attributes import base_attributes
 from worker.files.exchange.imported import Imported, Origin
-from worker.files.exchange.names import plain_name
+from worker.files.exchange.lots import plain_name
 from worker.files.exchange.objects import mesh_file
 from worker.objects.options import as_asked
 from worker.objects.prepare import files_from_path

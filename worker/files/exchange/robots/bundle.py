@@ -10,12 +10,11 @@ import numpy as np
 import yaml
 
 from service.model.transforms import Floats, compose, invert
-from worker.files.exchange.names import plain_name, prim_names
-from worker.hands.description import Description
-from worker.robots.arm import Arm
+from worker.files.exchange.lots import plain_name, prim_names
+from worker.robots.arm import Arm, Description
 from worker.robots.execution import Executions
+from worker.robots.reach import World
 from worker.robots.timing import Path, Trajectory
-from worker.robots.world import World
 
 
 @dataclass(frozen=True)

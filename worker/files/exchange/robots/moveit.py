@@ -15,7 +15,7 @@ import numpy as np
 
 from service.model.errors import InputError
 from service.model.transforms import Floats
-from worker.files.exchange.names import plain_name
+from worker.files.exchange.lots import plain_name
 from worker.files.exchange.objects import mesh_file
 from worker.files.exchange.robots.bundle import Bundle, dump_yaml, numbers
 from worker.robots.timing import Trajectory

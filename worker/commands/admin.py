@@ -1,7 +1,11 @@
-"""Command line: `graspd admin bench-render` and `graspd admin gallery`."""
+"""Command line: `graspd admin kernels`.
+
+Command line: `graspd admin bench-render` and `graspd admin gallery`.
+"""
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +21,40 @@ if TYPE_CHECKING:
     from worker.objects.model import ObjectModel
 
 app = typer.Typer(add_completion=False)
+
+
+@app.command(epilog="graspd admin kernels ./kernels --arch 90")
+@reporting_errors
+def kernels(
+    folder: Annotated[Path, typer.Argument(help="Where they go; name it in GRASPD_KERNELS.")],
+    arch: Annotated[list[int] | None, typer.Option(help="GPU architecture, such as 90; several times.")] = None,
+    cuda: Annotated[bool, typer.Option(help="Binaries for GPUs.")] = True,
+    cpu: Annotated[bool, typer.Option(help="Objects for CPUs with the instructions of this one.")] = True,
+    json: JsonFlag = False,
+) -> None:
+    """Compile all kernels ahead of time, so that a fresh machine compiles none. No GPU is needed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    os.environ["WARP_CACHE_PATH"] = str(folder.resolve())
+    from worker.engines import backend, baked
+
+    backend.start()
+    architectures = (arch or baked.ARCHITECTURES) if cuda else ()
+    files = baked.bake(baked.modules(), architectures=architectures, cpu=cpu)
+    size = sum(file.stat().st_size for file in files)
+    if json:
+        emit(
+            {
+                "folder": str(folder),
+                "files": len(files),
+                "bytes": size,
+                "architectures": list(architectures),
+                "cpu": cpu,
+            }
+        )
+    else:
+        typer.echo(
+            f"{len(files)} files of kernels, {size / 1e6:.1f} MB, in {folder}; GRASPD_KERNELS={folder.resolve()}"
+        )
 
 
 @app.command("bench-render", epilog="graspd admin bench-render --object mug --size 320x240 --size 640x480")
