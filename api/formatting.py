@@ -1,7 +1,4 @@
-"""How numbers, times and sizes read, on pages and on a terminal.
-
-Names and addresses of machines as HTTP writes them.
-"""
+"""Numbers, times, sizes and names of machines as pages and terminals show them."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""`graspd doctor`: everything an installation stands on, looked at by one command, with the mend for each fault.
-
-The checks of the shared room, in the order in which they are told.
-"""
+"""`graspd doctor`: checks of everything an installation stands on, in one command, with the fix for each fault."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
-"""What a viewer shows of hand, object and scene, as nodes of viser's scene tree. Metres; poses x y z, w x y z.
-
-The viewer: viser's server with the grasps of one file, a slider for the way, and buttons from grasp to grasp.
-"""
+"""The viewer: viser's server with the grasps of one file, a slider for the trajectory, hand, object and scene as nodes.
+Metres; poses x y z, w x y z."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Who asks: the key that a request shows, by header or by the cookie of a browser, or whom a proxy has signed in; and
-what they may do.
+"""Authentication of a request: a key in a header, the cookie of a browser session, or a proxy that signed a person in;
+and what the caller may do.
 
 The service is open while no key was ever made and it binds to this machine only. Once there is a key it stays closed,
 also when the last one is revoked or expired.

@@ -1,11 +1,8 @@
-"""What one key, and the keys of one project together, may have in work: grasps in unfinished jobs, and what is asked
-for in a day.
+"""Quotas of a key, and of the keys of a project together: grasps in unfinished jobs, and requests of a day.
 
 Redis counts, in one step for all API processes. What it holds may be lost: then a quota is forgotten, never a job.
 A job counts with the grasps that were asked for, from its submission until it ends. Whether it has ended is asked of
 the index only when the quota would be passed, so a submission costs one round trip.
-
-Of what a key has in work, jobs and datasets, that which has not ended: what its quota counts.
 """
 
 from __future__ import annotations

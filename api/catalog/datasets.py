@@ -1,8 +1,6 @@
-"""Datasets and named sets of objects.
+"""Datasets, named sets of objects, and the comparison of two datasets.
 
 A dataset counts against its key's quota as one job with all its grasps until it ends, and only its owner changes it.
-
-Two datasets side by side: what they asked for, what each cell came to, and how good their grasps are.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
-"""Server-sent events: a stream that says when a job, or anything, has changed. It ends when
-its key does.
-
-The feed of ends, and the addresses that are told of them.
-"""
+"""Events: server-sent streams of changes, which end with their key; the feed of ends, and the webhooks that are told of
+them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Grasps: found by their metrics, shown whole, and counted into the distributions of a job.
+"""Grasps: found by their metrics, counted into the distributions of a job, and shown whole from their base shard.
 
 What a base shard says of one grasp: postures, quality at every threshold, the referee's verdict push by push; of its
 scene, and of its way there: approach, grasp, lift.

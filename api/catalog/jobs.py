@@ -1,7 +1,4 @@
-"""Jobs: submitted within the caller's quota, shown with their progress, changed by those who own them.
-
-Progress, rate and expected end of a job's stages, from what the index says of its tasks.
-"""
+"""Jobs: submitted within the caller's quota, shown with progress, rate and expected end, changed by their owners."""
 
 from __future__ import annotations
 

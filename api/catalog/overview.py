@@ -1,9 +1,4 @@
-"""The service as a whole: its workers, its queue, its health, its numbers.
-
-Whether the parts of the service answer, and how fast. A part that hangs does not make the answer wait.
-
-What projects used, day by day.
-"""
+"""The service as a whole: workers, queue, numbers, usage of projects, and the health of its parts."""
 
 from __future__ import annotations
 

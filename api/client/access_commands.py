@@ -1,9 +1,5 @@
-"""`graspd keys`: make, list, rotate, limit and revoke API keys.
-
-`graspd projects`: list projects, and limit what each may use.
-
-`graspd webhooks`: addresses that are told when jobs and datasets end.
-"""
+"""`graspd keys`, `graspd projects` and `graspd webhooks`: who may use the service, how much, and who is told of
+ends."""
 
 from __future__ import annotations
 

@@ -1,8 +1,5 @@
-"""`graspd hands add`, `objects add` and `networks add`: upload one with what its files do not say, and wait for its
-check. A hand on the user's disk is a folder, or a description with what belongs to it: it becomes one ZIP.
-
-`graspd objects add FOLDER`: every object of a folder or ZIP in one command.
-"""
+"""`graspd hands add`, `objects add` and `networks add`: upload one, or every object of a folder, and wait for the
+check. A hand on the user's disk is a folder, or a description with what belongs to it: it becomes one ZIP."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
-"""The fields of `JobOptions` as options of a command: a new field is a new option, with its type, default and words.
-
-A dataset's spec as a file: what the options of `graspd datasets create` say, as TOML or JSON, to keep and share.
-"""
+"""Job options as options of commands, and as files: each field of `JobOptions` is an option with its type, default and
+words; a dataset's spec is TOML or JSON."""
 
 from __future__ import annotations
 

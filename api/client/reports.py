@@ -1,8 +1,6 @@
-"""What the commands share: the client of the settings, progress, and how jobs and assets are told.
+"""Reports of the commands: the client of the settings, progress, jobs, assets, estimates and datasets on a terminal.
 
 Progress of a job: in a terminal one bar a stage with its rate and the time left, elsewhere plain lines.
-
-How estimates and datasets are told on a terminal.
 """
 
 from __future__ import annotations

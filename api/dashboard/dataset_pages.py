@@ -1,7 +1,5 @@
-"""Datasets: the hand x object matrix of all work and of each dataset, and what is done to chosen cells.
-
-Two datasets side by side.
-"""
+"""Pages of datasets: the hand x object matrix of all work and of each dataset, actions on its cells, and the comparison
+of two."""
 
 from __future__ import annotations
 

@@ -1,9 +1,5 @@
-"""Charts as SVG that need no script: the geometry is made here, the templates only write it down.
-
-The hand x object matrix as the pages show it: a cell's state, its yield as number and colour.
-
-The maps of failure that `graspd stability` leaves in the store: read, and laid out as tables of coloured cells.
-"""
+"""Figures of the pages: charts as SVG without scripts, the hand x object matrix, and maps of failure as coloured
+cells."""
 
 from __future__ import annotations
 

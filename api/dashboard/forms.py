@@ -1,7 +1,5 @@
-"""The form of a job and what its buttons do: submit, cancel, retry. They work without JavaScript and answer a page.
-
-What each fidelity is expected to cost and give for a job, from what was measured here or is stored.
-"""
+"""The form of a job, its expected cost for each fidelity, and its buttons: submit, cancel, retry. They work without
+JavaScript."""
 
 from __future__ import annotations
 

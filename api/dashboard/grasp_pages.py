@@ -1,7 +1,4 @@
-"""The pages of grasps: the list with its filters, and one grasp in 3D.
-
-What is done with chosen grasps: tagged, no longer tagged, taken home. Forms that work without JavaScript.
-"""
+"""Pages of grasps: the list with its filters, one grasp in 3D, and forms for chosen grasps: tag, remove tag, export."""
 
 from __future__ import annotations
 

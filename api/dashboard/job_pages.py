@@ -1,7 +1,5 @@
-"""The page of one job: stages, loss, quality, views, best grasps, attempts, files; and the pictures it shows.
-
-Pictures of rendered views as PNG: colour, depth, segmentation; whole or as thumbnails.
-"""
+"""The page of one job: stages, loss, quality, best grasps, attempts, files; and its pictures as PNG, whole or as
+thumbnails."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Templates to pages.
-
-Code to copy: how to load a job's files.
-"""
+"""Templates to pages, and snippets of code that load a job's files."""
 
 from __future__ import annotations
 

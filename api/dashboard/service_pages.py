@@ -1,9 +1,4 @@
-"""The pages of the service as a whole: home, workers, speed against accuracy, where it breaks.
-
-The page of what projects used, day by day.
-
-What was deleted: confirmed by its name before, and brought back afterwards.
-"""
+"""Pages of the service as a whole: home, workers, speed against accuracy, maps of failure, usage, deletions."""
 
 from __future__ import annotations
 

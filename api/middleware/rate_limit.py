@@ -1,7 +1,5 @@
 """Rate-limit middleware: identifies the caller and enforces limits before anything of the request is read.
 
-How often and how many at once: one script in Redis counts for all API processes together.
-
 Rates follow GCRA (ITU-T I.371 annex A), a leaky bucket that keeps one number a caller: the time at which the bucket is
 empty again. Requests being answered are a sorted set by the time until which each is believed to run, so that those of
 a killed process count no longer than that. Redis's own clock is asked, so the clocks of the API machines do not matter.

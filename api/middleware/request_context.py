@@ -1,13 +1,8 @@
-"""What stands before every route: request ids, security headers, and the checks that keep foreign web pages out.
-
-HEAD wherever there is GET (RFC 9110 §9.3.2): the same answer without its body.
-
-The service below a path of a proxy: `https://host/graspd/` instead of `https://host/`.
+"""Middleware before every route: request ids, security headers, HEAD (RFC 9110 §9.3.2), the path of a proxy, and the
+check that keeps foreign web pages out.
 
 Inside, all paths are as without it. What comes in with the prefix loses it here, where the proxy has not taken it away
 already; addresses that leave in headers get it. Those in pages get it where they are rendered (`with_prefix`).
-
-The middleware that keeps foreign web pages out.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""`/v1/hands`, `/v1/objects` and `/v1/networks`: what can be grasped, with what, and what proposes grasps.
-
-`/v1/hands/{name}/corrections`: what was guessed wrongly of a hand, said rightly, is another hand.
-"""
+"""`/v1/hands`, `/v1/objects` and `/v1/networks`, and corrections of hands: a corrected hand is another hand."""
 
 from __future__ import annotations
 

@@ -1,11 +1,5 @@
-"""What routes ask for: the nouns of this application, and the right to use them.
-
-Links between the pages of a list.
-
-Threads of their own for requests that take long, so that those which wait for one keep no other request waiting.
-
-What a client has already (RFC 9110 §13): whether it needs a file again, and whether its half of one still fits.
-"""
+"""Dependencies of routes: parts of the application, permissions, links between pages, threads for long requests,
+conditional requests (RFC 9110 §13)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""`/v1/grasps`: the index of every grasp.
-
-`/v1/tags`: names that users give to grasps.
-"""
+"""`/v1/grasps`: the index of every grasp; `/v1/tags`: names that users give to them."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""Workers, statistics, health and metrics.
-
-`/v1/usage`: what projects used, day by day.
-
-`/v1/deletions`, and `/v1/{datasets,jobs,...}/NAME/restore`: what was deleted is brought back.
-"""
+"""Workers, statistics, health and metrics; `/v1/usage`; `/v1/deletions` and restores."""
 
 from __future__ import annotations
 

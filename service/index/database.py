@@ -3,8 +3,6 @@
 There are no migrations: the index follows from the store. `graspd admin index rebuild` makes one of another revision
 anew. Columns of metrics that the table of grasps lacks are added when it is opened, so a new metric needs no other
 revision. Grasps whose shards lack it hold NULL. A column whose metric is gone stays.
-
-The file of an SQLite index: which one it is, and how one that is gone or damaged gives way to a new one.
 """
 
 from __future__ import annotations

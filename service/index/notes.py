@@ -1,7 +1,5 @@
-"""What the index knows of itself: whether it was made whole, and how far the store was read through.
-
-What is known to be damaged in the store.
-"""
+"""What the index knows of itself and of the store: whether it is complete, how far the store was read, which objects
+are damaged."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What the index answers: plain frozen records, ready for JSON. Times are RFC 3339 in UTC.
-
-What the index answers on datasets. Times are RFC 3339 in UTC.
-"""
+"""Answers of the index: plain frozen records, ready for JSON. Times are RFC 3339 in UTC."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""What all models of the domain have in common.
-
-What names and addresses of things look like.
-
-What a model refuses, in a line of this project's words; pydantic's own are about inputs, types and patterns.
-"""
+"""Common parts of the domain models: their base, patterns of names, and refusals in this project's words."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Versions of installed libraries, each looked up once by a process.
-
-Modules imported without the garbage collector: what they make is no garbage, and there is much of it.
+"""Installed libraries: their versions, each looked up once, and imports without the garbage collector.
 
 A room's modules are half a million objects. Each collection while they come looks at all that are there already, and so
 does each full one afterwards, the last of them when the process ends: half of what a start and an end take.

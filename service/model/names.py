@@ -1,7 +1,4 @@
-"""Names of things in the object store: every key graspd writes is made here (table in ARCHITECTURE.md).
-
-Names that are longer than a service or a format takes.
-"""
+"""Names of things in the object store: every key graspd writes is made here (table in ARCHITECTURE.md)."""
 
 from __future__ import annotations
 

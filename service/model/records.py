@@ -1,6 +1,4 @@
-"""Small JSON records that the store keeps besides shards: jobs, what users did to them, failed attempts.
-
-Records of datasets in the store: the matrix and its jobs, what users did later, snapshots, sets of objects.
+"""JSON records that the store keeps besides shards: jobs, datasets, what users did to them, failed attempts.
 
 `datasets/{name}/dataset.json` names the jobs of its cells, so that a dataset stays what it was when graspd's
 algorithms, or the meaning of a name, change later.

@@ -1,10 +1,6 @@
-"""The scene that grasps are for, as a user says it: a kind, or a document of supports and the target's pose.
+"""The scene that grasps are for: a kind, or a document of supports, neighbours and the target's pose.
 
 The scene frame has z up. A support is a half-space (everything below a plane) or a box.
-
-What stands in a scene of each kind: its supports as half-spaces and boxes, in the scene frame.
-
-The scene as a request over HTTP says it: a kind, or a document of supports and neighbours; neighbours by name.
 """
 
 from __future__ import annotations

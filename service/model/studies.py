@@ -1,8 +1,6 @@
-"""What a study of failure says: a map of cells, where it breaks, how that shows, and what guards against it.
+"""Records of studies: maps of failure, and the words of charts of speed against accuracy.
 
 `graspd stability` makes the maps and publishes them; the report and the dashboard draw them from the same record.
-
-Words of the charts of speed against accuracy: studies write them, fidelities are chosen by them, pages draw them.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""What a living worker says about itself; the queue carries it, the index keeps it.
-
-What a worker must be able to do for a task, and what it says that it can: versions that work side by side.
+"""Reports of living workers, their capabilities, and the requirements of tasks: versions that work side by side.
 
 A message carries a range of schemas: from the oldest that can say what it says to the newest whose meaning its writer
 knew. A worker reads a range too, and makes one revision of each stage.

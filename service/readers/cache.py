@@ -1,7 +1,4 @@
-"""Shards of a remote store kept on this machine: checked when they come, the longest unused dropped when it is full.
-
-Samples read ahead: threads unpack the next ones while the last one is worked on.
-"""
+"""Local copies of remote shards, checked on arrival and bounded in size; and samples read ahead by threads."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Pictures as point clouds with the labels of their scenes, made when they are asked for; nothing is stored.
-
-One view of a cloud: its pixels as points, perfect or as a depth camera would tell them.
-"""
+"""Pictures as labelled point clouds, view by view, perfect or as a depth camera sees them; nothing is stored."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
-"""Pictures of a store read by ranges of bytes: nothing is put on this machine's disk, and what is read in turn is read
-ahead, so that a request brings several pictures.
-
-Rows of the columns of a shard without the HDF5 library: where each lies is asked once, then only its bytes are read.
+"""Pictures of a store by ranges of bytes: rows of columns without the HDF5 library, read ahead, nothing put on the
+disk.
 
 A picture is one chunk of its column, packed by zlib. Opening a file and its datasets costs as much as unpacking a
 picture does, and the library lets one thread work at a time; bytes are read and unpacked by any number of threads.

@@ -1,9 +1,7 @@
-"""Where the service of a data folder answers: `graspd up` writes it down, clients on the same machine read it.
+"""Addresses of a running service: where it answers, and how workers of other machines join it.
 
 The record says which process wrote it. One whose process is gone is of a service that ended without a word: it is not
 believed, and the next start replaces it.
-
-How workers of other machines join the service of `graspd up`: its Redis asks for a password, a file tells it them.
 
 The file is its user's alone, and meant for a folder that the machines of a cluster share. It appears whole, is written
 anew by every start, and goes with the service that wrote it.

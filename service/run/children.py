@@ -1,7 +1,4 @@
-"""One child process of a supervisor: started, watched, started again with a growing pause, stopped.
-
-Which process a pid meant: the system gives the number of one that ended to another.
-"""
+"""One child process of a supervisor: started, watched, started again with a growing pause, stopped."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""`graspd admin store`: whether the store still holds what was put into it.
-
-Tables of the index as Parquet files, for DuckDB, pandas and whatever else reads them.
-"""
+"""`graspd admin store`, and tables of the index as Parquet files."""
 
 from __future__ import annotations
 

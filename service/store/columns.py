@@ -1,7 +1,4 @@
-"""The HDF5 schema of shards: every dataset's shape, unit and meaning.
-
-The root attributes of shards: each one's type and meaning, and which kinds have it.
-"""
+"""The HDF5 schema of shards: shape, unit and meaning of each dataset, type and meaning of each root attribute."""
 
 from __future__ import annotations
 

@@ -1,8 +1,5 @@
-"""`asset.json` as the front door takes it: a small, flat JSON object. What its keys mean is checked by the worker that
-reads the hand or object (`worker.hands.options`, `worker.objects.options`).
-
-What was guessed of a hand, and what a user says instead: both as keys of an `asset.json`.
-"""
+"""`asset.json`: a small, flat JSON object, and corrections of what was guessed of a hand. The worker checks what its
+keys mean (`worker.hands.options`, `worker.objects.options`)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The files that make a hand on the user's disk: the same ones whether it is checked, used here, or uploaded.
-
-Which of a hand's files describes it, and in which format: the suffix proposes, the root element decides.
-"""
+"""Files of a hand on the user's disk: which belong to it, which one describes it, and in which format."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Whether bytes are what their checksum says: of objects in a store, and of shards in a folder on this machine.
-
-Seals: the SHA-256 that an object of the store carries in itself, so that any byte that turned is found.
+"""Checksums: of objects in a store, of shards in a folder, and seals that objects carry in themselves.
 
 A seal is the digest of the object with the 64 digits of the seal as zeros. A JSON record has it as its first field
 `checksum`, a ZIP (`.npz` too) in its comment, a binary glTF in the `extras` of its document. Objects of graspd 0.2 have

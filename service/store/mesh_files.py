@@ -1,7 +1,4 @@
-"""Names of files as descriptions of hands write them: one rule for those on a disk and for those of an upload.
-
-Files beside a mesh that say how it looks: what an OBJ calls its material library, and that or a DAE its pictures.
-"""
+"""Names of mesh files as descriptions write them, and of the files beside a mesh that colour it."""
 
 from __future__ import annotations
 

@@ -2,10 +2,6 @@
 
 The architecture is fixed, so a file is checked whole against the shapes that its joints imply; what a network computes
 is in `worker.planners.learned.network`.
-
-What is found of an uploaded network: whose grasps it proposes, and that its file can be read at all.
-
-Reading one is arithmetic on bounded arrays, so the front door does it before anything is kept; no worker is needed.
 """
 
 from __future__ import annotations

@@ -1,17 +1,7 @@
-"""Small JSON records in the store besides shards: jobs, what users did to them, failed attempts.
-
-Records of datasets in the store: read, and appended to.
-
-Records of tags in the store: each change is a record of its own, and the last one counts.
-
-A mark that store and index share: where they differ, one of them was exchanged for an older copy.
-
-What a study leaves in the store for everybody: each record is an immutable object, the last by name counts.
+"""JSON records in the store besides shards: jobs, attempts, datasets, tags, marks, deletions, studies.
 
 A record of a kind is `{kind}/{created}.json`; `charts` come from `graspd chart`, `scene_charts/{scene}` from it with a
 scene, `stability` from `graspd stability`.
-
-Records of what users deleted: a record is the fact, the rest follows.
 """
 
 from __future__ import annotations

@@ -1,7 +1,5 @@
-"""Shards as HDF5 files, which are written and read here only; `columns` says what is in them.
-
-Some of the grasps of a base shard as a shard of their own, and where it lies in a folder.
-"""
+"""Shards as HDF5 files, whole or the part of chosen grasps; only here are they written and read (`columns` is their
+schema)."""
 
 from __future__ import annotations
 

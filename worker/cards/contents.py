@@ -1,7 +1,5 @@
-"""What a card is made of: a dataset's snapshot in a store, or a folder of shards.
-
-The shards of a dataset one after the other, with no more of each than a card needs. Pictures are not fetched.
-"""
+"""Contents of a card: a dataset's snapshot in a store or a folder of shards, read one after the other without
+pictures."""
 
 from __future__ import annotations
 

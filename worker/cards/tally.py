@@ -1,8 +1,5 @@
-"""Sums over the shards of a dataset. Grasps become a few float32 columns of a cell, so that millions fit in memory;
-`JointUse` says how much of its range each joint of a hand uses.
-
-From where hands come: directions on the sphere in cells of equal area, and elevations over the table.
-"""
+"""Sums over the shards of a dataset, and directions of approach in cells of equal area. Grasps become a few float32
+columns of a cell, so that millions fit in memory."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Command line: `graspd admin kernels`.
-
-Command line: `graspd admin bench-render` and `graspd admin gallery`.
-"""
+"""Command line: `graspd admin kernels`, `bench-render` and `gallery`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Command line: `graspd grasps where`, `graspd datasets balance`, `graspd datasets diff`.
-
-Command line: `graspd datasets card`.
-"""
+"""Command line: `graspd grasps where`, `graspd datasets balance`, `diff` and `card`."""
 
 from __future__ import annotations
 

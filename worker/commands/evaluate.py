@@ -1,7 +1,4 @@
-"""Command line: `graspd evaluate`.
-
-Copies of base shards that say in which share of other models their grasps hold.
-"""
+"""Command line: `graspd evaluate`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Command line: `graspd export` and `graspd import`.
-
-Command line: `graspd clouds`.
-"""
+"""Command line: `graspd export`, `graspd import` and `graspd clouds`."""
 
 from __future__ import annotations
 

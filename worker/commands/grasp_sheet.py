@@ -1,7 +1,4 @@
-"""Sheets of the grasps of a base shard: hand and object, in their scene where they have one, alone or on their way.
-
-A film of grasps of a base shard as a robot carries them out: the hand comes, closes and lifts.
-"""
+"""Sheets and films of the grasps of a base shard: hand and object, in their scene, alone or along their trajectory."""
 
 from __future__ import annotations
 

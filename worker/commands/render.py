@@ -1,7 +1,4 @@
-"""Command line: `graspd render` and `graspd pictures`.
-
-Command line: `graspd view`.
-"""
+"""Command line: `graspd render`, `graspd pictures` and `graspd view`."""
 
 from __future__ import annotations
 

@@ -1,10 +1,8 @@
-"""Kernels compiled ahead of time: an image brings them, so that a process of a fresh machine compiles nothing.
+"""Kernels compiled ahead of time, and names of compiled kernels: a fresh machine with such an image compiles nothing.
 
 A folder of such kernels is laid out as Warp's cache is, VERSION/MODULE/FILE. Names of files hold what they are good
 for: the digest of the module's source and options, the GPU's architecture, or the instructions of the CPU that they
 were compiled on. What does not fit a machine is not found there and compiled as ever.
-
-Names of compiled kernels, for what is kept of their results.
 """
 
 from __future__ import annotations

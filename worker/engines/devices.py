@@ -1,11 +1,9 @@
-"""The Warp device of a worker, what people call it, and which GPU a process takes where nobody names one.
+"""Warp devices: their names, the GPU that a process takes where nobody names one, and errors of a GPU.
 
 `CUDA_VISIBLE_DEVICES` says which there are: the driver shows no others. Of these, worker number k takes the k-th, round
 and round; who has no number takes the one with the fewest processes. That is told by locks that the kernel drops with
 the process, however it ends: lock n of a GPU is held by the n-th process on it. They lie in the user's cache, which the
 containers of one machine share.
-
-What went wrong on a GPU: no memory for a launch, which a smaller one may mend; or a device that is lost.
 
 After an illegal access, a reset or a bus error nothing runs any more in the CUDA context of a process. Warp only writes
 a line to stderr and goes on with whatever lies in memory, so the device is waited for before results leave the process.

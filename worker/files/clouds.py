@@ -1,7 +1,4 @@
-"""Point clouds written to files, for those who train without graspd: one npz for each shard of pictures.
-
-The hand of a shard as points on its surface in each grasp: what tells which points of an object it touches.
-"""
+"""Point clouds as files, one npz for each shard of pictures, and the hand of each grasp as points."""
 
 from __future__ import annotations
 

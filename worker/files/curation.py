@@ -1,7 +1,4 @@
-"""Grasps of a dataset shared out evenly to kinds: types, directions of approach, faces that the object lies on.
-
-What two datasets do not have in common: cells, shards, grasps, and how they were made.
-"""
+"""Curation of datasets: balanced parts (types, approaches, resting faces), and the differences of two datasets."""
 
 from __future__ import annotations
 

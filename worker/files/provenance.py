@@ -1,8 +1,6 @@
-"""Where the hand and the object of a shard come from: what a shard notes of it, and how their files are found again.
+"""The hand and the object of a shard: what it notes of them, and how their files are found again.
 
 They are known by their digests, so a file that was changed or is another one is never taken for them.
-
-The hand and the object that a shard was made with, for commands that work on files.
 """
 
 from __future__ import annotations

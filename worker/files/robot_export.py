@@ -173,5 +173,7 @@ def _write(bundle: Bundle, format_: str, folder: Path, hand_files: dict[str, byt
     if format_ == "moveit":
         return moveit.write(bundle, folder, hand_files)
     if format_ == "mujoco":
-        return mujoco_scene.write_scene(bundle, folder, decompose(bundle.found.obj)) + mujoco_scene.write_arm(bundle, folder)
+        return mujoco_scene.write_scene(bundle, folder, decompose(bundle.found.obj)) + mujoco_scene.write_arm(
+            bundle, folder
+        )
     raise InputError(format_)

@@ -1,7 +1,4 @@
-"""Parts of a dataset as base shards of their own: some of the grasps, with all that is known of them.
-
-Which grasps of a base shard a command takes: valid ones, unless somebody says otherwise.
-"""
+"""Parts of a dataset as base shards of their own, and the choice of grasps that a command takes."""
 
 from __future__ import annotations
 

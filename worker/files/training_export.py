@@ -1,6 +1,4 @@
-"""From a folder of shards to the folder that another project trains on: grasps, their pictures, and who is held out.
-
-Objects of one shape under several names, for splits in which none is on both sides.
+"""From a folder of shards to a training folder of another project: grasps, pictures, and splits by families of objects.
 
 What is compared is the distribution of distances between two random points of the surface (D2 of Osada et al., "Shape
 distributions", 2002) over their root mean square: turned, moved, mirrored, scaled and remeshed copies have the same.

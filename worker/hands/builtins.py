@@ -2,16 +2,6 @@
 
 ``python -m worker.hands.builtins`` writes them into `service/builtin/hands/`. Frames and numbers follow the makers'
 data: Wonik Allegro Hand (right), Barrett BH8-280, Shadow Dexterous Hand E (right, without forearm and wrist).
-
-Wonik Allegro Hand, right.
-
-BarrettHand BH8-280.
-
-Shadow Dexterous Hand E, right, from the palm on.
-
-Lines of a URDF: what the built-in hands are written with.
-
-Write the built-in hands into the source tree.
 """
 
 from __future__ import annotations
@@ -346,4 +336,5 @@ def write(root: Path) -> None:
             (root / name / filename).write_bytes(data)
 
 
-write(Path(__file__).parents[3] / "service" / "builtin" / "hands")
+if __name__ == "__main__":
+    write(Path(__file__).parents[2] / "service" / "builtin" / "hands")

@@ -1,7 +1,4 @@
-"""Forward kinematics in float64 NumPy: the reference the kernels are tested against, and what slow paths use.
-
-Transpose of the hand's Jacobian: from forces at points of bodies to torques of the degrees of freedom.
-"""
+"""Forward kinematics and the transposed Jacobian of a hand in float64 NumPy: the reference of the kernels."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""A hand from its files: its description, meshes, and what is said of it in `asset.json` or `hand.json`.
-
-Gains and limits of joints for which nobody states any, where the unit of a revolute joint would be absurd.
-"""
+"""A hand from its files: description, meshes, `asset.json` or `hand.json`, and gains where nobody states any."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Which joints of an MJCF model follow others: by joint equalities, fixed tendons, and closed loops.
-
-Closed loops of an MJCF model: the joints that nothing drives, as lines of those that do.
+"""Couplings of an MJCF model: joint equalities, fixed tendons, and closed loops as lines of the driving joints.
 
 A four-bar linkage is a tree whose ends `connect` constraints hold together. The loops are solved at values over the
 drivers' ranges, and each passive joint becomes a line of its driver, with the error that this leaves.

@@ -1,6 +1,5 @@
-"""Collision elements of a robot as convex pieces: primitives stay exact, meshes become reduced hulls.
-
-Meshes of links whose convex hull would hide what touches: they become several convex pieces.
+"""Collision shapes of a robot as convex pieces: primitives stay exact, meshes become hulls, or several where one would
+hide what touches.
 
 The error of a mesh's pieces is how far its surface lies beneath them, along the shortest free way out: nine tenths of
 what can be seen from outside lie no deeper. Insides of housings do not count.

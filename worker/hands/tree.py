@@ -1,7 +1,5 @@
-"""From a robot's joints to a tree of bodies: fixed joints merged, mimic chains resolved, dropped links left out.
-
-Where a hand begins: below the arm that it sits on, and which parts of a whole robot are hands.
-"""
+"""From a robot's joints to a hand's tree of bodies: its root, fixed joints merged, mimic chains resolved, links
+dropped."""
 
 from __future__ import annotations
 

@@ -1,9 +1,7 @@
-"""Read a URDF written by a stranger: every value is checked here, so that nothing behind this module has to.
+"""URDF and XML from strangers, read with every value checked here, so that nothing behind this module has to.
 
 The common URDF libraries accept reversed limits, NaN, unknown mimics and several roots, and resolve mimic chains
 wrongly; this reader refuses each by name. It knows only what a hand needs: links with shapes and masses, and joints.
-
-The tree of an XML text that a stranger wrote, whatever its encoding; entities are refused.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""What a hand looks like: the visual elements of its links with their colours, read when somebody draws them.
+"""Visual elements of a hand's links with their colours and mesh files, read when somebody draws them.
 
 Nothing but pictures needs them, so none of them can make a hand unusable: what cannot be read is left out.
-
-From a mesh as a URDF names it to a file of the upload.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
-"""Xacro expanded to URDF in a child process that can open no file, reach no network and start no command.
+"""A robot from its description in any format; xacro is expanded in a child process without files, network or commands.
 
 Xacro's expressions are Python. The child is given all files of the hand in memory, and then gives up what it could do
 harm with: see `worker.hands.xacro_child`.
-
-A robot from its description, whatever format that is in.
 """
 
 from __future__ import annotations

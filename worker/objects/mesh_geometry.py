@@ -1,9 +1,4 @@
-"""Mass properties of a closed mesh, exact for its triangles.
-
-Normals per face corner that are smooth on curved surfaces and sharp on edges.
-
-Booleans and validity through manifold3d, in float64.
-"""
+"""Geometry of closed meshes: exact mass properties, corner normals, and booleans through manifold3d in float64."""
 
 from __future__ import annotations
 

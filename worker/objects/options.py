@@ -1,7 +1,4 @@
-"""What an object's `asset.json` may say beside the mesh.
-
-How heavy and how slippery the object of a job is.
-"""
+"""Options of an object: the keys of its `asset.json`, and the mass and friction of a job."""
 
 from __future__ import annotations
 

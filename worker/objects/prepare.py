@@ -1,10 +1,7 @@
-"""An object from its files: read, repaired, simplified, with normals, hull and mass properties.
+"""An object from its files: read, repaired, simplified, with normals, hull and mass properties; as bytes and back, bit
+for bit.
 
 What one command has prepared on this machine, every later one reads in milliseconds.
-
-Fewer faces within a stated error, never at the price of a hole.
-
-A prepared object as bytes and back, bit for bit; no code is ever read from them.
 """
 
 from __future__ import annotations

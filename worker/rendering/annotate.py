@@ -1,7 +1,4 @@
-"""Labels of a picture: segmentation, boxes in the picture and in space.
-
-What a picture can show besides colour, depth and segmentation.
-"""
+"""Labels of a picture: segmentation, boxes in the picture and in space, and further channels."""
 
 from __future__ import annotations
 

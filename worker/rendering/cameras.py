@@ -1,9 +1,7 @@
-"""Pinhole cameras: where they stand, what they map to which pixel.
+"""Pinhole cameras: where they stand, what they map to which pixel, and those of a caller's JSON file.
 
 Camera frame: x right, y down, z forward (OpenCV). Extrinsics E = [R | t] map table to camera: x_camera = R x + t.
 Pixel (column i, row j) covers [i, i + 1) x [j, j + 1): its centre is (i + 0.5, j + 0.5).
-
-Cameras that the caller gives: a JSON file with intrinsics, places, or both.
 """
 
 from __future__ import annotations

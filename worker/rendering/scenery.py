@@ -1,7 +1,4 @@
-"""What stands before the cameras: solids, materials, lights; and what a shot asks for and gives.
-
-Supports before the cameras: tables, walls and boards as boxes that rays meet, and what they hide.
-"""
+"""What stands before the cameras: solids, supports as boxes, materials, lights; and what a shot asks for and gives."""
 
 from __future__ import annotations
 

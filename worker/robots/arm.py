@@ -1,7 +1,4 @@
-"""An arm that carries a hand: the joints between its base and the link that the hand is mounted on.
-
-What a hand's files say that planning does not need and robots do: frames of all links, and what is coupled there.
-"""
+"""An arm that carries a hand: the joints up to the hand's mount, and the frames and couplings of its description."""
 
 from __future__ import annotations
 

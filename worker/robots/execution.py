@@ -1,7 +1,5 @@
-"""Grasps ready to be carried out: six postures each, in one frame, and how the hand gets from one to the next.
-
-Frames that a user names: poses written as seven numbers, and the tool frame of a hand.
-"""
+"""Grasps ready to be carried out: six postures each, in one frame that the user names, and the trajectory between
+them."""
 
 from __future__ import annotations
 

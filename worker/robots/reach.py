@@ -1,9 +1,7 @@
-"""Which grasps an arm can carry out: inverse kinematics along the whole way, joint limits, collisions.
+"""Grasps that an arm can carry out: inverse kinematics along the trajectory, joint limits, collisions in MuJoCo.
 
 Differential inverse kinematics by mink: each step is a quadratic program in the joints' increments that holds their
 limits. From one pose of the way to the next the arm must move on without a jump.
-
-Arm, hand, object and supports in MuJoCo, to see whether the arm runs into itself or into what stands around.
 """
 
 from __future__ import annotations

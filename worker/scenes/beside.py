@@ -1,7 +1,4 @@
-"""The other objects of a scene: as few convex pieces, and where they stand.
-
-Convex solids with few faces around convex pieces with many: what a hand stays clear of need not be finer.
-"""
+"""The other objects of a scene: as few convex pieces with few faces, and where they stand."""
 
 from __future__ import annotations
 

@@ -1,8 +1,5 @@
-"""The trial that candidates of a grasp go through: in their scene a short lift, and a free way in and out; around a
-free object short pushes (`worker.quality.referee.short`). What passes goes through the referee's own test.
-
-What grasps are worth in their scenes: are they clear, and do they lift the object, at half the friction too?
-"""
+"""Pre-screening of candidates: in a scene clearance and a short lift, around a free object short pushes
+(`worker.quality.referee.short`). What passes goes through the validator's own test."""
 
 from __future__ import annotations
 

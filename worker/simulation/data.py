@@ -1,9 +1,7 @@
-"""The data of a simulation: arrays for a capacity of hands, and the tables that tell what each iteration takes.
+"""The data of a simulation: hands to the device and back, arrays for a capacity of hands, tables of each iteration.
 
 All per-iteration values (dilation, weights, rates) lie in tables on the device, read at a counter on the device, so an
 iteration is the same list of launches each time.
-
-What goes to the device and comes back: the hands, and the values that each iteration takes.
 """
 
 from __future__ import annotations

@@ -2,8 +2,6 @@
 
 Both follow from the object alone and are a fifth of what the first grasp of a process takes, so a CPU's are read by
 later processes. A GPU makes them sooner than a file is read.
-
-Lists of near faces for the cells of a distance grid; see `worker.simulation.kernels.nearest`.
 """
 
 from __future__ import annotations

@@ -1,12 +1,6 @@
-"""Hands, objects and networks of the tasks, loaded from the store once and kept while the worker goes on with the same
-pair. Objects are repaired and simplified once, by the worker that meets them first, and lie prepared in the store.
-
-Convex pieces of objects, shared by all workers through the store: they move verdicts, and cost up to minutes.
-
-What a task reads: the shard of the stage before it.
-
-Files of a hand in the store, its xacro expanded once: what a later expansion would give is another hand.
-"""
+"""Inputs of tasks: hands, objects, networks, convex pieces and shards from the store, kept while a worker goes on with
+one pair. Objects are repaired and simplified once, by the worker that meets them first, and lie prepared in the
+store."""
 
 from __future__ import annotations
 

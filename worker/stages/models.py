@@ -1,8 +1,6 @@
-"""The models that viewers show: made beside the check of an upload, or when a task first loads a hand or an object.
+"""Models for viewers: hands and objects as binary glTF, made beside the check of an upload or at first use.
 
 ``python -m worker.stages.models`` writes those of the built-in hands and objects into `service/builtin/models/`.
-
-Hands and objects as binary glTF for viewers: one node a body, with what moves it; opened by any glTF tool.
 
 The joint tree stands in the `extras` of the nodes, so a viewer poses the hand from the joint positions of a shard:
 a node's pose is parent * rest pose * motion about `axis`. Points of the hand's surface come as POINTS primitives.

@@ -1,7 +1,5 @@
-"""Throughput of the planner: grasps per second over fidelities, batches, threads, hand points and object faces.
-
-A benchmark as a Markdown table, JSON and a plot.
-"""
+"""Throughput of the planner over fidelities, batches, threads, hand points and object faces; as table, JSON and
+plot."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""From the records in the store to the rows of the index.
-
-Keeps the states of tasks and jobs in step with the facts about them, inside one transaction.
-"""
+"""From records of the store to rows of the index, and the states of tasks and jobs that follow, in one transaction."""
 
 from __future__ import annotations
 

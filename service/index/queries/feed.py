@@ -1,7 +1,4 @@
-"""What the controller asks the index: which tasks should be queued, and which it believes are.
-
-What the planner of datasets asks the index: what is left to do, cell by cell.
-"""
+"""Queries of the controller: tasks to queue, tasks believed queued, and cells of datasets that are left to plan."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Queries on grasps.
-
-How the grasps of a filter are found in the order of a metric, in a bounded time at millions of rows.
+"""Queries on grasps: their filters, and the search in the order of a metric, bounded in time at millions of rows.
 
 The choice of an index is made here and not left to the database: SQLite does not know how the values are spread, and
 takes an order's index to the end for a filter that almost nothing passes. There are three ways:
@@ -10,8 +8,6 @@ takes an order's index to the end for a filter that almost nothing passes. There
 3. A filter that hardly any row passes, though many pass each of its conditions: all rows are read, once.
 
 The language that chooses grasps (`service.model.where`) is asked of the rows by `truth`.
-
-What grasps may be filtered and sorted by.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Queries on jobs, tasks and attempts.
-
-What became of the candidates of jobs, from the manifests of their shards.
-"""
+"""Queries on jobs, tasks and attempts, and the outcomes of a job's candidates."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Queries on workers and the service as a whole.
-
-What the index says at the moment of a scrape. Each read has a bound that does not grow with the index.
-"""
+"""Queries on workers and the service as a whole; those of a scrape have a bound that does not grow with the index."""
 
 from __future__ import annotations
 

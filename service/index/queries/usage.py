@@ -1,7 +1,4 @@
-"""What projects used, day by day.
-
-What finished batches cost: the measurements behind the estimate of a dataset.
-"""
+"""Queries on usage: what projects used day by day, and what finished batches cost."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Who is there: a controller, workers that fit to this graspd, and the port of the API.
-
-The clock of this machine against those of Redis, database, store and workers.
+"""Checks of the fleet: controller, workers that fit, the port of the API, and clocks.
 
 Leases go by each process's own monotonic clock, so work goes on whatever the clocks say. What suffers: times that users
 see and sort by, keys that expire, the grace of shards, and requests to S3, which are refused beyond fifteen minutes.

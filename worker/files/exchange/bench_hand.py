@@ -1,9 +1,8 @@
-"""A hand as DexGraspBench keeps it: an MJCF model with position actuators, and the configuration that names it.
+"""A hand as DexGraspBench keeps it: an MJCF model with position actuators, its configuration, and the map of its
+joints.
 
 The model's world frame is the frame of our root link, so `qpos` begins with our pose of it. Bodies are named
 `root_<link>` and `f<number of the finger>_<link>`: the evaluator finds fingers by the beginning of a body's name.
-
-How a hand of ours lies in the model that a benchmark evaluates: root frame and joints, for writers and readers.
 """
 
 from __future__ import annotations

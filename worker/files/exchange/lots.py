@@ -1,9 +1,5 @@
-"""What goes into an export for training: grasps of many shards, the pictures of their scenes, and who is held out.
-
-What came of an export, for the user.
-
-Names as files and formats allow them, one rule for each.
-"""
+"""The plan of an export for training: grasps of many shards, pictures of their scenes, splits, names, and the
+summary."""
 
 from __future__ import annotations
 

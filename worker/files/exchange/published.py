@@ -1,4 +1,4 @@
-"""DDGC's grasps of the Barrett hand: `barrett_translation_K.npy` and `barrett_representation_K.npy` of a scene.
+"""Published grasp sets, read: DDGC, DexGraspNet, MultiDex (GenDexGrasp), and `reference-grasps/1`.
 
 Lundell et al., DDGC, RA-L 2021. For each object of the scene a list of grasps: position and quaternion x y z w of the
 hand in the object's frame; eight joint angles, spread, medial and distal of finger 1, of finger 2, then medial and

@@ -1,9 +1,5 @@
-"""PLY, ASCII and binary of both byte orders: positions and polygons; all other properties are stepped over.
-
-STL, binary and ASCII. A binary file is known by its length: its header may well begin with "solid".
-
-OFF: the counts, the vertices, the polygons; colours, normals and texture coordinates are passed over.
-"""
+"""Formats of bare geometry: PLY (ASCII, binary of both byte orders), STL (binary, ASCII), OFF. Colours and normals are
+passed over."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Material libraries of OBJ: the diffuse colour of each material, or the mean of its picture.
-
-The mean colour of a picture that colours a mesh.
-"""
+"""Colours of meshes: materials of OBJ's libraries, and the mean colour of a picture."""
 
 from __future__ import annotations
 

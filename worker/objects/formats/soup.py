@@ -1,7 +1,4 @@
-"""Triangles as a file gives them, checked for what no later step could survive.
-
-Polygons cut into triangles: n corners become n - 2 triangles, inside the polygon where it has re-entrant corners.
-"""
+"""Triangles of a file, checked for what no later step could survive; polygons are cut into triangles."""
 
 from __future__ import annotations
 

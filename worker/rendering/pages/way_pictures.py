@@ -1,7 +1,4 @@
-"""Pictures of grasps in their scenes and on their way, for people: one camera a grasp, from a side that shows it.
-
-Pictures one after the other in one file: GIF, WebP or animated PNG.
-"""
+"""Pictures and films of grasps along their trajectories, for people: one camera a grasp, from a side that shows it."""
 
 from __future__ import annotations
 

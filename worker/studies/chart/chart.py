@@ -1,7 +1,4 @@
-"""The run: every setting on every pair, repeats taken in turn so that a busy moment of the machine hits all alike.
-
-From names on the command line to what the chart runs.
-"""
+"""The run of a chart: settings from names on the command line, each on every pair, repeats in turn."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The chart's pictures: accuracy over speed with bars and Pareto front, over all and for each hand; knobs.
-
-Words beside the points of a plot, so placed that none lies on another word, a point or its bars.
-"""
+"""The chart's pictures: accuracy over speed with bars, labels and Pareto front, over all and for each hand; knobs."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The studies by name, whole or quick.
-
-What other methods do with shapes that are hard, beside graspd's own, through the same doors.
-"""
+"""The stability studies by name, whole or quick; and the baselines on shapes that are hard."""
 
 from __future__ import annotations
 

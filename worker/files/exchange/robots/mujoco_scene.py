@@ -1,11 +1,8 @@
-"""Grasps as a MuJoCo scene: hand, object and supports with the referee's physics, and a key frame for each posture.
+"""Grasps as MuJoCo scenes with a key frame for each posture: the hand alone with the validator's physics, or on its
+arm.
 
 The world is the frame of the grasps, z up in a scene. A mocap body leads the hand's root; position actuators bear the
 names of the degrees of freedom. In a scene gravity pulls the object alone; a free object floats.
-
-Arm and hand in MuJoCo with a key frame for each posture: to look at, and to start a controller of one's own from.
-
-Nothing is simulated here: bodies have no masses of their own, the object is moved from key frame to key frame.
 """
 
 from __future__ import annotations

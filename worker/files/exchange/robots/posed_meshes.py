@@ -1,8 +1,5 @@
-"""Grasps as binary glTF, one file each: hand and object as they touch, in metres, turned so that +y is up.
-
-Hand, object and supports as meshes, for formats that show a grasp and simulate nothing.
-
-Grasps as USD stages, one file each: hand and object posed, and their way over time. Needs the extra `usd`.
+"""Grasps as posed meshes, one file each: binary glTF (+y up), and USD stages with the trajectory over time (extra
+`usd`).
 
 A stage is in metres and z up. Its default values show the grasp; time samples, 24 a second, lead from the standoff to
 the lift.

@@ -1,9 +1,8 @@
-"""Grasps as three tables of comma-separated values: the grasps, their postures, their trajectories.
+"""Grasps as text files: three tables of comma-separated values, and the grasp file of Isaac Sim (`isaac_grasp`, version
+1.0).
 
 Poses are those of the tool frame: x y z [m], unit quaternion qw qx qy qz. Joints are radians or metres, in columns that
 bear their names.
-
-The grasp file of Isaac Sim's grasp editor (`isaac_grasp`, version 1.0), which Isaac ROS and cuMotion read too.
 
 A grasp is the pose of the gripper's frame in the object's: position [m], quaternion w and xyz; `cspace_position` are
 the joints that hold, `pregrasp_cspace_position` those before. Joints that the URDF couples are left out. The two frames
