@@ -145,9 +145,15 @@ def _outer_finger(hand: UrdfWriter, finger: int, parent: str, xyz: Vector, rpy: 
     # Fingers 1 and 2 end at y = 3.0 and 3.4 mm in the maker's data; one value serves all three.
     hand.joint(f"finger_{finger}_medial", parent, medial, xyz, z, (-MEDIAL_MAX, 0), rpy=rpy, effort=2.0)
     hand.joint(
-        f"finger_{finger}_distal", medial, distal, (-0.069936, 0.003, 0), z, (-MEDIAL_MAX * DISTAL_RATIO, 0),
-        effort=2.0, mimic=(f"finger_{finger}_medial", DISTAL_RATIO),
-    )  # fmt: skip
+        f"finger_{finger}_distal",
+        medial,
+        distal,
+        (-0.069936, 0.003, 0),
+        z,
+        (-MEDIAL_MAX * DISTAL_RATIO, 0),
+        effort=2.0,
+        mimic=(f"finger_{finger}_medial", DISTAL_RATIO),
+    )
 
 
 Vector = tuple[float, float, float]

@@ -47,9 +47,11 @@ def check_hand(
         facts = error.facts if isinstance(error, AssetError) else {}
         return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": facts}
     stated = {
-        "palm": settings.palm is not None, "preshape": bool(settings.preshape), "closing": bool(settings.closing),
+        "palm": settings.palm is not None,
+        "preshape": bool(settings.preshape),
+        "closing": bool(settings.closing),
         "effort": not assumed_efforts(robot, hand.dof_names, settings),
-    }  # fmt: skip
+    }
     facts = hand_facts(hand, robot) | {
         "surface_area_m2": area,
         "guessed": [key for key, said in stated.items() if not said]

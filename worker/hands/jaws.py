@@ -299,11 +299,16 @@ def _measured(
     along = place[both] @ (approach if approach is not None else np.zeros(3))
     bodies = tuple(tuple(sorted(set(points.body[side].tolist()))) for side in sides)
     return Jaws(
-        path[kept], np.maximum(width, 0.0)[kept], middle[kept], axes[kept], speed[kept],
+        path[kept],
+        np.maximum(width, 0.0)[kept],
+        middle[kept],
+        axes[kept],
+        speed[kept],
         (bodies[0], bodies[1]),
         SurfacePoints(points.body[both], points.position[both], points.normal[both], points.area[both]),
-        np.arange(len(both)) < len(one), float(np.ptp(along)),
-    )  # fmt: skip
+        np.arange(len(both)) < len(one),
+        float(np.ptp(along)),
+    )
 
 
 def slides(hand: HandModel) -> NDArray[np.bool_]:

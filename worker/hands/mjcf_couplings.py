@@ -111,18 +111,25 @@ def _leads_to(joint: int, first: int, found: dict[int, Mimic | float], name: Cal
 
 
 def _couple_tendons(
-    model: Any, equality: int, one: tuple[int, float], other: tuple[int, float], found: dict[int, Mimic | float],
+    model: Any,
+    equality: int,
+    one: tuple[int, float],
+    other: tuple[int, float],
+    found: dict[int, Mimic | float],
     name: Callable[[int], str],
-) -> str:  # fmt: skip
+) -> str:
     """The same for tendons of one joint each: c1 (q1 - q1_0) = p(c2 (q2 - q2_0))."""
     scaled = np.asarray(model.eq_data[equality, :5]) * other[1] ** np.arange(5) / one[1]
     return _couple(model, one[0], other[0], scaled, found, name)
 
 
 def _couple_on_tendon(
-    model: Any, equality: int, pulled: list[tuple[int, float]], found: dict[int, Mimic | float],
+    model: Any,
+    equality: int,
+    pulled: list[tuple[int, float]],
+    found: dict[int, Mimic | float],
     name: Callable[[int], str],
-) -> str:  # fmt: skip
+) -> str:
     """Two joints on a tendon of fixed length: c1 (q1 - q1_0) + c2 (q2 - q2_0) = p0. What no actuator moves, follows.
 
     Limits go before the tendon: where they stop the follower it stays, as in a finger whose end gives way.
@@ -231,9 +238,14 @@ def follow_loops(
 
 
 def _follow(
-    model: Any, group: list[int], joints: list[int], passive: list[int], actuated: set[int],
-    found: dict[int, Mimic | float], name: Callable[[int], str],
-) -> str:  # fmt: skip
+    model: Any,
+    group: list[int],
+    joints: list[int],
+    passive: list[int],
+    actuated: set[int],
+    found: dict[int, Mimic | float],
+    name: Callable[[int], str],
+) -> str:
     """Add to `found` what the passive joints of a group of loops follow; a note.
 
     Raises:

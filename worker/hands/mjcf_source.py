@@ -185,9 +185,13 @@ def _mesh_folder(root: Element) -> tuple[str, bool]:
 
 
 def _take_mesh(
-    element: Element, file: str, files: Mapping[str, bytes], main: str, where: tuple[str, bool],
+    element: Element,
+    file: str,
+    files: Mapping[str, bytes],
+    main: str,
+    where: tuple[str, bool],
     assets: dict[str, bytes],
-) -> None:  # fmt: skip
+) -> None:
     folder, strip = where
     wanted = PurePosixPath(file.replace("\\", "/")).name if strip else file
     base = posixpath.dirname(main)

@@ -159,10 +159,13 @@ class _Seen:
         towards = -np.einsum("nfi,ni->nf", looks[:, others], axis).mean(axis=1)
         middle, ahead = 0.5 * (a + b), hand.palm.approach
         return cls(
-            axis=axis, middle=middle, width=width,
+            axis=axis,
+            middle=middle,
+            width=width,
             facing=np.minimum(np.einsum("ni,ni->n", looks[:, one], axis), towards),
-            square=np.abs(axis @ ahead), ahead=(middle - hand.palm.centre) @ ahead,
-        )  # fmt: skip
+            square=np.abs(axis @ ahead),
+            ahead=(middle - hand.palm.centre) @ ahead,
+        )
 
     def cost(self, wanted: Floats) -> Floats:
         """(N,) how far from an opposition of the widths `wanted` (N,)."""

@@ -183,8 +183,9 @@ def _fit(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
     def residual(x: Floats) -> Floats:
         return np.concatenate([gap(x).ravel(), _PRIOR * (x[6:] - guess.ravel())])
 
-    found = least_squares(residual, np.concatenate([np.zeros(6), guess.ravel()]), xtol=1e-12, ftol=1e-12, gtol=1e-15,
-                          max_nfev=_LOOKS)  # fmt: skip
+    found = least_squares(
+        residual, np.concatenate([np.zeros(6), guess.ravel()]), xtol=1e-12, ftol=1e-12, gtol=1e-15, max_nfev=_LOOKS
+    )
     return pose_of(found.x), found.x[6:].reshape(-1, 3)
 
 

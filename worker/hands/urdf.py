@@ -137,9 +137,14 @@ def _moving(element: ElementTree.Element, still: Joint, what: str, notes: list[s
     else:
         lower, upper, effort = _follower_limits(element, still.type, what)
     return replace(
-        still, axis=_axis(element, what, notes), lower=lower, upper=upper, effort=effort, mimic=mimic,
+        still,
+        axis=_axis(element, what, notes),
+        lower=lower,
+        upper=upper,
+        effort=effort,
+        mimic=mimic,
         velocity=_velocity(element),
-    )  # fmt: skip
+    )
 
 
 def _velocity(element: ElementTree.Element) -> float:

@@ -49,20 +49,26 @@ def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) 
     if find_spec("xacro") is None:
         raise HandError(f"{main}: the package xacro is not installed: pip install 'graspd[worker]', or expand it first")
     given = {
-        "main": main, "arguments": dict(arguments), "names": sorted(files), "memory": MEMORY_LIMIT_BYTES,
-        "cpu": CPU_LIMIT_S, "limit": MAX_BYTES,
-        "texts": {
-            name: text_of(files[name])
-            for name in sorted(files) if PurePosixPath(name).suffix.lower() in _READ
-        },
-    }  # fmt: skip
+        "main": main,
+        "arguments": dict(arguments),
+        "names": sorted(files),
+        "memory": MEMORY_LIMIT_BYTES,
+        "cpu": CPU_LIMIT_S,
+        "limit": MAX_BYTES,
+        "texts": {name: text_of(files[name]) for name in sorted(files) if PurePosixPath(name).suffix.lower() in _READ},
+    }
     passed_on = {name: os.environ[name] for name in ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH") if name in os.environ}
     command = [sys.executable, "-m", "worker.hands.xacro_child"]
     try:
         done = subprocess.run(
-            command, input=json.dumps(given).encode(), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            timeout=_WALL_LIMIT_S, check=False, env={**passed_on, "PYTHONHASHSEED": "0"},
-        )  # fmt: skip
+            command,
+            input=json.dumps(given).encode(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            timeout=_WALL_LIMIT_S,
+            check=False,
+            env={**passed_on, "PYTHONHASHSEED": "0"},
+        )
     except subprocess.TimeoutExpired:
         raise TimeoutError(f"{main}: expanding it did not end in {_WALL_LIMIT_S:.0f} s; try again") from None
     if done.returncode == -signal.SIGKILL:

@@ -135,9 +135,17 @@ def _expand(given: dict[str, Any]) -> str:
 
 
 _PLAIN: Final[dict[str, Any]] = {
-    "true": True, "false": False, "True": True, "False": False,
-    "list": list, "dict": dict, "map": map, "str": str, "float": float, "int": int,
-}  # fmt: skip
+    "true": True,
+    "false": False,
+    "True": True,
+    "False": False,
+    "list": list,
+    "dict": dict,
+    "map": map,
+    "str": str,
+    "float": float,
+    "int": int,
+}
 
 
 def _checked(expression: str) -> Any:

@@ -158,9 +158,14 @@ def _dropped(
 
 
 def _laid(
-    spec: SceneSpec, obj: ObjectModel, others: Sequence[ObjectModel], supports: Sequence[Obstacle], *, count: int,
+    spec: SceneSpec,
+    obj: ObjectModel,
+    others: Sequence[ObjectModel],
+    supports: Sequence[Obstacle],
+    *,
+    count: int,
     seed: int,
-) -> dict[str, Floats]:  # fmt: skip
+) -> dict[str, Floats]:
     """The object as it stands alone, and the others beside it; where they find no room it moves elsewhere."""
     poses = rest_poses(spec, obj, count=count, seed=seed)
     alone, size = poses["scene/object_pose"], room_in(spec)

@@ -62,9 +62,13 @@ def trial_on(
 
 
 def hold_trial(
-    hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, known: KnownTrials | None = None,
+    hand: HandModel,
+    obj: ObjectModel,
+    pieces: Callable[[], ConvexPieces],
+    *,
+    known: KnownTrials | None = None,
     level: Level = "certificate",
-) -> Callable[[GraspSet, Placed | None, Floats], Floats]:  # fmt: skip
+) -> Callable[[GraspSet, Placed | None, Floats], Floats]:
     """A trial of free grasps as `worker.planners.Wanted` takes it: (N,) scores of short pushes, below 2 for grasps that
     hold the object against the six pushes as well.
 
@@ -91,9 +95,14 @@ def hold_trial(
 
 
 def lift_trial(
-    hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1,
-    known: KnownLifts | None = None, level: LiftLevel = "lift",
-) -> Callable[[GraspSet, Placed | None, Floats], Floats]:  # fmt: skip
+    hand: HandModel,
+    obj: ObjectModel,
+    pieces: Callable[[], ConvexPieces],
+    *,
+    threads: int = 1,
+    known: KnownLifts | None = None,
+    level: LiftLevel = "lift",
+) -> Callable[[GraspSet, Placed | None, Floats], Floats]:
     """A trial as `worker.planners.Wanted` takes it: (N,) scores, below 1 for grasps that lift the object at half the
     friction, and below 2 at the whole of it, and whose way is clear.
 

@@ -21,13 +21,18 @@ from worker.hands.pads import pads_of
 from worker.stages.models import hand_glb
 
 CLAW = robot(
-    link("palm", BOX), link("a", BOX), link("b", BOX), link("c", BOX), link("mount", ""), link("tip", ""),
+    link("palm", BOX),
+    link("a", BOX),
+    link("b", BOX),
+    link("c", BOX),
+    link("mount", ""),
+    link("tip", ""),
     joint("ja", "palm", "a", origin="0.02 0 0.02", axis="0 -1 0"),
     joint("jb", "palm", "b", origin="-0.02 0 0.02"),
     joint("jc", "palm", "c", origin="-0.02 0.03 0.02"),
     joint("jm", "palm", "mount", kind="fixed", origin="0.01 0.02 0.03"),
     joint("jt", "a", "tip", kind="fixed", origin="0 0 0.04"),
-)  # fmt: skip
+)
 
 
 def same(one: HandModel, other: HandModel, *, palm: bool) -> bool:
@@ -46,7 +51,7 @@ def same(one: HandModel, other: HandModel, *, palm: bool) -> bool:
         ({"fingertips": ["a"], "preshape": {"jb": 0.7}}, ["--fingertips", "a", "--pre-shape", "jb=0.7"], False),
         ({"palm": {"link": "mount"}}, ["--palm", "mount"], True),
     ],
-)  # fmt: skip
+)
 def test_corrections_and_options_make_the_same_hand(
     said: dict[str, object], options: list[str], palm: bool, tmp_path: Path
 ) -> None:

@@ -121,9 +121,11 @@ def test_two_fingers_that_oppose_one_take_hold_between_them_and_not_sideways(mir
         bend = {"axis": "0 -1 0", "limit": '<limit lower="0" upper="1.4" effort="10"/>'}
         base = joint(f"j{k}", "palm", f"f{k}", origin=f"{x} {y} 0", **bend)
         parts += [
-            link(f"f{k}", _bar(0.05)), base.replace("<origin xyz", f'<origin rpy="0 0 {about}" xyz'),
-            link(f"t{k}", _bar(0.04)), joint(f"k{k}", f"f{k}", f"t{k}", origin="0 0 0.05", **bend),
-        ]  # fmt: skip
+            link(f"f{k}", _bar(0.05)),
+            base.replace("<origin xyz", f'<origin rpy="0 0 {about}" xyz'),
+            link(f"t{k}", _bar(0.04)),
+            joint(f"k{k}", f"f{k}", f"t{k}", origin="0 0 0.05", **bend),
+        ]
     np.testing.assert_allclose(hand(robot(*parts)).palm.approach, [0, 0, 1], atol=1e-9)
 
 
