@@ -11,9 +11,9 @@ from pydantic import ValidationError
 
 from graspd.grasps import Grasps
 from service.model.base import refusal
-from service.model.diversity import MIN_DISTANCE_M
 from service.model.domain import JobOptions
 from service.model.errors import InputError
+from service.model.metrics import MIN_DISTANCE_M
 from service.model.scene_spec import parse_scene
 
 

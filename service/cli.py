@@ -209,9 +209,9 @@ def engine_settings() -> EngineSettings:
 
 def log_to_stderr(settings: Settings, process: str = "graspd") -> None:
     """Log lines of this process: JSON, or text on a terminal."""
-    from service import logs
+    from service import telemetry
 
-    logs.set_up(settings, process)
+    telemetry.set_up_logs(settings, process)
 
 
 def keep_private(settings: Settings) -> None:

@@ -32,8 +32,7 @@ from worker.process.engine import Engine
 from worker.process.fitness import Check
 from worker.process.link import Link, Setup, StartEngine, start_engine
 from worker.process.selfcheck import EngineError
-from worker.stages.context import TaskContext
-from worker.stages.output import Output, StageFunction, shard_of
+from worker.stages.context import Output, StageFunction, TaskContext, shard_of
 from worker.stages.ranges import base_rows, batches_of, joined
 
 HAND_FILES = {"asset.json": b'{"file": "hand.urdf"}', "hand.urdf": b"<robot name='fake'/>"}

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from service.model.domain import JobOptions
 from service.model.errors import TaskCancelled
-from service.model.outcomes import totals
+from service.model.planning import totals
 from worker.grasps import GraspSet, joined, joined_columns
 from worker.hands.model import HandModel
 from worker.hands.oppositions import require_opposing
@@ -85,7 +85,7 @@ class Certified:
     rejected: dict[str, int]
     """Those of them that were not kept, by `REJECTIONS`."""
     outcomes: dict[str, int]
-    """The same, by `service.model.outcomes.OUTCOMES`: what the referee saw, which gate."""
+    """The same, by `service.model.planning.OUTCOMES`: what the referee saw, which gate."""
     verdict_key: str | None
     """Digest of the terms of the verdicts; None: nobody judged."""
     planned: int

@@ -20,7 +20,7 @@ from api.catalog.grasps import Grasps
 from api.catalog.tags import Tags
 from service.index.views import GraspView
 from service.model.errors import InputError, LimitError
-from service.model.tags import Grasp, by_shard
+from service.model.records import Grasp, by_shard
 from service.pipeline.backends import Services
 from service.store.integrity import read_checked
 from service.store.shards import part_of_shard, place_of, read_shard

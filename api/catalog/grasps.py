@@ -29,11 +29,10 @@ from api.models import (
 from service.index.queries.grasps import GraspFilter, GraspSort, Metric
 from service.index.queries.statistics import Kinds
 from service.index.views import GraspView, JobView, Page, ShardView
-from service.model.diversity import CELLS, GraspType, entropy_bits, evenness
 from service.model.errors import InputError, LimitError, NotFoundError
-from service.model.metrics import GRASP_METRICS, Indexed, indexed
+from service.model.metrics import DIRECTION_CELLS, GRASP_METRICS, GraspType, Indexed, entropy_bits, evenness, indexed
+from service.model.records import MOST_TAGGED, Grasp
 from service.model.scene_spec import supports_in
-from service.model.tags import MOST_TAGGED, Grasp
 from service.pipeline.backends import Services
 from service.readers.ways import scene_spec_of, stop_places, way_of
 from service.store.columns import SCHEMAS
@@ -143,7 +142,7 @@ def _told(kinds: Kinds) -> Diversity | None:
         type_entropy_bits=round(entropy_bits(kinds.types.values()), 4),
         directions_used=len(kinds.cells),
         direction_entropy_bits=round(entropy_bits(kinds.cells.values()), 4),
-        evenness=round(evenness(kinds.cells.values(), CELLS), 4),
+        evenness=round(evenness(kinds.cells.values(), DIRECTION_CELLS), 4),
     )
 
 

@@ -17,11 +17,11 @@ from api.catalog.grasps import MEAN_METRICS, Grasps
 from api.catalog.shards import Shards
 from api.models import Job, JobDetail, LossCurve, MeanMetrics, StageStatus, stage_state
 from service.index.views import JobView, Page, StageProgress, TaskView
-from service.logs import bind
 from service.model.domain import JobRequest
 from service.model.states import Stage, State
 from service.pipeline import deletion, job_actions
 from service.pipeline.backends import Services
+from service.telemetry import bind
 
 log = logging.getLogger(__name__)
 

@@ -27,9 +27,9 @@ from api.client.reports import (
 from api.formatting import count, minute, percent, size
 from api.uploads import MAIN_SUFFIXES, name_of_upload
 from service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
-from service.model.diversity import MIN_DISTANCE_M
 from service.model.domain import AUDITS, NETWORK_METHODS, JobRequest
 from service.model.errors import InputError
+from service.model.metrics import MIN_DISTANCE_M
 from service.model.scene_spec import scene_option
 from service.model.states import AssetKind, State
 from service.store.asset_options import (

@@ -24,10 +24,8 @@ from api.routes.dependencies import AssetsOf, ExportsOf, GraspsOf, ShardsOf, Tag
 from api.routes.grasps import exported
 from service.index.views import GraspView, TagView
 from service.model.base import TagName
-from service.model.diversity import GraspType
 from service.model.errors import InputError
-from service.model.metrics import GRASP_METRICS, Indexed, indexed
-from service.model.robust import MEANINGS
+from service.model.metrics import AXIS_MEANINGS, GRASP_METRICS, GraspType, Indexed, indexed
 from service.model.states import AssetKind
 
 PAGE_SIZES: Final = {"cards": 24, "table": 50}
@@ -42,7 +40,7 @@ _LESS_IS_BETTER: Final = frozenset(metric.name for metric in indexed() if metric
 _BESIDE_VERDICT: Final = frozenset({"contact_links", "robustness", "robust_share", "grasp_type", "approach_cell"})
 
 #: What differs along the axes of models around the nominal one.
-_WEAKEST: Final = {axis.word: words for axis, words in MEANINGS.items()}
+_WEAKEST: Final = {axis.word: words for axis, words in AXIS_MEANINGS.items()}
 
 router = APIRouter(include_in_schema=False)
 

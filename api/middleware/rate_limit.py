@@ -25,8 +25,8 @@ from api.access.auth import Proxy, identify
 from api.access.auth import caller as present_caller
 from api.access.keys import Key, KeyFile
 from api.problems import ApiError, answer
-from service.logs import bind
 from service.settings import Settings
+from service.telemetry import bind
 
 #: What costs nothing and is asked often, by browsers and by whatever watches the service.
 _FREE: Final = ("/static/", "/healthz", "/readyz")

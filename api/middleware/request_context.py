@@ -22,9 +22,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from api.formatting import host_name
 from api.metrics import Metrics
 from api.problems import ApiError, answer, log_unforeseen
-from service import tracing
-from service.logs import bind
+from service import telemetry
 from service.model.errors import GraspdError
+from service.telemetry import bind
 
 _access = logging.getLogger("graspd.access")
 
@@ -67,8 +67,8 @@ class RequestContext:
         request_id = _request_id(Headers(scope=scope).get("x-request-id"))
         scope.setdefault("state", {})["request_id"] = request_id
         parent = Headers(scope=scope).get("traceparent", "")
-        with tracing.span(f"HTTP {_method(scope)}", parent=parent, request=request_id) as facts:
-            with bind(request=request_id, traceparent=tracing.traceparent()):
+        with telemetry.span(f"HTTP {_method(scope)}", parent=parent, request=request_id) as facts:
+            with bind(request=request_id, traceparent=telemetry.traceparent()):
                 await self._answer(scope, receive, send, request_id)
             facts["http.route"] = _route(scope)
 

@@ -28,9 +28,9 @@ from service.model.records import (
     ObjectSet,
     Record,
     Snapshot,
+    Tag,
 )
 from service.model.states import State
-from service.model.tags import Tag
 from service.model.webhooks import Webhook
 from service.settings import sqlite_url
 from service.store.library import load_asset, load_check, stored_assets

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, computed_field
 
 from service.model.domain import JobOptions, JobRequest
 from service.model.metric_fields import values, with_fields
-from service.model.outcomes import shortfall
+from service.model.planning import shortfall
 from service.model.records import Choice
 from service.model.states import AssetKind, Lane, Stage, State
 

@@ -14,7 +14,6 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from service.heartbeat_file import HeartbeatFile
 from service.index.queries.feed import ReadyTask
 from service.index.rebuild import complete_if_new, rebuild
 from service.model import names
@@ -41,6 +40,7 @@ from service.pipeline.webhook_dispatcher import WebhookDispatcher
 from service.queue.port import Event, EventKind
 from service.store.library import publish_builtins, stored_assets
 from service.store.packs import take_apart
+from service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
 #: Events of one round: a second's work. Those behind them wait for the next round, which follows at once.

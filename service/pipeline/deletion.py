@@ -18,9 +18,8 @@ from service.model import names
 from service.model.clock import timestamp
 from service.model.errors import ConflictError, DamagedError, NotFoundError
 from service.model.projects import EVERYTHING, ProjectScope
-from service.model.records import AttemptRecord, JobRecord, Snapshot
+from service.model.records import AttemptRecord, JobRecord, Snapshot, Tag
 from service.model.states import AssetKind
-from service.model.tags import Tag
 from service.pipeline import tagging
 from service.pipeline.backends import Services
 from service.pipeline.recording import recording

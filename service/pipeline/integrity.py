@@ -14,9 +14,17 @@ from service.model.clock import age_of
 from service.model.digests import digest_files
 from service.model.domain import Asset
 from service.model.errors import DamagedError, InputError, NotFoundError
-from service.model.records import AttemptRecord, DatasetEvent, DatasetRecord, JobEvent, JobRecord, ObjectSet, Snapshot
+from service.model.records import (
+    AttemptRecord,
+    DatasetEvent,
+    DatasetRecord,
+    JobEvent,
+    JobRecord,
+    ObjectSet,
+    Snapshot,
+    Tag,
+)
 from service.model.states import AssetKind, Stage
-from service.model.tags import Tag
 from service.model.webhooks import Webhook
 from service.store.assets import ZipFiles
 from service.store.integrity import is_sealed

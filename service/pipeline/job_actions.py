@@ -11,7 +11,6 @@ from typing import Final, Literal
 
 from service.index.queries.feed import ReadyTask
 from service.index.views import JobView
-from service.logs import bound
 from service.model import names
 from service.model.clock import timestamp
 from service.model.digests import job_id
@@ -32,6 +31,7 @@ from service.pipeline.scene_check import check_scene
 from service.pipeline.usable import usable, with_neighbours, with_network
 from service.queue.port import Event, EventKind
 from service.store.records import add_job_event, job_events, put_record, read_record, refuse_pending
+from service.telemetry import bound
 
 log = logging.getLogger(__name__)
 #: Wait before it is looked again whether a worker can do what was held back [s].

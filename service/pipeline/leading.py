@@ -17,9 +17,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from service.heartbeat_file import HeartbeatFile
 from service.model.errors import QueueUnavailable
 from service.queue.port import Presence
+from service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
 #: As what the controller that leads announces itself; an API of graspd 0.2 looks for the same name.

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 from service.model import names
 from service.model.clock import timestamp
 from service.model.errors import ConflictError, LimitError, NotFoundError
-from service.model.tags import MOST_TAGGED, Grasp, Tag, by_shard, tag_id
+from service.model.records import MOST_TAGGED, Grasp, Tag, by_shard, tag_id
 from service.pipeline.backends import Services
 from service.pipeline.recording import recording
 from service.store.records import Deletion, drop_older, newest_version, put_record, put_version, removed_folder

@@ -13,10 +13,10 @@ from typing import Annotated
 import typer
 
 from service.cli import JsonFlag, emit, keep_private, load_settings, log_to_stderr, plain_console, reporting_errors
-from service.heartbeat_file import HeartbeatFile
 from service.model import names
 from service.model.errors import IndexDamaged, QueueUnavailable, UnavailableError, without_secrets
 from service.settings import Settings
+from service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
 

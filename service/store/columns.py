@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from service.model.errors import InputError
-from service.model.metrics import GRASP_METRICS
-from service.model.robust import MEANINGS
+from service.model.metrics import AXIS_MEANINGS, GRASP_METRICS
 
 ShardKind = Literal["base", "scene", "views"]
 
@@ -126,7 +125,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "enum",
             "none",
             "what differed in the first model around the nominal one in which it does not hold: 0 none, "
-            + ", ".join(f"{axis:d} {words}" for axis, words in MEANINGS.items()),
+            + ", ".join(f"{axis:d} {words}" for axis, words in AXIS_MEANINGS.items()),
             optional=True,
         ),
         # Grasps that were planned for a scene say which, and how they are reached and lifted there.

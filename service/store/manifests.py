@@ -16,8 +16,7 @@ from service.model.clock import timestamp
 from service.model.domain import Digest, JobRequest, batches_of
 from service.model.messages import TaskMessage
 from service.model.metric_fields import values, with_fields
-from service.model.metrics import indexed
-from service.model.robust import axis_word
+from service.model.metrics import axis_word, indexed
 from service.model.states import Stage
 from service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from service.store import validity

@@ -22,9 +22,8 @@ from service.model.base import refusal
 from service.model.clock import timestamp
 from service.model.digests import digest_json
 from service.model.errors import ConflictError, DamagedError, NotFoundError
-from service.model.records import AttemptRecord, DatasetEvent, DatasetRecord, JobEvent, JobRecord, Record, Snapshot
+from service.model.records import AttemptRecord, DatasetEvent, DatasetRecord, JobEvent, JobRecord, Record, Snapshot, Tag
 from service.model.scene_spec import SceneSpec
-from service.model.tags import Tag
 from service.store.integrity import get_document, is_sealed, put_document, put_sealed
 from service.store.store import Store
 

@@ -11,9 +11,9 @@ from service.model import names
 from service.model.clock import timestamp
 from service.model.digests import job_id
 from service.model.domain import JobRequest
+from service.model.metrics import Axis
 from service.model.planning import PlannedTask, message_of, plan
 from service.model.records import AttemptRecord, JobRecord
-from service.model.robust import Axis
 from service.model.states import AssetKind, Lane, Stage
 from service.model.transforms import pose_to_matrix
 from service.model.workers import WorkerBeat

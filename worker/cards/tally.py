@@ -11,8 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.diversity import BANDS, CELLS, SECTORS
-from service.model.metrics import GRASP_METRICS
+from service.model.metrics import BANDS, DIRECTION_CELLS, GRASP_METRICS, SECTORS
 from service.model.transforms import Floats, quat_rotate
 from service.store import validity
 from service.store.manifests import INDEX_THRESHOLD_M
@@ -300,7 +299,7 @@ def _add_scene(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts, va
 
 
 #: Fewer grasps leave cells empty by chance: with this many uniform ones e^-5 of a cell, 0.3 of all 48.
-ENOUGH: Final = 5 * CELLS
+ENOUGH: Final = 5 * DIRECTION_CELLS
 
 #: Elevations from -90 to 90 degrees.
 ELEVATION_BINS: Final = 36

@@ -32,11 +32,11 @@ def kernels(
     """Compile all kernels ahead of time, so that a fresh machine compiles none. No GPU is needed."""
     folder.mkdir(parents=True, exist_ok=True)
     os.environ["WARP_CACHE_PATH"] = str(folder.resolve())
-    from worker.engines import backend, baked
+    from worker.engines import backend
 
     backend.start()
-    architectures = (arch or baked.ARCHITECTURES) if cuda else ()
-    files = baked.bake(baked.modules(), architectures=architectures, cpu=cpu)
+    architectures = (arch or backend.ARCHITECTURES) if cuda else ()
+    files = backend.bake(backend.modules(), architectures=architectures, cpu=cpu)
     size = sum(file.stat().st_size for file in files)
     if json:
         emit(

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from service.cli import JsonFlag, emit, plain_console, reporting_errors
 from service.model.errors import InputError, one_of
-from service.model.robust import MEANINGS, MOST_MODELS
+from service.model.metrics import AXIS_MEANINGS, MOST_ROBUST_MODELS
 from service.store.shards import carried, json_attribute, read_shard, write_shard
 from worker.files.cases import expand, load_case
 from worker.files.evaluate import Protocol, combine, evaluate
@@ -69,7 +69,9 @@ def evaluate_command(
     robust: Annotated[
         int,
         typer.Option(
-            min=0, max=MOST_MODELS, help="Models around the nominal one in which what holds is judged again, such as 8."
+            min=0,
+            max=MOST_ROBUST_MODELS,
+            help="Models around the nominal one in which what holds is judged again, such as 8.",
         ),
     ] = 0,
     friction: Annotated[
@@ -177,7 +179,7 @@ def _copies(paths: list[Path], files: list[Path], out: Path | None, *, robust: i
 
 def _said_of_models(whole: dict[str, Any]) -> str:
     """How far the verdicts can be trusted, the axis that costs most first."""
-    words = {axis.word: name for axis, name in MEANINGS.items()}
+    words = {axis.word: name for axis, name in AXIS_MEANINGS.items()}
     axes = sorted(whole["robust_axes"].items(), key=lambda pair: pair[1]["share"])
     each = ", ".join(f"{words[axis]} {one['share']:.2f}" for axis, one in axes)
     return (

@@ -21,8 +21,16 @@ from worker.objects.model import ObjectModel
 from worker.rendering.pages.pictures import SAMPLES, THREE_SIDES, grasp_pictures
 from worker.rendering.pages.sheets import contact_sheet, figures, label_page, three_sides_sheet
 from worker.rendering.pages.way_pictures import FREE_STRIP, STRIP, Around, animation, animation_kind, way_pictures
-from worker.robots.execution import Executions, executions, tool_frame
-from worker.robots.timing import STEP_S, Trajectory, hand_limits, straight_paths, timed
+from worker.robots.execution import (
+    STEP_S,
+    Executions,
+    Trajectory,
+    executions,
+    hand_limits,
+    straight_paths,
+    timed,
+    tool_frame,
+)
 from worker.run import Run
 
 Kind = Literal["one side", "three sides", "way"]

@@ -11,7 +11,6 @@ import typer
 from service.cli import JsonFlag, emit, reporting_errors, write_output
 from service.store.columns import Attribute
 from service.store.shards import read_shard, write_shard
-from worker.files.base_attributes import wrist_attributes
 from worker.files.provenance import (
     INHERITED,
     NEIGHBOUR_FACE_ERROR_M,
@@ -20,6 +19,7 @@ from worker.files.provenance import (
     id_of_columns,
     made_of,
     object_of_shard,
+    wrist_attributes,
 )
 from worker.grasps import Posture
 from worker.objects.prepare import object_from_path

@@ -20,9 +20,20 @@ from worker.files.subsets import choose
 from worker.quality.referee.decomposition import decompose
 from worker.rendering.pages.sheets import best as best_of
 from worker.robots.arm import Description, describe, read_arm
-from worker.robots.execution import Executions, executions, parse_pose, tool_frame
+from worker.robots.execution import (
+    ASSUMED_M_S,
+    ASSUMED_RAD_S,
+    Executions,
+    Limits,
+    Trajectory,
+    executions,
+    hand_limits,
+    parse_pose,
+    straight_paths,
+    timed,
+    tool_frame,
+)
 from worker.robots.reach import Reach
-from worker.robots.timing import ASSUMED_M_S, ASSUMED_RAD_S, Limits, Trajectory, hand_limits, straight_paths, timed
 from worker.run import ALONE, Run
 
 FORMATS: Final = ("mujoco", "usd", "glb", "moveit", "isaac", "csv")

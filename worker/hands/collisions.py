@@ -9,7 +9,7 @@ import numpy as np
 from service.model.transforms import IDENTITY_POSE, Floats, apply
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
-from worker.objects.kept_arrays import recalled
+from worker.objects.disk_cache import recalled
 
 #: Pieces closer than this [m] at rest count as touching.
 TOUCH_M = 1e-4

@@ -16,7 +16,7 @@ from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel, PalmFrame
 from worker.hands.options import HandOptions
 from worker.hands.tree import Tree
-from worker.objects.kept_arrays import recalled
+from worker.objects.disk_cache import recalled
 
 #: Share of the way from open to closed at which the hand approaches.
 PRESHAPE_SHARE = 0.25

@@ -37,7 +37,7 @@ from worker.hands.tendons import tendons_of
 from worker.hands.tree import Tree, build_tree, joint_type
 from worker.hands.visuals import PlacedShape, Visuals
 from worker.hands.xacro import read_robot
-from worker.objects.kept_arrays import recalling
+from worker.objects.disk_cache import recalling
 from worker.run import ALONE, Run
 
 log = logging.getLogger(__name__)

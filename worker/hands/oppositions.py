@@ -22,13 +22,13 @@ from service.model import transforms
 from service.model.errors import HandError
 from service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
 from worker.hands import closing, guess, jaws, kinematics, primitives, surface
-from worker.hands import pads as pads_code
+from worker.hands import jaws as pads_code
 from worker.hands.closing import posture
+from worker.hands.jaws import Pad, fingertip_pad
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
-from worker.hands.pads import Pad, fingertip_pad
 from worker.hands.surface import sample_surface
-from worker.objects.kept_arrays import arrays_kept_or_made
+from worker.objects.disk_cache import arrays_kept_or_made
 
 #: Postures that are wanted, from so many times as many, and random steps that make them better.
 POSTURES: Final = 160

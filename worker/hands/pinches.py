@@ -22,7 +22,7 @@ from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel, SurfacePoints
 from worker.hands.oppositions import Oppositions, climbed, opposed_finger, random_postures
 from worker.hands.surface import farthest_points, sample_surface
-from worker.objects.kept_arrays import arrays_kept_or_made
+from worker.objects.disk_cache import arrays_kept_or_made
 
 #: Heights of objects that have postures of their own [m]; what is higher reaches the pads.
 HEIGHTS_M: Final = (0.005, 0.008, 0.012, 0.018)

@@ -24,7 +24,7 @@ from worker.hands.kinematics import body_poses, generalized_forces
 from worker.hands.model import HandModel, SurfacePoints
 from worker.hands.oppositions import Oppositions, oppositions_of
 from worker.hands.surface import sample_surface
-from worker.objects.kept_arrays import arrays_kept_or_made
+from worker.objects.disk_cache import arrays_kept_or_made
 
 Ints = NDArray[np.intp]
 Size = Literal["small", "wide"]

@@ -17,8 +17,7 @@ from service.model.transforms import IDENTITY_POSE, Floats, apply, invert, quat_
 from worker.hands import kinematics, primitives
 from worker.hands.kinematics import body_poses
 from worker.hands.model import ConvexPiece, HandModel, SurfacePoints
-from worker.objects.content import content_of
-from worker.objects.kept_arrays import arrays_kept_or_made
+from worker.objects.disk_cache import arrays_kept_or_made, content_of
 
 #: Candidates per wanted point; thinning keeps the one in five that spreads most evenly.
 OVERSAMPLING: Final = 5

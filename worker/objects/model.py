@@ -1,7 +1,7 @@
 """An object as the engine sees it: one closed, outward, simplified triangle mesh with its mass properties.
 
 Everything is in the object frame: the frame of the mesh as uploaded, in metres. `ObjectModel.centred` is the same
-object about its middle, which is what the engine works on; see `worker.objects.frames`.
+object about its middle, which is what the engine works on; see `worker.objects.mesh_geometry`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from service.model.errors import MeshError
 from service.model.matter import FRICTION, MASS_KG, MOST_KG
 from service.model.transforms import Floats
-from worker.objects.content import TOLD_IF_SET, content_of
+from worker.objects.disk_cache import TOLD_IF_SET, content_of
 
 Ints = NDArray[np.int32]
 

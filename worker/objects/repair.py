@@ -17,9 +17,8 @@ from worker.grasps import on_grid
 from worker.objects import mesh_geometry, topology
 from worker.objects.distance import MeshDistance, surface_points
 from worker.objects.formats import Soup
-from worker.objects.frames import Centred, centred
 from worker.objects.intersections import crossings, untangle
-from worker.objects.mesh_geometry import signed_volume
+from worker.objects.mesh_geometry import Centred, centred, signed_volume
 from worker.objects.options import UNITS, ObjectOptions
 from worker.objects.topology import Indices
 

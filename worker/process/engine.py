@@ -20,7 +20,7 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
-from service import logs, tracing
+from service import telemetry
 from service.model.errors import BusyError, InputError, TaskRefused, UnavailableError
 from service.model.libraries import own_process
 from service.model.states import Stage
@@ -34,8 +34,7 @@ from worker.process.runner import Runner
 from worker.process.selfcheck import check_engine
 from worker.process.surroundings import Surroundings
 from worker.stages import stage_table
-from worker.stages.context import StopReason, TaskContext
-from worker.stages.output import StageFunction
+from worker.stages.context import StageFunction, StopReason, TaskContext
 
 log = logging.getLogger(__name__)
 
@@ -180,8 +179,8 @@ def main(table: Mapping[Stage, StageFunction] | None = None, check: Check | None
     own_process()
     connection = Connection(int(sys.argv[-1]))
     setup: Setup = connection.recv()
-    logs.set_up(setup.settings, "worker")
-    tracing.set_up("worker")
+    telemetry.set_up_logs(setup.settings, "worker")
+    telemetry.set_up_tracing("worker")
     Engine(connection, setup, table, check).serve()
     end()
 

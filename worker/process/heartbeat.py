@@ -11,13 +11,13 @@ from typing import Any, Final
 
 from redis.exceptions import RedisError
 
-from service.heartbeat_file import HeartbeatFile
 from service.model.clock import timestamp
 from service.model.workers import WorkerBeat
 from service.queue.connection import connect
 from service.queue.port import Event, EventKind
 from service.queue.rates import beat_every_s
 from service.queue.rq_queue import list_worker, unlist_worker
+from service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
 #: News is not told more often than this [s].

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from service import logs, tracing
+from service import telemetry
 from service.model import names
 from service.model.clock import timestamp
 from service.model.errors import (
@@ -34,8 +34,7 @@ from service.store.records import put_record
 from worker.engines.devices import DeviceLost, check_device
 from worker.pool.pool import ProcessLost
 from worker.process.fitness import Fitness, first_loss
-from worker.stages.context import StopReason, TaskContext
-from worker.stages.output import StageFunction, shard_of
+from worker.stages.context import StageFunction, StopReason, TaskContext, shard_of
 
 log = logging.getLogger(__name__)
 
@@ -82,7 +81,7 @@ class Runner:
         message = parse_message(raw)
         subjects = _subjects(message)
         parent = message.origin.traceparent if isinstance(message, TaskMessage) and message.origin else ""
-        with logs.bind(**subjects), tracing.span(f"task {message.stage}", parent=parent, **subjects) as facts:
+        with telemetry.bind(**subjects), telemetry.span(f"task {message.stage}", parent=parent, **subjects) as facts:
             event = self._run(message, raw, context)
             facts["graspd.outcome"] = event.kind.value if event is not None else "lost"
             return event

@@ -20,7 +20,7 @@ from service.model.transforms import Floats
 from service.store.manifests import INDEX_THRESHOLD_M
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
-from worker.objects.content import content_of
+from worker.objects.disk_cache import content_of
 from worker.objects.model import ObjectModel
 from worker.quality.approach import approach_cells
 from worker.quality.contact import MAX_CONTACTS, contact_area_cm2, contact_links, spread_contacts

@@ -21,8 +21,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.diversity import GraspType
 from service.model.integers import distinct_values
+from service.model.metrics import GraspType
 from service.model.transforms import Floats
 from worker.hands.model import HandModel, JointType
 from worker.quality.contact import LINK_CONTACT_M, finger_of_body

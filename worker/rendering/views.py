@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError
 from service.model.transforms import Floats, apply
-from worker.objects.frames import to_centre
+from worker.objects.mesh_geometry import to_centre
 from worker.objects.model import ObjectModel
 from worker.rendering.annotate import box_corners, in_camera, loose_boxes, occlusion_ratio, ray_distance, tight_boxes
 from worker.rendering.cameras import BASELINE_M, SAMPLED, Cameras, GivenCameras

@@ -22,8 +22,7 @@ from worker.hands.model import HandModel, JointType
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.model import add_shape
 from worker.robots.arm import Arm
-from worker.robots.execution import Executions
-from worker.robots.timing import Path, straight_paths
+from worker.robots.execution import Executions, Path, straight_paths
 from worker.run import ALONE, Run
 from worker.simulation.surroundings import Obstacle
 

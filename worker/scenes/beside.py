@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from service.model.errors import MeshError, SceneError
 from service.model.scene_spec import SceneSpec
 from service.model.transforms import Floats
-from worker.hands.features import convex_edges
+from worker.hands.primitives import convex_edges
 from worker.objects.convex import union_volume
-from worker.objects.frames import to_centre, to_file
+from worker.objects.mesh_geometry import to_centre, to_file
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import decompose
 from worker.scenes.kinds import SUNK, check_free, inside, rest_poses, room_in, supports_of

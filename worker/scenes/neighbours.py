@@ -19,7 +19,7 @@ from worker.engines.mujoco_warnings import void
 from worker.grasps import Posture, moved
 from worker.hands.kinematics import body_poses
 from worker.hands.model import ConvexPiece, HandModel
-from worker.objects.frames import to_centre, to_file
+from worker.objects.mesh_geometry import to_centre, to_file
 from worker.objects.model import ObjectModel
 from worker.scenes.rest import RestingFaces, lay_flat, resting_faces, settle
 from worker.scenes.simulate import (

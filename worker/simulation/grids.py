@@ -15,8 +15,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from service.model.transforms import Floats
-from worker.engines.baked import binary_name
-from worker.objects.kept_arrays import arrays_kept_or_made
+from worker.engines.backend import binary_name
+from worker.objects.disk_cache import arrays_kept_or_made
 from worker.objects.model import ObjectModel
 from worker.simulation.kernels import nearest, surface
 

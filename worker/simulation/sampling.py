@@ -9,7 +9,7 @@ import numpy as np
 from service.model.transforms import Floats
 from worker.hands import surface
 from worker.hands.surface import farthest_points
-from worker.objects.kept_arrays import arrays_kept_or_made
+from worker.objects.disk_cache import arrays_kept_or_made
 from worker.objects.model import ObjectModel
 
 #: Edges between faces that turn by more than this carry samples of their own: they enter links between surface samples.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError
 from service.model.transforms import Floats, compose, invert, quat_conjugate, quat_rotate, quat_to_matrix
-from worker.objects.frames import to_centre
+from worker.objects.mesh_geometry import to_centre
 from worker.objects.model import ObjectModel
 
 #: Direction against gravity in the scene frame.

@@ -24,9 +24,9 @@ from service.store.assets import builtin_files, builtin_names
 from service.store.integrity import put_sealed
 from service.store.store import Store
 from worker.hands.check import model_facts
+from worker.hands.jaws import pads_of
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel, JointType
-from worker.hands.pads import pads_of
 from worker.hands.robot import Ints
 from worker.hands.surface import sample_surface
 from worker.hands.visuals import VisualMesh, lighter

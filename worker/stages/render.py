@@ -17,8 +17,7 @@ from worker.rendering.hands import DrawnHand
 from worker.rendering.pages.sheets import best_in_scenes
 from worker.scenes.neighbours import Neighbours
 from worker.stages.assets import beside_attributes, hand_of, input_of, neighbours_of, object_of
-from worker.stages.context import TaskContext
-from worker.stages.output import Output, batch_seed
+from worker.stages.context import Output, TaskContext, batch_seed
 
 
 def run(message: TaskMessage, context: TaskContext) -> Output:

@@ -35,9 +35,9 @@ from sqlalchemy import (
 )
 from sqlalchemy.sql.operators import in_op, is_
 
+from service.index import project_scope
 from service.index.database import Database, chunks
 from service.index.project_scope import seen_shards
-from service.index.queries import cursors
 from service.index.tables import dataset_cells, grasps, jobs, shards, tagged, tasks
 from service.index.views import GraspView, Page
 from service.model.base import Model
@@ -45,8 +45,8 @@ from service.model.errors import InputError, NotFoundError
 from service.model.metric_fields import SortedName
 from service.model.metrics import indexed
 from service.model.projects import EVERYTHING, ProjectScope
+from service.model.records import Grasp
 from service.model.states import Stage
-from service.model.tags import Grasp
 from service.model.where import Flag, Joined, Node, Not, OfMetric, OfType, parsed
 
 Metric = SortedName
@@ -80,13 +80,13 @@ class Grasps:
         cursor: str | None = None,
     ) -> Page[GraspView]:
         """Grasps in the order of a metric; those without it come last."""
-        size = cursors.page_size(limit)
-        start = None if cursor is None else cursors.decode(cursor, (float, int, str, type(None)), str, int)
+        size = project_scope.page_size(limit)
+        start = None if cursor is None else project_scope.decode(cursor, (float, int, str, type(None)), str, int)
         with self.database.reading() as connection:
             rows = search(connection, where, sort, size + 1, start)
         views = [_view(row) for row in rows[:size]]
         last = rows[size - 1] if len(rows) > size else None
-        return Page(items=views, next=last and cursors.encode(last[sort.by], last["shard_id"], last["row"]))
+        return Page(items=views, next=last and project_scope.encode(last[sort.by], last["shard_id"], last["row"]))
 
     def get(self, shard_id: str, row: int, *, scope: ProjectScope = EVERYTHING) -> GraspView:
         """One grasp by its shard and row; NotFoundError if there is none."""

@@ -10,9 +10,9 @@ from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Select, and_, case, func, select
 
+from service.index import project_scope
 from service.index.database import Database
 from service.index.project_scope import seen_attempts, seen_jobs, seen_shards, seen_tasks
-from service.index.queries import cursors
 from service.index.tables import attempts, damage, jobs, shards, tasks, workers
 from service.index.views import FailureGroup, MatrixCell, Stats, Throughput, WorkerView
 from service.model.clock import age_of
@@ -93,7 +93,7 @@ class Overview:
             .where(*seen)
             .group_by(attempts.c.stage, attempts.c.kind)
             .order_by(count.desc(), newest.desc())
-            .limit(cursors.page_size(limit))
+            .limit(project_scope.page_size(limit))
         )
         groups = []
         with self.database.reading() as connection:

@@ -10,7 +10,7 @@ from starlette.testclient import TestClient
 
 from api.client.client import events_of
 from service.model.clock import timestamp
-from service.model.diversity import GraspType
+from service.model.metrics import GraspType
 from service.model.planning import plan
 from service.pipeline.backends import Services
 from service.store.records import publish

@@ -11,8 +11,8 @@ from service.index.changes.removals import Removals
 from service.index.rebuild import differences
 from service.model import names
 from service.model.errors import ConflictError, NotFoundError
+from service.model.records import tag_id
 from service.model.states import AssetKind, State
-from service.model.tags import tag_id
 from service.pipeline import job_actions, tagging
 from service.pipeline.backends import Services
 from service.pipeline.datasets import actions

@@ -14,9 +14,8 @@ from service.index.rebuild import rebuild
 from service.model import names
 from service.model.clock import timestamp
 from service.model.errors import DamagedError
-from service.model.records import AttemptRecord, JobRecord, ObjectSet
+from service.model.records import AttemptRecord, JobRecord, ObjectSet, Tag
 from service.model.states import AssetKind, Stage
-from service.model.tags import Tag
 from service.model.webhooks import Webhook
 from service.pipeline import job_actions
 from service.pipeline.backends import Services

@@ -30,8 +30,7 @@ from service.store.manifests import ShardManifest, publish_shard
 from tests.fakes import OBJECT_FILES, fake_stages, request
 from tests.planning import plan_all
 from tests.service.pipeline.test_controller import Bench
-from worker.stages.context import TaskContext
-from worker.stages.output import shard_of
+from worker.stages.context import TaskContext, shard_of
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ from tests.api.factories import add_builtins, poses, scene_columns
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 from tests.planning import plan_all
-from worker.stages.output import Output, shard_of
+from worker.stages.context import Output, shard_of
 
 HANDS = ("allegro", "barrett")
 OBJECTS = ("block", "mug")

@@ -198,7 +198,7 @@ def test_a_mistake_is_one_line_and_exit_2(
     kitchen: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], words: str
 ) -> None:
     monkeypatch.setenv("GRASPD_DATA_DIR", str(kitchen.folder.parent))
-    done = CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "out")])
+    done = CliRunner().invoke(app, ["card", *arguments, "-o", str(tmp_path / "out")])
     assert done.exit_code == 2 and len(done.stderr.strip().splitlines()) == 1
     assert words in done.stderr and not (tmp_path / "out").exists()
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.model.diversity import BANDS, SECTORS, evenness
+from service.model.metrics import BANDS, SECTORS, evenness
 from service.model.states import Stage
 from service.model.transforms import quat_from_axis_angle
 from service.readers import Grasps

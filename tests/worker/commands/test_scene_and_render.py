@@ -19,7 +19,7 @@ from worker.commands.render import app as rendering
 from worker.commands.scene import app as scenes
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
-from worker.robots.timing import SHORTEST_S
+from worker.robots.execution import SHORTEST_S
 
 GRASPS = 3
 

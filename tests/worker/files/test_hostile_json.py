@@ -12,7 +12,7 @@ from service.model.errors import InputError
 from service.readers.ways import scene_spec_of
 from service.store.shards import Shard
 from worker.cards.contents import Contents, with_provenance
-from worker.commands.stability import _read as read_stability
+from worker.commands.studies import _read_maps as read_stability
 from worker.files.curation import _short
 from worker.files.exchange.bench_hand import _read as read_mapping
 from worker.files.exchange.published import friction

@@ -15,9 +15,9 @@ from service.store.assets import builtin_names
 from service.store.descriptions import HandCorrections, corrected, facts_of
 from tests.worker.hands.grippers import gripper
 from tests.worker.hands.urdfs import BOX, joint, link, robot
+from worker.hands.jaws import pads_of
 from worker.hands.load import files_from_path, hand_from_path, load_hand
 from worker.hands.model import HandModel
-from worker.hands.pads import pads_of
 from worker.stages.models import hand_glb
 
 CLAW = robot(

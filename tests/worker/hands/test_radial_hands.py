@@ -13,10 +13,9 @@ from service.store.asset_summary import summary
 from service.store.assets import builtin_files
 from tests.worker.hands.urdfs import joint, link, robot
 from worker.hands.check import check_hand
-from worker.hands.jaws import sign_of
+from worker.hands.jaws import fingertip_pad, sign_of
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
-from worker.hands.pads import fingertip_pad
 
 RADIUS = 0.045
 _PLATE = '<geometry><box size="0.16 0.1 0.02"/></geometry>'

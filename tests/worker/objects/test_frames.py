@@ -12,7 +12,7 @@ import trimesh
 from service.model.errors import MeshError
 from worker.grasps import GRID_M, GraspSet, Posture
 from worker.objects.check import check_object
-from worker.objects.frames import centred, to_centre, to_file
+from worker.objects.mesh_geometry import centred, to_centre, to_file
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import from_bytes, load_object, to_bytes
 

@@ -13,10 +13,10 @@ from service.model.transforms import apply, quat_from_matrix, quat_rotate
 from tests.worker.models import object_from_mesh
 from tests.worker.simulation.rigs import ball
 from worker.grasps import Posture
+from worker.hands.jaws import pads_of
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.oppositions import oppositions_of
-from worker.hands.pads import pads_of
 from worker.hands.pinches import pinches_of
 from worker.objects.prepare import object_from_path
 from worker.planners.fast_graspd.across import ACROSS, NEAR_M, Openings, across, crossings_of, promising

@@ -12,9 +12,9 @@ import graspd
 from service.model.fidelity import FIDELITIES
 from service.model.transforms import quat_rotate
 from tests.worker.simulation.rigs import object_of
+from worker.hands.jaws import fingertip_pad
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
-from worker.hands.pads import fingertip_pad
 from worker.planners.fast_graspd.pairs import pair_of
 from worker.planners.fast_graspd.reaching import Reaching
 from worker.planners.fast_graspd.selection import posture_of

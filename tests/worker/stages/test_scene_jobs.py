@@ -35,8 +35,7 @@ from worker.rendering import Extras
 from worker.rendering import render as pictures
 from worker.stages import render, scene, synthesize
 from worker.stages.assets import object_of
-from worker.stages.context import TaskContext
-from worker.stages.output import batch_seed
+from worker.stages.context import TaskContext, batch_seed
 
 TABLE = {
     "grasps": 6,

@@ -159,7 +159,7 @@ def test_without_viser_one_line_says_how_to_install_it(tmp_path, monkeypatch):
     from worker.commands.render import app
 
     monkeypatch.setitem(sys.modules, "viser", None)
-    result = CliRunner().invoke(app, [str(tmp_path / "grasps.h5")])
+    result = CliRunner().invoke(app, ["view", str(tmp_path / "grasps.h5")])
     assert result.exit_code == 2
     assert "pip install 'graspd[view]'" in result.output
     assert len(result.output.strip().splitlines()) == 1
@@ -202,7 +202,7 @@ def test_the_file_that_is_no_shard_is_one_line(tmp_path: Path):
 
     file = tmp_path / "grasps.h5"
     file.write_text("nothing")
-    result = CliRunner().invoke(app, [str(file)])
+    result = CliRunner().invoke(app, ["view", str(file)])
     assert result.exit_code == 2
     assert "grasps.h5 is not a readable HDF5 file" in result.output
 

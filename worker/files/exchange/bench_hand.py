@@ -21,7 +21,7 @@ from pydantic_core import from_json
 
 from service.model.errors import InputError
 from service.model.transforms import IDENTITY_POSE, Floats, compose, invert
-from worker.files.exchange.objects import write_obj
+from worker.files.exchange.imported import write_obj
 from worker.hands.model import ConvexPiece, HandModel, JointType
 
 #: Joint damping over position gain [s]: that of DexGraspBench's Allegro hand.

@@ -11,7 +11,7 @@ import trimesh
 
 from service.model.transforms import IDENTITY_POSE, Floats
 from worker.files.exchange.bench_scene import TABLETOP
-from worker.files.exchange.objects import mesh_file, write_obj
+from worker.files.exchange.imported import mesh_file, write_obj
 from worker.hands.primitives import hull, volume
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import decompose

@@ -17,7 +17,7 @@ from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
 from service.model.transforms import IDENTITY_POSE, Floats, compose, invert
 from worker.files.exchange.bench_hand import HandMapping
-from worker.files.exchange.pickles import load_npy
+from worker.files.exchange.imported import load_npy
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.scenes.kinds import supports_of

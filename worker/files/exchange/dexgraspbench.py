@@ -37,10 +37,8 @@ from worker.files.exchange.bench_scene import (
     tabletop_fields,
     with_way,
 )
-from worker.files.exchange.imported import Imported
+from worker.files.exchange.imported import Imported, load_npy, scaled_object
 from worker.files.exchange.lots import plain_name
-from worker.files.exchange.objects import scaled_object
-from worker.files.exchange.pickles import load_npy
 from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel

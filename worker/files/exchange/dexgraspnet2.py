@@ -37,9 +37,8 @@ from service.model.transforms import Floats, apply, compose, invert, pose_from_m
 from service.readers import DepthNoise, Pictures
 from service.readers.clouds import CloudView
 from worker.files.exchange.dexgraspnet2_graspness import SceneGraspness, surface_samples
-from worker.files.exchange.imported import Imported, completed, joints_by_name, verdicts
+from worker.files.exchange.imported import Imported, completed, joints_by_name, scaled_object, verdicts
 from worker.files.exchange.lots import Look, Lot, Written, by_scene, looks, plain_name
-from worker.files.exchange.objects import scaled_object
 from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel

@@ -31,9 +31,9 @@ from scipy.spatial.distance import cdist
 
 from service.model.transforms import IDENTITY_POSE, Floats, apply, invert, quat_rotate
 from worker.grasps import Posture
+from worker.hands.jaws import fingertip_pad
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
-from worker.hands.pads import fingertip_pad
 from worker.hands.surface import OVERSAMPLING, farthest_points
 from worker.objects.distance import sample_faces
 from worker.objects.model import ObjectModel

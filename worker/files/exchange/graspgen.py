@@ -27,9 +27,8 @@ from numpy.typing import NDArray
 from service.model.errors import InputError
 from service.model.transforms import Floats, apply, pose_from_matrix, pose_to_matrix, quat_from_matrix
 from service.store import validity
-from worker.files.exchange.imported import Imported, completed, joints_by_name
+from worker.files.exchange.imported import Imported, completed, joints_by_name, mesh_file, scaled_object
 from worker.files.exchange.lots import Lot, Written, plain_name
-from worker.files.exchange.objects import mesh_file, scaled_object
 from worker.grasps import GraspSet, Posture
 from worker.hands.jaws import jaws_of
 from worker.hands.kinematics import body_poses

@@ -27,9 +27,8 @@ from service.readers.clouds import CloudView
 from service.readers.ways import scene_spec_of
 from service.store.manifests import INDEX_THRESHOLD_M
 from worker.files.exchange.bench_scene import placed_of
-from worker.files.exchange.imported import Imported, joints_by_name, verdicts
+from worker.files.exchange.imported import Imported, joints_by_name, scaled_object, verdicts
 from worker.files.exchange.lots import Lot, Written
-from worker.files.exchange.objects import scaled_object
 from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
 from worker.rendering.export import PNG_STEP_M

@@ -30,9 +30,8 @@ from service.readers import Pictures
 from service.readers.ways import way_of
 from worker.files.exchange.bench_scene import placed_of
 from worker.files.exchange.huggingface import png
-from worker.files.exchange.imported import Imported, joints_by_name, verdicts
+from worker.files.exchange.imported import Imported, joints_by_name, scaled_object, verdicts
 from worker.files.exchange.lots import Look, Lot, Written, by_scene, looks
-from worker.files.exchange.objects import scaled_object
 from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
 

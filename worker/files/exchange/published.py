@@ -39,9 +39,7 @@ from service.model.transforms import (
     quat_from_matrix,
     quat_multiply,
 )
-from worker.files.exchange.imported import Imported, completed, joints_by_name
-from worker.files.exchange.objects import scaled_object
-from worker.files.exchange.pickles import load_npy
+from worker.files.exchange.imported import Imported, completed, joints_by_name, load_npy, scaled_object
 from worker.grasps import Posture
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel

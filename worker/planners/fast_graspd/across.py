@@ -15,9 +15,9 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from service.model.transforms import Floats
+from worker.hands.jaws import thinnest_fingertip
 from worker.hands.model import HandModel
 from worker.hands.oppositions import Oppositions, oppositions_of
-from worker.hands.pads import thinnest_fingertip
 from worker.hands.pinches import pinches_of
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.outlines import outlines_of

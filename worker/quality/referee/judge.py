@@ -18,7 +18,7 @@ from service.model.errors import InputError
 from service.model.transforms import Floats
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
-from worker.objects.content import content_of
+from worker.objects.disk_cache import content_of
 from worker.objects.model import ObjectModel
 from worker.quality.referee.compiled import scene_of
 from worker.quality.referee.decomposition import ConvexPieces, decompose

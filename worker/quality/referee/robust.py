@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.robust import MODELS, Axis
+from service.model.metrics import ROBUST_MODELS, Axis
 from service.model.transforms import Floats
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
@@ -98,7 +98,7 @@ def robust(
     held: NDArray[np.generic] | None = None,
     placed: Placed | None = None,
     level: LiftLevel = "lift",
-    models: int = MODELS,
+    models: int = ROBUST_MODELS,
     wanted: float = 0.0,
     seed: int = 0,
     hard: bool = False,

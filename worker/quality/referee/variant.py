@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from service.model.robust import Axis
+from service.model.metrics import Axis
 from worker.hands.model import HandModel
 from worker.quality.referee.recoupled import Coupling
 from worker.quality.referee.refit import Fit, fits_of

@@ -19,7 +19,7 @@ from service.readers.ways import Waypoint
 from worker.grasps import moved
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
-from worker.objects.frames import to_centre
+from worker.objects.mesh_geometry import to_centre
 from worker.objects.model import ObjectModel
 from worker.rendering.cameras import intrinsics, look_at
 from worker.rendering.hands import drawn_bodies, drawn_parts, drawn_poses

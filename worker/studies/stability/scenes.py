@@ -20,7 +20,7 @@ from worker.hands.model import HandModel
 from worker.run import ALONE, Run
 from worker.scenes.kinds import rest_poses, supports_of
 from worker.simulation.surroundings import Scenes
-from worker.studies.stability.shapes import prepared, refused
+from worker.studies.stability.assets import prepared, refused
 
 Say = Callable[[str], None]
 Support = HalfSpace | Box

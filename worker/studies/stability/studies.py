@@ -10,8 +10,8 @@ from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.prepare import object_from_path
 from worker.run import ALONE, Run
-from worker.studies.stability import descents, gradients, hands, integrators, model_errors, scenes, shapes
-from worker.studies.stability.shapes import BOUNDS, FAMILIES, MEASURE, SHOWS, shape_cell
+from worker.studies.stability import assets, descents, gradients, integrators, model_errors, scenes
+from worker.studies.stability.assets import BOUNDS, FAMILIES, MEASURE, SHOWS, shape_cell
 
 Say = Callable[[str], None]
 
@@ -47,13 +47,13 @@ def run(
         "gradient": lambda: gradients.gradient_map(
             few(gradients.SIZES_M), few(gradients.GAPS), repeats=1 if quick else 3
         ),
-        "shapes": lambda: shapes.shape_map(
+        "shapes": lambda: assets.shape_map(
             model,
             fidelities=("draft",) if quick else ("draft", "standard", "fine"),
             count=4 if quick else 8,
-            families=("plate", "cube") if quick else tuple(shapes.FAMILIES),
+            families=("plate", "cube") if quick else tuple(assets.FAMILIES),
             # Grasps on an open mesh cost more than all else of a quick run.
-            defects=shapes.CLOSED if quick else tuple(shapes.DEFECTS),
+            defects=assets.CLOSED if quick else tuple(assets.DEFECTS),
             run=work,
             say=say,
         ),
@@ -62,11 +62,11 @@ def run(
             model, thing, rates=few(descents.RATES), weights=few(descents.WEIGHTS), count=4 if quick else 8, say=say
         ),
         "length": lambda: descents.length_map(model, thing, lengths=lengths, say=say),
-        "hands": lambda: hands.hand_map(
-            fingers=(1, 3) if quick else hands.FINGERS,
-            sizes=() if quick else hands.SIZES,
-            ratios=() if quick else hands.RATIOS,
-            couplings=("each joint",) if quick else hands.COUPLINGS,
+        "hands": lambda: assets.hand_map(
+            fingers=(1, 3) if quick else assets.FINGERS,
+            sizes=() if quick else assets.SIZES,
+            ratios=() if quick else assets.RATIOS,
+            couplings=("each joint",) if quick else assets.COUPLINGS,
             fidelity="draft" if quick else "standard",
             count=4 if quick else 8,
             run=work,

@@ -14,8 +14,7 @@ from service.model.errors import InputError
 from service.model.transforms import compose, quat_to_matrix
 from service.store.shards import read_shard
 from worker.files.exchange import dexgraspbench, published
-from worker.files.exchange.imported import Origin, verdicts
-from worker.files.exchange.pickles import load_npy
+from worker.files.exchange.imported import Origin, load_npy, verdicts
 from worker.files.exchange.scoring import write_scored
 from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
@@ -210,7 +209,7 @@ def test_a_hand_that_lacks_a_joint_is_told() -> None:
 
 
 def test_an_object_at_two_scales_is_two_objects() -> None:
-    from worker.files.exchange.objects import scaled_object
+    from worker.files.exchange.imported import scaled_object
 
     # What is kept of a pair between calls is found by digest.
     assert len({scaled_object("block", scale).digest for scale in (1.0, 0.5, 2.0)}) == 3

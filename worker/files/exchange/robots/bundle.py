@@ -12,9 +12,8 @@ import yaml
 from service.model.transforms import Floats, compose, invert
 from worker.files.exchange.lots import plain_name, prim_names
 from worker.robots.arm import Arm, Description
-from worker.robots.execution import Executions
+from worker.robots.execution import Executions, Path, Trajectory
 from worker.robots.reach import World
-from worker.robots.timing import Path, Trajectory
 
 
 @dataclass(frozen=True)

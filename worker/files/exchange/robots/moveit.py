@@ -15,10 +15,10 @@ import numpy as np
 
 from service.model.errors import InputError
 from service.model.transforms import Floats
+from worker.files.exchange.imported import mesh_file
 from worker.files.exchange.lots import plain_name
-from worker.files.exchange.objects import mesh_file
 from worker.files.exchange.robots.bundle import Bundle, dump_yaml, numbers
-from worker.robots.timing import Trajectory
+from worker.robots.execution import Trajectory
 
 #: Share of a straight motion that must be possible for the grasp to be tried.
 LEAST_SHARE: Final = 0.5

@@ -24,8 +24,7 @@ from worker.hands.robot import Ints
 from worker.objects.glb_document import Document, plain
 from worker.objects.mesh_geometry import corner_normals
 from worker.rendering.hands import drawn_bodies, hand_parts
-from worker.robots.execution import Executions, posed_bodies
-from worker.robots.timing import Trajectory
+from worker.robots.execution import Executions, Trajectory, posed_bodies
 from worker.simulation.surroundings import Obstacle
 
 #: From z up to glTF's y up: a quarter turn about x, as x y z w.

@@ -1,6 +1,12 @@
 """Log lines of every process: JSON for machines, text on a terminal, each with the request, job and task it is about.
 
 `bind` says what a piece of work is about; every line written within carries that, whichever module writes it.
+
+OpenTelemetry spans, where the operator asks for them: OTEL_EXPORTER_OTLP_ENDPOINT set and `graspd[otel]` installed.
+
+Off, nothing of OpenTelemetry is imported and a span costs a comparison.
+
+A file that a process touches while it lives: a health check is then a look at its age, and no process of ours.
 """
 
 from __future__ import annotations
@@ -10,10 +16,12 @@ import json
 import logging
 import os
 import sys
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import UTC, datetime
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
@@ -24,8 +32,11 @@ if TYPE_CHECKING:
 
 #: What a line can be about, in the order in which it is shown.
 SUBJECTS: Final = ("request", "key", "job", "task", "attempt", "worker")
+
 _bound: ContextVar[Mapping[str, Any]] = ContextVar("bound", default=MappingProxyType({}))
+
 _ORDINARY: Final = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "about", "taskName"}
+
 #: RQ tells of every idle poll, httpx of every request.
 _TALKATIVE: Final = ("rq.worker", "rq.job", "rq.queue", "httpx")
 
@@ -45,7 +56,7 @@ def bound(subject: str) -> str:
     return str(_bound.get().get(subject, ""))
 
 
-def set_up(settings: Settings, process: str = "graspd") -> None:
+def set_up_logs(settings: Settings, process: str = "graspd") -> None:
     """Send the lines of this process to stderr.
 
     Args:
@@ -118,3 +129,102 @@ def _subjects(record: logging.LogRecord) -> dict[str, Any]:
 def _time(record: logging.LogRecord) -> str:
     when = datetime.fromtimestamp(record.created, UTC)
     return when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+log = logging.getLogger(__name__)
+
+_ASKED_BY: Final = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
+
+_tracer: Any = None
+
+
+def set_up_tracing(process: str, *, exporter: Any = None) -> None:
+    """Send the spans of this process where the environment says; do nothing if it says nothing.
+
+    Args:
+        process: its name: api or worker; the spans' service is `graspd-{process}`.
+        exporter: where to send them instead.
+    """
+    global _tracer
+    if exporter is None and not any(os.environ.get(name) for name in _ASKED_BY):
+        return
+    try:
+        from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
+        from opentelemetry.sdk.resources import Resource
+        from opentelemetry.sdk.trace import TracerProvider
+        from opentelemetry.sdk.trace.export import BatchSpanProcessor, SimpleSpanProcessor
+    except ImportError:
+        log.warning("no traces are sent: run `pip install 'graspd[otel]'`, or unset %s", _ASKED_BY[0])
+        return
+    resource = Resource.create({"service.name": os.environ.get("OTEL_SERVICE_NAME", f"graspd-{process}")})
+    provider = TracerProvider(resource=resource)
+    provider.add_span_processor(
+        SimpleSpanProcessor(exporter) if exporter is not None else BatchSpanProcessor(OTLPSpanExporter())
+    )
+    _tracer = provider.get_tracer("graspd")
+
+
+def stop() -> None:
+    """Make no more spans."""
+    global _tracer
+    _tracer = None
+
+
+@contextmanager
+def span(name: str, *, parent: str = "", **attributes: Any) -> Iterator[dict[str, Any]]:
+    """A span around what is done within; an exception marks it as failed.
+
+    Args:
+        parent: `traceparent` of the span that caused this one (W3C trace context), in whatever process.
+        attributes: what it is about, as `graspd.{name}`.
+
+    Yields:
+        a dictionary; what is put there becomes attributes at the end.
+    """
+    later: dict[str, Any] = {}
+    if _tracer is None:
+        yield later
+        return
+    from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
+
+    context = TraceContextTextMapPropagator().extract({"traceparent": parent}) if parent else None
+    known = {f"graspd.{key}": value for key, value in attributes.items()}
+    with _tracer.start_as_current_span(name, context=context, attributes=known) as current:
+        yield later
+        current.set_attributes(later)
+
+
+def traceparent() -> str:
+    """W3C trace context of the present span; empty without one."""
+    if _tracer is None:
+        return ""
+    from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
+
+    carrier: dict[str, str] = {}
+    TraceContextTextMapPropagator().inject(carrier)
+    return carrier.get("traceparent", "")
+
+
+#: Far below the minute after which a check calls the process dead.
+_EVERY_S: Final = 5.0
+
+
+class HeartbeatFile:
+    """Touched at most every few seconds, however often it is asked to."""
+
+    def __init__(self, path: Path | None) -> None:
+        """`path` is None where nobody looks."""
+        self._path = path
+        self._again = 0.0
+
+    def touch(self) -> None:
+        """Say that this process lives. A disk without room is said once, and ends nothing."""
+        now = time.monotonic()
+        if self._path is None or now < self._again:
+            return
+        self._again = now + _EVERY_S
+        try:
+            self._path.touch()
+        except OSError as error:
+            log.warning("health checks will miss this process: %s cannot be touched (%s)", self._path, error.strerror)
+            self._path = None
