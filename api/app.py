@@ -5,30 +5,25 @@ from __future__ import annotations
 import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
-from typing import Any
+from typing import Any, Final
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from fastapi.staticfiles import StaticFiles
 
 from api import problems
+from api.access.auth import Proxy
 from api.access.keys import KeyFile
-from api.access.proxy import Proxy
 from api.dashboard import pages
 from api.dashboard.rendering import STATIC, problem_page
-from api.hosts import host_name, is_loopback
+from api.formatting import host_name, is_loopback
 from api.metrics import Metrics
 from api.middleware.body_limit import BodyLimit
-from api.middleware.head import Head
-from api.middleware.rate_limit import RateLimit
-from api.middleware.rates import Rates
-from api.middleware.request_context import RequestContext
-from api.middleware.root_path import RootPath
-from api.middleware.same_origin import SameOrigin
-from api.routes import datasets, deletions, grasps, hand_corrections, jobs, shards, system, tags, usage, webhooks
+from api.middleware.rate_limit import RateLimit, Rates
+from api.middleware.request_context import Head, RequestContext, RootPath, SameOrigin
+from api.routes import assets, datasets, grasps, jobs, shards, system, webhooks
 from api.routes.assets import asset_router
-from api.routes.dependencies import provide
-from api.routes.long_requests import EXPORTS, FORMS, UPLOADS, Turns
+from api.routes.dependencies import EXPORTS, FORMS, UPLOADS, Turns, provide
 from service.index.rebuild import complete_if_new
 from service.model.errors import InputError, UnavailableError
 from service.model.states import AssetKind
@@ -39,6 +34,18 @@ from service.queue.connection import redis_url
 from service.settings import Settings
 
 _log = logging.getLogger("graspd.api")
+#: Those of all documents but of assets and datasets, in the order of the OpenAPI document.
+_ROUTERS: Final = (
+    jobs.router,
+    grasps.router,
+    shards.router,
+    system.router,
+    assets.correction_router,
+    grasps.tag_router,
+    system.usage_router,
+    webhooks.router,
+    system.deletion_router,
+)
 _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 
 
@@ -86,10 +93,8 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
     app.state.uploads, app.state.forms = Turns(UPLOADS), Turns(FORMS)
     app.state.exports = Turns(EXPORTS)
     problems.install(app, problem_page)
-    plain = (jobs, grasps, shards, system, hand_corrections, tags, usage, webhooks, deletions)
-    routers = [*(routes.router for routes in plain), *map(asset_router, AssetKind)]
     pages.install(app, opened)
-    for router in (*routers, *datasets.routers, *pages.routers):
+    for router in (*_ROUTERS, *map(asset_router, AssetKind), *datasets.routers, *pages.routers):
         # As they were built when imported: `include_router` would build each of them again, at the first request, and
         # silence warnings meanwhile, for the whole process and so not safely where two applications build at once.
         app.router.routes.extend(router.routes)

@@ -1,7 +1,8 @@
-"""How numbers, times and sizes read, on pages and on a terminal."""
+"""Numbers, times, sizes and names of machines as pages and terminals show them."""
 
 from __future__ import annotations
 
+import ipaddress
 import shlex
 from collections.abc import Callable, Mapping
 from datetime import datetime
@@ -111,3 +112,20 @@ FILTERS: Final[Mapping[str, Callable[..., str]]] = {
     "stamp": stamp,
     "shell": shlex.quote,
 }
+
+
+def host_name(host: str) -> str:
+    """Name in a Host header, without port and brackets."""
+    if host.startswith("["):
+        return host[1:].partition("]")[0]
+    return host.rpartition(":")[0] if host.count(":") == 1 else host
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address to bind is reachable from this machine alone."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

@@ -9,7 +9,7 @@ from typing import Any, Final
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 
-from service.index.at_scrape import IndexNow
+from service.index.queries.overview import IndexNow
 from service.pipeline.metrics import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S, parse_field
 from service.queue.port import QueueNow
 

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from service.index.views import AttemptView, GraspView, Judged, ShardView, StageProgress, TagView, WorkerView
-from service.model.diversity import CELLS
+from service.model.base import TagName
 from service.model.domain import Digest, JobRequest
-from service.model.labels import TagName
 from service.model.metric_fields import OfferedName, filters, means, with_fields
+from service.model.metrics import AXIS_WORDS, DIRECTION_CELLS
 from service.model.records import Choice
-from service.model.robust import WORDS
 from service.model.scene_spec import Box, HalfSpace, SceneKind
 from service.model.states import Stage, State
 from service.model.where import LONGEST
@@ -67,7 +66,7 @@ class Diversity(BaseModel):
     types: dict[str, int] = Field(description="how many are power, precision or lateral; none: not told")
     type_entropy_bits: float = Field(description="0: all of one type; 1.58: the three alike")
     directions_used: int = Field(description="cells of the sphere, in the object's frame, from which a palm comes")
-    directions: int = Field(CELLS, description="cells that there are, of equal area")
+    directions: int = Field(DIRECTION_CELLS, description="cells that there are, of equal area")
     direction_entropy_bits: float = Field(description="0: all from one cell; 5.58: from all 48 alike")
     evenness: float = Field(ge=0, le=1, description="2^entropy of the directions over their number")
 
@@ -120,7 +119,7 @@ class GraspQuery(BaseModel):
     )
     neighbours: bool | None = Field(None, description="whether other objects stood in that scene")
     lift_hard: bool | None = Field(None, description="lifted at half the friction")
-    robust_weakest: Literal[WORDS] | None = Field(  # type: ignore[valid-type]
+    robust_weakest: Literal[AXIS_WORDS] | None = Field(  # type: ignore[valid-type]
         None, description="axis of the first model around the nominal one in which it does not hold"
     )
     sort: OfferedName = "epsilon"

@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
-from service import tracing
+from service import telemetry
 from service.cli import keep_private, load_settings, log_to_stderr, reporting_errors
-from service.model.imports import imports
+from service.model.libraries import imports
 
 app = typer.Typer(add_completion=False)
 
@@ -26,5 +26,5 @@ def api(
     settings = load_settings(host=host, port=port)
     log_to_stderr(settings, "api")
     keep_private(settings)
-    tracing.set_up("api")
+    telemetry.set_up_tracing("api")
     serve(settings)

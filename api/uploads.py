@@ -11,13 +11,12 @@ from pathlib import PurePosixPath
 from typing import IO, Final
 
 from service.model.errors import InputError, LimitError
-from service.model.fitting_names import refuse_long
+from service.model.names import refuse_long
 from service.model.states import AssetKind
 from service.store.assets import UNPACK_FACTOR, ZipFiles, asset_json, check_path
 from service.store.descriptions import json_object
-from service.store.hand_main import SUFFIXES, hand_name, main_of
-from service.store.network_check import NETWORK_FILE
-from service.store.network_file import check_size
+from service.store.hand_files import SUFFIXES, hand_name, main_of
+from service.store.network_file import NETWORK_FILE, check_size
 
 MAIN_SUFFIXES: Final[dict[AssetKind, tuple[str, ...]]] = {
     AssetKind.HAND: SUFFIXES,

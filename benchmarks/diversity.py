@@ -12,7 +12,7 @@ from collections import Counter
 import numpy as np
 
 from benchmarks.cells import Cell, cell_parser, cells
-from service.model.diversity import CELLS, GraspType, entropy_bits
+from service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits
 from worker.quality.diversity import distances, hand_points
 from worker.quality.table import measure
 
@@ -26,7 +26,7 @@ def line(cell: Cell) -> tuple[str, list[int]]:
     apart = 1e3 * distances(hand_points(cell.hand, grasp), rows, others)
     columns = measure(cell.hand, cell.obj, cell.grasps, thresholds_m=[0.005])
     types = Counter(GraspType(int(one)).name.lower() for one in columns["quality/grasp_type"])
-    cells_used = np.bincount(columns["quality/approach_cell"], minlength=CELLS).tolist()
+    cells_used = np.bincount(columns["quality/approach_cell"], minlength=DIRECTION_CELLS).tolist()
     near = [int((apart < bound).sum()) for bound in NEAR_MM]
     shares = " | ".join(f"{types[name] / len(grasp):.2f}" for name in ("power", "precision", "lateral"))
     text = (

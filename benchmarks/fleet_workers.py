@@ -26,11 +26,11 @@ from typing import Any, Final
 from rq.defaults import DEFAULT_WORKER_TTL as LEASE_KEPT_S
 
 from service.model import names
-from service.model.ability import own_ability
 from service.model.clock import timestamp
 from service.model.messages import TaskMessage
 from service.model.states import Lane, Stage
 from service.model.version import PACKAGE_VERSION
+from service.model.workers import own_ability
 from service.queue.lists import execution_keys, held_key, job_key, list_key, queue_name, rq_worker_key
 from service.queue.port import Event, EventKind, Report
 from service.queue.rq_queue import REPORTS, WORKERS, RqQueue, cancel_key, open_queue, worker_key

@@ -26,8 +26,7 @@ import trimesh
 import yourdfpy
 
 from service.model.domain import JobOptions
-from service.model.scene_kinds import supports_in
-from service.model.scene_spec import Box, NeighbourSpec, SceneSpec
+from service.model.scene_spec import Box, NeighbourSpec, SceneSpec, supports_in
 from worker.files.synthesis import Synthesized, synthesized
 from worker.hands.load import hand_from_path
 

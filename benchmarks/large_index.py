@@ -21,8 +21,7 @@ import numpy as np
 from sqlalchemy import Connection, Table
 
 from service.index.bulk import upsert
-from service.index.changes.rows import attempt_row, job_row, shard_row, task_rows
-from service.index.changes.states import settle
+from service.index.changes.rows import attempt_row, job_row, settle, shard_row, task_rows
 from service.index.index import Index
 from service.index.tables import attempts, grasps, jobs, metadata, shards, tasks
 from service.model import names

@@ -25,7 +25,7 @@ import typer
 
 from api.client.client import Client
 from api.formatting import duration, size
-from service.index.dataset_views import CellView, DatasetView
+from service.index.views import CellView, DatasetView
 from service.model.cores import available_cores
 from service.model.version import PACKAGE_VERSION
 

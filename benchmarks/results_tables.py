@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cells import SEED, Cell, cell_parser, cells, write_json
-from service.model.robust import MODELS
+from service.model.metrics import ROBUST_MODELS
 from service.model.version import PACKAGE_VERSION
 from worker.quality.contact import contact_distance_consistency_mm
 from worker.quality.diversity import explained_variance
@@ -76,8 +76,10 @@ def metrics(cell: Cell) -> dict[str, Any]:
 def in_models(cell: Cell) -> dict[str, Any]:
     """Of each grasp that the certificate holds: the share of models around the nominal one in which it does."""
     held = np.array(cell.verdicts("certificate", False)["success"])
-    found = robust(cell.hand, cell.obj, cell.grasps, held=held, models=MODELS, seed=SEED, pieces=decompose(cell.obj))
-    return {"models": MODELS, "shares": found.share[held == 1].tolist(), "seconds": found.seconds}
+    found = robust(
+        cell.hand, cell.obj, cell.grasps, held=held, models=ROBUST_MODELS, seed=SEED, pieces=decompose(cell.obj)
+    )
+    return {"models": ROBUST_MODELS, "shares": found.share[held == 1].tolist(), "seconds": found.seconds}
 
 
 def row(cell: Cell) -> dict[str, Any]:
@@ -85,7 +87,7 @@ def row(cell: Cell) -> dict[str, Any]:
     letter, hard = (np.array(cell.verdicts("letter", h)["success"]) == 1 for h in (False, True))
     certificate = cell.verdicts("certificate", False)
     quality = cell.kept("metrics", lambda: metrics(cell))
-    shares = np.array(cell.kept(f"models-{MODELS}", lambda: in_models(cell))["shares"])
+    shares = np.array(cell.kept(f"models-{ROBUST_MODELS}", lambda: in_models(cell))["shares"])
     top = np.argsort(-np.array(quality["epsilon"]))[:TOP]
     made, judged = cell.cpu_seconds / CORES, certificate["cpu_seconds"] / CORES
     return {
@@ -160,13 +162,14 @@ def markdown(hand: str, rows: list[dict[str, Any]], total: dict[str, Any], comma
             f"**GSR {total['gsr']:.3f}, hard {total['gsr_hard']:.3f}; OSR {total['osr']:.2f}, hard "
             f"{total['osr_hard']:.2f}; {total['sgs']:.1f} holding grasps per second of two cores, "
             f"{total['sgs_without_referee']:.1f} without the referee. {total['robust_many']} of {total['robust_n']} "
-            f"that the certificate holds do in {SHARE} of {MODELS} models around the nominal one.**",
+            f"that the certificate holds do in {SHARE} of {ROBUST_MODELS} models around the nominal one.**",
             "",
             head,
             "| --- |" + " --: |" * len(PRINTED),
             *body,
             "",
-            f"GSR: share that holds, normal and at half the friction. robust: share of {MODELS} models around the "
+            f"GSR: share that holds, normal and at half the friction. robust: share of {ROBUST_MODELS} models around "
+            "the "
             "nominal one in which a grasp that the certificate holds does, on average. SGS: holding grasps per second, "
             "made and judged (level *certificate*), seconds being CPU time over two cores. PD, SPD: penetration, "
             "self-penetration mm. CDC: contact distance consistency mm. CA cm², ε, Vol at a contact threshold of 5 mm "

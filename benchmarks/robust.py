@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cells import Cell, cell_parser, cells, write_json
-from service.model.robust import MEANINGS, MODELS, Axis
+from service.model.metrics import AXIS_MEANINGS, ROBUST_MODELS, Axis
 from worker.quality.intervals import wilson
 from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.model import MujocoOptions
@@ -43,12 +43,12 @@ def kinds(cell: Cell, draws: int) -> dict[str, list[Callable[[np.random.Generato
     for fit, grown in SHAPES:
         if fit == "own" or fit in fits_of(hand):
             name = WORDS[fit] or f"{1e3 * grown:+.0f} mm"
-            found[f"{MEANINGS[Axis.SHAPES]}: {name}"] = [lambda _, f=fit, g=grown: Variant(fit=f, grown_m=g)]  # type: ignore[misc]
+            found[f"{AXIS_MEANINGS[Axis.SHAPES]}: {name}"] = [lambda _, f=fit, g=grown: Variant(fit=f, grown_m=g)]  # type: ignore[misc]
     for coupling in couplings_of(hand):
-        found[f"{MEANINGS[Axis.COUPLINGS]}: {coupling}"] = [lambda _, c=coupling: Variant(coupling=c)]  # type: ignore[misc]
+        found[f"{AXIS_MEANINGS[Axis.COUPLINGS]}: {coupling}"] = [lambda _, c=coupling: Variant(coupling=c)]  # type: ignore[misc]
     for axis in axes_of(hand):
         if axis not in (Axis.SHAPES, Axis.COUPLINGS):
-            found[MEANINGS[axis]] = [lambda rng, a=axis: draw(a, hand, rng)] * draws  # type: ignore[misc]
+            found[AXIS_MEANINGS[axis]] = [lambda rng, a=axis: draw(a, hand, rng)] * draws  # type: ignore[misc]
     found[ALL] = [lambda rng: together(draw(axis, hand, rng) for axis in axes_of(hand))] * draws
     return found
 
@@ -94,7 +94,7 @@ def summed(hand: str, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
         for name, (held, n) in cell["rows"].items():
             rows[name] = [held + rows.get(name, [0, 0])[0], n + rows.get(name, [0, 0])[1]]
     shares = np.concatenate([np.array(cell["shares"]) for cell in every])
-    weakest = Counter(MEANINGS[Axis(one)] for cell in every for one in cell["weakest"] if one)
+    weakest = Counter(AXIS_MEANINGS[Axis(one)] for cell in every for one in cell["weakest"] if one)
     tried = len(shares)
     reached = {f"{wanted:g}": int(reaches(shares, wanted).sum()) for wanted in SHARES}
     return {
@@ -139,7 +139,8 @@ def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
     lines += [f"| {name} | {' | '.join(_cell(one['rows'].get(name)) for one in done)} |" for name in names]
     lines += [
         "",
-        f"As `--robust` judges: {MODELS} models a grasp, each along one axis, the axes in an order at random. *First "
+        f"As `--robust` judges: {ROBUST_MODELS} models a grasp, each along one axis, the axes in an order at random. "
+        "*First "
         "lost to*: what differed in the first model in which a grasp failed, of those that failed in any.",
         "",
         "| | " + " | ".join(hands) + " |",

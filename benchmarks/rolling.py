@@ -19,8 +19,8 @@ from unittest.mock import patch
 import mujoco
 import numpy as np
 
-from service.model.transforms import quat_conjugate, quat_multiply, quat_rotate
-from worker.objects.model import Floats, ObjectModel
+from service.model.transforms import Floats, quat_conjugate, quat_multiply, quat_rotate
+from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.model import FRICTION, MujocoOptions, add_object

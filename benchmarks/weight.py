@@ -30,7 +30,7 @@ import pin  # noqa: E402
 EXTRAS: Final = ("", "api", "worker", "all", "dev")
 LARGEST: Final = 6
 _COMMAND: Final = "import sys; sys.argv = ['graspd', {}]; import graspd.cli; graspd.cli.main()"
-_OURS: Final = "from service.model.imports import imports, own_process; own_process()\nwith imports(): {}"
+_OURS: Final = "from service.model.libraries import imports, own_process; own_process()\nwith imports(): {}"
 _ENGINE: Final = "import worker.certified, worker.planners.fast_graspd.method"
 #: What somebody waits for, and what does it.
 STARTS: Final = {

@@ -9,15 +9,18 @@
     graspd.Client("http://127.0.0.1:8000").submit("allegro", "mug", grasps=64).wait().grasps()
 
 Everything is imported when it is first used. Every error that graspd raises on purpose is a `graspd.GraspdError`.
+
+Its rooms are top-level packages called service, worker and api: no folder of a user must hide them.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from graspd import shadows
-from service.model.imports import imports
+from service.model.libraries import imports
 
 if TYPE_CHECKING:
     from graspd.grasps import Grasp, Grasps, Postures, open
@@ -40,6 +43,7 @@ if TYPE_CHECKING:
     __version__: str
 
 _ERRORS: Final = "service.model.errors"
+
 #: Name, the module it lives in.
 _LIVES_IN: Final = {
     "synthesize": "graspd.synthesis",
@@ -84,8 +88,6 @@ __all__ = [
     "synthesize",
 ]
 
-shadows.check()
-
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
@@ -100,3 +102,32 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return __all__
+
+
+#: The packages that graspd is made of, besides its front door.
+_ROOMS: Final = ("service", "worker", "api")
+
+
+def _check_rooms() -> None:
+    """ImportError, in one line that names the folder, if a package of the user stands in the place of one of graspd's.
+
+    Nothing is imported. A room that is not there at all is told when it is needed.
+    """
+    home = Path(__file__).resolve().parent.parent
+    for room in _ROOMS:
+        if not (home / room).is_dir():
+            continue
+        spec = find_spec(room)
+        if spec is None or spec.origin == str(home / room / "__init__.py"):
+            continue
+        places = [spec.origin] if spec.origin else list(spec.submodule_search_locations or [])
+        found = Path(places[0]) if places else home
+        if found.name == "__init__.py":
+            found = found.parent
+        if found.resolve() != home / room:
+            raise ImportError(
+                f"graspd: {found} hides graspd's own package {room!r}; rename it, or start Python in another folder"
+            )
+
+
+_check_rooms()

@@ -14,9 +14,9 @@ from pydantic import ValidationError
 from typer.core import TyperCommand, TyperGroup
 
 from service.cli import at_the_door
-from service.model.imports import imports, own_process
-from service.model.refusals import words
-from service.model.suggestions import did_you_mean
+from service.model.base import words
+from service.model.errors import did_you_mean
+from service.model.libraries import imports, own_process
 from service.model.version import PACKAGE_VERSION
 
 #: Command, module of its group, panel of the overview, help.
@@ -26,13 +26,13 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("evaluate", "worker.commands.evaluate", "Make grasps", "Validate grasps in MuJoCo, an independent engine."),
     ("scene", "worker.commands.scene", "Make grasps", "Drop the object on a table, and keep grasps that fit there."),
     ("render", "worker.commands.render", "Make grasps", "Render pictures of scenes, with labels."),
-    ("chart", "worker.commands.chart", "Make grasps", "Compare speed and accuracy of methods and fidelities."),
-    ("bench", "worker.commands.bench", "Make grasps", "Measure grasps per second, and where the time goes."),
-    ("stability", "worker.commands.stability", "Make grasps", "Map where integrators and planners fail."),
+    ("chart", "worker.commands.studies", "Make grasps", "Compare speed and accuracy of methods and fidelities."),
+    ("bench", "worker.commands.studies", "Make grasps", "Measure grasps per second, and where the time goes."),
+    ("stability", "worker.commands.studies", "Make grasps", "Map where integrators and planners fail."),
     ("pictures", "worker.commands.render", "Use grasps", "Draw the best grasps of a file on one sheet."),
-    ("view", "worker.commands.view", "Use grasps", "Show grasps of a file in 3D in the browser."),
+    ("view", "worker.commands.render", "Use grasps", "Show grasps of a file in 3D in the browser."),
     ("grasps", "worker.commands.curate", "Use grasps", "Select grasps of files and datasets by their metrics."),
-    ("clouds", "worker.commands.clouds", "Use grasps", "Write pictures as point clouds, with their grasps."),
+    ("clouds", "worker.commands.exchange", "Use grasps", "Write pictures as point clouds, with their grasps."),
     ("export", "worker.commands.exchange", "Use grasps", "Export grasps and pictures to other formats."),
     ("import", "worker.commands.exchange", "Use grasps", "Import grasps from other formats, and validate them."),
     ("up", "service.run.commands", "Service", "Run the whole service on this machine, until Ctrl-C."),
@@ -61,16 +61,16 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
 
 #: Group, command in it, module that has it, help.
 JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
-    ("admin", "kernels", "worker.commands.kernels", "Compile all kernels ahead of time."),
+    ("admin", "kernels", "worker.commands.admin", "Compile all kernels ahead of time."),
     ("admin", "index", "service.run.commands", "Rebuild the index from the store, or export its tables."),
     ("admin", "store", "service.run.store_commands", "Check the store, and repair it."),
-    ("admin", "bench-render", "worker.commands.gallery", "Measure pictures per second, and where the time goes."),
-    ("admin", "gallery", "worker.commands.gallery", "Draw hands and objects at rest, as a camera sees them."),
+    ("admin", "bench-render", "worker.commands.admin", "Measure pictures per second, and where the time goes."),
+    ("admin", "gallery", "worker.commands.admin", "Draw hands and objects at rest, as a camera sees them."),
     ("hands", "check", "worker.commands.hands", "Say whether a hand can be used, and what was guessed about it."),
     ("objects", "check", "worker.commands.objects", "Say whether a mesh can be used, and what was repaired."),
     ("datasets", "balance", "worker.commands.curate", "Draw a part in which no kind of grasps is more frequent."),
     ("datasets", "diff", "worker.commands.curate", "Compare two datasets."),
-    ("datasets", "card", "worker.commands.card", "Write a dataset's card: contents, quality, biases, plots."),
+    ("datasets", "card", "worker.commands.curate", "Write a dataset's card: contents, quality, biases, plots."),
 )
 
 #: What a room cannot work without, and the extra that brings it: an image has only the rooms it needs.

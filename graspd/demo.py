@@ -14,8 +14,7 @@ from rich.table import Table
 
 from api.client.client import Client
 from api.client.job_options import validated
-from api.client.reports import job_summary, means_of, yield_of
-from api.client.watching import JobDisplay
+from api.client.reports import JobDisplay, job_summary, means_of, yield_of
 from api.formatting import count, duration, metric
 from api.models import GraspQuery, JobDetail
 from service.cli import JsonFlag, emit, load_settings, plain_console, reporting_errors, write_output
@@ -24,7 +23,7 @@ from service.model.domain import JobRequest
 from service.model.errors import TaskError
 from service.model.states import AssetKind, State
 from service.run.supervisor import Supervisor
-from service.store import standing
+from service.store import validity
 from service.store.assets import builtin_files
 from service.store.shards import Shard, read_shard
 
@@ -174,7 +173,7 @@ def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     hand = load_hand(hand_files, name=job.hand, digest=job.hand_digest)
     error_m = job.request.knobs.face_error_m
     obj = load_object(object_files, name=job.object, digest=job.object_digest, face_error_m=error_m)
-    rows = best(base.arrays, _SHOWN_GRASPS, standing.valid(base.arrays))
+    rows = best(base.arrays, _SHOWN_GRASPS, validity.valid(base.arrays))
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
     pictures = grasp_pictures(hand, obj, poses, joints, samples=_SAMPLES)[:, 0]
     # The sheet's typeface has neither Greek letters nor a multiplication sign.

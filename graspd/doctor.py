@@ -1,4 +1,4 @@
-"""`graspd doctor`: everything an installation stands on, looked at by one command, with the mend for each fault."""
+"""`graspd doctor`: checks of everything an installation stands on, in one command, with the fix for each fault."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import logging
 import os
 import sys
 import threading
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -16,11 +17,12 @@ from graspd.cli import missing_extra
 from service.cli import JsonFlag, emit, load_settings, reporting_errors
 from service.model.errors import InputError
 from service.model.finding import Condition, Finding, skipped
-from service.run.doctor.checks import checks_of
+from service.run.doctor import backends, fleet, machine
 from service.run.doctor.patience import THREADS, Check, run_checks
 from service.settings import Settings
 
 app = typer.Typer(no_args_is_help=False)
+
 _COLOURS: Final = {
     Condition.GOOD: typer.colors.GREEN,
     Condition.WARNING: typer.colors.YELLOW,
@@ -110,3 +112,30 @@ def _show(finding: Finding) -> None:
     typer.echo(f"{mark} {finding.name:17} {finding.message}")
     if finding.mend:
         typer.echo(f"{'':26} mend: {finding.mend}")
+
+
+#: A whole comparison reads every record of the store.
+_FULL_S: Final = 24 * 3600.0
+
+
+def checks_of(settings: Settings, *, full: bool = False) -> list[Check]:
+    """What can be looked at without engine and API. `full`: compare all of the index with the store."""
+    return [
+        Check("disk", partial(machine.disk, settings)),
+        Check("data-folder", partial(machine.data_folder, settings)),
+        Check("limits", machine.limits),
+        Check("versions", machine.versions),
+        Check("redis", partial(backends.redis, settings)),
+        Check("redis-persistence", partial(backends.persistence, settings)),
+        Check("store", partial(backends.store, settings), limit_s=120.0),
+        Check("index", partial(backends.index, settings)),
+        Check("identity", partial(backends.index_identity, settings)),
+        Check(
+            "index-is-store", partial(backends.index_is_store, settings, full=full), limit_s=_FULL_S if full else 120.0
+        ),
+        Check("damage", partial(backends.store_damage, settings)),
+        Check("clocks", partial(fleet.clocks, settings), limit_s=120.0),
+        Check("controller", partial(fleet.controller, settings)),
+        Check("workers", partial(fleet.workers, settings)),
+        Check("port", partial(fleet.port, settings)),
+    ]

@@ -14,19 +14,17 @@ from numpy.typing import NDArray
 from service.cli import write_output
 from service.model.errors import InputError
 from service.model.metrics import GRASP_METRICS, GraspMetric
-from service.model.transforms import compose
+from service.model.transforms import Floats, compose
 from service.readers.files import Shards, open_shards
-from service.store import standing
-from service.store.attributes import Attribute
-from service.store.columns import SCHEMAS
+from service.store import validity
+from service.store.columns import SCHEMAS, Attribute
 from service.store.manifests import INDEX_THRESHOLD_M
 from service.store.shards import Shard, read_shard, write_shard
 
 if TYPE_CHECKING:
-    from worker.viewing.viewer import Viewer
+    from worker.viewing import Viewer
 
 Array = NDArray[Any]
-Floats = NDArray[np.float64]
 #: Rows to keep: a mask (N,), row numbers, or a function that makes either from the grasps.
 Rows = NDArray[Any] | Sequence[int] | Sequence[bool]
 
@@ -200,12 +198,12 @@ class Grasps:
     @property
     def is_valid(self) -> NDArray[np.bool_]:
         """(N,) feasible, and held by the validator; in a scene: lifted."""
-        return standing.valid(self._columns)
+        return validity.valid(self._columns)
 
     @property
     def is_sound(self) -> NDArray[np.bool_]:
         """(N,) feasible: within the limits of penetration and contact."""
-        return standing.sound(self._columns)
+        return validity.sound(self._columns)
 
     @property
     def metrics(self) -> list[str]:

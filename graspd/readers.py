@@ -26,6 +26,6 @@ def hand_surface(shard: Any, rows: Any) -> Any:
     Raises:
         NotFoundError: the shard's hand is not found.
     """
-    from worker.files.hand_surface import hand_surface as found  # loads the hands' reader
+    from worker.files.clouds import hand_surface as found  # loads the hands' reader
 
     return found(shard, rows)

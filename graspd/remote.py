@@ -8,9 +8,9 @@ from typing import Any, Self
 from pydantic import ValidationError
 
 from graspd.grasps import Grasps, joined
+from service.model.base import refusal
 from service.model.domain import JobRequest
 from service.model.errors import InputError, TaskError
-from service.model.refusals import refusal
 from service.model.states import State
 from service.store.shards import read_shard
 

@@ -10,10 +10,10 @@ from typing import Any, Literal
 from pydantic import ValidationError
 
 from graspd.grasps import Grasps
-from service.model.diversity import MIN_DISTANCE_M
+from service.model.base import refusal
 from service.model.domain import JobOptions
 from service.model.errors import InputError
-from service.model.refusals import refusal
+from service.model.metrics import MIN_DISTANCE_M
 from service.model.scene_spec import parse_scene
 
 

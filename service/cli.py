@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, ParamSpec, 
 import typer
 from pydantic import BaseModel, ValidationError
 
-from service.model.errors import GraspdError, InputError
-from service.model.redaction import without_secrets
-from service.model.refusals import refusal
+from service.model.base import refusal
+from service.model.errors import GraspdError, InputError, without_secrets
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -210,9 +209,9 @@ def engine_settings() -> EngineSettings:
 
 def log_to_stderr(settings: Settings, process: str = "graspd") -> None:
     """Log lines of this process: JSON, or text on a terminal."""
-    from service import logs
+    from service import telemetry
 
-    logs.set_up(settings, process)
+    telemetry.set_up_logs(settings, process)
 
 
 def keep_private(settings: Settings) -> None:

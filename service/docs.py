@@ -13,8 +13,7 @@ from typing import Final
 
 from service.pipeline.metrics import series_table
 from service.settings import Settings
-from service.store.attributes import ATTRIBUTES
-from service.store.columns import SCHEMAS, ShardKind
+from service.store.columns import ATTRIBUTES, SCHEMAS, ShardKind
 
 
 def schema_table(kind: ShardKind) -> str:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from service.index.dataset_views import CellView, DatasetView
 from service.index.index import Index
-from service.index.views import View
+from service.index.views import CellView, DatasetView, View
 
 _PAGE = 200
 

@@ -25,16 +25,15 @@ from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane, Stage
 from service.model.version import STAGE_REVISIONS
 from service.pipeline.backends import Services
+from service.store.integrity import put_document
 from service.store.library import publish_asset
 from service.store.manifests import ShardManifest, load_shard, publish_shard
-from service.store.seals import put_document
 from service.store.store import Store
 from worker.process.engine import Engine
 from worker.process.fitness import Check
 from worker.process.link import Link, Setup, StartEngine, start_engine
 from worker.process.selfcheck import EngineError
-from worker.stages.context import TaskContext
-from worker.stages.output import Output, StageFunction, shard_of
+from worker.stages.context import Output, StageFunction, TaskContext, shard_of
 from worker.stages.ranges import base_rows, batches_of, joined
 
 HAND_FILES = {"asset.json": b'{"file": "hand.urdf"}', "hand.urdf": b"<robot name='fake'/>"}

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from service.model.states import Lane, Stage
-from service.model.worker_beat import WorkerBeat
+from service.model.workers import WorkerBeat
 from service.queue.port import (
     Event,
     Lease,

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from service.model.domain import JobOptions
 from service.model.errors import TaskCancelled
-from service.model.outcomes import totals
+from service.model.planning import totals
 from worker.grasps import GraspSet, joined, joined_columns
 from worker.hands.model import HandModel
 from worker.hands.oppositions import require_opposing
@@ -46,8 +46,7 @@ from worker.quality.referee.shake import shake_margins
 from worker.quality.table import measure
 from worker.rounds import ROUND_STRIDE, Arrays, Round, enough, lanes_of, next_round, taken
 from worker.run import ALONE, Run
-from worker.scenes.trial import trial_on
-from worker.scenes.verdicts import lift_level, scene_verdicts
+from worker.scenes.trial import lift_level, scene_verdicts, trial_on
 from worker.side_by_side import side_by_side
 from worker.simulation.surroundings import Placed, Scenes
 
@@ -86,7 +85,7 @@ class Certified:
     rejected: dict[str, int]
     """Those of them that were not kept, by `REJECTIONS`."""
     outcomes: dict[str, int]
-    """The same, by `service.model.outcomes.OUTCOMES`: what the referee saw, which gate."""
+    """The same, by `service.model.planning.OUTCOMES`: what the referee saw, which gate."""
     verdict_key: str | None
     """Digest of the terms of the verdicts; None: nobody judged."""
     planned: int

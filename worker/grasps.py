@@ -9,7 +9,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Floats = NDArray[np.float64]
+from service.model.transforms import Floats
+
 Columns = Mapping[str, NDArray[Any]]
 #: The one column of a base shard that is no row for each grasp.
 THRESHOLDS: Final = "quality/thresholds_m"

@@ -32,7 +32,7 @@ class Round:
     grasps: GraspSet
     columns: Arrays
     fates: NDArray[np.object_]
-    """What became of each grasp that was planned: kept, or one of `service.model.outcomes.OUTCOMES`."""
+    """What became of each grasp that was planned: kept, or one of `service.model.planning.OUTCOMES`."""
     in_scene: dict[str, int]
     """In scenes: how many were clear, lifted, lifted_hard."""
     seconds: dict[str, float]

@@ -6,8 +6,8 @@ import stat
 from datetime import UTC, datetime, timedelta
 from typing import Final
 
+from api.access.auth import Proxy
 from api.access.keys import Key, KeyFile, Scope
-from api.access.proxy import Proxy
 from service.model.errors import GraspdError
 from service.model.finding import Finding, bad, good, warning
 from service.settings import Settings

@@ -1,5 +1,4 @@
-"""What one key, and the keys of one project together, may have in work: grasps in unfinished jobs, and what is asked
-for in a day.
+"""Quotas of a key, and of the keys of a project together: grasps in unfinished jobs, and requests of a day.
 
 Redis counts, in one step for all API processes. What it holds may be lost: then a quota is forgotten, never a job.
 A job counts with the grasps that were asked for, from its submission until it ends. Whether it has ended is asked of
@@ -19,12 +18,15 @@ from typing import Any, Final
 from redis.exceptions import RedisError
 
 from api.access.keys import Key, ProjectLimits
+from service.index.index import Index
 from service.model.errors import QuotaError
 from service.settings import Settings
 
 log = logging.getLogger(__name__)
+
 #: A key that submits nothing for this long is forgotten [s].
 _KEPT_S: Final = 30 * 86400
+
 _AT_ONCE: Final = 1000
 
 #: A submission that has not ended after this long died with its process [s].
@@ -284,3 +286,13 @@ def _until_midnight() -> int:
     now = datetime.now(UTC)
     midnight = (now + timedelta(days=1)).replace(hour=0, minute=0, second=0, microsecond=0)
     return int((midnight - now).total_seconds()) + 1
+
+
+DATASET_PREFIX: Final = "dataset:"
+
+
+def unfinished(index: Index, ids: Collection[str]) -> set[str]:
+    """Of these jobs and datasets, as quotas name them, those that have not ended."""
+    names = {one.removeprefix(DATASET_PREFIX) for one in ids if one.startswith(DATASET_PREFIX)}
+    found = index.jobs.unfinished([one for one in ids if not one.startswith(DATASET_PREFIX)])
+    return found | {DATASET_PREFIX + name for name in index.datasets.unfinished(names)}

@@ -15,7 +15,7 @@ from service.index.views import AssetView, Page
 from service.model import names
 from service.model.digests import digest_files
 from service.model.errors import ConflictError, DamagedError, LimitError, NotFoundError
-from service.model.fitting_names import MOST, fitted
+from service.model.names import MOST, fitted
 from service.model.projects import marks_of
 from service.model.states import AssetKind
 from service.pipeline import deletion
@@ -23,10 +23,9 @@ from service.pipeline.backends import Services
 from service.pipeline.recording import recording
 from service.store import library
 from service.store.assets import ZipFiles, asset_json
-from service.store.descriptions import MAX_BYTES, json_object
-from service.store.hand_corrections import HandCorrections, HandFacts, corrected, facts_of
-from service.store.network_check import network_report
-from service.store.seals import get_sealed, put_document
+from service.store.descriptions import MAX_BYTES, HandCorrections, HandFacts, corrected, facts_of, json_object
+from service.store.integrity import get_sealed, put_document
+from service.store.network_file import network_report
 
 log = logging.getLogger(__name__)
 _NAMES_TRIED: Final = 100

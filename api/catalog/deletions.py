@@ -11,7 +11,7 @@ from api.access.auth import must_own, project_scope
 from service.index.views import View
 from service.pipeline import deletion
 from service.pipeline.backends import Services
-from service.store.deletions import Deletion, What, deletions
+from service.store.records import Deletion, What, deletions
 
 log = logging.getLogger(__name__)
 

@@ -1,9 +1,11 @@
-"""Server-sent events: a stream that says when a job, or anything, has changed. It ends when
-its key does."""
+"""Events: server-sent streams of changes, which end with their key; the feed of ends, and the webhooks that are told of
+them."""
 
 from __future__ import annotations
 
 import asyncio
+import logging
+import secrets
 from collections.abc import AsyncIterator
 from functools import partial
 from typing import Final
@@ -12,17 +14,25 @@ from anyio.to_thread import run_sync
 from fastapi import Request
 from fastapi.sse import ServerSentEvent
 
-from api.access.auth import may_still
+from api.access.auth import caller, caller_id, may_change, may_still, must_own, project_scope
 from api.access.keys import Scope
 from api.catalog.jobs import Jobs
 from api.catalog.overview import Overview
-from api.catalog.webhooks import Webhooks
+from service.index.views import DeliveryView, EndView, WebhookView
+from service.model import names
+from service.model.clock import timestamp
 from service.model.digests import digest_json
-from service.model.errors import UnavailableError
+from service.model.errors import ConflictError, LimitError, UnavailableError
+from service.model.projects import ProjectScope
+from service.model.webhooks import MOST_HOOKS, End, Webhook, check_url, secret_of
+from service.pipeline.backends import Services
+from service.pipeline.recording import recording
 
 POLL_S: Final = 0.5
+
 #: A client that reconnects waits this long.
 RETRY_MS: Final = 2000
+
 _ENDS_AT_ONCE: Final = 100
 
 
@@ -75,3 +85,80 @@ async def service_events(overview: Overview, request: Request) -> AsyncIterator[
             last = digest
             yield ServerSentEvent(event="progress", data={}, retry=RETRY_MS)
         await asyncio.sleep(2 * POLL_S)
+
+
+log = logging.getLogger(__name__)
+
+
+class Webhooks:
+    """Webhooks of the caller's project, and what was delivered to them."""
+
+    def __init__(self, services: Services) -> None:
+        self._services = services
+
+    def ends(self, since: int, *, limit: int) -> list[EndView]:
+        """The next ends of jobs and datasets in scope, behind a number."""
+        return self._services.index.outbox.ends(since, limit=limit, scope=project_scope())
+
+    def add(self, url: str, states: tuple[End, ...]) -> tuple[WebhookView, str]:
+        """A webhook and its secret, which is told this once.
+
+        Raises:
+            InputError: the address is none that can be asked.
+            LimitError: the project has `MOST_HOOKS` of them.
+            ConflictError: the operator has not switched webhooks on.
+        """
+        master = self._services.settings.webhook_secret
+        if master is None:
+            raise ConflictError(
+                "webhooks are switched off; the operator sets GRASPD_WEBHOOK_SECRET for API and controller"
+            )
+        project = project_scope().project
+        hook = Webhook(
+            id=secrets.token_hex(16),
+            url=check_url(url),
+            states=tuple(dict.fromkeys(states)),
+            created=timestamp(),
+            owner=caller_id(),
+            project=project,
+        )
+        with recording(self._services) as (connection, put):
+            if len(self._services.index.outbox.hooks(scope=ProjectScope(project, everything=False))) >= MOST_HOOKS:
+                raise LimitError(f"there are {MOST_HOOKS} webhooks, which is the most; delete one")
+            put(names.webhook(hook.id), hook)
+            self._services.index.outbox.add(hook, within=connection)
+        key = caller.get()
+        log.info("webhook %s made by %s", hook.id, key.name if key else "this machine")
+        return self._services.index.outbox.hook(hook.id), secret_of(master.get_secret_value(), hook.id)
+
+    def all(self) -> list[WebhookView]:
+        """Webhooks that the caller may change: the addresses of others may hold words that let somebody in."""
+        return [hook for hook in self._services.index.outbox.hooks(scope=project_scope()) if self._is_theirs(hook)]
+
+    def log(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
+        """Deliveries of a webhook, the newest first.
+
+        Raises:
+            NotYours: another key made it.
+        """
+        return self._services.index.outbox.log(self._owned(webhook).id, limit=limit)
+
+    def delete(self, webhook: str) -> None:
+        """Take a webhook away; what waits for it is not sent.
+
+        Raises:
+            NotYours: another key made it.
+        """
+        hook = self._owned(webhook)
+        # The record first: what is left of a broken-off deletion is a row that a rebuild drops.
+        self._services.store.delete(names.webhook(hook.id))
+        self._services.index.outbox.remove(hook.id)
+        log.info("webhook %s deleted", hook.id)
+
+    def _owned(self, webhook: str) -> WebhookView:
+        hook = self._services.index.outbox.hook(webhook, scope=project_scope())
+        must_own(hook.owner, f"webhook {webhook}", hook.project)
+        return hook
+
+    def _is_theirs(self, hook: WebhookView) -> bool:
+        return may_change(hook.owner, hook.project)

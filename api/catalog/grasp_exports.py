@@ -20,11 +20,10 @@ from api.catalog.grasps import Grasps
 from api.catalog.tags import Tags
 from service.index.views import GraspView
 from service.model.errors import InputError, LimitError
-from service.model.tags import Grasp, by_shard
+from service.model.records import Grasp, by_shard
 from service.pipeline.backends import Services
 from service.store.integrity import read_checked
-from service.store.shards import read_shard
-from service.store.subsets import part_of_shard, place_of
+from service.store.shards import part_of_shard, place_of, read_shard
 
 Format = Literal["csv", "json", "zip"]
 MEDIA_TYPES: Final[dict[Format, str]] = {"csv": "text/csv", "json": "application/json", "zip": "application/zip"}

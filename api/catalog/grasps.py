@@ -1,23 +1,47 @@
-"""Grasps: found by their metrics, shown whole, and counted into the distributions of a job."""
+"""Grasps: found by their metrics, counted into the distributions of a job, and shown whole from their base shard.
+
+What a base shard says of one grasp: postures, quality at every threshold, the referee's verdict push by push; of its
+scene, and of its way there: approach, grasp, lift.
+"""
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Iterator, Sequence
-from typing import Final
+from functools import lru_cache
+from itertools import zip_longest
+from typing import Any, Final, Literal
 
 from api.access.auth import project_scope
-from api.catalog.grasp_files import GraspFiles
-from api.models import Diversity, GraspDetail, GraspQuery, Histogram, JobDetail
-from service.index.filters import GraspFilter, GraspSort, Metric
+from api.models import (
+    Diversity,
+    GraspDetail,
+    GraspQuery,
+    GraspScene,
+    Histogram,
+    JobDetail,
+    Neighbour,
+    Posture,
+    Push,
+    Waypoint,
+)
+from service.index.queries.grasps import GraspFilter, GraspSort, Metric
 from service.index.queries.statistics import Kinds
-from service.index.views import GraspView, JobView, Page
-from service.model.diversity import CELLS, GraspType, entropy_bits, evenness
-from service.model.errors import LimitError
-from service.model.metrics import Indexed, indexed
-from service.model.tags import MOST_TAGGED, Grasp
+from service.index.views import GraspView, JobView, Page, ShardView
+from service.model.errors import InputError, LimitError, NotFoundError
+from service.model.metrics import DIRECTION_CELLS, GRASP_METRICS, GraspType, Indexed, entropy_bits, evenness, indexed
+from service.model.records import MOST_TAGGED, Grasp
+from service.model.scene_spec import supports_in
 from service.pipeline.backends import Services
+from service.readers.ways import scene_spec_of, stop_places, way_of
+from service.store.columns import SCHEMAS
+from service.store.integrity import read_checked
+from service.store.shards import Shard, read_shard
+from service.store.store import Store
 
 _KEPT_HISTOGRAMS: Final = 256
+
 MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(metric.name for metric in indexed(Indexed.OFFERED))
 
 
@@ -118,7 +142,7 @@ def _told(kinds: Kinds) -> Diversity | None:
         type_entropy_bits=round(entropy_bits(kinds.types.values()), 4),
         directions_used=len(kinds.cells),
         direction_entropy_bits=round(entropy_bits(kinds.cells.values()), 4),
-        evenness=round(evenness(kinds.cells.values(), CELLS), 4),
+        evenness=round(evenness(kinds.cells.values(), DIRECTION_CELLS), 4),
     )
 
 
@@ -148,3 +172,167 @@ def _bounded(query: GraspQuery) -> GraspFilter:
         at_least=bounds["min"],
         at_most=bounds["max"],
     )
+
+
+#: A base shard of 32 grasps is some 60 kB; a page of grasps reads as many as it has rows, at worst.
+_KEPT_SHARDS: Final = 64
+
+_POSTURES: Final = ("pregrasp", "grasp", "squeeze")
+
+_OUTCOME: Final = "quality/verdict_outcome"
+
+#: What the numbers of the column mean, as its description in the schema says.
+OUTCOMES: Final = {
+    int(code): words for code, words in re.findall(r"(\d) ([a-z ]+)", SCHEMAS["base"][_OUTCOME].description)
+}
+
+DIRECTIONS: Final = ("+x", "−x", "+y", "−y", "+z", "−z")
+
+_LIFT: Final = "quality/lift_outcome"
+
+#: What the numbers of the column mean, as its description in the schema says.
+LIFT_OUTCOMES: Final = {
+    int(code): words for code, words in re.findall(r"(\d) ([a-z ]+)", SCHEMAS["base"][_LIFT].description)
+}
+
+
+class GraspFiles:
+    """Reads base shards; keeps the ones it read last, which is memory that may be lost."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._read = lru_cache(maxsize=_KEPT_SHARDS)(self._fetch)
+
+    def detail(self, grasp: GraspView, shard: ShardView) -> GraspDetail:
+        """The grasp of the index with what stands in its shard.
+
+        Raises:
+            NotFoundError: the shard holds no grasps.
+            DamagedShard: its file is gone, or not what its checksum says.
+        """
+        file = self._read(shard.key, shard.sha256)
+        row = grasp.row
+        return GraspDetail(
+            **grasp.model_dump(),
+            hand_digest=shard.hand_digest,
+            object_digest=shard.object_digest,
+            joint_names=_texts(file.attributes.get("joint_names")),
+            postures={name: _posture(file, name, row) for name in _POSTURES},
+            thresholds_m=_numbers(file["quality/thresholds_m"]),
+            sweep={
+                metric.name: _numbers(file[metric.path][row])
+                for metric in GRASP_METRICS
+                if metric.swept and metric.path in file.arrays
+            },
+            way=way(file, row),
+            scene=scene(file, row),
+            pushes=_pushes(file, row),
+            verdict_margin=_value(file, "quality/verdict_margin", row),
+            judged_by=judged_by(file, row),
+            audit=_verdict(file, "quality/audit", row),
+            friction=_number(file.attributes.get("mu")),
+        )
+
+    def _fetch(self, key: str, sha256: str) -> Shard:
+        data = read_checked(self._store, key, sha256)
+        try:
+            return read_shard(data, kind="base", name=key)
+        except InputError as error:
+            raise NotFoundError(f"{key} holds no grasps that can be shown: {error}") from None
+
+
+def _posture(file: Shard, name: str, row: int) -> Posture:
+    pose, joints = file[f"{name}/hand_pose"][row], file[f"{name}/joint_positions"][row]
+    return Posture(hand_pose=pose.tolist(), joint_positions=joints.tolist())
+
+
+def judged_by(file: Shard, row: int) -> Literal["mujoco", "mujoco_warp"] | None:
+    """Whose verdict a grasp of a base shard has; None: nobody judged it."""
+    if "quality/success" not in file.arrays:
+        return None
+    judged = file.arrays.get("quality/judged_by")
+    return "mujoco_warp" if judged is not None and judged[row] == 1 else "mujoco"
+
+
+def _pushes(file: Shard, row: int) -> list[Push]:
+    outcomes = file.arrays.get(_OUTCOME)
+    if outcomes is None or _verdict(file, "quality/success", row) is None:
+        return []
+    codes = outcomes[row].tolist()
+    return [
+        Push(direction=direction, outcome=OUTCOMES.get(code, "unknown"))
+        for direction, code in zip(DIRECTIONS, codes, strict=False)
+    ]
+
+
+def _verdict(file: Shard, path: str, row: int) -> bool | None:
+    column = file.arrays.get(path)
+    return None if column is None or column[row] < 0 else bool(column[row])
+
+
+def _value(file: Shard, path: str, row: int) -> float | None:
+    column = file.arrays.get(path)
+    return None if column is None else _number(column[row])
+
+
+def _numbers(values: Any) -> list[Any]:
+    return [_number(value) for value in values.tolist()]
+
+
+def _number(value: Any) -> float | None:
+    return None if value is None or not math.isfinite(float(value)) else float(value)
+
+
+def _texts(value: Any) -> list[str]:
+    return [str(name) for name in value] if isinstance(value, list) else []
+
+
+def way(file: Shard, row: int) -> list[Waypoint]:
+    """The postures of a grasp in turn."""
+    points = way_of(file, row)
+    return [
+        Waypoint(
+            name=point.name,
+            place=place,
+            hand_pose=point.hand_pose.tolist(),
+            joint_positions=point.joint_positions.tolist(),
+            carried=point.carried.tolist(),
+        )
+        for point, place in zip(points, stop_places(points).tolist(), strict=True)
+    ]
+
+
+def scene(file: Shard, row: int) -> GraspScene | None:
+    """The scene of a grasp; None if it was planned around a free object.
+
+    Raises:
+        InputError: what the shard says of its scene is no scene.
+    """
+    spec = scene_spec_of(file)
+    if spec is None or spec.kind == "free" or "grasp/scene_index" not in file.arrays:
+        return None
+    number = int(file["grasp/scene_index"][row])
+    tried = int(file[_LIFT][row]) if _LIFT in file.arrays else 0
+    clearance = float(file["quality/clearance_m"][row]) if "quality/clearance_m" in file.arrays else math.nan
+    return GraspScene(
+        kind=spec.kind,
+        number=number,
+        object_pose=file["scene/object_pose"][number].tolist(),
+        supports=list(supports_in(spec)),
+        neighbours=_neighbours(file, number),
+        clearance_m=clearance if math.isfinite(clearance) else None,
+        lift=LIFT_OUTCOMES.get(tried, "unknown") if tried else None,
+        lift_hard=_verdict(file, "quality/lift_hard", row),
+    )
+
+
+def _neighbours(file: Shard, number: int) -> list[Neighbour]:
+    if "scene/neighbour_pose" not in file.arrays:
+        return []
+    names, digests = (file.attributes.get(key) for key in ("neighbours", "neighbour_digests"))
+    poses = file["scene/neighbour_pose"][number].tolist()
+    known = zip_longest(names if isinstance(names, list) else [], digests if isinstance(digests, list) else [])
+    return [
+        Neighbour(name=str(name), digest=str(digest), pose=pose)
+        for (name, digest), pose in zip(known, poses, strict=False)
+    ]

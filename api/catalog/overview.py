@@ -1,32 +1,37 @@
-"""The service as a whole: its workers, its queue, its health, its numbers."""
+"""The service as a whole: workers, queue, numbers, usage of projects, and the health of its parts."""
 
 from __future__ import annotations
 
 import contextlib
+import csv
+import io
 import threading
 import time
-from collections.abc import Iterable
-from datetime import UTC, datetime, timedelta
+from collections.abc import Callable, Iterable
+from datetime import UTC, date, datetime, timedelta
 from typing import Final
 
-from api.access.auth import project_scope
-from api.catalog.health import Probes
+from api.access.auth import caller, project_scope
+from api.access.keys import KeyFile, ProjectLimits
 from api.catalog.jobs import Jobs
 from api.metrics import Snapshot
 from api.models import Health, Part, Worker
-from service.index.at_scrape import read_index
-from service.index.damage import Damage
-from service.index.views import FailureGroup, Stats, TaskView
+from service.index.notes import Damage
+from service.index.queries.overview import read_index
+from service.index.views import FailureGroup, Stats, TaskView, UsageDay
 from service.model.digests import digest_json
-from service.model.errors import NotFoundError, UnavailableError
+from service.model.errors import BusyError, GraspdError, InputError, NotFoundError, StoreUnavailable, UnavailableError
 from service.model.projects import ProjectScope
 from service.model.states import Lane, Stage
 from service.pipeline.backends import Services
+from service.pipeline.identity import check_queue
 from service.pipeline.leading import PART
 from service.queue.port import QueueNow
 
 _DAMAGE_SHOWN: Final = 5
+
 _JOBS_WATCHED: Final = 20
+
 #: The fingerprint is made anew at most this often, however many pages watch it [s].
 FINGERPRINT_S: Final = 1.0
 
@@ -147,3 +152,151 @@ class Overview:
 
 def _seconds(part: Part) -> float | None:
     return None if part.latency_ms is None else part.latency_ms / 1000
+
+
+#: The parts are asked anew at most this often [s].
+KEPT_S: Final = 2.0
+
+#: A part that has not answered by then counts as away [s].
+PATIENCE_S: Final = 2.0
+
+_INCOMPLETE: Final = "the controller makes it from the store now; until it has, jobs are missing from it"
+
+
+class Probes:
+    """Asks Redis, index and store at the same time, each in a thread of its own; one that hangs is not asked again."""
+
+    def __init__(self, services: Services, *, patience_s: float = PATIENCE_S) -> None:
+        self._services = services
+        self._patience_s = patience_s
+        self._known: tuple[float, Health] | None = None
+        self._hanging: dict[str, _Probe] = {}
+        self._service: str | None = None
+        """Whose Redis it was when it was last asked."""
+        self._lock = threading.Lock()
+
+    def health(self) -> Health:
+        """State of the parts; ready while all three answer. Controller and workers are told, and not waited for."""
+        with self._lock:
+            now = time.monotonic()
+            if self._known is None or now - self._known[0] > KEPT_S:
+                self._known = (now, self._ask())
+            return self._known[1]
+
+    def _ask(self) -> Health:
+        questions: dict[str, Callable[[], Part]] = {
+            "redis": self._redis,
+            "index": self._index,
+            "store": lambda: _answering(self._services.store.probe()),
+        }
+        probes = {name: self._hanging.get(name) or _Probe(name, question) for name, question in questions.items()}
+        deadline = time.monotonic() + self._patience_s
+        parts = {name: probe.part(deadline) for name, probe in probes.items()}
+        self._hanging = {name: probe for name, probe in probes.items() if probe.thread.is_alive()}
+        controller, workers = self._others() if parts["redis"].ok else (False, 0)
+        return Health(ok=all(part.ok for part in parts.values()), parts=parts, controller=controller, workers=workers)
+
+    def _redis(self) -> Part:
+        """A Redis of another service is not ready: its controller and workers know nothing of this one's jobs."""
+        part, service = _answering(self._services.queue.ping()), self._services.queue.service()
+        if service != self._service:
+            try:
+                check_queue(self._services.store, self._services.queue)
+            except BusyError as error:
+                return part.model_copy(update={"ok": False, "detail": str(error)})
+            except StoreUnavailable:
+                return part  # the store's own part tells that
+            self._service = service
+        return part
+
+    def _index(self) -> Part:
+        """An index that may lack what the store has is not ready: jobs would seem to be gone."""
+        part, made = _answering(self._services.index.database.ping()), self._services.index.notes.completeness()
+        if made is None:
+            return part.model_copy(update={"ok": False, "detail": _INCOMPLETE})
+        if made.left_out:
+            some = ", ".join(made.names[:3])
+            detail = f"{made.left_out} damaged records of the store are left out: {some}; `graspd admin store verify`"
+            return part.model_copy(update={"detail": detail})
+        return part
+
+    def _others(self) -> tuple[bool, int]:
+        try:
+            fit = [beat for beat in self._services.queue.workers() if beat.state != "quarantined"]
+            return self._services.queue.announced(PART), len(fit)
+        except UnavailableError:
+            return False, 0
+
+
+def _answering(seconds: float) -> Part:
+    return Part(ok=True, latency_ms=round(1000 * seconds, 3))
+
+
+class _Probe:
+    """One question to one part."""
+
+    def __init__(self, name: str, question: Callable[[], Part]) -> None:
+        self._question = question
+        self._part: Part | None = None
+        self.thread = threading.Thread(target=self._run, name=f"probe-{name}", daemon=True)
+        self.thread.start()
+
+    def part(self, deadline: float) -> Part:
+        """The answer, if it came by then."""
+        start = time.monotonic()
+        self.thread.join(max(0.0, deadline - start))
+        return self._part or Part(ok=False, detail="it has not answered in time; see the log of the part itself")
+
+    def _run(self) -> None:
+        try:
+            self._part = self._question()
+        except GraspdError as error:
+            self._part = Part(ok=False, detail=str(error))
+        except Exception as error:
+            self._part = Part(ok=False, detail=f"{type(error).__name__}: {error}")
+
+
+#: Days that are told where nobody asks for others.
+DAYS: Final = 31
+
+MOST_DAYS: Final = 366
+
+_COLUMNS: Final = tuple(UsageDay.model_fields)
+
+
+class Usage:
+    """Use in the caller's scope: of the project of the key, and with `admin` of all."""
+
+    def __init__(self, services: Services, keys: KeyFile) -> None:
+        self._services = services
+        self._keys = keys
+
+    def days(self, since: date | None = None, until: date | None = None) -> list[UsageDay]:
+        """Each project's use of each day, the newest first; by default of the last month.
+
+        Raises:
+            InputError: the days are in no order, or more than a year.
+        """
+        last = until or datetime.now(UTC).date()
+        first = since or last - timedelta(days=min(DAYS - 1, last.toordinal() - 1))
+        if first > last:
+            raise InputError(f"since {first} is after until {last}")
+        if (last - first).days >= MOST_DAYS:
+            raise InputError(f"at most {MOST_DAYS} days are told at once; ask for fewer")
+        return self._services.index.usage.days(first.isoformat(), last.isoformat(), scope=project_scope())
+
+    def limits(self) -> dict[str, ProjectLimits]:
+        """What each project in scope may use together."""
+        key = caller.get()
+        if key is None:
+            return {}
+        return {name: limits for name, limits in self._keys.projects().items() if project_scope().sees(name)}
+
+
+def as_csv(days: list[UsageDay]) -> str:
+    """A table with a line of names (RFC 4180)."""
+    text = io.StringIO()
+    table = csv.writer(text)
+    table.writerow(_COLUMNS)
+    table.writerows([getattr(one, column) for column in _COLUMNS] for one in days)
+    return text.getvalue()

@@ -11,7 +11,7 @@ from api.models import Selection, TagChange
 from service.index.views import TagView
 from service.model.errors import InputError, LimitError, NotFoundError
 from service.model.projects import ProjectScope
-from service.model.tags import MOST_TAGS, Grasp, Tag, tag_id
+from service.model.records import MOST_TAGS, Grasp, Tag, tag_id
 from service.pipeline import tagging
 from service.pipeline.backends import Services
 

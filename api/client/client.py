@@ -14,14 +14,12 @@ import httpx
 from httpx_sse import EventSource
 from pydantic import BaseModel, TypeAdapter
 
-from api.hosts import is_loopback
+from api.formatting import is_loopback
 from api.models import GraspQuery, Health, Job, JobDetail, Shard
-from service.index.dataset_views import CellView, DatasetView, ObjectSetView, SnapshotView
-from service.index.views import AssetView, GraspView, Page
-from service.model.dataset_records import Snapshot
+from service.index.views import AssetView, CellView, DatasetView, GraspView, ObjectSetView, Page, SnapshotView
 from service.model.domain import JobRequest
-from service.model.errors import ERRORS, GraspdError, InputError, RateError, UnavailableError
-from service.model.redaction import without_secrets
+from service.model.errors import ERRORS, GraspdError, InputError, RateError, UnavailableError, without_secrets
+from service.model.records import Snapshot
 from service.model.states import AssetKind, State
 from service.pipeline.datasets.estimate import Estimate
 from service.pipeline.datasets.spec import DatasetRequest, Matrix

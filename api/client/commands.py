@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from api.client import key_commands, project_commands, tag_commands, webhook_commands
+from api.client import access_commands, tag_commands
 from api.client.add_commands import add_hand, add_network, add_object
 from api.client.client import Client, path_of
 from api.client.job_options import pairs, validated
@@ -27,10 +27,10 @@ from api.client.reports import (
 from api.formatting import count, minute, percent, size
 from api.uploads import MAIN_SUFFIXES, name_of_upload
 from service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
-from service.model.diversity import MIN_DISTANCE_M
 from service.model.domain import AUDITS, NETWORK_METHODS, JobRequest
 from service.model.errors import InputError
-from service.model.scene_options import scene_option
+from service.model.metrics import MIN_DISTANCE_M
+from service.model.scene_spec import scene_option
 from service.model.states import AssetKind, State
 from service.store.asset_options import (
     DensityOption,
@@ -349,9 +349,9 @@ def sets(url: UrlOption = None, json: JsonFlag = False) -> None:
 app.add_typer(hands_app, name="hands")
 app.add_typer(objects_app, name="objects")
 app.add_typer(networks_app, name="networks")
-app.add_typer(key_commands.app, name="keys")
-app.add_typer(project_commands.app, name="projects")
-app.add_typer(webhook_commands.app, name="webhooks")
+app.add_typer(access_commands.keys_app, name="keys")
+app.add_typer(access_commands.projects_app, name="projects")
+app.add_typer(access_commands.webhooks_app, name="webhooks")
 app.add_typer(tag_commands.app, name="tags")
 
 

@@ -10,18 +10,26 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
-from api.client.add_sets import name_of_set, upload_set
+from api.client.add_commands import name_of_set, upload_set
 from api.client.client import Client, path_of
-from api.client.dataset_reports import print_cells, print_dataset, print_estimate, watch_dataset
-from api.client.dataset_specs import SpecOption, Wanted, wanted
-from api.client.job_options import validated, with_job_options
-from api.client.reports import UrlOption, YesOption, confirm, open_client, restore, say_deleted
+from api.client.job_options import SpecOption, Wanted, validated, wanted, with_job_options
+from api.client.reports import (
+    UrlOption,
+    YesOption,
+    confirm,
+    open_client,
+    print_cells,
+    print_dataset,
+    print_estimate,
+    restore,
+    say_deleted,
+    watch_dataset,
+)
 from api.formatting import count, minute, percent, size
 from service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
-from service.index.dataset_views import DatasetView
-from service.model.errors import InputError, TaskError
+from service.index.views import DatasetView
+from service.model.errors import InputError, TaskError, did_you_mean, one_of
 from service.model.states import AssetKind, State
-from service.model.suggestions import did_you_mean, one_of
 from service.pipeline.datasets.estimate import Estimate
 from service.pipeline.datasets.export import FORMATS
 from service.pipeline.datasets.spec import DatasetRequest, Matrix

@@ -1,4 +1,5 @@
-"""Datasets: the hand x object matrix of all work and of each dataset, and what is done to chosen cells."""
+"""Pages of datasets: the hand x object matrix of all work and of each dataset, actions on its cells, and the comparison
+of two."""
 
 from __future__ import annotations
 
@@ -16,13 +17,14 @@ from api.access.auth import NotYours
 from api.catalog.assets import Assets
 from api.catalog.datasets import Datasets
 from api.catalog.jobs import Jobs
-from api.dashboard.expected import listed
-from api.dashboard.figures import matrix
+from api.dashboard import figures
+from api.dashboard.figures import twins
 from api.dashboard.form_uploads import asset_choices
-from api.dashboard.forms import first_message
+from api.dashboard.forms import first_message, listed
+from api.dashboard.grasp_pages import COLUMNS
 from api.dashboard.rendering import render
-from api.routes.dependencies import AssetsOf, DatasetsOf, JobsOf, may_read, may_submit
-from service.index.dataset_views import CellView
+from api.routes.dependencies import AssetsOf, ComparisonsOf, DatasetsOf, JobsOf, may_read, may_submit
+from service.index.views import CellView
 from service.model.domain import JobRequest
 from service.model.errors import ConflictError, InputError
 from service.model.fidelity import OFFERED
@@ -30,10 +32,14 @@ from service.model.states import AssetKind, State
 from service.pipeline.datasets.spec import DatasetRequest
 
 PAGE_SIZE: Final = 20
+
 #: A matrix of more cells is shown as a list, a page at a time: nobody reads a table of ten thousand fields.
 MATRIX_CELLS: Final = 1000
+
 _CELLS_AT_ONCE: Final = 200
+
 _MAX_FIELDS: Final = 4000
+
 _DONE: Final = {"submit": "submitted", "retry": "retried", "cancel": "cancelled", "snapshot": "taken as a snapshot"}
 
 #: Fields of the form of a dataset, and what stands there at first.
@@ -102,7 +108,7 @@ def dataset_page(
         events="" if dataset.state.is_final else "/events",
         refresh_s=0 if dataset.state.is_final else 5,
         dataset=dataset,
-        grid=matrix.of_dataset(dataset, cells) if as_matrix else None,
+        grid=figures.of_dataset(dataset, cells) if as_matrix else None,
         cells=cells,
         chosen=chosen or "",
         next=page.next if page else None,
@@ -251,11 +257,37 @@ def _overview(
         refresh_s=10,
         datasets=page.items,
         next=page.next,
-        grid=matrix.of_service(datasets.matrix(), [name for name, _ in hands], [name for name, _ in objects]),
+        grid=figures.of_service(datasets.matrix(), [name for name, _ in hands], [name for name, _ in objects]),
         hands=hands,
         objects=objects,
         fidelities=OFFERED,
         form=_MAKE | {"hands": [], "objects": []} | (form or {}),
         problem=problem,
         did=_did(request),
+    )
+
+
+#: Datasets that the fields of the page offer, the newest first.
+_OFFERED: Final = 200
+
+comparison_router = APIRouter(include_in_schema=False)
+
+Named = Annotated[str, Query(max_length=64)]
+
+
+@comparison_router.get("/compare", dependencies=[Depends(may_read)])
+def compare_page(
+    request: Request, datasets: DatasetsOf, comparisons: ComparisonsOf, one: Named = "", other: Named = ""
+) -> HTMLResponse:
+    """What two datasets asked for, what each cell came to, how good their grasps are; the address can be shared."""
+    found = comparisons.of(one, other) if one and other else None
+    shown = {key: (label, unit) for key, label, unit in COLUMNS}
+    return render(
+        request,
+        "compare.html",
+        page="/datasets",
+        names=[dataset.name for dataset in datasets.page(limit=_OFFERED).items],
+        chosen=(one, other),
+        found=found,
+        metrics=[(*shown[metric], both, twins(both)) for metric, both in found.metrics.items()] if found else [],
     )

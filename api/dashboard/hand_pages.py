@@ -13,14 +13,13 @@ from starlette.datastructures import FormData
 from api.catalog.assets import Assets
 from api.dashboard.forms import first_message
 from api.dashboard.rendering import render
-from api.routes.assets import store_correction
+from api.routes.assets import CorrectionRequest, store_correction
 from api.routes.dependencies import AssetsOf, may_read, may_submit
-from api.routes.hand_corrections import CorrectionRequest
 from service.index.views import AssetView
 from service.model.errors import ConflictError, InputError, NotFoundError
 from service.model.states import AssetKind
 from service.store.asset_summary import hand_line, limit_line, self_test_line
-from service.store.hand_corrections import MAX_ENTRIES, HandFacts
+from service.store.descriptions import MAX_ENTRIES, HandFacts
 
 PAGE_SIZE: Final = 50
 #: A check takes seconds.
@@ -113,8 +112,13 @@ def _page(
 
 
 _APPROACHES: Final = (
-    ("+x", "1,0,0"), ("-x", "-1,0,0"), ("+y", "0,1,0"), ("-y", "0,-1,0"), ("+z", "0,0,1"), ("-z", "0,0,-1"),
-)  # fmt: skip
+    ("+x", "1,0,0"),
+    ("-x", "-1,0,0"),
+    ("+y", "0,1,0"),
+    ("-y", "0,-1,0"),
+    ("+z", "0,0,1"),
+    ("-z", "0,0,-1"),
+)
 
 
 def _facts(assets: Assets, hand: AssetView) -> tuple[HandFacts | None, str]:

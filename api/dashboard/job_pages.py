@@ -1,22 +1,30 @@
-"""The page of one job: stages, loss, quality, views, best grasps, attempts, files; and the pictures it shows."""
+"""The page of one job: stages, loss, quality, best grasps, attempts, files; and its pictures as PNG, whole or as
+thumbnails."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final
+import io
+from functools import lru_cache, partial
+from typing import Annotated, Any, Final, Literal
 
+import numpy as np
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import HTMLResponse
+from numpy.typing import NDArray
+from PIL import Image
 
-from api.dashboard import snippets
-from api.dashboard.choice_forms import did
-from api.dashboard.figures import charts
-from api.dashboard.grasp_pages import COLUMNS, choice_of
-from api.dashboard.pictures import Channel
+from api.dashboard import figures, rendering
+from api.dashboard.grasp_pages import COLUMNS, choice_of, did
 from api.dashboard.rendering import base_url, render
 from api.models import GraspQuery, JobDetail, LossCurve
 from api.routes.dependencies import GraspsOf, JobsOf, ShardsOf, TagsOf, may_read
+from service.model.errors import NotFoundError
+from service.store.integrity import read_checked
+from service.store.shards import open_shard
+from service.store.store import Store
 
 _SHOWN_PICTURES: Final = 8
+
 _SHOWN_GRASPS: Final = 10
 
 router = APIRouter(include_in_schema=False)
@@ -39,7 +47,7 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
         refresh_s=0 if job.state.is_final else 3,
         job=job,
         histograms=[
-            (*shown[data.metric], data, charts.bars(data, "/grasps", where)) for data in grasps.histograms(job)
+            (*shown[data.metric], data, figures.bars(data, "/grasps", where)) for data in grasps.histograms(job)
         ],
         loss=_loss(jobs.loss_curve(job)),
         pictures=pictures[:_SHOWN_PICTURES],
@@ -54,9 +62,12 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
         columns=COLUMNS,
         sort="epsilon",
         shards=job.shards,
-        loader=snippets.loader(job, base_url(request)),
-        curl=snippets.curl(job, base_url(request)),
+        loader=rendering.loader(job, base_url(request)),
+        curl=rendering.curl(job, base_url(request)),
     )
+
+
+Channel = Literal["rgb", "depth", "segmentation", "rgb_hand"]
 
 
 @router.get("/shards/{shard_id}/pictures/{index}.png", dependencies=[Depends(may_read)])
@@ -74,10 +85,10 @@ def picture(
     return Response(data, media_type="image/png", headers={"Cache-Control": "private, max-age=86400, immutable"})
 
 
-def _loss(curve: LossCurve | None) -> charts.Plot | None:
+def _loss(curve: LossCurve | None) -> figures.Plot | None:
     if curve is None:
         return None
-    return charts.line(curve.iterations, curve.losses, x="iteration", y="Loss", log=True)
+    return figures.line(curve.iterations, curve.losses, x="iteration", y="Loss", log=True)
 
 
 def _pictures(job: JobDetail) -> list[dict[str, Any]]:
@@ -93,3 +104,78 @@ def _pictures(job: JobDetail) -> list[dict[str, Any]]:
         if shard.kind == "views"
         for index in range(shard.count)
     ]
+
+
+#: A views shard of 48 pictures is a few megabytes; a page asks for several pictures of the same one.
+_KEPT_SHARDS: Final = 2
+
+#: Near to far: light and warm to dark and cool, with lightness falling all the way.
+_DEPTH_COLOURS: Final = np.array(
+    [(252, 244, 190), (250, 203, 116), (240, 148, 87), (205, 92, 103), (142, 58, 121), (78, 38, 108), (24, 18, 56)],
+    np.float64,
+)
+
+_NOTHING: Final = (12, 15, 20)
+
+#: Background, table, object, then the neighbours.
+_CLASSES: Final = np.array(
+    [(24, 29, 33), (96, 108, 118), (23, 163, 152), (227, 171, 98), (88, 134, 214), (190, 98, 160), (150, 178, 82)],
+    np.uint8,
+)
+
+
+class Pictures:
+    """Decodes pictures of views shards; keeps the shards it read last."""
+
+    def __init__(self, store: Store) -> None:
+        self._fetch = lru_cache(maxsize=_KEPT_SHARDS)(partial(read_checked, store))
+
+    def png(self, key: str, sha256: str, index: int, channel: Channel = "rgb", width: int | None = None) -> bytes:
+        """PNG of the picture at row `index` of a channel, no wider than `width` pixels.
+
+        Raises:
+            NotFoundError: the shard holds fewer pictures, or none of this channel.
+            DamagedShard: its file is gone, or not what its checksum says.
+        """
+        with open_shard(self._fetch(key, sha256), name=key) as file:
+            path = f"image/{channel}"
+            if path not in file:
+                raise NotFoundError("the shard holds no pictures; only a views shard does")
+            pictures = file[path]
+            if not 0 <= index < len(pictures):
+                raise NotFoundError(f"the shard holds {len(pictures)} pictures; there is no picture {index}")
+            pixels = _PAINTERS[channel](np.asarray(pictures[index]))
+        image = Image.fromarray(pixels)
+        if width is not None and width < image.width:
+            kind = Image.Resampling.NEAREST if channel == "segmentation" else Image.Resampling.LANCZOS
+            image = image.resize((width, max(1, round(image.height * width / image.width))), kind)
+        buffer = io.BytesIO()
+        image.save(buffer, "PNG", compress_level=3)
+        return buffer.getvalue()
+
+
+def paint_depth(depth: NDArray[Any]) -> NDArray[np.uint8]:
+    """Depth (H, W) [m] as colours (H, W, 3) over the range that this picture has; dark where there is nothing."""
+    seen = np.isfinite(depth)
+    painted = np.empty((*depth.shape, 3), np.uint8)
+    painted[:] = _NOTHING
+    if seen.any():
+        low, high = np.percentile(depth[seen], (1, 99))
+        place = np.clip((depth[seen] - low) / max(high - low, 1e-6), 0, 1) * (len(_DEPTH_COLOURS) - 1)
+        below = np.minimum(place.astype(int), len(_DEPTH_COLOURS) - 2)
+        share = (place - below)[:, None]
+        painted[seen] = _DEPTH_COLOURS[below] * (1 - share) + _DEPTH_COLOURS[below + 1] * share
+    return painted
+
+
+def paint_segmentation(labels: NDArray[Any]) -> NDArray[np.uint8]:
+    """Labels (H, W) as colours (H, W, 3); neighbours beyond the palette share its last colours."""
+    return _CLASSES[np.minimum(labels, len(_CLASSES) - 1)]
+
+
+_PAINTERS: Final = {
+    "rgb": lambda pixels: pixels,
+    "rgb_hand": lambda pixels: pixels,
+    "depth": paint_depth,
+    "segmentation": paint_segmentation,
+}

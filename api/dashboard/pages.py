@@ -1,54 +1,39 @@
-"""The dashboard as a whole: its pages put together, the stream that moves them, the meaning of problem types."""
+"""The dashboard as a whole: its pages, the stream that moves them, the meaning of problem types, the session.
+
+Sign in with a key: the browser gets a signed cookie that ends with the key.
+"""
 
 from __future__ import annotations
 
 from collections.abc import AsyncIterable
-from typing import Final
+from typing import Annotated, Final
 
-from fastapi import APIRouter, Depends, FastAPI, Request
-from fastapi.responses import HTMLResponse
+from fastapi import APIRouter, Depends, FastAPI, Form, Request
+from fastapi.responses import HTMLResponse, RedirectResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
+from api.access.auth import SESSION_COOKIE
+from api.access.keys import SESSION_S, KeyFile
 from api.catalog import events
-from api.dashboard import (
-    choice_forms,
-    comparison_pages,
-    dataset_pages,
-    deleted_pages,
-    forms,
-    grasp_pages,
-    hand_pages,
-    job_pages,
-    service_pages,
-    session,
-    usage_pages,
-)
-from api.dashboard.expected import Expectations
-from api.dashboard.pictures import Pictures
+from api.dashboard import dataset_pages, forms, grasp_pages, hand_pages, job_pages, service_pages
+from api.dashboard.forms import Expectations
+from api.dashboard.job_pages import Pictures
 from api.dashboard.rendering import environment, render
 from api.routes.dependencies import OverviewOf, may_read
 from service.model.errors import ERRORS
 from service.pipeline.backends import Services
 
 router = APIRouter(include_in_schema=False)
+
 #: Those of all pages, in the order in which they are asked.
 routers: Final = (
-    *(
-        part.router
-        for part in (
-            service_pages,
-            job_pages,
-            grasp_pages,
-            hand_pages,
-            deleted_pages,
-            dataset_pages,
-            comparison_pages,
-            usage_pages,
-            forms,
-            choice_forms,
-            session,
-        )
-    ),
+    service_pages.router,
+    job_pages.router,
+    grasp_pages.router,
+    hand_pages.router,
+    dataset_pages.router,
+    dataset_pages.comparison_router,
+    forms.router,
     router,
 )
 
@@ -91,3 +76,39 @@ _HTTP_PROBLEMS: Final = {
     "range-not-satisfiable": (416, "The range of bytes lies behind the end of the file."),
     "misdirected-request": (421, "The service does not answer to this host name while it is open."),
 }
+
+
+@router.get("/login")
+def login_page(request: Request) -> HTMLResponse:
+    """The form for the key; with a session, whose it is and the way out of it."""
+    key = request.scope["state"].get("key") if SESSION_COOKIE in request.cookies else None
+    return render(request, "login.html", problem="", health=None, session=key.name if key else "")
+
+
+@router.post("/logout")
+def logout(request: Request) -> RedirectResponse:
+    """End the session of this browser. Others of the same key go on; revoking the key ends all of them."""
+    response = RedirectResponse("/login", status_code=303)
+    response.delete_cookie(SESSION_COOKIE, httponly=True, samesite="strict", secure=request.url.scheme == "https")
+    return response
+
+
+@router.post("/login", response_model=None)
+def login(request: Request, key: Annotated[str, Form(max_length=200)]) -> HTMLResponse | RedirectResponse:
+    """Change a key for a cookie."""
+    keys: KeyFile = request.app.state.keys
+    found = keys.find(key.strip())
+    if found is None:
+        return render(
+            request, "login.html", session="", problem="No live key is like this one.", health=None, status=401
+        )
+    response = RedirectResponse("/", status_code=303)
+    response.set_cookie(
+        SESSION_COOKIE,
+        keys.open_session(found),
+        max_age=SESSION_S,
+        httponly=True,
+        samesite="strict",
+        secure=request.url.scheme == "https",
+    )
+    return response

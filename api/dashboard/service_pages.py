@@ -1,29 +1,45 @@
-"""The pages of the service as a whole: home, workers, speed against accuracy, where it breaks."""
+"""Pages of the service as a whole: home, workers, speed against accuracy, maps of failure, usage, deletions."""
 
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Final
 
-from fastapi import APIRouter, Depends, Query, Request
-from fastapi.responses import HTMLResponse
+from fastapi import APIRouter, Depends, Form, Query, Request
+from fastapi.responses import HTMLResponse, RedirectResponse
 
 from api.catalog.datasets import Datasets
 from api.catalog.overview import Overview
-from api.dashboard.figures import charts, stability, tradeoff
+from api.dashboard import figures, tradeoff
 from api.dashboard.rendering import render
 from api.models import STAGE_LABELS
-from api.routes.dependencies import DatasetsOf, JobsOf, OverviewOf, StoreOf, may_read
-from service.index.dataset_views import DatasetView
-from service.index.views import WorkerView
-from service.model.errors import UnavailableError
+from api.routes.dependencies import (
+    DatasetsOf,
+    DeletionsOf,
+    JobsOf,
+    OverviewOf,
+    StoreOf,
+    TagsOf,
+    UsageOf,
+    may_read,
+    may_submit,
+)
+from api.routes.system import Since, Until
+from service.index.views import DatasetView, WorkerView
+from service.model.errors import InputError, UnavailableError
 from service.model.states import State
+from service.store.records import What
 
 PAGE_SIZE: Final = 25
+
 _LOST_SHOWN: Final = timedelta(minutes=10)
+
 _MINUTES: Final = 60
+
 _DATASETS: Final = 6
+
 #: A study takes minutes, and nothing tells when it is published.
 _STUDY_S: Final = 10
 
@@ -52,7 +68,7 @@ def home(
         chosen=chosen or "",
         stats=overview.stats(),
         minutes=minutes,
-        pace=charts.minutes(minutes, start),
+        pace=figures.minutes(minutes, start),
         jobs=jobs.page(state=chosen, limit=PAGE_SIZE, cursor=cursor),
         stages=stage_depths(overview),
         workers=[worker for worker in overview.workers() if is_recent(worker)],
@@ -117,14 +133,14 @@ def chart_page(
 @router.get("/stability", dependencies=[Depends(may_read)])
 def stability_page(request: Request, store: StoreOf) -> HTMLResponse:
     """Maps of where integrators and the planner fail, as `graspd stability` measured them last."""
-    measured = stability.load(store)
+    measured = figures.load(store)
     return render(
         request,
         "stability.html",
         page="/stability",
         poll_s=_STUDY_S,
         measured=measured,
-        maps=[stability.draw(one) for one in measured.maps] if measured else [],
+        maps=[figures.draw(one) for one in measured.maps] if measured else [],
     )
 
 
@@ -150,3 +166,96 @@ def _latest_datasets(datasets: Datasets) -> list[DatasetView]:
     """The newest datasets, those still at work first."""
     newest = datasets.page(limit=_DATASETS).items
     return sorted(newest, key=lambda dataset: dataset.state.is_final)[:4]
+
+
+_SUMMED = ("grasps", "valid", "tasks", "gpu_seconds", "cpu_seconds")
+
+
+@router.get("/usage", dependencies=[Depends(may_read)])
+def usage_page(
+    request: Request,
+    usage: UsageOf,
+    since: Since = None,
+    until: Until = None,
+) -> HTMLResponse:
+    """Use of each project: in sum, against its quotas, and day by day."""
+    days = usage.days(since, until)
+    limits = usage.limits()
+    today = datetime.now(UTC).date().isoformat()
+    totals: dict[str, dict[str, float]] = {name: defaultdict(float) for name in limits}
+    for one in days:
+        total = totals.setdefault(one.project, defaultdict(float))
+        for name in _SUMMED:
+            total[name] += getattr(one, name)
+            if one.day == today:
+                total[f"today_{name}"] += getattr(one, name)
+    given = request.url.query
+    return render(
+        request,
+        "usage.html",
+        page="/usage",
+        poll_s=30,
+        days=days,
+        totals=[(name, totals[name], limits.get(name)) for name in sorted(totals)],
+        has_projects=bool(limits) or any(one.project for one in days),
+        csv="/v1/usage.csv" + (f"?{given}" if given else ""),
+        since=since or "",
+        until=until or "",
+    )
+
+
+#: Letters of a job's id that its page shows, and that its deletion is confirmed by.
+SHORT_ID = 12
+
+Typed = Annotated[str, Form(max_length=64)]
+
+
+@router.get("/deleted", dependencies=[Depends(may_read)])
+def deleted_page(request: Request, deletions: DeletionsOf, done: str = "") -> HTMLResponse:
+    """All that can be restored; `done` names what was deleted just now."""
+    found = deletions.recent()
+    return render(request, "deleted.html", found=found, just_now=next((one for one in found if one.id == done), None))
+
+
+@router.post("/deleted/{what}/{name}/restore", dependencies=[Depends(may_submit)])
+def restore(what: What, name: str, deletions: DeletionsOf) -> RedirectResponse:
+    """Bring a thing back and show it."""
+    found = deletions.restore(what, name)
+    pages = {"job": f"/jobs/{found.id}", "dataset": f"/datasets/{found.id}", "hand": f"/hands/{found.name}"}
+    return RedirectResponse(pages.get(what, "/grasps" if what == "tag" else "/deleted"), status_code=303)
+
+
+@router.post("/datasets/{name}/delete", dependencies=[Depends(may_submit)])
+def delete_dataset(
+    name: str, datasets: DatasetsOf, typed: Typed = "", with_snapshots: Annotated[bool, Form()] = False
+) -> RedirectResponse:
+    """Take a dataset away that has ended."""
+    _confirmed(typed, name)
+    datasets.delete(name, with_snapshots=with_snapshots)
+    return _deleted(name)
+
+
+@router.post("/jobs/{job_id}/delete", dependencies=[Depends(may_submit)])
+def delete_job(job_id: str, jobs: JobsOf, typed: Typed = "") -> RedirectResponse:
+    """Take a job away that has ended."""
+    _confirmed(typed, job_id, job_id[:SHORT_ID])
+    jobs.delete(job_id)
+    return _deleted(job_id)
+
+
+@router.post("/tags/{name}/delete", dependencies=[Depends(may_submit)])
+def delete_tag(name: str, tags: TagsOf, typed: Typed = "") -> RedirectResponse:
+    """Take a tag away; its grasps stay."""
+    _confirmed(typed, name)
+    tag = tags.one(name)
+    tags.remove(name)
+    return _deleted(tag.id)
+
+
+def _confirmed(typed: str, *names: str) -> None:
+    if typed.strip() not in names:
+        raise InputError(f"nothing was deleted: to confirm it, type {names[-1]}")
+
+
+def _deleted(id: str) -> RedirectResponse:
+    return RedirectResponse(f"/deleted?done={id}", status_code=303)

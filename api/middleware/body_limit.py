@@ -11,7 +11,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.access.auth import authorize
 from api.access.keys import Scope as KeyScope
-from api.middleware.same_origin import SAFE_METHODS
+from api.middleware.request_context import SAFE_METHODS
 from api.problems import ApiError, answer
 from service.model.errors import LimitError
 

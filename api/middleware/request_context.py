@@ -1,4 +1,9 @@
-"""What stands before every route: request ids, security headers, and the checks that keep foreign web pages out."""
+"""Middleware before every route: request ids, security headers, HEAD (RFC 9110 §9.3.2), the path of a proxy, and the
+check that keeps foreign web pages out.
+
+Inside, all paths are as without it. What comes in with the prefix loses it here, where the proxy has not taken it away
+already; addresses that leave in headers get it. Those in pages get it where they are rendered (`with_prefix`).
+"""
 
 from __future__ import annotations
 
@@ -7,24 +12,29 @@ import re
 import time
 import uuid
 from typing import Final
+from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import Request
+from starlette.routing import Match
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from api.formatting import host_name
 from api.metrics import Metrics
-from api.middleware.same_origin import SAFE_METHODS
-from api.problems import answer, log_unforeseen
-from service import tracing
-from service.logs import bind
+from api.problems import ApiError, answer, log_unforeseen
+from service import telemetry
 from service.model.errors import GraspdError
+from service.telemetry import bind
 
 _access = logging.getLogger("graspd.access")
+
 #: Asked every few seconds by whatever watches the service.
 _QUIET: Final = ("/static/", "/healthz", "/readyz", "/metrics")
 
+SAFE_METHODS: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 
 _METHODS: Final = SAFE_METHODS | {"POST", "PUT", "PATCH", "DELETE"}
+
 _REQUEST_ID: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 CONTENT_SECURITY_POLICY: Final = (
@@ -57,8 +67,8 @@ class RequestContext:
         request_id = _request_id(Headers(scope=scope).get("x-request-id"))
         scope.setdefault("state", {})["request_id"] = request_id
         parent = Headers(scope=scope).get("traceparent", "")
-        with tracing.span(f"HTTP {_method(scope)}", parent=parent, request=request_id) as facts:
-            with bind(request=request_id, traceparent=tracing.traceparent()):
+        with telemetry.span(f"HTTP {_method(scope)}", parent=parent, request=request_id) as facts:
+            with bind(request=request_id, traceparent=telemetry.traceparent()):
                 await self._answer(scope, receive, send, request_id)
             facts["http.route"] = _route(scope)
 
@@ -114,3 +124,136 @@ def _route(scope: Scope) -> str:
 
 def _request_id(given: str | None) -> str:
     return given if given and _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex[:16]
+
+
+class Head:
+    """Answers HEAD as GET where no route takes HEAD itself."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or scope["method"] != "HEAD" or _is_taken(scope):
+            await self.app(scope, receive, send)
+            return
+
+        is_over = False
+
+        async def without_body(message: Message) -> None:
+            nonlocal is_over
+            if message["type"] == "http.response.start":
+                await send(message)
+                # A stream that may never end hears that its client is gone; what has a length closes its files itself.
+                is_last = all(name.lower() != b"content-length" for name, _ in message["headers"])
+            else:
+                is_last = not message.get("more_body", False)
+            if is_last and not is_over:
+                is_over = True
+                await send({"type": "http.response.body", "body": b"", "more_body": False})
+
+        headers = scope["headers"]
+        scope["method"], scope["headers"] = "GET", [one for one in headers if one[0] != b"range"]
+        try:
+            await self.app(scope, receive, without_body)
+        finally:
+            scope["method"], scope["headers"] = "HEAD", headers
+
+
+def _is_taken(scope: Scope) -> bool:
+    return any(route.matches(dict(scope))[0] is Match.FULL for route in scope["app"].routes)
+
+
+#: An attribute whose value is an address on this host. What a user wrote holds no quotes in a page.
+_ADDRESS: Final = re.compile(r'(?<=\s)((?:href|src|action|formaction|hx-[a-z-]+|data-[a-z-]+)=")(?=/(?!/))')
+
+_COOKIE_PATH: Final = re.compile(r";\s*Path=/(?=;|$)", re.IGNORECASE)
+
+
+class RootPath:
+    """Takes the prefix off paths and puts it on `Location` and on the path of cookies.
+
+    Args:
+        prefix: such as `/graspd`.
+    """
+
+    def __init__(self, app: ASGIApp, *, prefix: str) -> None:
+        self.app = app
+        self.prefix = prefix
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        if scope["path"] == self.prefix or scope["path"].startswith(f"{self.prefix}/"):
+            scope = {**scope, "path": scope["path"].removeprefix(self.prefix) or "/"}
+            if raw := scope.get("raw_path"):
+                scope["raw_path"] = raw.removeprefix(self.prefix.encode()) or b"/"
+        host = Headers(scope=scope).get("host", "")
+
+        async def prefixed(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                if (where := headers.get("location")) is not None:
+                    headers["location"] = self._below(where, host)
+                if cookies := headers.getlist("set-cookie"):
+                    del headers["set-cookie"]
+                    for cookie in cookies:
+                        headers.append("set-cookie", _COOKIE_PATH.sub(f"; Path={self.prefix}", cookie))
+            await send(message)
+
+        await self.app(scope, receive, prefixed)
+
+    def _below(self, where: str, host: str) -> str:
+        parts = urlsplit(where)
+        if parts.netloc not in ("", host) or not parts.path.startswith("/"):
+            return where  # a signed address of the store, say
+        return parts._replace(path=f"{self.prefix}{parts.path}").geturl()
+
+
+def with_prefix(page: str, prefix: str) -> str:
+    """A page whose addresses on this host begin with the prefix."""
+    return _ADDRESS.sub(rf"\g<1>{prefix}", page) if prefix else page
+
+
+class SameOrigin:
+    """Refuses what a foreign web page could make a visitor's browser do.
+
+    A browser names the page a request comes from (Sec-Fetch-Site, Origin); other clients send neither. While no keys
+    exist the service answers only to names of this machine, so that a rebound DNS name reaches nothing.
+
+    Args:
+        allowed_hosts: host names the service answers to; None: any.
+    """
+
+    def __init__(self, app: ASGIApp, *, allowed_hosts: frozenset[str] | None) -> None:
+        self.app = app
+        self.allowed_hosts = allowed_hosts
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http" and (error := self._refusal(scope)) is not None:
+            await answer(Request(scope), error)(scope, receive, send)
+            return
+        await self.app(scope, receive, send)
+
+    def _refusal(self, scope: Scope) -> ApiError | None:
+        headers = Headers(scope=scope)
+        host = headers.get("host", "")
+        if self.allowed_hosts is not None and host_name(host) not in self.allowed_hosts:
+            return ApiError(421, f"this service does not answer to the name {host_name(host)!r}; use 127.0.0.1")
+        if scope["method"] in SAFE_METHODS:
+            return None
+        site = headers.get("sec-fetch-site")
+        origin = headers.get("origin")
+        if site not in (None, "same-origin", "none"):
+            return ApiError(403, "the request comes from another web site; open the dashboard itself and try again")
+        if origin is not None and _place(origin) != host:
+            return ApiError(403, f"the request comes from {origin}; open the dashboard itself and try again")
+        return None
+
+
+def _place(origin: str) -> str | None:
+    """Host and port of an origin; None where it is no address at all."""
+    try:
+        return urlsplit(origin).netloc
+    except ValueError:
+        return None

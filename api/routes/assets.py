@@ -1,4 +1,4 @@
-"""`/v1/hands`, `/v1/objects` and `/v1/networks`: what can be grasped, with what, and what proposes grasps."""
+"""`/v1/hands`, `/v1/objects` and `/v1/networks`, and corrections of hands: a corrected hand is another hand."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from threading import BoundedSemaphore
 from typing import Annotated, Final
 
 from fastapi import APIRouter, Depends, Form, Query, Request, Response, UploadFile
+from pydantic import Field
 from starlette.datastructures import UploadFile as AnyUpload
 
 from api.catalog.assets import Assets
 from api.problems import responses
-from api.routes.conditions import is_known
-from api.routes.dependencies import AssetsOf, Cursor, Limit, may_read, may_submit
-from api.routes.long_requests import UPLOADS, Turns
-from api.routes.paging import link_next
+from api.routes.dependencies import UPLOADS, AssetsOf, Cursor, Limit, Turns, is_known, link_next, may_read, may_submit
 from api.uploads import files_of_upload, name_of_upload
 from service.index.views import AssetView, Page
 from service.model.domain import Name
 from service.model.errors import InputError, RateError
 from service.model.states import AssetKind
-from service.store.hand_corrections import HandCorrections
+from service.store.descriptions import HandCorrections
 
 _GLB: Final = "model/gltf-binary"
+
 #: Uploads being unpacked and packed in this process; each may hold one file of its size in memory.
 _AT_ONCE: Final = BoundedSemaphore(UPLOADS)
+
 _TURN_S: Final = 20.0
 
-
 _ZIPPED: Final = "Upload a file, or a ZIP of its folder. It is checked by a worker before the first job uses it."
+
 #: What the document says of an upload.
 _ADDED: Final = {
     AssetKind.HAND: _ZIPPED,
@@ -203,3 +203,29 @@ def _one_of_few() -> Iterator[None]:
         yield
     finally:
         _AT_ONCE.release()
+
+
+correction_router = APIRouter(prefix="/v1/hands", tags=["hands"])
+
+
+class CorrectionRequest(HandCorrections):
+    """Corrections, and the name of the hand that has them."""
+
+    name: Name | None = Field(None, description="of the corrected hand; default: the hand's name with the next number")
+
+
+@correction_router.post(
+    "/{name}/corrections",
+    status_code=202,
+    dependencies=[Depends(may_submit)],
+    responses=responses(400, 401, 403, 404, 409, 413, 422, 429, 503),
+)
+async def correct_hand(
+    name: str, body: CorrectionRequest, request: Request, response: Response, assets: AssetsOf
+) -> AssetView:
+    """A hand of the same files with these corrections; a worker checks it. `name` may be a digest."""
+    uploads: Turns = request.app.state.uploads
+    asset = await uploads.run(store_correction, assets, name, body, body.name)
+    response.headers["Location"] = f"/v1/hands/{asset.name}"
+    response.headers["Retry-After"] = "1"
+    return asset

@@ -10,12 +10,10 @@ from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
 from api.problems import ApiError, responses
-from api.routes.dependencies import Cursor, DatasetsOf, Limit, may_read, may_submit
-from api.routes.paging import link_next
-from service.index.dataset_views import CellView, DatasetView, ObjectSetView, SnapshotView
-from service.index.views import Page
-from service.model.dataset_records import Snapshot
+from api.routes.dependencies import Cursor, DatasetsOf, Limit, link_next, may_read, may_submit
+from service.index.views import CellView, DatasetView, ObjectSetView, Page, SnapshotView
 from service.model.domain import Name
+from service.model.records import Snapshot
 from service.model.states import State
 from service.pipeline.datasets.estimate import Estimate
 from service.pipeline.datasets.spec import DatasetRequest, Matrix, Names

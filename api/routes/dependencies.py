@@ -1,29 +1,33 @@
-"""What routes ask for: the nouns of this application, and the right to use them."""
+"""Dependencies of routes: parts of the application, permissions, links between pages, threads for long requests,
+conditional requests (RFC 9110 §13)."""
 
 from __future__ import annotations
 
+import asyncio
+import re
 from collections.abc import Callable, Coroutine
-from typing import Annotated, Any
+from functools import partial
+from typing import Annotated, Any, Final, TypeVar
 
-from fastapi import Depends, FastAPI, Query, Request
+from anyio import CapacityLimiter, to_thread
+from fastapi import Depends, FastAPI, Query, Request, Response
+from starlette.datastructures import Headers
 
 from api.access.auth import authorize
 from api.access.idempotency import Idempotency
 from api.access.keys import Scope
-from api.access.quotas import Quotas
-from api.access.unfinished import unfinished
+from api.access.quotas import Quotas, unfinished
 from api.catalog.assets import Assets
-from api.catalog.comparison import Comparisons
-from api.catalog.datasets import Datasets
+from api.catalog.datasets import Comparisons, Datasets
 from api.catalog.deletions import Deletions
+from api.catalog.events import Webhooks
 from api.catalog.grasp_exports import GraspExports
 from api.catalog.grasps import Grasps
 from api.catalog.jobs import Jobs
-from api.catalog.overview import Overview
+from api.catalog.overview import Overview, Usage
 from api.catalog.shards import Shards
 from api.catalog.tags import Tags
-from api.catalog.usage import Usage
-from api.catalog.webhooks import Webhooks
+from service.model.errors import UnavailableError
 from service.pipeline.backends import Services
 from service.queue.connection import connect, redis_url
 from service.store.store import Store
@@ -76,17 +80,122 @@ def _provided(name: str) -> Callable[[Request], Coroutine[Any, Any, Any]]:
 
 
 JobsOf = Annotated[Jobs, Depends(_provided("jobs"))]
+
 DatasetsOf = Annotated[Datasets, Depends(_provided("datasets"))]
+
 ComparisonsOf = Annotated[Comparisons, Depends(_provided("comparisons"))]
+
 AssetsOf = Annotated[Assets, Depends(_provided("assets"))]
+
 GraspsOf = Annotated[Grasps, Depends(_provided("grasps"))]
+
 ShardsOf = Annotated[Shards, Depends(_provided("shards"))]
+
 StoreOf = Annotated[Store, Depends(_provided("store"))]
+
 UsageOf = Annotated[Usage, Depends(_provided("usage"))]
+
 TagsOf = Annotated[Tags, Depends(_provided("tags"))]
+
 ExportsOf = Annotated[GraspExports, Depends(_provided("grasp_exports"))]
+
 DeletionsOf = Annotated[Deletions, Depends(_provided("deletions"))]
+
 WebhooksOf = Annotated[Webhooks, Depends(_provided("webhooks"))]
+
 OverviewOf = Annotated[Overview, Depends(_provided("overview"))]
+
 Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="items on a page")]
+
 Cursor = Annotated[str | None, Query(max_length=512, description="`next` of the page before")]
+
+
+def link_next(request: Request, response: Response, cursor: str | None) -> None:
+    """Name the next page in the Link header (RFC 8288), with the filters of this one."""
+    if cursor is not None:
+        response.headers["Link"] = f'<{next_address(request, cursor)}>; rel="next"'
+
+
+def next_address(request: Request, cursor: str) -> str:
+    """Path and query of the page behind a cursor."""
+    url = request.url.include_query_params(cursor=cursor)
+    return f"{url.path}?{url.query}"
+
+
+T = TypeVar("T")
+
+#: Uploads that are unpacked and packed at once; each may hold one file of its size in memory.
+UPLOADS: Final = 4
+
+#: Forms with an upload: they wait for its check too.
+FORMS: Final = 8
+
+#: Files of chosen grasps that are written at once.
+EXPORTS: Final = 2
+
+_WAITING: Final = 32
+
+_PATIENCE_S: Final = 20.0
+
+
+class Turns:
+    """A bounded number of threads, and of requests that wait for one.
+
+    Args:
+        at_once: threads.
+        waiting: requests that may wait.
+        patience_s: how long each of these waits [s].
+    """
+
+    def __init__(self, at_once: int, *, waiting: int = _WAITING, patience_s: float = _PATIENCE_S) -> None:
+        self._free = asyncio.Semaphore(at_once)
+        self._threads = CapacityLimiter(at_once)
+        self._waiting = 0
+        self._most_waiting = waiting
+        self._patience_s = patience_s
+
+    async def run(self, function: Callable[..., T], *args: Any, **options: Any) -> T:
+        """What the function answers, in a thread of these.
+
+        Raises:
+            UnavailableError: too many wait already, or no turn came in time.
+        """
+        await self._take()
+        try:
+            return await to_thread.run_sync(partial(function, *args, **options), limiter=self._threads)
+        finally:
+            self._free.release()
+
+    async def _take(self) -> None:
+        busy = UnavailableError("too many requests of this kind at once; try again in a moment")
+        if self._free.locked() and self._waiting >= self._most_waiting:
+            raise busy
+        self._waiting += 1
+        try:
+            async with asyncio.timeout(self._patience_s):
+                await self._free.acquire()
+        except TimeoutError:
+            raise busy from None
+        finally:
+            self._waiting -= 1
+
+
+_TAGS: Final = re.compile(r'\s*((?:W/)?"[^"]*")\s*(?:,|$)')
+
+
+def is_known(headers: Headers, etag: str) -> bool:
+    """Whether If-None-Match names this file, so that 304 is the answer.
+
+    Args:
+        etag: strong entity tag, with its quotes.
+    """
+    given = headers.getlist("if-none-match")
+    return any(value.strip() == "*" for value in given) or etag in {
+        tag.removeprefix("W/") for value in given for tag in _TAGS.findall(value)
+    }
+
+
+def range_applies(headers: Headers, etag: str) -> bool:
+    """Whether Range counts: If-Range is absent, or names this very file. Dates name none, for none is ever sent."""
+    given = headers.get("if-range")
+    return given is None or given.strip() == etag

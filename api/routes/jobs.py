@@ -11,8 +11,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from api.catalog import events
 from api.models import Job, JobDetail
 from api.problems import responses
-from api.routes.dependencies import Cursor, JobsOf, Limit, may_read, may_submit
-from api.routes.paging import link_next
+from api.routes.dependencies import Cursor, JobsOf, Limit, link_next, may_read, may_submit
 from service.index.views import Page
 from service.model.domain import JobRequest
 from service.model.states import State

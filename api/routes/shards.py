@@ -10,9 +10,7 @@ from fastapi.responses import RedirectResponse, StreamingResponse
 
 from api.models import Shard
 from api.problems import ApiError, responses
-from api.routes.conditions import is_known, range_applies
-from api.routes.dependencies import Cursor, Limit, ShardsOf, may_read
-from api.routes.paging import link_next
+from api.routes.dependencies import Cursor, Limit, ShardsOf, is_known, link_next, may_read, range_applies
 from service.index.views import Page
 
 router = APIRouter(prefix="/v1/shards", tags=["shards"])

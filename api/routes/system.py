@@ -1,16 +1,24 @@
-"""Workers, statistics, health and metrics."""
+"""Workers, statistics, health and metrics; `/v1/usage`; `/v1/deletions` and restores."""
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Depends, Request, Response
+import re
+from datetime import date
+from typing import Annotated, Final, get_args
+
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from pydantic import BeforeValidator
 
 from api.access.auth import is_allowed
 from api.access.keys import Scope
+from api.catalog.deletions import DeletionView
+from api.catalog.overview import as_csv
 from api.metrics import CONTENT_TYPE, Metrics
 from api.models import Health, Worker
 from api.problems import responses
-from api.routes.dependencies import OverviewOf, may_read, may_scrape
-from service.index.views import Stats
+from api.routes.dependencies import DeletionsOf, OverviewOf, UsageOf, may_read, may_scrape, may_submit
+from service.index.views import Stats, UsageDay
+from service.store.records import What
 
 router = APIRouter(tags=["system"])
 
@@ -59,3 +67,74 @@ def metrics(request: Request, overview: OverviewOf) -> Response:
     """Prometheus text format. A scrape must show which part is down, so it succeeds without what that part knows."""
     values: Metrics = request.app.state.metrics
     return Response(values.render(overview.snapshot()), media_type=CONTENT_TYPE)
+
+
+usage_router = APIRouter(tags=["usage"])
+
+
+def _day(said: object) -> object:
+    """A number would be read as seconds since 1970, and of a time its day would be taken."""
+    if isinstance(said, str) and not re.fullmatch(r"[0-9]{4}-[0-9]{2}-[0-9]{2}", said):
+        raise ValueError("a day is written as 2026-01-31")
+    return said
+
+
+Day = Annotated[date, BeforeValidator(_day)]
+
+Since = Annotated[Day | None, Query(description="first day (UTC); default: a month before the last")]
+
+Until = Annotated[Day | None, Query(description="last day (UTC); default: today")]
+
+
+@usage_router.get("/v1/usage", dependencies=[Depends(may_read)], responses=responses(400, 401, 403, 422, 503))
+def get_usage(usage: UsageOf, since: Since = None, until: Until = None) -> list[UsageDay]:
+    """Grasps and seconds of each project on each day, the newest first: of the key's project, with `admin` of all."""
+    return usage.days(since, until)
+
+
+@usage_router.get(
+    "/v1/usage.csv",
+    dependencies=[Depends(may_read)],
+    response_class=Response,
+    responses=responses(
+        400,
+        401,
+        403,
+        422,
+        503,
+        others={200: {"content": {"text/csv": {}}, "description": "One line a day and project"}},
+    ),
+)
+def get_usage_csv(usage: UsageOf, since: Since = None, until: Until = None) -> Response:
+    """The same as a table."""
+    headers = {"Content-Disposition": 'attachment; filename="usage.csv"'}
+    return Response(as_csv(usage.days(since, until)), media_type="text/csv", headers=headers)
+
+
+deletion_router = APIRouter(tags=["deletions"])
+
+Name = Annotated[str, Path(max_length=64, description="its name, or its id")]
+
+KINDS: Final[tuple[What, ...]] = get_args(What)
+
+
+@deletion_router.get("/v1/deletions", dependencies=[Depends(may_read)], responses=responses(401, 403, 503))
+def list_deletions(deletions: DeletionsOf) -> list[DeletionView]:
+    """What can be restored, the newest first."""
+    return deletions.recent()
+
+
+def _add_restore(what: What) -> None:
+    @deletion_router.post(
+        f"/v1/{what}s/{{name}}/restore",
+        dependencies=[Depends(may_submit)],
+        responses=responses(401, 403, 404, 409, 422, 503),
+        name=f"restore_{what}",
+    )
+    def restore(name: Name, deletions: DeletionsOf) -> DeletionView:
+        """Bring back what was deleted within the grace time (`GRASPD_SHARD_GRACE_S`), as it was."""
+        return deletions.restore(what, name)
+
+
+for _kind in KINDS:
+    _add_restore(_kind)

@@ -7,37 +7,46 @@ revision. Grasps whose shards lack it hold NULL. A column whose metric is gone s
 
 from __future__ import annotations
 
+import fcntl
 import logging
 import sqlite3
 import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from sqlalchemy import URL, Connection, Engine, MetaData, create_engine, event, inspect, make_url, text
 from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlchemyError
 
-from service.index.sqlite_file import Identity, SqliteFile
 from service.index.tables import grasps, metadata
 from service.model.errors import IndexDamaged, IndexUnavailable, InputError
 from service.model.metrics import indexed
 
 log = logging.getLogger(__name__)
+
 T = TypeVar("T")
+
 #: Revision of `service.index.tables`: another number for every change of them but for new metrics.
 REVISION: Final = "0021"
+
 #: Table that names the revision. A graspd of 0.2 reads it, and refuses an index of a revision that it does not know.
 REVISION_TABLE: Final = "alembic_version"
+
 #: A job of a million grasps is one transaction of a few seconds; others wait for it.
 _BUSY_TIMEOUT_S: Final = 20.0
+
 #: Key of PostgreSQL's advisory lock that lets one process make tables at a time: the letters "grsp".
 _TABLES_LOCK: Final = 0x67727370
+
 #: Of the one that lets one process write at a time; it ends with its transaction: the letters "grsq".
 _TURN_LOCK: Final = 0x67727371
+
 #: What SQLAlchemy raises for a URL.
 UNUSABLE: Final = (ArgumentError, NoSuchModuleError, ModuleNotFoundError, ValueError)
+
 #: Codes of SQLite for a file whose content makes no sense.
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
@@ -320,3 +329,54 @@ def _add_missing_metrics(connection: Connection) -> list[str]:
         if index.name not in made:
             index.create(connection)
     return missing
+
+
+#: What SQLite keeps beside the file while it is open: the log of writes and its shared memory.
+_COMPANIONS: Final = ("-wal", "-shm")
+
+Identity = tuple[int, int] | None
+
+
+class SqliteFile:
+    """Processes that open the file take turns, so that none meets what another is putting aside."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def identity(self) -> Identity:
+        """Device and inode of the file that has the name now; None if there is none.
+
+        A process that holds a file which was removed would read and write what nobody else sees.
+        """
+        try:
+            facts = self.path.stat()
+        except FileNotFoundError:
+            return None
+        return facts.st_dev, facts.st_ino
+
+    @contextmanager
+    def opening(self) -> Iterator[None]:
+        """Alone among processes. What a file that is gone left beside it is removed: it belongs to no other."""
+        try:
+            lock = self._beside(".lock").open("w")
+        except OSError as error:
+            raise IndexUnavailable(f"the index {self.path} cannot be opened: {error.strerror}") from None
+        with lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if self.identity() is None:
+                for name in _COMPANIONS:
+                    self._beside(name).unlink(missing_ok=True)
+            yield
+
+    def set_aside(self, damaged: Identity) -> None:
+        """Move a damaged file out of the way, unless another process did; call it within `opening`."""
+        if damaged is None or self.identity() != damaged:
+            return
+        suffix = f".damaged-{datetime.now(UTC):%Y%m%dT%H%M%S}"
+        log.error("the index %s is damaged and moved to %s%s; a new one takes its place", self.path, self.path, suffix)
+        for name in ("", *_COMPANIONS):
+            if (found := self._beside(name)).exists():
+                found.rename(found.with_name(f"{self.path.name}{suffix}{name}"))
+
+    def _beside(self, name: str) -> Path:
+        return self.path.with_name(f"{self.path.name}{name}")

@@ -7,21 +7,17 @@ from sqlalchemy import URL
 from service.index.changes.live import Live
 from service.index.changes.records import Changes, DatasetChanges
 from service.index.changes.removals import Removals
-from service.index.damage import KnownDamage
 from service.index.database import Database
-from service.index.notes import Notes
+from service.index.notes import KnownDamage, Notes
 from service.index.outbox import Outbox
 from service.index.queries.assets import Assets, ObjectSets
-from service.index.queries.costs import Costs
-from service.index.queries.dataset_feed import DatasetFeed
 from service.index.queries.datasets import Datasets
-from service.index.queries.feed import Feed
+from service.index.queries.feed import DatasetFeed, Feed
 from service.index.queries.grasps import Grasps
-from service.index.queries.jobs import Jobs
+from service.index.queries.jobs import Jobs, Shards
 from service.index.queries.overview import Overview
-from service.index.queries.shards import Shards
 from service.index.queries.statistics import Statistics
-from service.index.queries.usage import Usage
+from service.index.queries.usage import Costs, Usage
 from service.index.tags import Tags
 
 

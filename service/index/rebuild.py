@@ -13,23 +13,29 @@ from typing import Any, Final, TypeVar
 from sqlalchemy import Connection, Table, delete, select
 from sqlalchemy.exc import DataError
 
-from service.index.changes.states import QUIET
+from service.index.changes.rows import QUIET
 from service.index.index import Index
 from service.index.notes import Marked
 from service.index.tables import LIVE_COLUMNS, LIVE_TABLES, metadata
 from service.model import names
-from service.model.dataset_records import DatasetEvent, DatasetRecord, ObjectSet, Snapshot
 from service.model.errors import DamagedError, InputError, NotFoundError
-from service.model.records import AttemptRecord, JobEvent, JobRecord, Record
+from service.model.records import (
+    AttemptRecord,
+    DatasetEvent,
+    DatasetRecord,
+    JobEvent,
+    JobRecord,
+    ObjectSet,
+    Record,
+    Snapshot,
+    Tag,
+)
 from service.model.states import State
-from service.model.tags import Tag
 from service.model.webhooks import Webhook
 from service.settings import sqlite_url
-from service.store.deletions import pending
 from service.store.library import load_asset, load_check, stored_assets
 from service.store.manifests import ShardManifest
-from service.store.marks import newest_mark
-from service.store.records import parse_record
+from service.store.records import newest_mark, parse_record, pending
 from service.store.store import Store
 
 log = logging.getLogger(__name__)

@@ -22,9 +22,8 @@ from service.model import names
 from service.model.errors import DamagedError, IndexDamaged, IndexUnavailable, NotFoundError
 from service.model.records import JobRecord
 from service.model.states import Stage
-from service.store.deletions import pending
 from service.store.manifests import load_manifest
-from service.store.records import read_record
+from service.store.records import pending, read_record
 from service.store.store import Store
 
 #: Rows of a kind from each side.

@@ -15,7 +15,7 @@ from service.index.tables import grasps, tagged, tags
 from service.index.views import TagView
 from service.model.errors import NotFoundError
 from service.model.projects import EVERYTHING, ProjectScope
-from service.model.tags import Grasp, Tag
+from service.model.records import Grasp, Tag
 
 #: Grasps that one statement names: two parameters each.
 _AT_ONCE: Final = 400

@@ -1,11 +1,106 @@
-"""What all models of the domain have in common."""
+"""Common parts of the domain models: their base, patterns of names, and refusals in this project's words."""
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
+import re
+from collections.abc import Mapping
+from typing import Annotated, Any, Final
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic.fields import FieldInfo
+
+from service.model.errors import one_of
 
 
 class Model(BaseModel):
     """Base of the domain models: frozen, and strict about unknown fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+#: A name a user gives: used in file names and URLs, so letters, digits, dot, dash and underscore only.
+NAME: Final = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+
+Name = Annotated[str, Field(pattern=NAME)]
+
+#: A name a user gives to grasps: words of such characters with one space between.
+TagName = Annotated[
+    str,
+    StringConstraints(strip_whitespace=True, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*( [A-Za-z0-9._-]+)*$"),
+]
+
+#: Lower-case hexadecimal SHA-256, shortened to 32 digits (128 bits).
+DIGEST: Final = r"^[0-9a-f]{32}$"
+
+Digest = Annotated[str, Field(pattern=DIGEST)]
+
+#: An id or nothing. Whoever writes to Redis may say anything, so what is read from there is bounded like this.
+Word = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{0,64}$")]
+
+_WORDS: Final = {
+    "missing": "is missing",
+    "extra_forbidden": "is not known",
+    "greater_than_equal": "must be at least {ge}",
+    "less_than_equal": "must be at most {le}",
+    "greater_than": "must be more than {gt}",
+    "less_than": "must be less than {lt}",
+    "string_pattern_mismatch": "must match {pattern}",
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "must be a whole number"),
+    **dict.fromkeys(("float_type", "float_parsing"), "must be a number"),
+    **dict.fromkeys(("bool_type", "bool_parsing"), "must be true or false"),
+}
+
+#: Kinds of errors about a bound, and how pydantic names it.
+_BOUNDS: Final = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_equal": "le", "less_than": "lt"}
+
+_NAMES: Final = "must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores"
+
+#: How pydantic begins: of what, not of which field.
+_SUBJECT: Final = re.compile(r"^(Value error, )|^\w+ should ")
+
+_CLASS: Final = re.compile(r"_[A-Z]\w*$")
+
+#: How typer names the choices of an option; pydantic gives them as `expected`.
+_CHOICES: Final = re.compile(r"'(?P<word>.*?)' is not one of (?P<expected>'.*')")
+
+
+def refusal(error: ValidationError, model: type[BaseModel] | None = None) -> str:
+    """The first thing that is wrong, after its place: `scene.touch: must be at least -1`.
+
+    With the model that refused, a number's whole range is named: `share: must be more than 0 and at most 1; got 3`.
+    """
+    first = error.errors(include_url=False)[0]
+    # Of several models that would do, pydantic names the one that it tried.
+    where = ".".join(str(part) for part in first["loc"] if not _CLASS.match(str(part)))
+    field = model.model_fields.get(where) if model else None
+    said = f"{_range(field)}; got {first['input']!r}" if field and first["type"] in _BOUNDS else words(first)
+    return f"{where}: {said}" if where else said
+
+
+def _range(field: FieldInfo) -> str:
+    """The bounds of a number: `must be at least 0 and at most 3`."""
+    held = ((name, getattr(one, key, None)) for one in field.metadata for name, key in _BOUNDS.items())
+    said = [_WORDS[name].format(**{_BOUNDS[name]: f"{value:.12g}"}) for name, value in held if value is not None]
+    return " and ".join([*said[:1], *(words.removeprefix("must be ") for words in said[1:])])
+
+
+def words(entry: Mapping[str, Any]) -> str:
+    """What is wrong by one entry of `ValidationError.errors()`, without its place."""
+    facts = entry.get("ctx", {})
+    message = _SUBJECT.sub(lambda found: "" if found[1] else "must ", entry["msg"])
+    if facts.get("pattern") == NAME:
+        return _NAMES
+    choices = _CHOICES.match(message)
+    if "expected" in facts or choices:
+        expected = choices["expected"] if choices else facts["expected"]
+        known = re.findall(r"'([^']*)'", expected)
+        word = choices["word"] if choices else entry.get("input")
+        return f"must be one of {one_of(str(word), known)}" if known else message
+    said = _WORDS.get(entry["type"])
+    bounds = {name: f"{value:g}" if isinstance(value, float) else value for name, value in facts.items()}
+    return said.format(**bounds) if said else message
+
+
+def why(error: Exception) -> str:
+    """What a library says of a file, the system's words without their number and the path once more."""
+    return getattr(error, "strerror", None) or str(error)

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Mapping, MutableMapping
 from contextlib import AbstractContextManager
 from typing import IO, Final
 
-from service.model.diversity import MIN_DISTANCE_M
 from service.model.domain import JobRequest, batches_of
+from service.model.metrics import MIN_DISTANCE_M
 from service.model.states import AssetKind, Stage
 from service.model.version import STAGE_REVISIONS
 

@@ -12,25 +12,27 @@ from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
-from service.model.base import Model
-from service.model.diversity import MIN_DISTANCE_M
+from service.model.base import DIGEST, Model
+from service.model.base import Digest as Digest
+from service.model.base import Name as Name
+from service.model.base import Word as Word
 from service.model.fidelity import AUTO, Fidelity, resolve_fidelity
-from service.model.labels import DIGEST
-from service.model.labels import Digest as Digest
-from service.model.labels import Name as Name
-from service.model.labels import Word as Word
 from service.model.matter import FRICTION, MASS_KG, MOST_KG, Density, Friction, Mass
+from service.model.metrics import MIN_DISTANCE_M, MOST_ROBUST_MODELS, ROBUST_MODELS
 from service.model.projects import Project
-from service.model.robust import MODELS, MOST_MODELS
-from service.model.scene_kinds import has_table
-from service.model.scene_options import (
+from service.model.scene_spec import (
+    LEAST_TOUCH,
+    MOST_NEIGHBOURS,
+    MOST_TOUCH,
+    TOUCH,
     BesideOption,
     NamedNeighbour,
     SceneDocument,
     SceneOption,
+    SceneSpec,
+    has_table,
     scene_of,
 )
-from service.model.scene_spec import LEAST_TOUCH, MOST_NEIGHBOURS, MOST_TOUCH, TOUCH, SceneSpec
 from service.model.states import AssetKind
 
 #: Grasps of a batch: the unit of seeds and of the planner's launches.
@@ -154,9 +156,10 @@ class JobOptions(Model):
     robust_models: int = Field(
         0,
         ge=0,
-        le=MOST_MODELS,
+        le=MOST_ROBUST_MODELS,
         exclude_if=lambda value: value == 0,
-        description=f"models in which each valid grasp is judged too; 0: {MODELS} where a share is wanted, else none",
+        description=f"models in which each valid grasp is judged too; 0: {ROBUST_MODELS} where a share is wanted, "
+        "else none",
     )
     payload: bool = Field(
         False,
@@ -295,7 +298,7 @@ class JobOptions(Model):
     @property
     def models(self) -> int:
         """Models around the nominal one in which each valid grasp is judged; 0: none."""
-        return self.robust_models or (MODELS if self.robust else 0)
+        return self.robust_models or (ROBUST_MODELS if self.robust else 0)
 
     @property
     def place(self) -> SceneSpec:

@@ -25,18 +25,22 @@
 
 A message is one line that names what is wrong and the fix. `exit_code` and `status` are the one table from errors to
 exit codes and HTTP statuses; `slug` names the problem type (RFC 9457).
+
+Secrets do not leave in messages: neither in errors nor in log lines, whatever these quote.
+
+What somebody may have meant by a word that is not known.
 """
 
 from __future__ import annotations
 
+import difflib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Final, Self
-
-from service.model.redaction import without_secrets
 
 #: Line breaks with the space around them, all that `str.splitlines` knows; control characters.
 _BREAK: Final = re.compile(r"\s*[\n\r\v\f\x1c-\x1e\x85\u2028\u2029]\s*")
+
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
@@ -240,3 +244,44 @@ ERRORS: Final[dict[str, type[GraspdError]]] = {
         GraspdError,
     )
 }
+
+#: User and password of a URL, up to the last @: a password that nobody quoted may hold one, and a slash.
+_LOGIN: Final = re.compile(r"(?<=://)[^/\s\"'<>][^\s\"'<>]*@")
+
+_PARAMETER: Final = re.compile(
+    r"([?&][\w.%-]*(?:password|passwd|token|secret|signature|credential|sig|key)=)[^&\s\"'<>]+", re.IGNORECASE
+)
+
+_API_KEY: Final = re.compile(r"\bgd_[A-Za-z0-9_-]{8,}")
+
+
+def without_secrets(text: str) -> str:
+    """The text with stars for passwords in URLs and for API keys."""
+    if "://" in text:
+        text = _PARAMETER.sub(r"\1***", _LOGIN.sub("***@", text))
+    return _API_KEY.sub("gd_***", text) if "gd_" in text else text
+
+
+#: Names among which a similar one is sought, and those that a message lists.
+SEARCHED: Final = 1000
+
+_LISTED: Final = 20
+
+
+def known_names(word: str, names: Sequence[str]) -> str:
+    """`; there are: A, B` with the first of at most `SEARCHED` names, and the one that is like the word."""
+    listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
+    return f"; there are: {listed or 'none yet'}{did_you_mean(word, names)}"
+
+
+def did_you_mean(word: str, choices: Iterable[str]) -> str:
+    """`; did you mean X?` for the choice that is like the word, else nothing."""
+    known = {choice.lower(): choice for choice in choices}
+    like = difflib.get_close_matches(word.lower(), known, n=1)
+    return f"; did you mean {known[like[0]]}?" if like else ""
+
+
+def one_of(word: str, choices: Iterable[str]) -> str:
+    """`A, B, C`, and which of them was meant."""
+    known = list(choices)
+    return f"{', '.join(known)}{did_you_mean(word, known)}"

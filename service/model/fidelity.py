@@ -7,7 +7,7 @@ from typing import Final, Literal
 from pydantic import Field
 
 from service.model.base import Model
-from service.model.suggestions import did_you_mean
+from service.model.errors import did_you_mean
 
 
 class Fidelity(Model):

@@ -6,9 +6,8 @@ from typing import Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
-from service.model.base import Model
+from service.model.base import Digest, Model, Name, Word
 from service.model.domain import JobRequest, check_known
-from service.model.labels import Digest, Name, Word
 from service.model.states import AssetKind, Stage
 
 

@@ -4,11 +4,16 @@ Shards (`service.store.columns`), manifests, the index, the API, the dashboard, 
 table. A new metric is a row here and the function that computes it (`MEASURES` in `worker.quality.table`); make it
 `optional`, since older shards lack it. The index gets its column when it is opened next
 (`service.index.database`). What says yes or no of a grasp is a verdict and no metric.
+
+Words of robustness: the axes along which a model of a hand and an object may be another than ours.
+
+How different grasps are, in words and numbers that all rooms share: types, directions of approach, entropy.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, Literal
@@ -267,3 +272,89 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
 def indexed(least: Indexed = Indexed.KEPT) -> tuple[GraspMetric, ...]:
     """Metrics of which the index knows that much."""
     return tuple(metric for metric in GRASP_METRICS if metric.indexed >= least)
+
+
+#: Models around the nominal one in which a grasp is judged, where nobody says how many.
+ROBUST_MODELS: Final = 8
+
+MOST_ROBUST_MODELS: Final = 64
+
+
+class Axis(IntEnum):
+    """What differs from the nominal model. Numbers stand in shards: new axes come last."""
+
+    NONE = 0
+    SHAPES = 1
+    JOINTS = 2
+    COUPLINGS = 3
+    FRICTION = 4
+    MASS = 5
+    CENTRE = 6
+    POSE = 7
+    CALIBRATION = 8
+    ORDER = 9
+
+    @property
+    def word(self) -> str:
+        """As documents and pages say it."""
+        return self.name.lower()
+
+
+#: What differs on each axis, for people.
+AXIS_MEANINGS: Final[dict[Axis, str]] = {
+    Axis.SHAPES: "collision shapes",
+    Axis.JOINTS: "joint drives",
+    Axis.COUPLINGS: "couplings of joints",
+    Axis.FRICTION: "friction",
+    Axis.MASS: "mass of the object",
+    Axis.CENTRE: "centre of mass",
+    Axis.POSE: "pose of the object",
+    Axis.CALIBRATION: "calibration of the hand",
+    Axis.ORDER: "order of closing",
+}
+
+#: Words of the axes.
+AXIS_WORDS: Final = tuple(axis.word for axis in AXIS_MEANINGS)
+
+
+def axis_word(number: int) -> str | None:
+    """The word of an axis as a shard has it; None: none, or one that this version does not know."""
+    return Axis(number).word if number in AXIS_MEANINGS else None
+
+
+class GraspType(IntEnum):
+    """What a hand does in a grasp, by the opposition in it; `worker.quality.taxonomy` has the rule."""
+
+    NONE = 0
+    """Not told: one digit alone touches, or nothing does."""
+    POWER = 1
+    PRECISION = 2
+    LATERAL = 3
+
+
+#: Directions fall into cells of equal area: bands of equal height z (Archimedes), each cut into equal azimuths.
+BANDS: Final = 4
+
+SECTORS: Final = 12
+
+DIRECTION_CELLS: Final = BANDS * SECTORS
+
+#: Two grasps of a job are nearer than this only by accident [m]: mean distance between the same points of the hand's
+#: surface. Twice as much is hard to tell apart in a picture; of 100 pairs of batches less than one has such a pair.
+MIN_DISTANCE_M: Final = 0.005
+
+
+def entropy_bits(counts: Iterable[int]) -> float:
+    """Shannon entropy [bit] of how grasps are shared out to kinds; 0: all are of one, or there are none."""
+    known = [count for count in counts if count > 0]
+    total = sum(known)
+    return -sum(count / total * math.log2(count / total) for count in known) + 0.0
+
+
+def evenness(counts: Iterable[int], kinds: int) -> float:
+    """Kinds that would be needed to spread as widely if each were used alike, over all kinds: 2^entropy / kinds.
+
+    1 is even; 1 / kinds is all of one kind; 0 if there is none.
+    """
+    counts = list(counts)
+    return float(2 ** entropy_bits(counts) / kinds) if any(counts) else 0.0

@@ -1,15 +1,20 @@
-"""From a job to its tasks, and from what is known of the tasks to their states. Pure functions: no store, no clock.
+"""From a job to its tasks, from facts about tasks to their states, and fair scheduling. Pure functions: no store, no
+clock.
 
 A job is cut into batches of `BATCH_SIZE` grasps, the unit of seeds and launches, and its batches into ranges of
 `JobRecord.span`. Each range is a chain of tasks, one a stage as far as asked: synthesize -> scene -> render, or where
 grasps are planned in scenes, scene -> synthesize -> render.
+
+What became of the candidates of a job, by name, and the sentence that says why it found fewer grasps than asked.
 """
 
 from __future__ import annotations
 
+import math
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeVar
 
 from service.model.digests import digest_json, shard_id
 from service.model.domain import BATCH_SIZE, JobOptions, JobRequest, batches_of
@@ -26,7 +31,6 @@ from service.model.version import (
 
 #: A job this small is somebody waiting at a screen; anything larger runs in bulk.
 INTERACTIVE_GRASPS: Final = 4 * BATCH_SIZE
-
 
 #: Longest wait between two attempts of a task [s].
 MAX_BACKOFF_S: Final = 300.0
@@ -205,3 +209,134 @@ def _own_state(facts: TaskFacts, *, job_cancelled: bool) -> State:
     if job_cancelled:
         return State.CANCELLED
     return State.RUNNING if facts.running else State.QUEUED
+
+
+T = TypeVar("T")
+
+#: Jobs fed in one round; the others have their turn in the next ones.
+JOBS_A_ROUND: Final = 64
+
+#: Turns remembered: more than there are jobs with waiting tasks, or a forgotten one would come first again.
+_REMEMBERED: Final = 100_000
+
+
+@dataclass(frozen=True)
+class WaitingJob:
+    """A job with tasks that may be queued, and whose share of the queue it takes (see `share_of`)."""
+
+    id: str
+    key: str
+
+
+def share_of(project: str, key: str) -> str:
+    """Whose share of the queue a job takes: its project's, or without one its key's ("" where there are no keys)."""
+    # No name of a key holds a space.
+    return f"project {project}" if project else key
+
+
+class Turns:
+    """Remembers who was served last. Lost with its process, which costs nobody more than one turn."""
+
+    def __init__(self) -> None:
+        self._served: dict[str, int] = {}
+        self._count = 0
+
+    def order(self, jobs: Iterable[WaitingJob], limit: int) -> list[tuple[WaitingJob, int]]:
+        """The jobs whose turn it is, and how many of their tasks may be queued, `limit` or somewhat more in all."""
+        of_key: dict[str, list[WaitingJob]] = defaultdict(list)
+        for job in sorted(jobs, key=lambda job: self._served.get(f"job {job.id}", 0)):
+            of_key[job.key].append(job)
+        keys = sorted(of_key, key=lambda key: self._served.get(f"key {key}", 0))
+        chosen = interleave([of_key[key] for key in keys])[: min(JOBS_A_ROUND, limit)]
+        number: dict[str, int] = defaultdict(int)
+        for job in chosen:
+            number[job.key] += 1
+        return [(job, -(-limit // (len(number) * number[job.key]))) for job in chosen]
+
+    def served(self, jobs: Sequence[WaitingJob]) -> None:
+        """These jobs had their turn, in this order."""
+        for job in jobs:
+            self._count += 1
+            self._served[f"job {job.id}"] = self._served[f"key {job.key}"] = self._count
+        if len(self._served) > _REMEMBERED:
+            self._served.clear()
+
+
+def interleave(lists: Sequence[Sequence[T]]) -> list[T]:
+    """One of each list, then the second of each, and so on."""
+    longest = max(map(len, lists), default=0)
+    return [some[place] for place in range(longest) for some in lists if place < len(some)]
+
+
+#: Outcomes of candidates that are not kept, in the order in which they are tested, with their words.
+OUTCOMES: Final = {
+    "diverged": "without a finite posture",
+    "no_place": "without a clear place or way in the scene",
+    "touched_on_the_way": "touched on the way",
+    "penetration": "inside the object when simulated",
+    "lost_while_closing": "lost while closing",
+    "not_lifted": "not lifted",
+    "turned": "turned in the hand",
+    "slipped": "slipped",
+    "neighbour_moved": "moved a neighbour",
+    "unstable": "unstable in simulation",
+    "gate_penetration": "too deep in the object (gate)",
+    "gate_self_penetration": "hand too deep in itself (gate)",
+    "gate_contacts": "did not oppose: fewer than two links in contact (gate)",
+    "fragile": "held in too few models",
+    "weak": "lifted less than the wanted payload",
+    "alike": "too similar to another",
+    "repeated": "repeated attempts",
+}
+
+
+def totals(parts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    """Sums by outcome over several counts, those above zero, in the order of `OUTCOMES`."""
+    found: dict[str, int] = dict.fromkeys(OUTCOMES, 0)
+    for part in parts:
+        for name, count in part.items():
+            found[name] = found.get(name, 0) + int(count)
+    return {name: count for name, count in found.items() if count}
+
+
+def told(outcomes: Mapping[str, int]) -> str:
+    """The counts in words, the most frequent first."""
+    order = sorted(outcomes.items(), key=lambda pair: -pair[1])
+    return ", ".join(f"{count:,} {OUTCOMES.get(name, name.replace('_', ' '))}" for name, count in order if count)
+
+
+def shortfall(
+    found: int, wanted: int, counted: str, tried: int, budget: float, outcomes: Mapping[str, int], limit: str = ""
+) -> str | None:
+    """Why fewer grasps were found than wanted, in a sentence; None where all were.
+
+    Args:
+        found: grasps that count.
+        wanted: grasps asked for.
+        counted: which grasps count: valid or sound.
+        tried: candidates planned.
+        budget: tries for each grasp wanted, at most: candidates and repeated attempts.
+        outcomes: candidates that were not kept, by `OUTCOMES`, and the repeated attempts.
+        limit: what the hand lifts at best, in place of the budget that ended.
+    """
+    if found >= wanted:
+        return None
+    lost, tries = told(outcomes), tried + outcomes.get("repeated", 0)
+    ended = limit or f"the budget of {budget:g} tries for each ended first"
+    return f"found {found:,} of {wanted:,} {counted} grasps in {tries:,} tries{': ' if lost else ''}{lost}; {ended}"
+
+
+def limit_told(hand: str, friction: float, grasps: int, lifts: float, bound: float, wanted: float | None = None) -> str:
+    """What a hand lifts at best, in a sentence.
+
+    Args:
+        hand: its name.
+        friction: Coulomb coefficient.
+        grasps: that were measured.
+        lifts: payload of the best of them [kg].
+        bound: that none exceeds by actuator effort and friction [kg]; inf: there is none.
+        wanted: mass that it should lift [kg]; None: nobody asked for one.
+    """
+    most = f", and at most {bound:.2g} kg by actuator effort" if math.isfinite(bound) else ""
+    less = "" if wanted is None else f"; {wanted:.3g} kg are wanted"
+    return f"{hand} lifts {lifts:.2g} kg at friction {friction:g} in the best of {grasps} grasps{most}{less}"

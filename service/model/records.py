@@ -1,12 +1,25 @@
-"""Small JSON records that the store keeps besides shards: jobs, what users did to them, failed attempts."""
+"""JSON records that the store keeps besides shards: jobs, datasets, what users did to them, failed attempts.
+
+`datasets/{name}/dataset.json` names the jobs of its cells, so that a dataset stays what it was when graspd's
+algorithms, or the meaning of a name, change later.
+
+Tags: names that users give to grasps, to find them again and to take them away together.
+"""
 
 from __future__ import annotations
 
-from typing import Any, Final, Literal, Self
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
-from service.model.domain import Digest, JobRequest, check_known
+from service.model import names
+from service.model.base import TagName
+from service.model.clock import timestamp
+from service.model.digests import digest_json
+from service.model.domain import Digest, JobOptions, JobRequest, Name, check_known
+from service.model.fidelity import AUTO
 from service.model.messages import Origin
 from service.model.projects import Project
 from service.model.states import AssetKind, Lane, Stage
@@ -107,3 +120,208 @@ class AttemptRecord(Record):
     started: str | None = None
     ended: str
     last: bool
+
+
+class Member(Record):
+    """A hand or object of a dataset: the very version that it was created with."""
+
+    name: Name
+    digest: Digest
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One hand x object of a dataset, and its job."""
+
+    position: int
+    hand: Member
+    object: Member
+    job_id: str
+    fidelity: str = ""
+    """What the chart promised for this cell, where the dataset's fidelity is `auto`."""
+    choice: Choice | None = None
+    """How that was chosen; None also of datasets from before it was written down."""
+
+
+class DatasetRecord(Record):
+    """`dataset.json`. `jobs` are those of the cells, hand by hand, and in each hand object by object; with fidelity
+    `auto`, `fidelities` are what the chart promised for them when the dataset was created, and `chosen` the places in
+    `choices` of how each was chosen."""
+
+    version: Literal[1] = 1
+    name: Name
+    digest: Digest
+    hands: tuple[Member, ...]
+    objects: tuple[Member, ...]
+    options: JobOptions
+    revisions: dict[str, int]
+    jobs: tuple[Digest, ...]
+    fidelities: tuple[str, ...] = ()
+    choices: tuple[Choice, ...] = Field((), exclude_if=lambda value: not value)
+    chosen: tuple[Annotated[int, Field(ge=0)], ...] = Field((), exclude_if=lambda value: not value)
+    created: str
+    owner: str = Field("", max_length=64, description="id of the API key that submitted it; empty: none, or not known")
+    project: Project = Field("", description="project of that key; empty: the one without a name")
+
+    @model_validator(mode="after")
+    def _a_job_a_cell(self) -> DatasetRecord:
+        if len(self.jobs) != len(self.hands) * len(self.objects):
+            raise ValueError("a dataset has a job for each hand and object")
+        if len(self.fidelities) != (len(self.jobs) if self.options.fidelity == AUTO else 0):
+            raise ValueError("a dataset has a fidelity for each cell if its own is auto, and else none")
+        if self.chosen and (len(self.chosen) != len(self.jobs) or max(self.chosen) >= len(self.choices)):
+            raise ValueError("a dataset says of each cell how its fidelity was chosen, or of none")
+        return self
+
+    def cells(self) -> Iterator[Cell]:
+        """The cells in their order."""
+        pairs = ((hand, obj) for hand in self.hands for obj in self.objects)
+        for position, ((hand, obj), job) in enumerate(zip(pairs, self.jobs, strict=True)):
+            fidelity = self.fidelities[position] if self.fidelities else ""
+            choice = self.choices[self.chosen[position]] if self.chosen else None
+            yield Cell(position, hand, obj, job, fidelity, choice)
+
+
+class DatasetEvent(Record):
+    """What a user did to a dataset later. The last one decides whether it is cancelled."""
+
+    number: int = Field(ge=1)
+    what: Literal["cancelled", "retried"]
+    at: str
+
+
+class SnapshotShard(Record):
+    """A file of a snapshot."""
+
+    id: Digest
+    kind: Literal["base", "scene", "views"]
+    key: str
+    sha256: str
+    size_bytes: int
+    count: int
+    valid: int
+    hand: Name
+    object: Name
+    batch: int
+
+    @field_validator("key")
+    @classmethod
+    def _taken_apart(cls, key: str, info: ValidationInfo) -> str:
+        # A snapshot of 0.2 may name a stretch of a pack; its shards have files of their own since.
+        stages = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
+        return names.shard_file(stages[info.data["kind"]], info.data["id"]) if "@" in key else key
+
+
+class Snapshot(Record):
+    """An immutable list of shards: what a dataset held at one moment."""
+
+    version: Literal[1] = 1
+    dataset: Name
+    dataset_digest: Digest
+    digest: Digest = Field(description="follows from the shards: the same files are the same snapshot")
+    complete: bool = Field(description="every cell had succeeded")
+    grasps: int
+    valid: int
+    size_bytes: int
+    created: str
+    shards: tuple[SnapshotShard, ...]
+
+
+class ObjectSet(Record):
+    """A version of a named set of objects; the newest counts."""
+
+    version: Literal[1] = 1
+    name: Name
+    digest: Digest
+    objects: tuple[Name, ...]
+    created: str
+    owner: str = ""
+    """Id of the key that made the set; empty: none, or not known."""
+    project: Project = ""
+    """Project of that key; empty: the one without a name."""
+
+
+def request_of(options: JobOptions, hand: str, obj: str, fidelity: str = "") -> JobRequest:
+    """The request of one cell; with a fidelity in the place of `auto`, if one is given."""
+    shared = {name: getattr(options, name) for name in JobOptions.model_fields}
+    return JobRequest(hand=hand, object=obj, **shared | ({"fidelity": fidelity, "target": ""} if fidelity else {}))
+
+
+def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: str = "", project: str = "") -> JobRecord:
+    """The job of a cell as it was planned when the dataset was created. Jobs of datasets go in bulk.
+
+    Args:
+        owner: whose dataset it is.
+        project: project of the dataset.
+    """
+    return JobRecord(
+        id=cell.job_id,
+        request=request_of(options, cell.hand.name, cell.object.name, cell.fidelity),
+        revisions=revisions,
+        hand_digest=cell.hand.digest,
+        object_digest=cell.object.digest,
+        lane=Lane.BULK,
+        created=timestamp(),
+        owner=owner,
+        project=project,
+        choice=cell.choice,
+    )
+
+
+def object_set_of(
+    name: str, objects: Iterable[str], *, after: str = "", owner: str = "", project: str = ""
+) -> ObjectSet:
+    """The version of a set that follows the one with digest `after`; the order of the objects does not matter."""
+    members = tuple(sorted(set(objects)))
+    return ObjectSet(
+        name=name,
+        digest=digest_json([after, *members]),
+        objects=members,
+        created=timestamp(),
+        owner=owner,
+        project=project,
+    )
+
+
+#: Tags of one project (of one key, where it belongs to none), and grasps of one tag.
+MOST_TAGS: Final = 100
+
+MOST_TAGGED: Final = 20_000
+
+#: A grasp: its shard, and its row there.
+Grasp = tuple[str, int]
+
+Row = Annotated[int, Field(ge=0, lt=2**31)]
+
+
+class Tag(Record):
+    """`tags/{id}/{number:06}.json`: a tag after a change of a user's. The last one counts; `gone` is the end."""
+
+    version: Literal[1] = 1
+    id: Digest
+    name: TagName
+    number: int = Field(ge=1)
+    created: str
+    changed: str
+    owner: str = Field("", max_length=64, description="id of the API key that made it")
+    project: Project = Field("", description="whose grasps it is given to")
+    gone: bool = False
+    grasps: dict[Digest, tuple[Row, ...]] = Field(default_factory=dict, description="rows of each base shard")
+
+    @property
+    def members(self) -> set[Grasp]:
+        """The grasps that have it."""
+        return {(shard, row) for shard, rows in self.grasps.items() for row in rows}
+
+
+def tag_id(name: str, project: str) -> str:
+    """What a project's tag of a name is called in the store."""
+    return digest_json(["tag", project, name])
+
+
+def by_shard(grasps: Iterable[Grasp]) -> Mapping[str, tuple[int, ...]]:
+    """Rows of each shard, in order."""
+    found: dict[str, list[int]] = {}
+    for shard, row in sorted(set(grasps)):
+        found.setdefault(shard, []).append(row)
+    return {shard: tuple(rows) for shard, rows in found.items()}

@@ -1,4 +1,4 @@
-"""The scene that grasps are for, as a user says it: a kind, or a document of supports and the target's pose.
+"""The scene that grasps are for: a kind, or a document of supports, neighbours and the target's pose.
 
 The scene frame has z up. A support is a half-space (everything below a plane) or a box.
 """
@@ -7,39 +7,52 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
-from service.model.errors import InputError
-from service.model.labels import Digest
-from service.model.refusals import refusal, why
-from service.model.suggestions import did_you_mean
+from service.model.base import Digest, Name, refusal, why
+from service.model.errors import InputError, did_you_mean
 
 #: Kinds of scenes; `free` is an object that floats, `file` one whose supports are given.
 SceneKind = Literal["free", "table", "bin", "shelf", "file"]
+
 KINDS: Final = ("free", "table", "bin", "shelf")
+
 MOST_SUPPORTS: Final = 32
+
 #: Distance that fingertips keep from supports [mm]: least, that of the whole hand, and unless a user says otherwise.
 LEAST_TOUCH: Final = -1.0
+
 MOST_TOUCH: Final = 2.0
+
 TOUCH: Final = 0.0
+
 SCENE_FILES: Final = (".json", ".yaml", ".yml")
+
 MOST_NEIGHBOURS: Final = 8
+
 #: Scenes that the grasps of one call are shared out to, at most.
 MOST_SCENES: Final = 4096
+
 #: A scene is no larger than this [m].
 FARTHEST_M: Final = 10.0
+
 #: Largest scene file [bytes].
 MAX_FILE_BYTES: Final = 64 * 1024
 
 _Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
+
 _Extent = Annotated[float, Field(gt=1e-4, le=2 * FARTHEST_M, allow_inf_nan=False)]
+
 _Number = Annotated[float, Field(ge=-2.0, le=2.0, allow_inf_nan=False)]
+
 Touch = Annotated[float, Field(ge=LEAST_TOUCH, le=MOST_TOUCH, allow_inf_nan=False)]
+
 Vector = tuple[_Metres, _Metres, _Metres]
+
 Pose = tuple[_Metres, _Metres, _Metres, _Number, _Number, _Number, _Number]
 
 
@@ -233,3 +246,179 @@ def check_quaternion(pose: tuple[float, ...]) -> None:
     """Raises ValueError for a pose whose quaternion is no rotation."""
     if abs(math.hypot(*pose[3:]) - 1.0) > 1e-3:
         raise ValueError("the quaternion w x y z of a pose must have unit length")
+
+
+#: Inner size of a bin, height of its walls and their thickness [m].
+BIN_SIZE: Final = (0.40, 0.30)
+
+BIN_HEIGHT: Final = 0.15
+
+WALL: Final = 0.02
+
+#: Width and depth of a shelf's boards, and the height between them [m]; it is open towards -x.
+SHELF_SIZE: Final = (0.80, 0.35)
+
+SHELF_HEIGHT: Final = 0.35
+
+#: A half-space whose normal is so upright (cosine) is a table.
+UPRIGHT: Final = 1 - 1e-6
+
+
+def supports_in(spec: SceneSpec) -> tuple[HalfSpace | Box, ...]:
+    """Supports of a scene in the scene frame; none for a free object."""
+    if spec.kind == "free":
+        return ()
+    if spec.kind == "file":
+        return spec.supports
+    if spec.kind == "table":
+        return (HalfSpace(),)
+    return _bin() if spec.kind == "bin" else _shelf()
+
+
+def has_table(spec: SceneSpec) -> bool:
+    """Whether a scene has a level half-space."""
+    flat = (one for one in supports_in(spec) if isinstance(one, HalfSpace))
+    return any(one.normal[2] / math.hypot(*one.normal) > UPRIGHT for one in flat)
+
+
+def _box(x: float, y: float, z: float, size: tuple[float, float, float]) -> Box:
+    return Box(size=size, pose=(x, y, z, 1.0, 0.0, 0.0, 0.0))
+
+
+def _bin() -> tuple[HalfSpace | Box, ...]:
+    (x, y), z = BIN_SIZE, BIN_HEIGHT / 2
+    along, across = (WALL, y + 2 * WALL, BIN_HEIGHT), (x, WALL, BIN_HEIGHT)
+    ends = [_box(s * (x + WALL) / 2, 0, z, along) for s in (-1, 1)]
+    sides = [_box(0, s * (y + WALL) / 2, z, across) for s in (-1, 1)]
+    return (HalfSpace(), *ends, *sides)
+
+
+def _shelf() -> tuple[HalfSpace | Box, ...]:
+    width, depth = SHELF_SIZE
+    board = (depth, width, WALL)
+    return (
+        _box(0, 0, -WALL / 2, board),
+        _box((depth + WALL) / 2, 0, SHELF_HEIGHT / 2, (WALL, width, SHELF_HEIGHT + 2 * WALL)),
+        _box(0, 0, SHELF_HEIGHT + WALL / 2, board),
+    )
+
+
+class NamedNeighbour(NeighbourSpec):
+    """Another object in the scene, known to the service."""
+
+    object: Name = Field(description="name of an object known to the service")
+
+
+def _beside_form(value: object) -> str:
+    return "name" if isinstance(value, str) else "neighbour"
+
+
+def _whole(value: str | NamedNeighbour) -> NamedNeighbour:
+    return NamedNeighbour(object=value) if isinstance(value, str) else value
+
+
+#: A neighbour as a request says it: a name, or the name with a pose.
+BesideOption = Annotated[
+    Annotated[Name, Tag("name")] | Annotated[NamedNeighbour, Tag("neighbour")],
+    Discriminator(_beside_form),
+    AfterValidator(_whole),
+]
+
+
+class SceneDocument(Part):
+    """A scene that a request holds whole."""
+
+    supports: Supports = Field(
+        min_length=1, max_length=MOST_SUPPORTS, description="what the object stands on and among, scene frame, z up [m]"
+    )
+    target: Pose | None = Field(
+        None, description="frame of the object in the scene: x y z [m], unit quaternion w x y z; absent: it is dropped"
+    )
+    neighbours: tuple[NamedNeighbour, ...] = Field(
+        (),
+        max_length=MOST_NEIGHBOURS,
+        exclude_if=lambda value: not value,
+        description="other objects: all with their poses, or all without, to be dropped around the target",
+    )
+    touch: Touch = Field(
+        TOUCH,
+        exclude_if=lambda value: value == TOUCH,
+        description="distance that fingertips keep from the supports [mm], unless the request says so itself",
+    )
+
+    @model_validator(mode="after")
+    def _turned(self) -> Self:
+        if self.target is not None:
+            check_quaternion(self.target)
+        return self
+
+
+def _form(value: object) -> str:
+    return "document" if isinstance(value, dict | SceneDocument) else "kind"
+
+
+#: A scene as a request says it: a kind, or a document. One of two forms, so that a mistake is told of the one meant.
+SceneOption = Annotated[
+    Annotated[Literal["free", "table", "bin", "shelf"], Tag("kind")] | Annotated[SceneDocument, Tag("document")],
+    Discriminator(_form),
+]
+
+
+def scene_of(
+    option: str | SceneDocument,
+    *,
+    faces: Literal["drawn", "all"] = "drawn",
+    touch: float = TOUCH,
+    beside: Sequence[NeighbourSpec] = (),
+) -> SceneSpec:
+    """The scene that a request means, with more neighbours than its document has.
+
+    Raises:
+        ValueError: the faces, the touch or the neighbours do not go with it, in one line.
+    """
+    try:
+        if isinstance(option, SceneDocument):
+            touch = option.touch if touch == TOUCH else touch
+            return SceneSpec(
+                kind="file",
+                supports=option.supports,
+                target=option.target,
+                faces=faces,
+                touch=touch,
+                neighbours=(*option.neighbours, *beside),
+            )
+        return SceneSpec(kind=option, faces=faces, touch=touch, neighbours=tuple(beside))
+    except ValidationError as error:
+        raise ValueError(first_mistake(error)) from None
+
+
+def known_name(text: str) -> str:
+    """The name of an object; InputError for a file, which the service does not know yet."""
+    if "/" in text or Path(text).is_file():
+        raise InputError(f"the neighbour {text} is a file: `graspd objects add {text}` first, then give its name")
+    return text
+
+
+def scene_option(
+    text: str, *, beside: Path | None = None, named: Callable[[str], str] = known_name
+) -> str | dict[str, Any]:
+    """What a request says for a scene that a user names: the kind, or the document in a file.
+
+    Args:
+        text: one of `KINDS`, or a JSON or YAML file.
+        beside: folder in which the file lies; None: this one.
+        named: from a neighbour as the file says it, a name or a path, to a name that the service knows.
+
+    Raises:
+        InputError: as `parse_scene`.
+    """
+    if text in KINDS:
+        return text
+    is_file = Path(text).suffix.lower() in SCENE_FILES
+    found = read_scene(Path(text) if beside is None else beside / text) if is_file else parse_scene(text)
+    said = found.model_dump(mode="json", include={"supports", "target", "neighbours"}, exclude_none=True)
+    if found.touch != TOUCH:
+        said["touch"] = found.touch
+    for one in said["neighbours"]:
+        one["object"] = named(one["object"])
+    return said if said["neighbours"] else {key: value for key, value in said.items() if key != "neighbours"}

@@ -7,7 +7,7 @@ from typing import Final
 PACKAGE_VERSION: Final = "0.2.0"
 
 #: Newest schema of task messages, and the oldest that a worker of this version still reads. A message carries the range
-#: that can read it, so workers of two versions may run side by side (`service/model/ability.py`).
+#: that can read it, so workers of two versions may run side by side (`service/model/workers.py`).
 TASK_SCHEMA: Final = 6
 OLDEST_TASK_SCHEMA: Final = 2
 #: Fields of a request by the schema that first had them. A job that uses one needs a worker that knows it; all other

@@ -8,7 +8,7 @@
 A metric is called by its name in `service.model.metrics`, a swept one has its value at the threshold that the index
 tells. A metric is compared with a number, `hand`, `object` and `type` with a word; a flag stands alone. A grasp that
 lacks the number fails each comparison with it. The text becomes a tree here; nothing of it is evaluated.
-`service.readers.where` asks it of base shards, `service.index.queries.grasp_search` of the index.
+`service.readers.where` asks it of base shards, `service.index.queries.grasps` of the index.
 """
 
 from __future__ import annotations
@@ -18,10 +18,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from service.model.diversity import GraspType
-from service.model.errors import InputError
-from service.model.metrics import GRASP_METRICS
-from service.model.suggestions import one_of
+from service.model.errors import InputError, one_of
+from service.model.metrics import GRASP_METRICS, GraspType
 
 #: Longest expression, and deepest nesting of one.
 LONGEST: Final = 1000

@@ -14,19 +14,16 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from service.heartbeat_file import HeartbeatFile
 from service.index.notes import Marked
 from service.index.queries.feed import ReadyTask
 from service.index.rebuild import complete_if_new, rebuild
 from service.model import names
-from service.model.ability import need_of
 from service.model.clock import timestamp
 from service.model.errors import BusyError, DamagedError, NotFoundError, StoreUnavailable, UnavailableError
-from service.model.planning import ingest_id, ingest_message
+from service.model.planning import Turns, ingest_id, ingest_message
 from service.model.records import JobRecord
 from service.model.states import Lane
-from service.model.turns import Turns
-from service.model.worker_beat import WorkerBeat
+from service.model.workers import WorkerBeat, need_of
 from service.pipeline.backends import Services
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.garbage_collector import GarbageCollector
@@ -40,9 +37,9 @@ from service.pipeline.routes import Routes
 from service.pipeline.webhook_dispatcher import WebhookDispatcher
 from service.queue.port import Event, EventKind, Report
 from service.store.library import publish_builtins, stored_assets
-from service.store.marks import newest_mark, next_mark, set_mark
 from service.store.packs import take_apart
-from service.store.records import read_record
+from service.store.records import newest_mark, next_mark, read_record, set_mark
+from service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
 #: Events of one round: a second's work. Those behind them wait for the next round, which follows at once.

@@ -13,22 +13,31 @@ from collections.abc import Callable, Collection, Iterable
 
 from sqlalchemy import Connection
 
-from service.index.changes.states import QUIET
+from service.index.changes.rows import QUIET
 from service.model import names
 from service.model.clock import timestamp
-from service.model.dataset_records import Snapshot
 from service.model.errors import ConflictError, DamagedError, NotFoundError
 from service.model.projects import EVERYTHING, ProjectScope
-from service.model.records import AttemptRecord, JobRecord
+from service.model.records import AttemptRecord, JobRecord, Snapshot, Tag
 from service.model.states import AssetKind
-from service.model.tags import Tag
 from service.pipeline import tagging
 from service.pipeline.backends import Services
 from service.pipeline.recording import recording
-from service.store.datasets import dataset_events, load_dataset
-from service.store.deletions import Deletion, Released, What, deletions, released_key, removed_folder
 from service.store.library import load_asset, load_check
-from service.store.records import Put, job_events, put_record, read_record
+from service.store.records import (
+    Deletion,
+    Put,
+    Released,
+    What,
+    dataset_events,
+    deletions,
+    job_events,
+    load_dataset,
+    put_record,
+    read_record,
+    released_key,
+    removed_folder,
+)
 from service.store.store import Store
 
 

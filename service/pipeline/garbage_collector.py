@@ -19,9 +19,7 @@ from service.model.states import AssetKind, Stage
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
 from service.pipeline.deletion import delete_job, put_away
-from service.store.datasets import load_dataset
-from service.store.deletions import Deletion, Released, removed_before
-from service.store.records import read_record
+from service.store.records import Deletion, Released, load_dataset, read_record, removed_before
 
 log = logging.getLogger(__name__)
 #: Time for deletions in one round of the controller [s].

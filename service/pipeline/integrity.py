@@ -8,25 +8,30 @@ import tempfile
 from collections.abc import Callable, Iterator
 from typing import Any, Final
 
-from service.index.damage import Damage
+from service.index.notes import Damage
 from service.model import names
 from service.model.clock import age_of
-from service.model.dataset_records import DatasetEvent, DatasetRecord, ObjectSet, Snapshot
 from service.model.digests import digest_files
 from service.model.domain import Asset
 from service.model.errors import DamagedError, InputError, NotFoundError
-from service.model.records import AttemptRecord, JobEvent, JobRecord
+from service.model.records import (
+    AttemptRecord,
+    DatasetEvent,
+    DatasetRecord,
+    JobEvent,
+    JobRecord,
+    ObjectSet,
+    Snapshot,
+    Tag,
+)
 from service.model.states import AssetKind, Stage
-from service.model.tags import Tag
 from service.model.webhooks import Webhook
 from service.store.assets import ZipFiles
-from service.store.deletions import Deletion, Released
+from service.store.integrity import is_sealed
 from service.store.library import UNPACKED_LIMIT_BYTES, load_check
 from service.store.manifests import ShardManifest
-from service.store.records import parse_record
-from service.store.seals import is_sealed
+from service.store.records import CHARTS, IN_SCENES, STABILITY, Deletion, Released, parse_record
 from service.store.store import Store
-from service.store.study_records import CHARTS, IN_SCENES, STABILITY
 
 #: What the key of a record looks like, and what it must hold.
 _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (

@@ -12,8 +12,7 @@ from dataclasses import replace
 from typing import Final
 from uuid import uuid4
 
-from service.index.damage import Damage
-from service.index.notes import ScanNote
+from service.index.notes import Damage, ScanNote
 from service.model.clock import age_of, timestamp
 from service.model.errors import GraspdError
 from service.pipeline.backends import Services

@@ -13,9 +13,7 @@ import numpy as np
 
 from service.index.queries.feed import ReadyTask
 from service.index.views import AssetView, JobView
-from service.logs import bound
 from service.model import names
-from service.model.ability import need_of
 from service.model.clock import timestamp
 from service.model.digests import job_id
 from service.model.domain import JobOptions, JobRequest
@@ -27,6 +25,7 @@ from service.model.records import JobRecord
 from service.model.scene_spec import HalfSpace, Pose, Supports
 from service.model.states import AssetKind, Lane, State
 from service.model.transforms import quat_conjugate, quat_rotate
+from service.model.workers import need_of
 from service.pipeline.backends import Services
 from service.pipeline.fidelity_choice import Resolver
 from service.pipeline.ranges import TaskRanges
@@ -34,8 +33,8 @@ from service.pipeline.recording import recording
 from service.pipeline.routes import Routes
 from service.pipeline.usable import usable, with_neighbours, with_network
 from service.queue.port import Event, EventKind
-from service.store.deletions import refuse_pending
-from service.store.records import add_job_event, job_events, put_record, read_record
+from service.store.records import add_job_event, job_events, put_record, read_record, refuse_pending
+from service.telemetry import bound
 
 log = logging.getLogger(__name__)
 #: Wait before it is looked again whether a worker can do what was held back [s].

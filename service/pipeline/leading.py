@@ -17,8 +17,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
-from service.heartbeat_file import HeartbeatFile
 from service.model.errors import QueueUnavailable
+from service.telemetry import HeartbeatFile
 
 if TYPE_CHECKING:
     from service.queue.rq_queue import RqQueue

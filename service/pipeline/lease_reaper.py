@@ -17,10 +17,10 @@ from service.model.states import AssetKind, Stage
 from service.pipeline.backends import Services
 from service.pipeline.indexer import Indexer
 from service.queue.port import Lease
+from service.store.integrity import put_document
 from service.store.manifests import load_manifest
 from service.store.packs import take_apart
 from service.store.records import put_record, read_record, task_attempts
-from service.store.seals import put_document
 
 log = logging.getLogger(__name__)
 #: A task on its way between queue, worker and stream is in none of them for a moment [s].

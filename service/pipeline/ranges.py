@@ -7,13 +7,13 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from service.index.queries.costs import BatchCost
+from service.index.queries.usage import BatchCost
 from service.model.domain import JobRequest, batches_of
 from service.model.projects import EVERYTHING, ProjectScope
 from service.model.records import MOST_BATCHES, JobRecord
 from service.model.states import Lane, Stage
 from service.model.version import SCHEMA_OF_RANGES
-from service.model.worker_beat import WorkerBeat
+from service.model.workers import WorkerBeat
 from service.pipeline.backends import Services
 from service.pipeline.rates import Rates, tries
 

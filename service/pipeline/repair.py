@@ -8,7 +8,7 @@ import re
 from collections.abc import Sequence
 from typing import Final
 
-from service.index.damage import Damage
+from service.index.notes import Damage
 from service.model import names
 from service.model.errors import DamagedError, NotFoundError
 from service.model.planning import PlannedTask, message_of, plan

@@ -6,9 +6,8 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from service.model.ability import Ability, Need, own_ability
 from service.model.states import Stage
-from service.model.worker_beat import WorkerBeat
+from service.model.workers import Ability, Need, WorkerBeat, own_ability
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,10 @@ from collections.abc import Callable, Collection
 from service.model import names
 from service.model.clock import timestamp
 from service.model.errors import ConflictError, LimitError, NotFoundError
-from service.model.tags import MOST_TAGGED, Grasp, Tag, by_shard, tag_id
+from service.model.records import MOST_TAGGED, Grasp, Tag, by_shard, tag_id
 from service.pipeline.backends import Services
 from service.pipeline.recording import recording
-from service.store.deletions import Deletion, removed_folder
-from service.store.records import put_record
-from service.store.tags import drop_older, newest_version, put_version
+from service.store.records import Deletion, drop_older, newest_version, put_record, put_version, removed_folder
 
 #: Asked with what is to be changed, None if it is to be made; raises where that is not allowed.
 Permit = Callable[[Tag | None], None]

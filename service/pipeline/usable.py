@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from service.index.views import AssetView
-from service.model.dataset_records import Member
 from service.model.domain import JobOptions
 from service.model.errors import ConflictError, InputError
 from service.model.projects import EVERYTHING, ProjectScope
+from service.model.records import Member
 from service.model.states import AssetKind
 from service.pipeline.backends import Services
 

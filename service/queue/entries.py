@@ -17,7 +17,7 @@ from redis.exceptions import ResponseError
 
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Stage
-from service.model.worker_beat import WorkerBeat
+from service.model.workers import WorkerBeat
 from service.queue.port import Event, Message, Report
 
 Entry = TypeVar("Entry", WorkerBeat, Event, Report)

@@ -20,8 +20,8 @@ from rq.job import Job
 from rq.registry import FailedJobRegistry, StartedJobRegistry
 from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
-from service.model.ability import FIRST_SCHEMA, Ability, Need
 from service.model.states import Lane, Stage
+from service.model.workers import FIRST_SCHEMA, Ability, Need
 from service.queue import entries
 from service.queue.port import lane_order
 

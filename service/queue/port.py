@@ -13,7 +13,7 @@ from service.model.base import Model
 from service.model.domain import Word
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Lane, Stage
-from service.model.worker_beat import Count, HostWord, WorkerBeat
+from service.model.workers import Count, HostWord, WorkerBeat
 
 Message = TaskMessage | IngestMessage
 

@@ -21,11 +21,10 @@ from rq.executions import Execution
 from rq.job import Job
 from rq.serializers import JSONSerializer
 
-from service.model.ability import need_of
 from service.model.clock import age_of
 from service.model.errors import QueueUnavailable
 from service.model.states import Lane, Stage
-from service.model.worker_beat import WorkerBeat
+from service.model.workers import WorkerBeat, need_of
 from service.queue import entries
 from service.queue.allowed import TASK_FUNCTION, new_job
 from service.queue.connection import connect, redis_url

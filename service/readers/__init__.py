@@ -19,13 +19,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from service.readers.cache import ShardCache
+    from service.readers.cache import ShardCache, prefetched
     from service.readers.clouds import Clouds
     from service.readers.depth_noise import DepthNoise
     from service.readers.files import ShardFile, Shards, open_shards
     from service.readers.grasps import Grasps
     from service.readers.pictures import Pictures
-    from service.readers.prefetch import prefetched
 
 #: Name, the module it lives in.
 _LIVES_IN: Final = {
@@ -37,7 +36,7 @@ _LIVES_IN: Final = {
     "ShardFile": "files",
     "Shards": "files",
     "open_shards": "files",
-    "prefetched": "prefetch",
+    "prefetched": "cache",
 }
 
 __all__ = [

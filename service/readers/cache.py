@@ -1,4 +1,4 @@
-"""Shards of a remote store kept on this machine: checked when they come, the longest unused dropped when it is full."""
+"""Local copies of remote shards, checked on arrival and bounded in size; and samples read ahead by threads."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import hashlib
 import os
 import tempfile
 import time
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
 
@@ -86,3 +89,40 @@ def check_not_forked(store: Store, process: int) -> None:
             f"{store.url} cannot be read in a fork of the process that opened it; "
             "start the processes anew: DataLoader(..., multiprocessing_context='spawn')"
         )
+
+
+def prefetched(
+    source: Sequence[dict[str, Any]], order: Iterable[int] | None = None, *, workers: int = 2, ahead: int = 8
+) -> Iterator[dict[str, Any]]:
+    """Samples of `Pictures`, `Clouds` or `Grasps`, in the stated order, each the same as `source[i]`.
+
+    Reading and unpacking pictures leaves the interpreter to others, so that threads share the work; from a store they
+    wait for the network at the same time.
+
+    Args:
+        source: the samples.
+        order: their indices; by default all in turn.
+        workers: threads.
+        ahead: how many samples are held that nobody took yet: so much memory.
+
+    Raises:
+        InputError: a number is less than one.
+        and what reading a sample raises, when it is its turn.
+    """
+    if workers < 1 or ahead < 1:
+        raise InputError(f"reading ahead takes at least one thread and one sample; got {workers} and {ahead}")
+    return _read(source, iter(range(len(source)) if order is None else order), workers, ahead)
+
+
+def _read(source: Sequence[dict[str, Any]], order: Iterator[int], workers: int, ahead: int) -> Iterator[dict[str, Any]]:
+    waiting: deque[Future[dict[str, Any]]] = deque()
+    pool = ThreadPoolExecutor(workers, thread_name_prefix="prefetch")
+    try:
+        for index in order:
+            waiting.append(pool.submit(source.__getitem__, index))
+            if len(waiting) > ahead:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)

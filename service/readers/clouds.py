@@ -1,9 +1,11 @@
-"""Pictures as point clouds with the labels of their scenes, made when they are asked for; nothing is stored."""
+"""Pictures as labelled point clouds, view by view, perfect or as a depth camera sees them; nothing is stored."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -11,22 +13,31 @@ from numpy.typing import NDArray
 
 from service.model import transforms
 from service.model.errors import InputError
-from service.readers.cloud_views import COLUMNS, CloudView
-from service.readers.depth_noise import DepthNoise, noise_of
+from service.model.pinhole import back_project, fitted_normals, surface_normals
+from service.model.transforms import Floats
+from service.readers.depth_noise import DepthNoise, incidence, noise_of
 from service.readers.pictures import Pictures, Place, Scenes
 from service.store.shards import Shard
 
 Array = NDArray[Any]
-Floats = NDArray[np.float64]
+
+
 Ints = NDArray[np.intp]
+
 #: From a base shard and K of its rows to points (K, H, 3) on the hand's surface in the object's frame [m].
 HandSurface = Callable[[Shard, Ints], Floats]
+
 Frame = Literal["camera", "table", "object"]
+
 FRAMES: Final[tuple[Frame, ...]] = ("camera", "table", "object")
+
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
+
 #: Beginnings of the keys that have a row for each grasp.
 OF_GRASPS: Final = ("pregrasp/", "grasp/", "squeeze/", "quality/")
+
 _NOWHERE: Final = np.array([0.0, 0, 0, 1, 0, 0, 0])
+
 #: The hand touches a point when its surface is at most this far from it [m]: the middle contact threshold of shards.
 TOUCH_M: Final = 0.005
 
@@ -249,3 +260,93 @@ def graspness(points: NDArray[Any], hands: NDArray[Any], *, touch_m: float = TOU
             touched = tree.query_ball_point(near, touch_m)
             found[np.unique(np.concatenate(touched).astype(np.intp))] += 1
     return found / len(hands)
+
+
+COLUMNS: Final = ("image/depth", "image/segmentation", "camera/intrinsics", "camera/extrinsics")
+
+_OBJECT: Final = 2
+
+#: Planes are fitted to noisy points in windows of 7 x 7 pixels, which are let reach this many deviations in depth.
+_RADIUS: Final = 3
+
+_DEVIATIONS: Final = 4.0
+
+#: Steepest surface within such a window: its depth grows by this many times the way across.
+_SLOPE: Final = 3.0
+
+
+@dataclass(frozen=True)
+class CloudView:
+    """The columns `COLUMNS` of one picture, and what a camera makes of its depth."""
+
+    columns: Mapping[str, Array]
+    noise: DepthNoise | None
+    seen: Floats
+    """(H, W) depth as it is told [m]; not finite: nothing."""
+    angle: Floats | None
+    """(H, W) of incidence [rad]; None: without noise nobody asks."""
+
+    @classmethod
+    def of(cls, columns: Mapping[str, Array], noise: DepthNoise | None, draw: np.random.Generator) -> CloudView:
+        """A picture; `draw` decides the noise."""
+        depth = np.asarray(columns["image/depth"], float)
+        k = np.asarray(columns["camera/intrinsics"], float)
+        if noise is None:
+            return cls(columns, noise, depth, None)
+        angle = incidence(depth, k)
+        return cls(columns, noise, noise.apply(depth, k, draw, angle=angle), angle)
+
+    def pixels(self, *, whole: bool) -> tuple[Ints, Ints]:
+        """Rows and columns of what is seen of the object, or of the whole scene."""
+        labels = self.columns["image/segmentation"]
+        wanted = np.isfinite(self.seen) & ((labels > 0) if whole else (labels == _OBJECT))
+        if self.noise is None:  # a pixel without neighbours has no normal
+            wanted &= np.isfinite(self._normals[..., 0])
+        row, column = np.nonzero(wanted & np.isfinite(self._true[..., 2]))
+        return row, column
+
+    def points(self, row: Ints, column: Ints) -> Floats:
+        """(P, 3) of some pixels, in the frame of the table [m]."""
+        return transforms.apply(self._back, self._points[row, column])
+
+    def true_points(self, row: Ints, column: Ints) -> Floats:
+        """The same without noise."""
+        return transforms.apply(self._back, self._true[row, column])
+
+    def normals(self, row: Ints, column: Ints) -> Floats:
+        """(P, 3) unit normals of some pixels, toward the camera, in the frame of the table."""
+        if self.noise is None or self.angle is None:
+            return transforms.quat_rotate(self._back[3:], self._normals[row, column])
+        z = self._points[row, column, 2]
+        gap = _SLOPE * _RADIUS * z / self._k[0, 0] + _DEVIATIONS * self.noise.sigma(z, self.angle[row, column])
+        fitted = fitted_normals(self._points, row, column, radius=_RADIUS, gap_m=gap)
+        return transforms.quat_rotate(self._back[3:], fitted)
+
+    def is_object(self, row: Ints, column: Ints) -> NDArray[np.bool_]:
+        """(P,) whether pixels show the object."""
+        return np.asarray(self.columns["image/segmentation"][row, column] == _OBJECT)
+
+    @property
+    def extrinsics(self) -> Floats:
+        """(4, 4) table to camera."""
+        return np.asarray(self.columns["camera/extrinsics"], float)
+
+    @property
+    def _k(self) -> Floats:
+        return np.asarray(self.columns["camera/intrinsics"], float)
+
+    @cached_property
+    def _back(self) -> Floats:
+        return transforms.invert(transforms.pose_from_matrix(self.extrinsics))
+
+    @cached_property
+    def _true(self) -> Floats:
+        return back_project(self._k, self.columns["image/depth"])
+
+    @cached_property
+    def _points(self) -> Floats:
+        return self._true if self.noise is None else back_project(self._k, self.seen)
+
+    @cached_property
+    def _normals(self) -> Floats:
+        return surface_normals(self._true)

@@ -30,11 +30,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError
+from service.model.errors import InputError, one_of
 from service.model.pinhole import EDGE, back_project, surface_normals
-from service.model.suggestions import one_of
+from service.model.transforms import Floats
 
-Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 

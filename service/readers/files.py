@@ -18,11 +18,10 @@ from service.model.records import JobRecord
 from service.readers.cache import DEFAULT_BYTES, ShardCache
 from service.readers.ranges import RangeReader
 from service.store.columns import ShardKind
-from service.store.datasets import newest_snapshot
 from service.store.integrity import check_file
 from service.store.manifests import load_manifest
 from service.store.packs import PACKED, has_packs
-from service.store.records import read_record
+from service.store.records import newest_snapshot, read_record
 from service.store.shards import kind_of, open_shard
 from service.store.store import Store, open_store
 from service.user_cache import folder

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError
 from service.readers.files import ShardFile, Shards
-from service.store import standing
+from service.store import validity
 from service.store.columns import SCHEMAS
 from service.store.shards import open_shard, read_column
 
@@ -127,9 +127,9 @@ class Grasps(Sequence[dict[str, Any]]):
         return sample | {"hand": file.hand, "object": file.object, "shard_id": file.id, "row": row}
 
     def _kept(self, file: ShardFile) -> NDArray[np.intp]:
-        held = self._load(file, tuple(SCHEMAS["base"]) if self._where else standing.COLUMNS, keep=False)
+        held = self._load(file, tuple(SCHEMAS["base"]) if self._where else validity.COLUMNS, keep=False)
         if self._valid or self._unjudged:
-            mask = standing.chosen(held, unjudged=self._unjudged)
+            mask = validity.chosen(held, unjudged=self._unjudged)
         else:
             mask = np.ones(len(held["quality/valid"]), bool)
         if self._where is not None:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from service.model import transforms
 from service.model.errors import InputError
-from service.readers.chunks import RowTable, read_file
 from service.readers.files import ShardFile, Shards
-from service.store import standing
+from service.readers.ranges import RowTable, read_file
+from service.store import validity
 from service.store.columns import SCHEMAS
 from service.store.shards import read_shard
 
@@ -212,7 +212,7 @@ class Scenes:
         free = np.asarray(base["quality/success"]) >= 0 if planned else np.asarray(scenes["grasp/valid"]) == 1
         mask = free if clear else np.ones(len(scene), bool)
         if valid or unjudged:
-            mask = mask & standing.chosen(base.arrays, unjudged=unjudged)[row]
+            mask = mask & validity.chosen(base.arrays, unjudged=unjudged)[row]
         kept = np.flatnonzero(mask)
         self._scene, self._row = scene[kept], row[kept]
         pose = np.asarray(scenes["grasp/hand_pose"], float)[kept]

@@ -12,10 +12,8 @@ from pydantic_core import from_json
 
 from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
-from service.model.transforms import slerp
+from service.model.transforms import Floats, slerp
 from service.store.shards import Shard
-
-Floats = NDArray[np.float64]
 
 #: Names of the postures at which something begins or ends. What lies between them has none.
 STOPS: Final = ("standoff", "pregrasp", "grasp", "squeeze", "lift")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from service.model.metrics import GRASP_METRICS, GraspMetric
 from service.model.where import Flag, Joined, Node, Not, OfMetric, OfType, parsed
-from service.store import standing
+from service.store import validity
 from service.store.manifests import INDEX_THRESHOLD_M
 
 Array = NDArray[Any]
@@ -69,9 +69,9 @@ def _mask(node: Node, columns: Mapping[str, Array], said: Mapping[str, Any]) -> 
 
 def _flag(name: str, columns: Mapping[str, Array]) -> Mask:
     if name == "valid":
-        return standing.valid(columns)
+        return validity.valid(columns)
     if name == "sound":
-        return standing.sound(columns)
+        return validity.sound(columns)
     if name == "judged":
         return np.asarray(columns.get("quality/success", np.full(len(columns["quality/valid"]), -1))) >= 0
     path = _FLAGS[name]

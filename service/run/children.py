@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
@@ -17,15 +18,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Final
 
-from service.run.processes import start_of
-
 log = logging.getLogger(__name__)
+
 #: Variable of a child by which a later `graspd up` knows it.
 _TOKEN: Final = "GRASPD_CHILD_TOKEN"
 #: Pause between two looks at whether a child ended [s].
 _WATCH_S: Final = 0.1
 _FIRST_PAUSE_S: Final = 0.2
+
 _LONGEST_PAUSE_S: Final = 10.0
+
 #: A child that lived this long was well: the next restart is quick again [s].
 _WELL_AFTER_S: Final = 20.0
 
@@ -163,3 +165,21 @@ def _has_token(pid: int, token: str) -> bool:
 
 def _ended(code: int) -> str:
     return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+
+_BOOT: Final = Path("/proc/sys/kernel/random/boot_id")
+
+#: Place of the start time among the words after the name of a program in /proc/PID/stat.
+_STARTED: Final = 19
+
+
+def start_of(pid: int) -> str:
+    """When a process started: no two with one pid give the same text. "" if there is no such process."""
+    with contextlib.suppress(OSError, IndexError):
+        # A name of a program may hold blanks and brackets.
+        words = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
+        return f"{words[_STARTED]} {_BOOT.read_text().strip()}"
+    if _BOOT.exists():
+        return ""
+    said = subprocess.run(["ps", "-o", "lstart=", "-p", str(pid)], capture_output=True, text=True, check=False)
+    return " ".join(said.stdout.split())

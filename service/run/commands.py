@@ -13,11 +13,10 @@ from typing import Annotated
 import typer
 
 from service.cli import JsonFlag, emit, keep_private, load_settings, log_to_stderr, plain_console, reporting_errors
-from service.heartbeat_file import HeartbeatFile
 from service.model import names
-from service.model.errors import IndexDamaged, QueueUnavailable, UnavailableError
-from service.model.redaction import without_secrets
+from service.model.errors import IndexDamaged, QueueUnavailable, UnavailableError, without_secrets
 from service.settings import Settings
+from service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +49,7 @@ def up(
 ) -> None:
     """The whole service on this machine, until Ctrl-C."""
     _check_rooms(workers)
-    from service.run.joining import joining
+    from service.run.address import joining
     from service.run.supervisor import Supervisor
 
     settings = load_settings(host=host, port=port, device=device, data_dir=data_dir)
@@ -195,8 +194,8 @@ def export(
     json: JsonFlag = False,
 ) -> None:
     """Write grasps, shards, jobs, tasks, assets, datasets and usage as Parquet files, for DuckDB or pandas."""
-    from service.index.export import export as write
     from service.index.index import Index
+    from service.run.store_commands import export as write
 
     index = Index(load_settings(data_dir=data_dir).resolved_index_url)
     try:

@@ -17,7 +17,7 @@ from typing import IO, Final
 
 from service.model.errors import BusyError, QueueUnavailable
 from service.queue.connection import password_file, socket_path
-from service.run.joining import Joining
+from service.run.address import Joining
 from service.settings import Settings
 
 log = logging.getLogger(__name__)

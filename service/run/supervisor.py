@@ -24,10 +24,9 @@ from service.pipeline.identity import identify_if_redis_answers, recorded
 from service.pipeline.leading import PART
 from service.queue.connection import redis_url
 from service.queue.rq_queue import RqQueue, open_queue
-from service.run.address import forget_address, record_address
+from service.run.address import Joining, forget_address, record_address
 from service.run.children import Child, end_leftovers, keep_alive, stop_children
 from service.run.embedded import find_server, give_up_log, lock_file, own_redis, server_command, set_log_aside
-from service.run.joining import Joining
 from service.settings import Settings
 from service.store.store import open_store
 

@@ -15,8 +15,8 @@ from service.model.domain import Asset
 from service.model.errors import ConflictError, DamagedError, InputError
 from service.model.states import AssetKind
 from service.store.assets import builtin_asset, builtin_model, builtin_names, describe, pack_into, unpack
+from service.store.integrity import get_document, is_sealed, seal_archive, sealed
 from service.store.records import Put, put_record, read_record
-from service.store.seals import get_document, is_sealed, seal_archive, sealed
 from service.store.store import Store
 
 log = logging.getLogger(__name__)

@@ -16,11 +16,10 @@ from service.model.clock import timestamp
 from service.model.domain import Digest, JobRequest, batches_of
 from service.model.messages import TaskMessage
 from service.model.metric_fields import values, with_fields
-from service.model.metrics import indexed
-from service.model.robust import axis_word
+from service.model.metrics import axis_word, indexed
 from service.model.states import Stage
 from service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
-from service.store import standing
+from service.store import validity
 from service.store.columns import SCHEMAS, ShardKind
 from service.store.integrity import read_checked
 from service.store.records import put_record, read_record
@@ -157,7 +156,7 @@ def manifest_of(
 
 def _contents(kind: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> dict[str, Any]:
     """The manifest's fields that follow from the shard's own columns and attributes."""
-    valid = standing.valid(arrays) if kind == "base" else arrays.get("grasp/valid")
+    valid = validity.valid(arrays) if kind == "base" else arrays.get("grasp/valid")
     fields: dict[str, Any] = {"valid": 0 if valid is None else int(np.count_nonzero(valid))}
     if kind == "base":
         audit = arrays.get("quality/audit", np.empty(0, np.int8))
@@ -179,7 +178,7 @@ def summarise(
         for metric in indexed()
         if not metric.optional or metric.path in arrays
     }
-    columns["valid"] = standing.valid(arrays).tolist()
+    columns["valid"] = validity.valid(arrays).tolist()
     columns["success"] = [_verdict(int(v)) for v in arrays.get("quality/success", np.full(count, -1))]
     level = (attributes or {}).get("verdict_level")
     columns["verdict_level"] = [None if verdict is None else level for verdict in columns["success"]]

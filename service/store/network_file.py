@@ -20,28 +20,40 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from service.model.base import Digest, Name, refusal
+from service.model.digests import digest_bytes
 from service.model.errors import InputError, LimitError
-from service.model.labels import Digest, Name
-from service.model.refusals import refusal
-from service.store.descriptions import json_object
+from service.store.assets import asset_json
+from service.store.descriptions import json_object, parse_description
 
 SCHEMA: Final = "graspd/proposals@1"
+
 #: Most that a file may hold, packed or not; a network of 22 joints takes 5.4 MB [bytes].
 MAX_BYTES: Final = 64 << 20
+
 #: Numbers of a point, as the encoder takes them; widths of its layers, the last one before the maximum over points.
 ENCODER: Final = (7, 64, 128, 256)
+
 FEATURE: Final = 256
+
 #: The feature of the cloud, its height above the table, and the label.
 CONDITION: Final = FEATURE + 2
+
 #: Sines and cosines of time.
 TIME_FEATURES: Final = 8
+
 HIDDEN: Final = 512
+
 BLOCKS: Final = 2
+
 #: Numbers of a grasp besides its joints: position, two columns of the rotation, way in.
 POSE: Final = 12
+
 _META: Final = "meta"
+
 #: A text array keeps four bytes a letter; a header of its own comes before each array.
 _MOST_META: Final = 4 * (64 << 10)
+
 _HEADER: Final = 4096
 
 Floats32 = NDArray[np.float32]
@@ -291,3 +303,57 @@ def _difference(found: list[str], expected: Mapping[str, object]) -> str:
     missing, foreign = sorted(wanted - {*found, f"{_META}.npy"}), sorted(set(found) - wanted)
     parts = [f"{word} {', '.join(names[:4])}" for word, names in (("without", missing), ("besides", foreign)) if names]
     return "; ".join(parts) or "a name stands twice"
+
+
+#: Name of the file in its archive, whatever the user called it: the same network is the same asset.
+NETWORK_FILE: Final = "network.npz"
+
+
+def network_bytes(files: Mapping[str, bytes], what: str) -> bytes:
+    """The network's file among those of an asset; that it is one is for `from_bytes` to say.
+
+    Args:
+        files: the file and `asset.json`.
+        what: what errors call it.
+
+    Raises:
+        InputError: it is not there, or `asset.json` says what a network does not have.
+    """
+    described = parse_description(asset_json(files), what)
+    if described.file not in files:
+        raise InputError(f"{what}: the main file {described.file!r} is not among its files")
+    if extra := sorted(described.model_extra or {}):
+        raise InputError(f"{what}: a network has no {extra[0]!r}; it may have a description, a licence and a source")
+    return files[described.file]
+
+
+def network_report(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
+    """What is found of a network that can be used, as a check says it.
+
+    Raises:
+        LimitError: larger than any network.
+        InputError: no network.
+    """
+    data = network_bytes(files, name)
+    network = from_bytes(data, name)
+    joints = len(network.joint_names)
+    facts = {
+        "hand": network.hand,
+        "hand_digest": network.hand_digest,
+        "joints": joints,
+        "points": network.points,
+        "steps": network.steps,
+        "about": "".join(letter for letter in " ".join(network.about.split()) if letter.isprintable()),
+        # What shards of `graspd synth` name, which knows the file alone.
+        "file_digest": digest_bytes(data),
+    }
+    message = f"{name}: proposes grasps of {network.hand} ({network.hand_digest[:12]}), {joints} joints"
+    return {"verdict": "accept", "message": message, "repairs": [], "facts": facts}
+
+
+def check_network(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
+    """The same, or a refusal."""
+    try:
+        return network_report(files, name)
+    except InputError as error:
+        return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": {}}

@@ -9,7 +9,7 @@ from typing import Final
 
 from service.cli import load_settings
 from service.model.errors import InputError, LimitError
-from service.model.fitting_names import fitted
+from service.model.names import fitted
 from service.store.assets import MAX_FILES, UNPACK_FACTOR, unpack
 
 #: Meshes by their file names.

@@ -17,9 +17,9 @@ from typing import Final
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from service.model import names
+from service.model.base import Digest
 from service.model.digests import digest_bytes
 from service.model.errors import DamagedError, NotFoundError
-from service.model.labels import Digest
 from service.model.states import Stage
 from service.store.manifests import ShardManifest, load_manifest, publish_shard
 from service.store.records import parse_record, put_record

@@ -1,14 +1,15 @@
-"""Shards as HDF5 files, which are written and read here only; `columns` says what is in them."""
+"""Shards as HDF5 files, whole or the part of chosen grasps; only here are they written and read (`columns` is their
+schema)."""
 
 from __future__ import annotations
 
 import hashlib
 import io
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 import h5py
@@ -16,24 +17,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.clock import timestamp
+from service.model.digests import digest_json
 from service.model.errors import DamagedShard, InputError, NotFoundError
 from service.model.version import PACKAGE_VERSION
-from service.store.attributes import Attribute, check_attributes
-from service.store.columns import SCHEMAS, ShardKind
+from service.store.columns import SCHEMAS, Attribute, ShardKind, check_attributes
 from service.store.integrity import check_file
 
 Arrays = Mapping[str, NDArray[np.generic]]
+
 #: Attribute of each dataset: SHA-256 of its values, so that a file that left the store still shows damage.
 _DIGEST: Final = "sha256"
+
 #: A shard has some fifty datasets and groups.
 _MOST_ITEMS: Final = 1000
+
 #: No byte of deflate becomes more than so many; and what a dataset may claim without having been written [bytes].
 _MOST_DEFLATED: Final = 1032
+
 _FREE_BYTES: Final = 1 << 16
+
 #: What a whole file may unpack to, whatever its size, and how often its size beyond that [bytes]: masks shrink a
 #: thousandfold, and no shard is made of them alone.
 _FREE_IN_ALL: Final = 1 << 28
+
 _MOST_IN_ALL: Final = 64
+
 #: What h5py and the filters of HDF5 raise where they meet bytes that make no sense.
 _UNREADABLE: Final = (OSError, KeyError, ValueError, TypeError, RuntimeError, OverflowError, MemoryError)
 
@@ -230,3 +238,31 @@ def _attribute(value: object) -> Attribute:
 def json_attribute(value: object) -> str:
     """A JSON text fit for an HDF5 attribute."""
     return json.dumps(value, sort_keys=True)
+
+
+def carried(shard: Shard) -> dict[str, Attribute]:
+    """What a copy of a shard says at its root: all but what `write_shard` says itself."""
+    return {name: value for name, value in shard.attributes.items() if name != "schema"}
+
+
+def part_of_shard(shard: Shard, mask: NDArray[np.bool_]) -> bytes:
+    """A base shard of the rows of a mask (N,): what each grasp says, its scene too, is as it was."""
+    schema = SCHEMAS["base"]
+    arrays = {
+        path: array[mask] if schema[path].shape.split()[0] == "N" else array for path, array in shard.arrays.items()
+    }
+    attributes = carried(shard)
+    if "shard_id" in attributes:
+        attributes["shard_id"] = digest_json([attributes["shard_id"], np.flatnonzero(mask).tolist()])
+    return write_shard("base", arrays, attributes)
+
+
+def place_of(shard: Shard, taken: Collection[PurePosixPath]) -> PurePosixPath:
+    """`HAND/OBJECT/base-BATCH.h5`, or a name beside it: two jobs may have a batch of one number."""
+    said = shard.attributes
+    names = [str(said.get(name, "")).replace("/", "-").strip(".") or "unnamed" for name in ("hand", "object")]
+    path = PurePosixPath(*names) / f"base-{int(said.get('batch', 0)):05}.h5"  # type: ignore[arg-type]
+    found, number = path, 1
+    while found in taken:
+        found, number = path.with_stem(f"{path.stem}-{number}"), number + 1
+    return found

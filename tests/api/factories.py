@@ -11,14 +11,14 @@ from service.model import names
 from service.model.clock import timestamp
 from service.model.digests import job_id
 from service.model.domain import JobRequest
+from service.model.metrics import Axis
 from service.model.planning import PlannedTask, message_of, plan
 from service.model.records import AttemptRecord, JobRecord
-from service.model.robust import Axis
 from service.model.states import AssetKind, Lane, Stage
 from service.model.transforms import pose_to_matrix
-from service.model.worker_beat import WorkerBeat
+from service.model.workers import WorkerBeat
 from service.pipeline.backends import Services
-from service.store.attributes import Attribute
+from service.store.columns import Attribute
 from service.store.library import publish_builtins
 from service.store.manifests import ShardManifest, manifest_of, publish_shard
 from service.store.records import put_record

@@ -29,16 +29,7 @@ def test_a_command_line_needs_no_templates_and_no_server(statement: str) -> None
 
 
 def test_commands_that_talk_http_need_no_web_framework_and_no_database() -> None:
-    modules = (
-        "client",
-        "commands",
-        "add_commands",
-        "dataset_commands",
-        "key_commands",
-        "project_commands",
-        "webhook_commands",
-        "tag_commands",
-    )
+    modules = ("client", "commands", "add_commands", "dataset_commands", "access_commands", "tag_commands")
     statement = "import " + ", ".join(f"api.client.{module}" for module in modules)
     assert modules_after(statement).isdisjoint({"fastapi", "starlette", "sqlalchemy", "redis"})
 

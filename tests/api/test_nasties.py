@@ -18,7 +18,7 @@ from starlette.testclient import TestClient
 from api.access.keys import Key, Scope
 from api.access.quotas import Quotas
 from api.middleware.body_limit import MAX_BODY_BYTES
-from service.index.queries import cursors
+from service.index import project_scope
 from service.model.errors import QuotaError
 from service.model.states import AssetKind
 from service.pipeline.backends import Services
@@ -62,7 +62,7 @@ def test_a_cursor_of_somebody_s_own_making_is_refused(http: TestClient, path: st
 
 
 def test_a_cursor_that_a_list_gave_out_is_taken(http: TestClient) -> None:
-    assert http.get("/v1/objects", params={"cursor": cursors.encode("a", "b")}).status_code == 200
+    assert http.get("/v1/objects", params={"cursor": project_scope.encode("a", "b")}).status_code == 200
 
 
 @pytest.mark.parametrize("row", ["9223372036854775808", "9" * 4000])

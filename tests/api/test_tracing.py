@@ -10,7 +10,7 @@ import pytest
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from starlette.testclient import TestClient
 
-from service import tracing
+from service import telemetry
 from service.model import names
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
@@ -27,9 +27,9 @@ _PARENT = "00-" + "a" * 32 + "-" + "b" * 16 + "-01"
 @pytest.fixture
 def spans() -> Iterator[InMemorySpanExporter]:
     exporter = InMemorySpanExporter()
-    tracing.set_up("test", exporter=exporter)
+    telemetry.set_up_tracing("test", exporter=exporter)
     yield exporter
-    tracing.stop()
+    telemetry.stop()
 
 
 def test_a_task_is_in_the_trace_of_the_request_that_submitted_it(

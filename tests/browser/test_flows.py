@@ -21,7 +21,7 @@ from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.surface import sample_surface
 from worker.objects.prepare import object_from_path
-from worker.stages.glb import SURFACE_POINTS
+from worker.stages.models import SURFACE_POINTS
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
 

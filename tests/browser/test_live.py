@@ -17,8 +17,7 @@ from service.pipeline import deletion, tagging
 from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
-from service.store.records import read_record
-from service.store.study_records import publish
+from service.store.records import publish, read_record
 from tests.api.dashboard.test_stability_page import a_record
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
 from tests.planning import plan_all

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from service.heartbeat_file import HeartbeatFile
 from service.model.errors import QueueUnavailable
 from service.pipeline.backends import Services
 from service.pipeline.controller import Controller
+from service.telemetry import HeartbeatFile
 from tests.deploy.test_kubernetes import AGE_OF_THE_FILE
 from tests.waiting import until
 

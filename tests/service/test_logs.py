@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from service import logs
+from service import telemetry
 from service.settings import Settings
 
 log = logging.getLogger("graspd.test")
@@ -32,7 +32,7 @@ def lines(written: Callable[[], str]) -> list[dict[str, Any]]:
 
 
 def test_a_line_is_one_json_object_with_process_and_message(written: Callable[[], str]) -> None:
-    logs.set_up(Settings(), "controller")
+    telemetry.set_up_logs(Settings(), "controller")
     log.info("two\nlines, %d", 2)
     (line,) = lines(written)
     assert (line["process"], line["level"], line["logger"]) == ("controller", "INFO", "graspd.test")
@@ -41,9 +41,9 @@ def test_a_line_is_one_json_object_with_process_and_message(written: Callable[[]
 
 
 def test_lines_are_about_what_was_bound_around_them(written: Callable[[], str]) -> None:
-    logs.set_up(Settings())
-    with logs.bind(request="r1", key=""):
-        with logs.bind(job="j1"):
+    telemetry.set_up_logs(Settings())
+    with telemetry.bind(request="r1", key=""):
+        with telemetry.bind(job="j1"):
             log.info("inside", extra={"task": "t1"})
         log.info("after")
     log.info("outside")
@@ -54,8 +54,8 @@ def test_lines_are_about_what_was_bound_around_them(written: Callable[[], str]) 
 
 
 def test_one_thread_is_not_about_what_another_binds(written: Callable[[], str]) -> None:
-    logs.set_up(Settings())
-    with logs.bind(job="j1"):
+    telemetry.set_up_logs(Settings())
+    with telemetry.bind(job="j1"):
         thread = threading.Thread(target=lambda: log.info("elsewhere"))
         thread.start()
         thread.join()
@@ -63,7 +63,7 @@ def test_one_thread_is_not_about_what_another_binds(written: Callable[[], str]) 
 
 
 def test_an_error_brings_its_trace_in_the_same_line(written: Callable[[], str]) -> None:
-    logs.set_up(Settings())
+    telemetry.set_up_logs(Settings())
     try:
         raise ValueError("no")
     except ValueError:
@@ -73,20 +73,20 @@ def test_an_error_brings_its_trace_in_the_same_line(written: Callable[[], str]) 
 
 
 def test_on_a_terminal_a_message_writes_no_line_of_its_own(written: Callable[[], str]) -> None:
-    logs.set_up(Settings(log_format="text"))
+    telemetry.set_up_logs(Settings(log_format="text"))
     log.info("GET %s", "/a\r\n12:00:00 ERROR forged\x1b[2J\x9b0m\u2028\u202e")
     (line,) = written().splitlines()
     assert line.endswith(r"GET /a\r\n12:00:00 ERROR forged\x1b[2J\x9b0m\u2028\u202e")
 
 
 def test_on_a_terminal_a_line_is_text(written: Callable[[], str]) -> None:
-    logs.set_up(Settings(log_format="text"))
-    with logs.bind(job="j1"):
+    telemetry.set_up_logs(Settings(log_format="text"))
+    with telemetry.bind(job="j1"):
         log.warning("careful")
     assert written().endswith(" WARNING graspd.test careful [job=j1]\n")
 
 
 def test_lines_below_the_level_are_not_written(written: Callable[[], str]) -> None:
-    logs.set_up(Settings(log_level="WARNING"))
+    telemetry.set_up_logs(Settings(log_level="WARNING"))
     log.info("quiet")
     assert written() == ""

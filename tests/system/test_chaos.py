@@ -17,7 +17,7 @@ import pytest
 from rq import Queue
 from rq.serializers import JSONSerializer
 
-from service.index.filters import GraspFilter
+from service.index.queries.grasps import GraspFilter
 from service.index.rebuild import differences, rebuild
 from service.model import names
 from service.model.errors import BusyError

@@ -17,7 +17,7 @@ from service.model.states import State
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
 from service.queue.connection import redis_url
-from service.run.joining import joining
+from service.run.address import joining
 from service.run.supervisor import Supervisor
 from service.settings import Settings
 from tests.conftest import REPOSITORY

@@ -10,10 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.model.diversity import MIN_DISTANCE_M
 from service.model.domain import JobRequest
 from service.model.errors import InputError, TaskCancelled
-from service.model.robust import Axis
+from service.model.metrics import MIN_DISTANCE_M, Axis
 from worker import certified
 from worker.certified import Certified, certified_grasps
 from worker.grasps import GraspSet, Posture

@@ -6,10 +6,9 @@ import trimesh
 
 from service.model.domain import JobOptions
 from service.model.errors import InputError
-from service.store.attributes import ATTRIBUTES, check_attributes
-from service.store.columns import SCHEMAS
+from service.store.columns import ATTRIBUTES, SCHEMAS, check_attributes
 from tests.worker.models import object_from_mesh, two_finger_hand
-from worker.files.base_attributes import base_attributes
+from worker.files.provenance import base_attributes
 from worker.grasps import GraspSet, Posture
 
 COUNT, JOINTS = 3, 2

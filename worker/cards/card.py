@@ -16,13 +16,12 @@ from service.model.errors import InputError
 from service.pipeline.datasets.export import path_of
 from service.readers import ShardFile, Shards
 from service.store.shards import open_shard
-from worker.cards.contents import Contents
+from worker.cards.contents import Contents, Piece, pieces
 from worker.cards.numbers import numbers
 from worker.cards.page import page
 from worker.cards.plots import draw
-from worker.cards.reading import Piece, pieces
 from worker.cards.tally import tally_of
-from worker.rendering.pages import typography
+from worker.rendering.pages import sheets
 
 #: Pictures out of the dataset.
 SHEET: Final = "samples.jpg"
@@ -97,13 +96,13 @@ def write_samples(shards: Shards, file: Path) -> bool:
     heights = [round(one.height * _WIDTH / one.width) for one in pictures]
     line = max(heights) + _CAPTION
     columns = min(_COLUMNS, len(pictures))
-    sheet = Image.new("RGB", (_WIDTH * columns, line * -(-len(pictures) // columns)), typography.PAPER)
+    sheet = Image.new("RGB", (_WIDTH * columns, line * -(-len(pictures) // columns)), sheets.PAPER)
     draw = ImageDraw.Draw(sheet)
     for number, (one, shown, height) in enumerate(zip(chosen, pictures, heights, strict=True)):
         left, top = _WIDTH * (number % columns), line * (number // columns)
         sheet.paste(shown.resize((_WIDTH, height), Image.Resampling.LANCZOS), (left, top))
         caption = f"{one.object} ({one.hand})"
-        draw.text((left + 4, top + height + 2), caption, fill=typography.INK, font=typography.font(11))
+        draw.text((left + 4, top + height + 2), caption, fill=sheets.INK, font=sheets.font(11))
     sheet.save(file, quality=_QUALITY)
     return True
 

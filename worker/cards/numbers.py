@@ -11,13 +11,11 @@ from numpy.typing import NDArray
 from pydantic_core import from_json
 
 from service.model.clock import timestamp
-from service.model.diversity import CELLS, GraspType, entropy_bits, evenness
-from service.model.metrics import GRASP_METRICS
+from service.model.metrics import DIRECTION_CELLS, GRASP_METRICS, GraspType, entropy_bits, evenness
 from service.model.states import AssetKind
 from service.model.version import PACKAGE_VERSION
 from worker.cards.contents import AssetFacts, Contents
-from worker.cards.directions import ELEVATION_BINS, ENOUGH, cell_counts
-from worker.cards.tally import CellTally, Tally
+from worker.cards.tally import ELEVATION_BINS, ENOUGH, CellTally, Tally, cell_counts
 from worker.grasps import Posture
 from worker.quality.diversity import explained_variance
 from worker.quality.intervals import wilson
@@ -57,7 +55,7 @@ def numbers(contents: Contents, tally: Tally, *, licence: str = "", source: str 
         },
         "elevation_bins": ELEVATION_BINS,
         "directions": {
-            "cells": CELLS,
+            "cells": DIRECTION_CELLS,
             "enough": ENOUGH,
             "by_object": {obj: _directions(tally.of_object(obj)) for obj in contents.objects},
             "by_hand": {hand: _directions(tally.of_hand(hand)) for hand in contents.hands},
@@ -213,7 +211,7 @@ def _directions(cells: Iterable[CellTally]) -> Row | None:
     return {
         "grasps": len(vectors),
         "empty": int((counts == 0).sum()),
-        "evenness": _six(evenness(counts.ravel().tolist(), CELLS)),
+        "evenness": _six(evenness(counts.ravel().tolist(), DIRECTION_CELLS)),
         "entropy_bits": _six(entropy_bits(counts.ravel().tolist())),
     }
 

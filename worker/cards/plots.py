@@ -9,8 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from service.model.metrics import GRASP_METRICS
-from worker.cards.directions import cell_counts
-from worker.cards.tally import Tally
+from worker.cards.tally import Tally, cell_counts
 
 Row = Mapping[str, Any]
 

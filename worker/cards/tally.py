@@ -1,5 +1,5 @@
-"""Sums over the shards of a dataset. Grasps become a few float32 columns of a cell, so that millions fit in memory;
-`JointUse` says how much of its range each joint of a hand uses."""
+"""Sums over the shards of a dataset, and directions of approach in cells of equal area. Grasps become a few float32
+columns of a cell, so that millions fit in memory."""
 
 from __future__ import annotations
 
@@ -11,21 +11,16 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.metrics import GRASP_METRICS
-from service.model.transforms import quat_rotate
-from service.store import standing
+from service.model.metrics import BANDS, DIRECTION_CELLS, GRASP_METRICS, SECTORS
+from service.model.transforms import Floats, quat_rotate
+from service.store import validity
 from service.store.manifests import INDEX_THRESHOLD_M
-from worker.cards.contents import AssetFacts, Contents, Pair
-from worker.cards.directions import ELEVATION_BINS, elevations
-from worker.cards.reading import Piece
+from worker.cards.contents import AssetFacts, Contents, Pair, Piece
 from worker.grasps import Posture
-
-Floats = NDArray[np.float64]
-
+from worker.quality.approach import cells_of
 
 #: Bins between a joint's limits.
 BINS: Final = 200
-
 
 #: A joint is at a limit where it is nearer than this share of its range.
 _AT: Final = 0.01
@@ -86,11 +81,15 @@ class JointUse:
 
 
 Array = NDArray[Any]
+
 Floats32 = NDArray[np.float32]
+
 #: Grasps of a cell on which its diversity is measured, the first ones.
 SAMPLED: Final = 512
+
 #: So many arrays of a cell are packed into one.
 _UNPACKED: Final = 16
+
 #: Grasps that agree in all numbers to so many digits (metres, radians) are counted as one.
 _DIGITS: Final = 6
 
@@ -233,12 +232,12 @@ def _note(tally: Tally, cell: CellTally, piece: Piece) -> None:
 def _add_base(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts) -> Array:
     """Add a base shard; returns its mask (N,) of valid grasps."""
     columns = piece.columns
-    valid = standing.valid(columns)
+    valid = validity.valid(columns)
     cell.grasps += piece.rows
     cell.valid += int(valid.sum())
     tried = int(piece.said.get("tried", piece.rows))
     cell.tried += tried
-    if standing.judged(columns).any() or (not piece.rows and piece.said.get("verdict_level", "none") != "none"):
+    if validity.judged(columns).any() or (not piece.rows and piece.said.get("verdict_level", "none") != "none"):
         cell.judged += tried
     cell.rejected.update({str(why): int(count) for why, count in dict(piece.info.get("rejected", {})).items()})
     if (audit := columns.get("quality/audit")) is not None:
@@ -297,3 +296,23 @@ def _add_scene(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts, va
     )
     sums["all"] += elevations(towards[good])
     sums["clear"] += elevations(towards[clear])
+
+
+#: Fewer grasps leave cells empty by chance: with this many uniform ones e^-5 of a cell, 0.3 of all 48.
+ENOUGH: Final = 5 * DIRECTION_CELLS
+
+#: Elevations from -90 to 90 degrees.
+ELEVATION_BINS: Final = 36
+
+
+def cell_counts(directions: NDArray[Any], bands: int = BANDS, sectors: int = SECTORS) -> NDArray[np.int64]:
+    """(bands, sectors) how many unit vectors (N, 3) point into each cell; band 0 is the lowest, sector 0 begins at
+    azimuth -180 degrees."""
+    cells = cells_of(np.asarray(directions).reshape(-1, 3), bands, sectors)
+    return np.bincount(cells, minlength=bands * sectors).reshape(bands, sectors)
+
+
+def elevations(directions: NDArray[Any]) -> NDArray[np.int64]:
+    """(ELEVATION_BINS,) unit vectors (N, 3) by their angle over the horizontal."""
+    degrees = np.degrees(np.arcsin(np.clip(directions[:, 2], -1.0, 1.0)))
+    return np.histogram(degrees, bins=ELEVATION_BINS, range=(-90, 90))[0].astype(np.int64)

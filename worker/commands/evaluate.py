@@ -12,16 +12,16 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 
 from service.cli import JsonFlag, emit, plain_console, reporting_errors
-from service.model.errors import InputError
-from service.model.robust import MEANINGS, MOST_MODELS
-from service.model.suggestions import one_of
+from service.model.errors import InputError, one_of
+from service.model.metrics import AXIS_MEANINGS, MOST_ROBUST_MODELS
+from service.store.shards import carried, json_attribute, read_shard, write_shard
 from worker.files.cases import expand, load_case
 from worker.files.evaluate import Protocol, combine, evaluate
-from worker.files.robust_copies import copy_paths, write_copy
 from worker.hands.load import hand_from_path
 from worker.hands.same_hand import TOLERANCE_M, same_hand
 from worker.quality.referee.key import Level
 from worker.quality.referee.lifting import LiftLevel
+from worker.quality.referee.robust import Robustness
 from worker.run import Run
 
 app = typer.Typer(add_completion=False)
@@ -69,7 +69,9 @@ def evaluate_command(
     robust: Annotated[
         int,
         typer.Option(
-            min=0, max=MOST_MODELS, help="Models around the nominal one in which what holds is judged again, such as 8."
+            min=0,
+            max=MOST_ROBUST_MODELS,
+            help="Models around the nominal one in which what holds is judged again, such as 8.",
         ),
     ] = 0,
     friction: Annotated[
@@ -177,7 +179,7 @@ def _copies(paths: list[Path], files: list[Path], out: Path | None, *, robust: i
 
 def _said_of_models(whole: dict[str, Any]) -> str:
     """How far the verdicts can be trusted, the axis that costs most first."""
-    words = {axis.word: name for axis, name in MEANINGS.items()}
+    words = {axis.word: name for axis, name in AXIS_MEANINGS.items()}
     axes = sorted(whole["robust_axes"].items(), key=lambda pair: pair[1]["share"])
     each = ", ".join(f"{words[axis]} {one['share']:.2f}" for axis, one in axes)
     return (
@@ -235,3 +237,38 @@ def _foreign(whole: dict[str, Any], name: str) -> str:
 
 def _cell(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
+
+
+def copy_paths(source: Path, files: list[Path], out: Path) -> list[Path]:
+    """Where the copies go: of a file, `out`; of a folder's, the same places in `out`, which must be new or empty.
+
+    Raises:
+        InputError: a file is no shard, would be written over, or lies in no folder.
+    """
+    if other := next((file for file in files if file.suffix != ".h5"), None):
+        raise InputError(f"{other} is no shard of graspd: only these have columns for the shares")
+    if source.is_dir():
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise InputError(f"{out} is there already; choose a folder that is not")
+        return [out / file.relative_to(source) for file in files]
+    if not out.parent.is_dir() or out.is_dir():
+        raise InputError(f"{out} is no file that can be written: choose one in a folder that is there")
+    return [out]
+
+
+def write_copy(source: Path, out: Path, found: Robustness) -> None:
+    """A base shard with the shares of its grasps; all else, its id too, is as it was.
+
+    Raises:
+        InputError: it is no base shard, or cannot be written there.
+    """
+    shard = read_shard(source, kind="base")
+    said = json_attribute({"models": found.held.shape[1], "wanted": found.wanted})
+    data = write_shard("base", {**shard.arrays, **found.columns}, {**carried(shard), "robust": said})
+    part = out.with_name(f".{out.name}.part")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(data)
+        part.replace(out)
+    except OSError as error:
+        raise InputError(f"{out} cannot be written: {error.strerror}") from None

@@ -1,4 +1,4 @@
-"""Command line: `graspd export` and `graspd import`."""
+"""Command line: `graspd export`, `graspd import` and `graspd clouds`."""
 
 from __future__ import annotations
 
@@ -10,23 +10,30 @@ import numpy as np
 import typer
 
 from service.cli import JsonFlag, emit, reporting_errors
-from service.model.errors import InputError
-from service.model.suggestions import one_of
-from service.store import standing
+from service.model.errors import InputError, one_of
+from service.readers import Pictures
+from service.readers.clouds import Frame
+from service.readers.depth_noise import NOISES
+from service.store import validity
 from service.store.shards import read_shard
-from worker.files.choice import EveryOption, UnjudgedOption, choose
+from worker.files.clouds import hand_surface, write_clouds
 from worker.files.exchange.opening import opened
+from worker.files.subsets import EveryOption, UnjudgedOption, choose, shards_of
 from worker.run import Run
 
 app = typer.Typer(no_args_is_help=True)
 
 #: Formats of robots and their simulators; the first of them goes by two names.
 ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "usd", "glb", "isaac", "csv")
+
 #: Formats that a network is trained on: they take a folder of shards.
 TRAINING: Final = ("dexlearn", "dexgraspnet2", "graspgen", "huggingface", "lerobot")
+
 EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *TRAINING, *ROBOTS)
+
 #: Imports of one object, which `--name` names in the file.
 NAMED: Final = ("graspgen", "huggingface", "lerobot")
+
 IMPORTS: Final = ("dexgraspbench", "dexlearn", *NAMED, "dexgraspnet", "dexgraspnet2", "multidex", "ddgc", "reference")
 
 
@@ -149,14 +156,14 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
     Raises:
         InputError: unknown format, something that it needs is not given, or not such a file.
     """
-    from worker.files.exchange import ddgc, dexgraspbench, dexgraspnet, dexgraspnet2, multidex, reference
+    from worker.files.exchange import dexgraspbench, dexgraspnet2, published
 
     if format_ not in IMPORTS:
         raise InputError(f"there is no import format {format_!r}; choose one of {one_of(format_, IMPORTS)}")
     if not source.exists():
         raise InputError(f"{source} does not exist")
     if format_ == "reference":
-        return reference.read(source, hand=hand, obj=obj)
+        return published.read_reference(source, hand=hand, obj=obj)
     if hand is None or obj is None:
         raise InputError(f"{format_} files do not hold the hand and the object; name both: --hand and --object")
     if format_ in ("dexgraspbench", "dexlearn"):
@@ -164,20 +171,22 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
     if format_ in NAMED:
         return _named(format_, source, hand, obj, str(options["object_name"]))
     if format_ == "dexgraspnet":
-        return dexgraspnet.read(source, hand=hand, obj=obj)
+        return published.read_dexgraspnet(source, hand=hand, obj=obj)
     if format_ == "dexgraspnet2":
         return dexgraspnet2.read(source, hand=hand, obj=obj, number=int(options["number"]))
     if format_ == "ddgc":
-        return ddgc.read(source, hand=hand, obj=obj, number=int(options["number"]))
+        return published.read_ddgc(source, hand=hand, obj=obj, number=int(options["number"]))
     if not options["robot"] or not options["object_name"]:
         raise InputError("a multidex file holds many robots and objects; name one of each: --robot and --name")
-    return multidex.read(source, hand=hand, obj=obj, robot=options["robot"], object_name=options["object_name"])
+    return published.read_multidex(
+        source, hand=hand, obj=obj, robot=options["robot"], object_name=options["object_name"]
+    )
 
 
 def _named(format_: str, source: Path, hand: str, obj: str, name: str) -> list[Any]:
-    from worker.files.exchange import graspgen, huggingface, lerobot_import
+    from worker.files.exchange import graspgen, huggingface, lerobot
 
-    read = {"graspgen": graspgen.read, "huggingface": huggingface.read, "lerobot": lerobot_import.read}[format_]
+    read = {"graspgen": graspgen.read, "huggingface": huggingface.read, "lerobot": lerobot.read}[format_]
     return list(read(source, hand=hand, obj=obj, object_name=name))
 
 
@@ -225,9 +234,9 @@ def _compared(one: dict[str, Any]) -> str:
 
 def _summary(file: Path) -> dict[str, Any]:
     shard = read_shard(file, kind="base")
-    valid, sound = standing.valid(shard.arrays), standing.sound(shard.arrays)
+    valid, sound = validity.valid(shard.arrays), validity.sound(shard.arrays)
     said = np.asarray(shard.arrays.get("quality/published", np.full(len(valid), -1)))
-    both = (said >= 0) & standing.judged(shard.arrays)
+    both = (said >= 0) & validity.judged(shard.arrays)
     agree = float((said == shard.arrays["quality/success"])[both].mean()) if both.any() else None
     return {
         "file": str(file),
@@ -238,3 +247,54 @@ def _summary(file: Path) -> dict[str, Any]:
         "published": int((said >= 0).sum()),
         "agreement_published": agree,
     }
+
+
+@app.command(epilog="graspd clouds kitchen --points 1024 --noise stereo -o clouds")
+@reporting_errors
+def clouds(
+    source: Annotated[str, typer.Argument(help="A folder of shards with pictures, or a dataset of the store.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write; it must be new or empty.")],
+    points: Annotated[int, typer.Option(min=1, max=10_000_000, help="Points of each cloud.")] = 1024,
+    noise: Annotated[str, typer.Option(help=f"A depth camera: {', '.join(NOISES)}; none.")] = "none",
+    frame: Annotated[
+        Frame | None, typer.Option(help="camera, table or object; default: the camera's, of fused views the table's.")
+    ] = None,
+    fuse: Annotated[bool, typer.Option("--fuse", help="One cloud of all views of a scene.")] = False,
+    scene: Annotated[bool, typer.Option("--scene", help="Table and neighbours too.")] = False,
+    voxel: Annotated[float, typer.Option(min=0.0, help="One point of each cube with this edge [m]; 0: all.")] = 0.0,
+    graspness: Annotated[
+        bool, typer.Option("--graspness", help="Of each point the share of grasps whose hand touches it.")
+    ] = False,
+    unjudged: Annotated[bool, typer.Option("--unjudged", help="Grasps that are sound and that nobody judged.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same clouds.")] = 0,
+    json: JsonFlag = False,
+) -> None:
+    """Write the pictures of a dataset as point clouds with their grasps: docs/how-to/clouds.md.
+
+    Who reads with graspd needs no files: `Pictures(shards).clouds()` makes the same when it is asked for.
+    """
+    pictures = Pictures(shards_of(source), unjudged=unjudged)
+    if not len(pictures):
+        raise InputError(f"{source} has no pictures; take some: graspd render")
+    camera = None if noise == "none" else noise
+    surface = hand_surface if graspness else None
+    found = pictures.clouds(
+        points, noise=camera, frame=frame, fuse=fuse, scene=scene, voxel_m=voxel, hand_surface=surface, seed=seed
+    )
+    said = {
+        "source": source,
+        "points": points,
+        "noise": noise,
+        "frame": found.frame,
+        "fuse": fuse,
+        "scene": scene,
+        "voxel_m": voxel,
+        "graspness": graspness,
+        "unjudged": unjudged,
+        "seed": seed,
+    }
+    done = write_clouds(found, out, said)
+    if json:
+        emit({"folder": str(out), **done})
+        return
+    typer.echo(f"{out}: {done['clouds']} clouds in {done['files']} files, {done['empty']} of them empty")

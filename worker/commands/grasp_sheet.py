@@ -1,7 +1,8 @@
-"""Sheets of the grasps of a base shard: hand and object, in their scene where they have one, alone or on their way."""
+"""Sheets and films of the grasps of a base shard: hand and object, in their scene, alone or along their trajectory."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -9,20 +10,31 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from service.model.scene_kinds import supports_in
-from service.model.scene_spec import SceneSpec
+from service.model.scene_spec import SceneSpec, supports_in
+from service.model.transforms import compose, invert
 from service.readers.ways import Waypoint, scene_spec_of, way_of, wrists_of
 from service.store.shards import Shard
-from worker.files.of_shard import neighbours_of_shard
-from worker.grasps import Posture
+from worker.files.provenance import neighbours_of_shard, placed_of_shard
+from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.rendering.pages.pictures import SAMPLES, THREE_SIDES, grasp_pictures
 from worker.rendering.pages.sheets import contact_sheet, figures, label_page, three_sides_sheet
-from worker.rendering.pages.way_pictures import FREE_STRIP, STRIP, Around, way_pictures
+from worker.rendering.pages.way_pictures import FREE_STRIP, STRIP, Around, animation, animation_kind, way_pictures
+from worker.robots.execution import (
+    STEP_S,
+    Executions,
+    Trajectory,
+    executions,
+    hand_limits,
+    straight_paths,
+    timed,
+    tool_frame,
+)
 from worker.run import Run
 
 Kind = Literal["one side", "three sides", "way"]
+
 #: Edge of a grasp's picture [px] and rays a pixel. Tracing costs what goes with both: three sides half of one alone.
 LOOKS: Final[dict[Kind, tuple[int, int]]] = {"one side": (300, SAMPLES), "three sides": (160, 8), "way": (300, SAMPLES)}
 
@@ -121,3 +133,94 @@ def _scene_of(shard: Shard) -> SceneSpec | None:
 
 def _named(way: list[Waypoint], name: str) -> Waypoint:
     return next(point for point in way if point.name == name)
+
+
+#: Width of the film [px], and its height as a share of that.
+WIDTH: Final = 480
+
+HIGH: Final = 0.75
+
+#: Rays a pixel: shadows that move show what is coarse in them.
+FILM_SAMPLES: Final = 24
+
+#: Share of the velocity limits of joints and hand that is used.
+SPEED: Final = 0.5
+
+#: The open hand is shown for so long before it sets out, and the lifted object before all begins anew [s].
+BEFORE_S: Final = 0.4
+
+AFTER_S: Final = 1.4
+
+
+@dataclass(frozen=True)
+class GraspAnimation:
+    """Grasps of a shard on their way, one after the other."""
+
+    shard: Shard
+    hand: HandModel
+    obj: ObjectModel
+    rows: NDArray[np.intp]
+    run: Run
+    width: int | None = None
+    """[px]; None: `WIDTH`."""
+    samples: int = FILM_SAMPLES
+
+    def file(self, suffix: str) -> bytes:
+        """The film as GIF, WebP or animated PNG.
+
+        Raises:
+            InputError: another suffix, or a grasp has no way that is free of the object.
+        """
+        animation_kind(suffix)
+        pictures: list[NDArray[np.uint8]] = []
+        seconds: list[float] = []
+        for row in self.rows:
+            found = self._executed(row)
+            way = _timed(found)
+            pictures.append(self._drawn(row, waypoints(found, way)))
+            seconds += _shown(way)
+        return animation(np.concatenate(pictures), seconds, suffix)
+
+    def _executed(self, row: np.intp) -> Executions:
+        one, placed = np.array([row]), placed_of_shard(self.shard)
+        grasps = GraspSet.from_columns(self.shard.arrays).take(one)
+        return executions(
+            self.hand,
+            self.obj,
+            grasps,
+            rows=one,
+            placed=None if placed is None else placed.take(one),
+            tool=tool_frame(None, self.hand.root_link, {}),
+            quality={},
+        )
+
+    def _drawn(self, row: np.intp, way: Sequence[Waypoint]) -> NDArray[np.uint8]:
+        width = self.width or WIDTH
+        around = around_of(self.shard, np.array([row]))
+        size = (width, round(HIGH * width))
+        (sides,) = way_pictures(
+            self.hand, self.obj, [way], around, size, whole=True, run=self.run, samples=self.samples
+        )
+        return np.asarray(sides[0])
+
+
+def waypoints(found: Executions, way: Trajectory) -> list[Waypoint]:
+    """The points of the trajectory of the first grasp, in the frame of the object at rest."""
+    rest = found.object_pose[0]
+    poses = compose(invert(rest), way.hand_pose)
+    held = way.phase.index("lift")
+    carried = np.where(np.arange(len(poses))[:, None] < held, 0.0, poses[:, :3] - poses[held - 1, :3])
+    closed = way.phase.index("squeeze") - 1
+    return [Waypoint("grasp" if k == closed else "", pose, way.joints[k], carried[k]) for k, pose in enumerate(poses)]
+
+
+def _timed(found: Executions) -> Trajectory:
+    limits = hand_limits(found.hand)
+    return timed(straight_paths(found, 0), found.hand.joint_names, limits.velocity, speed=SPEED)
+
+
+def _shown(way: Trajectory) -> list[float]:
+    seconds = [STEP_S, *np.diff(way.time).tolist()]
+    seconds[0] += BEFORE_S
+    seconds[-1] += AFTER_S
+    return seconds

@@ -28,7 +28,7 @@ from service.store.asset_options import (
     hand_options,
 )
 from service.store.asset_summary import say_check, self_test_lines
-from service.store.hand_corrections import described
+from service.store.descriptions import described
 from worker.hands.check import check_hand
 from worker.hands.load import files_from_path, hand_from_path, main_file
 from worker.hands.model import HandModel

@@ -1,7 +1,12 @@
-"""Command line: `graspd render` and `graspd pictures`."""
+"""Command line: `graspd render`, `graspd pictures` and `graspd view`."""
 
 from __future__ import annotations
 
+import getpass
+import os
+import signal
+import socket
+import threading
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -14,24 +19,28 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from service.cli import JsonFlag, emit, plain_console, reporting_errors, write_output
 from service.model.errors import InputError
-from service.model.scene_kinds import supports_in
+from service.model.scene_spec import supports_in
 from service.model.transforms import compose
 from service.readers.ways import scene_spec_of, wrists_of
-from service.store import standing
+from service.store import validity
 from service.store.shards import Shard, read_shard, write_shard
-from worker.commands.grasp_animation import GraspAnimation
-from worker.commands.grasp_sheet import GraspSheet
+from worker.commands.grasp_sheet import GraspAnimation, GraspSheet
 from worker.engines.devices import Device
-from worker.files.choice import EveryOption, UnjudgedOption, choose
-from worker.files.of_shard import INHERITED, hand_of_shard, id_of_columns, made_of, neighbours_of_shard, object_of_shard
-from worker.rendering.camera_file import SAMPLED, read_cameras
-from worker.rendering.cameras import BASELINE_M
-from worker.rendering.channels import parse_channels
+from worker.files.provenance import (
+    INHERITED,
+    hand_of_shard,
+    id_of_columns,
+    made_of,
+    neighbours_of_shard,
+    object_of_shard,
+)
+from worker.files.subsets import EveryOption, UnjudgedOption, choose
+from worker.rendering.annotate import parse_channels
+from worker.rendering.cameras import BASELINE_M, SAMPLED, read_cameras
 from worker.rendering.hands import DrawnHand
-from worker.rendering.pages.animation import animation_kind
-from worker.rendering.pages.sheets import best, best_in_scenes, best_kept, views_page
-from worker.rendering.pages.typography import with_palette
-from worker.rendering.standing import TABLE
+from worker.rendering.pages.sheets import best, best_in_scenes, best_kept, views_page, with_palette
+from worker.rendering.pages.way_pictures import animation_kind
+from worker.rendering.scenery import TABLE
 from worker.rendering.views import Extras
 from worker.rendering.views import render as render_views
 from worker.run import Run
@@ -39,6 +48,7 @@ from worker.run import Run
 app = typer.Typer(add_completion=False)
 
 _Device = Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")]
+
 _Object = Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")]
 
 
@@ -195,8 +205,8 @@ def _scenes(path: Path) -> Shard:
 
 def _drawn_in(base: Shard, hand: str | None) -> DrawnHand | None:
     """The best valid grasp of each scene that grasps were planned in; where nobody judged, the best sound one."""
-    judged = standing.valid(base.arrays).any()
-    rows = best_in_scenes(base.arrays, standing.chosen(base.arrays, unjudged=not judged))
+    judged = validity.valid(base.arrays).any()
+    rows = best_in_scenes(base.arrays, validity.chosen(base.arrays, unjudged=not judged))
     if not len(base["grasp/hand_pose"]):
         return None
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
@@ -241,3 +251,43 @@ def _progress(quiet: bool) -> Progress:
         disable=quiet,
         transient=True,
     )
+
+
+@app.command(epilog="graspd view grasps.h5")
+@reporting_errors
+def view(
+    grasps: Annotated[Path, typer.Argument(help="A base shard, as `graspd synth` writes it.")],
+    host: Annotated[str, typer.Option(help="Address to serve on; whoever reaches it sees the grasps.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="The first port tried; 0: any free one.")] = 8080,
+    hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
+    object: Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")] = None,
+) -> None:
+    """Show grasps in 3D in the browser: hand, object, scene, contacts, and the way as a slider. Ends with Ctrl-C."""
+    from worker.viewing import Shown, Viewer, missing
+
+    if said := missing():
+        raise InputError(said)
+    from worker.files.provenance import hand_of_shard, neighbours_of_shard, object_of_shard
+
+    base = read_shard(grasps, kind="base")
+    shown = Shown(base, hand_of_shard(base, hand), object_of_shard(base, object), neighbours_of_shard(base, []))
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    viewer = Viewer(shown, host=host, port=port)
+    try:
+        typer.echo(f"{grasps}: {viewer.url}")
+        typer.echo(
+            f"from another machine: {forwarding(viewer.server.get_port())}, then the same address; Ctrl-C ends it"
+        )
+        ended.wait()
+    finally:
+        viewer.close()
+
+
+def forwarding(port: int) -> str:
+    """The command that brings a port of this machine's loopback to the machine that one sits at."""
+    # sshd says the address under which it was reached.
+    reached = os.environ.get("SSH_CONNECTION", "").split()
+    host = reached[2] if len(reached) == 4 else socket.gethostname()
+    return f"ssh -L {port}:127.0.0.1:{port} {getpass.getuser()}@{host}"

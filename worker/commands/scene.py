@@ -9,10 +9,9 @@ from typing import Annotated, Any
 import typer
 
 from service.cli import JsonFlag, emit, reporting_errors, write_output
-from service.store.attributes import Attribute
+from service.store.columns import Attribute
 from service.store.shards import read_shard, write_shard
-from worker.files.base_attributes import wrist_attributes
-from worker.files.of_shard import (
+from worker.files.provenance import (
     INHERITED,
     NEIGHBOUR_FACE_ERROR_M,
     beside_attributes,
@@ -20,6 +19,7 @@ from worker.files.of_shard import (
     id_of_columns,
     made_of,
     object_of_shard,
+    wrist_attributes,
 )
 from worker.grasps import Posture
 from worker.objects.prepare import object_from_path

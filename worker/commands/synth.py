@@ -22,14 +22,12 @@ from service.cli import (
     told_to_stop,
     write_output,
 )
-from service.model.diversity import CELLS, MIN_DISTANCE_M
+from service.model.base import refusal
 from service.model.domain import JobOptions
-from service.model.errors import InputError, TaskCancelled
+from service.model.errors import InputError, TaskCancelled, one_of
 from service.model.fidelity import FIDELITIES
-from service.model.refusals import refusal
-from service.model.robust import MODELS
+from service.model.metrics import DIRECTION_CELLS, MIN_DISTANCE_M, ROBUST_MODELS
 from service.model.scene_spec import MOST_SCENES, parse_scene
-from service.model.suggestions import one_of
 from service.store.asset_options import (
     AllowOpenOption,
     CompoundOption,
@@ -44,7 +42,7 @@ from service.store.asset_options import (
     object_options,
 )
 from service.store.shards import write_shard
-from worker.files.of_shard import id_of_columns
+from worker.files.provenance import id_of_columns
 from worker.files.synthesis import chosen_fidelity, synthesized
 from worker.planners import PLANNERS
 from worker.planners.registry import of_this_machine, parsed_options
@@ -73,7 +71,10 @@ def synth(
         float, typer.Option(help="Share of models around the nominal one that a grasp must hold in.", min=0, max=1)
     ] = 0.0,
     robust_models: Annotated[
-        int, typer.Option(help=f"Models that each valid grasp is judged in; 0: {MODELS} with --robust.", min=0, max=64)
+        int,
+        typer.Option(
+            help=f"Models that each valid grasp is judged in; 0: {ROBUST_MODELS} with --robust.", min=0, max=64
+        ),
     ] = 0,
     method: Annotated[
         str, typer.Option(help=f"planner: {', '.join(PLANNERS)}, or one that another package offers")
@@ -267,7 +268,7 @@ def _said(found: dict[str, Any]) -> str:
             f"penetration {mean['penetration_depth_mm']:.2f} mm"
         )
         types = ", ".join(f"{number} {name}" for name, number in found["types"].items())
-        lines.append(f"{types}; from {found['directions_used']} of {CELLS} directions")
+        lines.append(f"{types}; from {found['directions_used']} of {DIRECTION_CELLS} directions")
     if found.get("payload_kg") is not None:
         lines.append(f"median payload {found['payload_kg']:.2f} kg")
     if found.get("shake_share") is not None:

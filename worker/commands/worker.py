@@ -13,7 +13,7 @@ import typer
 
 from service.cli import keep_private, load_settings, log_to_stderr, reporting_errors
 from service.model.errors import InputError, UnavailableError
-from service.model.imports import imports
+from service.model.libraries import imports
 from service.model.states import Stage
 from service.settings import Settings
 

@@ -1,26 +1,39 @@
 """Warp, started quietly: on a machine without a GPU its C++ side says so on stderr at every start.
 
 Compiled kernels are kept where Warp would, or where this user can write.
+
+Kernels compiled ahead of time, and names of compiled kernels: a fresh machine with such an image compiles nothing.
+
+A folder of such kernels is laid out as Warp's cache is, VERSION/MODULE/FILE. Names of files hold what they are good
+for: the digest of the module's source and options, the GPU's architecture, or the instructions of the CPU that they
+were compiled on. What does not fit a machine is not found there and compiled as ever.
 """
 
 from __future__ import annotations
 
 import logging
 import os
+import pkgutil
+import shutil
 import sys
 import tempfile
 import threading
+from collections.abc import Iterable, Sequence
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, Final
 
 import warp as wp
 
 from service import user_cache
-from worker.engines.baked import lay_out
 
 _HARMLESS = b"Could not find or load the NVIDIA CUDA driver"
+
 _lock = threading.Lock()
+
 _started = False
+
 log = logging.getLogger(__name__)
 
 
@@ -89,3 +102,81 @@ def kernel_cache() -> Path | None:
     folder = user_cache.folder("warp")
     log.warning("no kernels can be kept in %s (%s); they are kept in %s", wanted, trouble, folder)
     return folder
+
+
+#: Names the folder of kernels that were compiled ahead.
+VARIABLE: Final = "GRASPD_KERNELS"
+
+#: A100, H100 and H200, B200.
+ARCHITECTURES: Final = (80, 90, 100)
+
+
+def modules() -> list[str]:
+    """Names of all modules of ours with Warp kernels."""
+    worker = import_module("worker")
+    infos = pkgutil.walk_packages(worker.__path__, "worker.")
+    names = [info.name for info in infos if not info.ispkg]
+    return [name for name in names if (".kernels." in name or name.endswith(".kernels")) and _has_kernels(name)]
+
+
+def _has_kernels(name: str) -> bool:
+    return any(isinstance(value, wp.Kernel) for value in vars(import_module(name)).values())
+
+
+def bake(names: Iterable[str], *, architectures: Sequence[int] = ARCHITECTURES, cpu: bool = True) -> list[Path]:
+    """Compile modules into Warp's cache: binaries for GPUs of these architectures, and objects for this CPU.
+
+    No GPU is needed. Returns all files of the cache.
+    """
+    for name in names:
+        module = import_module(name)
+        if architectures:
+            wp.compile_aot_module(module, arch=list(architectures), use_ptx=False)
+        if cpu:
+            # What is compiled ahead for a CPU has another block size, and digest, than what a launch asks for.
+            wp.load_module(module, device="cpu")
+    return sorted(file for file in Path(wp.config.kernel_cache_dir).glob("*/*") if file.is_file())
+
+
+def lay_out(cache: Path) -> int:
+    """Copy what `$GRASPD_KERNELS` has for this version of Warp, and the cache has not, into the cache.
+
+    A folder that is missing or cannot be read is none: kernels are compiled then.
+
+    Returns:
+        Number of files copied.
+    """
+    named = os.environ.get(VARIABLE, "")
+    if not named:
+        return 0
+    source, copied = Path(named) / wp.config.version, 0
+    try:
+        for file in sorted(source.glob("*/*")):
+            copied += _copied(file, cache / file.parent.name / file.name)
+    except OSError as error:
+        log.warning("kernels of %s are not used: %s", source, error)
+    return copied
+
+
+def _copied(source: Path, target: Path) -> bool:
+    """Whether the file was not there; others see it whole or not at all."""
+    if target.exists():
+        return False
+    target.parent.mkdir(parents=True, exist_ok=True)
+    handle, partial = tempfile.mkstemp(dir=target.parent, suffix=".part")
+    os.close(handle)
+    shutil.copyfile(source, partial)
+    Path(partial).replace(target)
+    return True
+
+
+def binary_name(module: ModuleType) -> str:
+    """What the kernels of a module are compiled to on this CPU: a digest of their sources, of all they call and of how
+    they are compiled, and the name that Warp gives the file, which tells the instructions that the CPU has.
+
+    Two processes in which it is the same run the same instructions.
+    """
+    known = wp.get_module(module.__name__)
+    # A launch on the CPU has blocks of one thread.
+    name = known._get_compile_output_name(wp.get_device("cpu"), block_dim=1)
+    return f"{wp.config.version} {known.get_module_hash(1).hex()} {name}"

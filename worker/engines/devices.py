@@ -1,9 +1,12 @@
-"""The Warp device of a worker, what people call it, and which GPU a process takes where nobody names one.
+"""Warp devices: their names, the GPU that a process takes where nobody names one, and errors of a GPU.
 
 `CUDA_VISIBLE_DEVICES` says which there are: the driver shows no others. Of these, worker number k takes the k-th, round
 and round; who has no number takes the one with the fewest processes. That is told by locks that the kernel drops with
 the process, however it ends: lock n of a GPU is held by the n-th process on it. They lie in the user's cache, which the
 containers of one machine share.
+
+After an illegal access, a reset or a bus error nothing runs any more in the CUDA context of a process. Warp only writes
+a line to stderr and goes on with whatever lies in memory, so the device is waited for before results leave the process.
 """
 
 from __future__ import annotations
@@ -19,11 +22,13 @@ from pathlib import Path
 from typing import IO, Final
 
 from service import user_cache
-from service.model.errors import InputError
+from service.model.errors import GraspdError, InputError
 
 log = logging.getLogger(__name__)
+
 #: Processes on one GPU that are counted; more make no difference.
 _MOST: Final = 64
+
 #: Locks of this process, until it ends.
 _held: list[IO[bytes]] = []
 
@@ -138,3 +143,35 @@ def _lock(file: Path) -> bool:
         raise
     _held.append(opened)
     return True
+
+
+#: How Warp and the driver say that memory is short on a GPU.
+_NO_MEMORY: Final = re.compile(r"Failed to allocate \d+ bytes.*'cuda:\d+'|CUDA error 2\b|out of memory", re.DOTALL)
+
+
+class DeviceLost(GraspdError):
+    """A GPU does not work in this process any more; a fresh process may find it well."""
+
+    slug, title = "device-lost", "A GPU does not work in this process any more"
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether work failed because the memory of a GPU did not suffice."""
+    return isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error)) is not None
+
+
+def check_device(device: str) -> None:
+    """Wait for what was launched on a device.
+
+    Raises:
+        DeviceLost: CUDA reports an error that its context does not outlive.
+    """
+    if not device.startswith("cuda"):
+        return
+    import warp as wp
+
+    try:
+        wp.synchronize_device(device)
+    except RuntimeError as error:
+        if not is_out_of_memory(error):
+            raise DeviceLost(f"{error}; nothing runs there any more in this process") from error

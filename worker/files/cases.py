@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError, NotFoundError
 from service.store.shards import kind_of, open_shard, read_shard
-from worker.files.exchange import dexgraspbench, reference
-from worker.files.of_shard import hand_of_shard, object_of_shard, placed_of_shard
+from worker.files.exchange import dexgraspbench, published
+from worker.files.provenance import hand_of_shard, object_of_shard, placed_of_shard
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.simulation.surroundings import Placed
-
-Floats = NDArray[np.float64]
 
 #: JSON files beside shards that hold no grasps.
 BESIDE_SHARDS: Final = ("snapshot.json", "subset.json", "card.json")
@@ -114,9 +112,9 @@ def _shard(path: Path, hand: str | None, obj: str | None) -> Case:
 
 
 def _reference(path: Path, hand: str | None, obj: str | None) -> Case:
-    (found,) = reference.read(path, hand=hand, obj=obj)
+    (found,) = published.read_reference(path, hand=hand, obj=obj)
     return Case(
-        path.name, found.hand, found.obj, found.grasps, friction=reference.friction(path), published=found.published
+        path.name, found.hand, found.obj, found.grasps, friction=published.friction(path), published=found.published
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError, MeshError
-from service.model.robust import axis_word
+from service.model.metrics import axis_word
 from worker.files.cases import Case
 from worker.grasps import GraspSet
 from worker.hands.same_hand import SameHand

@@ -9,23 +9,31 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError
-from service.model.suggestions import one_of
+from service.model.errors import InputError, one_of
 from service.model.transforms import IDENTITY_POSE
 from service.store.shards import Shard, read_shard
 from worker.files.cases import load_case
-from worker.files.choice import choose
+from worker.files.exchange.lots import Written
 from worker.files.exchange.robots.bundle import Bundle, Carrier
-from worker.files.exchange.written import Written
-from worker.files.of_shard import hand_files_of_shard
-from worker.hands.description import Description, describe
+from worker.files.provenance import hand_files_of_shard
+from worker.files.subsets import choose
 from worker.quality.referee.decomposition import decompose
 from worker.rendering.pages.sheets import best as best_of
-from worker.robots.arm import read_arm
-from worker.robots.execution import Executions, executions
-from worker.robots.frames import parse_pose, tool_frame
+from worker.robots.arm import Description, describe, read_arm
+from worker.robots.execution import (
+    ASSUMED_M_S,
+    ASSUMED_RAD_S,
+    Executions,
+    Limits,
+    Trajectory,
+    executions,
+    hand_limits,
+    parse_pose,
+    straight_paths,
+    timed,
+    tool_frame,
+)
 from worker.robots.reach import Reach
-from worker.robots.timing import ASSUMED_M_S, ASSUMED_RAD_S, Limits, Trajectory, hand_limits, straight_paths, timed
 from worker.run import ALONE, Run
 
 FORMATS: Final = ("mujoco", "usd", "glb", "moveit", "isaac", "csv")
@@ -163,18 +171,20 @@ def _assumptions(limits: Limits) -> list[str]:
 
 
 def _write(bundle: Bundle, format_: str, folder: Path, hand_files: dict[str, bytes]) -> list[Path]:
-    from worker.files.exchange.robots import isaac, moveit, mujoco_arm, mujoco_scene, posed_glb, tables, usd_stage
+    from worker.files.exchange.robots import moveit, mujoco_scene, posed_meshes, tables
 
     if format_ == "csv":
-        return tables.write(bundle, folder)
+        return tables.write_tables(bundle, folder)
     if format_ == "isaac":
-        return isaac.write(bundle, folder)
+        return tables.write_isaac(bundle, folder)
     if format_ == "glb":
-        return posed_glb.write(bundle, folder)
+        return posed_meshes.write_glb(bundle, folder)
     if format_ == "usd":
-        return usd_stage.write(bundle, folder)
+        return posed_meshes.write_usd(bundle, folder)
     if format_ == "moveit":
         return moveit.write(bundle, folder, hand_files)
     if format_ == "mujoco":
-        return mujoco_scene.write(bundle, folder, decompose(bundle.found.obj)) + mujoco_arm.write(bundle, folder)
+        return mujoco_scene.write_scene(bundle, folder, decompose(bundle.found.obj)) + mujoco_scene.write_arm(
+            bundle, folder
+        )
     raise InputError(format_)

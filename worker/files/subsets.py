@@ -1,4 +1,4 @@
-"""Parts of a dataset as base shards of their own: some of the grasps, with all that is known of them."""
+"""Parts of a dataset as base shards of their own, and the choice of grasps that a command takes."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 
 from service.cli import load_settings
 from service.model.errors import InputError, NotFoundError
 from service.readers import Shards, open_shards
-from service.store.shards import Shard, read_shard
+from service.store import validity
+from service.store.shards import Shard, part_of_shard, place_of, read_shard
 from service.store.store import open_store
-from service.store.subsets import part_of_shard, place_of
 
 #: From the base shards of one hand on one object to the mask (N,) of each.
 Chooser = Callable[[list[Shard]], list[NDArray[np.bool_]]]
@@ -87,3 +88,39 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
     told = {**said, "looked_at": looked_at, "kept": kept, "shards": [str(path) for path, _ in ready]}
     (out / "subset.json").write_text(json.dumps(told, indent=1) + "\n")
     return Subset(looked_at, kept, files, len(shards) - len(shards.of("base")))
+
+
+UnjudgedOption = Annotated[
+    bool, typer.Option("--unjudged", help="Instead of valid grasps those that are sound and that nobody judged.")
+]
+
+EveryOption = Annotated[bool, typer.Option("--all", help="All grasps, also those that failed.")]
+
+
+def choose(base: Shard, *, unjudged: bool = False, every: bool = False) -> tuple[NDArray[np.bool_], str]:
+    """(N,) the grasps that are taken, and what they are called.
+
+    Raises:
+        InputError: both wishes at once, or there is no such grasp; tells what there is.
+    """
+    if unjudged and every:
+        raise InputError("--unjudged and --all exclude each other")
+    count = len(base["quality/valid"])
+    if every:
+        mask, word = np.ones(count, bool), "grasps of any kind"
+    else:
+        mask = validity.chosen(base.arrays, unjudged=unjudged)
+        word = "sound grasps that nobody judged" if unjudged else "valid grasps"
+    if not mask.any():
+        raise InputError(f"{base.path or 'the shard'} holds no {word}; {_there_are(base, count)}")
+    return mask, word
+
+
+def _there_are(base: Shard, count: int) -> str:
+    waiting = int(validity.chosen(base.arrays, unjudged=True).sum())
+    valid = int(validity.valid(base.arrays).sum())
+    if waiting:
+        return f"{waiting} of its {count} are sound and were judged by nobody: take them with --unjudged"
+    if valid:
+        return f"{valid} of its {count} are valid: leave out --unjudged"
+    return f"all {count} failed: take them with --all" if count else "it has no grasp at all"

@@ -11,26 +11,29 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.diversity import CELLS, GraspType, entropy_bits
 from service.model.domain import BATCH_SIZE, SHAKE_NEEDS_A_SCENE, JobOptions
-from service.model.errors import InputError, TaskCancelled
+from service.model.errors import InputError, TaskCancelled, did_you_mean, one_of
 from service.model.fidelity import FIDELITIES, Fidelity
-from service.model.outcomes import shortfall, totals
+from service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits
+from service.model.planning import shortfall, totals
 from service.model.scene_spec import MOST_SCENES, SceneSpec
-from service.model.suggestions import did_you_mean, one_of
-from service.store.attributes import Attribute
+from service.store.columns import Attribute
 from service.store.shards import json_attribute
 from worker.certified import Certified, certified_grasps
 from worker.engines.devices import Device
 from worker.engines.joins import batches_at_once, parse_join
-from worker.files.base_attributes import base_attributes, wrist_attributes
-from worker.files.of_shard import NEIGHBOUR_FACE_ERROR_M, beside_attributes
-from worker.files.origin import remembered
+from worker.files.provenance import (
+    NEIGHBOUR_FACE_ERROR_M,
+    base_attributes,
+    beside_attributes,
+    remembered,
+    wrist_attributes,
+)
 from worker.grasps import joined_columns
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
-from worker.objects.matter import as_asked
 from worker.objects.model import ObjectModel
+from worker.objects.options import as_asked
 from worker.objects.prepare import object_from_path
 from worker.planners import planner
 from worker.pool.pool import MODULES, Pool, processes_at_once
@@ -140,7 +143,7 @@ class Synthesized:
     def _diversity(self) -> dict[str, Any]:
         """Types of the grasps, and the entropies of types and of directions of approach."""
         types = np.bincount(np.asarray(self.arrays["quality/grasp_type"], int), minlength=len(GraspType))
-        cells = np.bincount(np.asarray(self.arrays["quality/approach_cell"], int), minlength=CELLS)
+        cells = np.bincount(np.asarray(self.arrays["quality/approach_cell"], int), minlength=DIRECTION_CELLS)
         return {
             "types": {kind.name.lower(): int(types[kind]) for kind in GraspType if types[kind]},
             "type_entropy_bits": round(entropy_bits(types.tolist()), 4),

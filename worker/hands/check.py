@@ -15,10 +15,10 @@ from worker.hands.load import assemble, assumed_efforts, main_file, mounting_of
 from worker.hands.model import HandModel
 from worker.hands.oppositions import require_opposing
 from worker.hands.options import HandOptions, parse_options
-from worker.hands.read import read_robot
 from worker.hands.robot import Robot, chain_to
 from worker.hands.surface import sample_surface
 from worker.hands.tree import build_tree, cut_drives, joints_above, passed_limits
+from worker.hands.xacro import read_robot
 from worker.run import ALONE, Run
 
 #: Points with which the outer surface is measured.
@@ -47,9 +47,11 @@ def check_hand(
         facts = error.facts if isinstance(error, AssetError) else {}
         return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": facts}
     stated = {
-        "palm": settings.palm is not None, "preshape": bool(settings.preshape), "closing": bool(settings.closing),
+        "palm": settings.palm is not None,
+        "preshape": bool(settings.preshape),
+        "closing": bool(settings.closing),
         "effort": not assumed_efforts(robot, hand.dof_names, settings),
-    }  # fmt: skip
+    }
     facts = hand_facts(hand, robot) | {
         "surface_area_m2": area,
         "guessed": [key for key, said in stated.items() if not said]

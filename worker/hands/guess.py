@@ -8,16 +8,15 @@ from functools import partial
 
 import numpy as np
 
-from service.model.errors import HandError
-from service.model.suggestions import did_you_mean
-from service.model.transforms import IDENTITY_POSE, apply, compose, quat_rotate
+from service.model.errors import HandError, did_you_mean
+from service.model.transforms import IDENTITY_POSE, Floats, apply, compose, quat_rotate
 from worker.hands.closing import carriers, closing_by_limits, closing_by_tips, posture, tips
 from worker.hands.jaws import MAX_DOFS, Jaws, closing_by_geometry, find_jaws, sign_of, slides
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel, PalmFrame
+from worker.hands.model import HandModel, PalmFrame
 from worker.hands.options import HandOptions
 from worker.hands.tree import Tree
-from worker.objects.kept_arrays import recalled
+from worker.objects.disk_cache import recalled
 
 #: Share of the way from open to closed at which the hand approaches.
 PRESHAPE_SHARE = 0.25

@@ -2,6 +2,8 @@
 
 A gripper is a hand whose closing is one motion of at most two degrees of freedom that brings opposing surfaces, the
 pads, together. Everything is found from geometry, so a joint at 0 may as well be open as closed.
+
+Where a hand presses: the pads of its jaws, or those of its fingertips.
 """
 
 from __future__ import annotations
@@ -15,37 +17,49 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, apply, quat_rotate
+from service.model.transforms import IDENTITY_POSE, Floats, apply, quat_conjugate, quat_rotate, spread_directions
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel, JointType, SurfacePoints
+from worker.hands.model import HandModel, JointType, SurfacePoints
 from worker.hands.surface import sample_surface
 
 Ints = NDArray[np.intp]
 
 #: Most degrees of freedom of a gripper's closing.
 MAX_DOFS: Final = 2
+
 #: Points that stand for the hand's surface.
 _POINTS: Final = 1600
+
 #: Two surfaces face each other where their normals are opposite to within 37 degrees ...
 _FACING_COS: Final = 0.8
+
 #: ... and one lies before the other, no farther to the side than so many distances between sample points.
 _ASIDE: Final = 1.5
+
 #: Of facing surfaces the ones that come together count: those with this share of the fastest approach.
 _FAST: Final = 0.5
+
 #: A pad is what of a jaw lies within this of the place that touches first [m].
 _PAD_DEPTH_M: Final = 0.003
+
 #: Shares of the limits at which the hand is looked at for surfaces that others hide.
 _LOOKS: Final = (0.5, 0.02, 0.98)
+
 #: Surfaces look where they go if they move along their normals with this share of the fastest point's speed.
 _LEADING: Final = 0.3
+
 #: A body carries a pad if it faced the other jaw with this share of the area of the one that faced it most.
 _PAD_SHARE: Final = 0.4
+
 #: Postures between open and closed that are looked at.
 _STEPS: Final = 17
+
 #: Pads face each other where the difference of their mean normals is longer than this: up to 120 degrees between them.
 _TOWARDS: Final = 1.0
+
 #: Pads that are this near touch [m].
 _TOUCH_M: Final = 2e-4
+
 #: Least over greatest singular value of the ends' motions from which on they are in no plane.
 _IN_SPACE: Final = 0.2
 
@@ -125,6 +139,7 @@ def jaws_of(hand: HandModel) -> Jaws | None:
 
 
 _found: LRUCache[str, Jaws | None] = LRUCache(32)
+
 _lock = threading.Lock()
 
 
@@ -299,13 +314,110 @@ def _measured(
     along = place[both] @ (approach if approach is not None else np.zeros(3))
     bodies = tuple(tuple(sorted(set(points.body[side].tolist()))) for side in sides)
     return Jaws(
-        path[kept], np.maximum(width, 0.0)[kept], middle[kept], axes[kept], speed[kept],
+        path[kept],
+        np.maximum(width, 0.0)[kept],
+        middle[kept],
+        axes[kept],
+        speed[kept],
         (bodies[0], bodies[1]),
         SurfacePoints(points.body[both], points.position[both], points.normal[both], points.area[both]),
-        np.arange(len(both)) < len(one), float(np.ptp(along)),
-    )  # fmt: skip
+        np.arange(len(both)) < len(one),
+        float(np.ptp(along)),
+    )
 
 
 def slides(hand: HandModel) -> NDArray[np.bool_]:
     """(D,) whether a dof drives a prismatic joint: its unit is the metre."""
     return np.array([JointType.PRISMATIC in hand.joint_type[hand.dof == d] for d in range(hand.dofs)])
+
+
+#: Share of a fingertip's speed, and so of its length, within which its points are its pad.
+PAD: Final = 0.5
+
+#: Least cosine of a pad's normals with its motion.
+_AHEAD: Final = 0.7
+
+#: Directions in which a fingertip is measured.
+_DIRECTIONS: Final = 256
+
+#: Points of the hand's surface that pads are made of.
+_PAD_POINTS: Final = 1000
+
+
+@dataclass(frozen=True)
+class Pad:
+    """A part of a body's surface that presses; in the body's frame."""
+
+    body: int
+    centre: Floats
+    """(3,) [m]"""
+    normal: Floats
+    """(3,) unit: where it presses."""
+    points: Floats
+    """(P, 3) of the surface [m]; none where the body has no shape."""
+
+
+def pads_of(hand: HandModel) -> tuple[Pad, ...]:
+    """The surfaces of a gripper that meet; of another hand the inner sides of its fingertips."""
+    jaws = jaws_of(hand)
+    if jaws is None:
+        return tuple(fingertip_pad(hand, tip) for tip in hand.fingertips)
+    found = []
+    for side in (jaws.first, ~jaws.first):
+        for body in np.unique(jaws.points.body[side]).tolist():
+            mine = side & (jaws.points.body == body)
+            place, look = jaws.points.position[mine], jaws.points.normal[mine].mean(axis=0)
+            found.append(Pad(body, place.mean(axis=0), look / max(float(np.linalg.norm(look)), 1e-9), place))
+    return tuple(found)
+
+
+def fingertip_pad(hand: HandModel, tip: int) -> Pad:
+    """Where and whereto a fingertip presses: the end of the side that its last joint moves ahead."""
+    points = sample_surface(hand, _PAD_POINTS)
+    mine = points.body == tip
+    place, normal = points.position[mine], points.normal[mine]
+    chain, body = [], tip
+    while body > 0:
+        chain.append(body)
+        body = int(hand.parent[body])
+    driven = [b for b in chain if hand.closing[hand.dof[b]] != 0] or chain
+    if not len(place) or not driven:
+        return Pad(tip, np.zeros(3), np.array([0.0, 0, 1]), np.zeros((0, 3)))
+    # A joint that turns the tip about itself moves no side of it ahead: then one nearer to the palm tells.
+    chosen = next((part for body in driven if (part := _moved_ahead(hand, tip, body, place, normal)).any()), None)
+    if chosen is None:
+        # Nothing tells; normals of a whole tip would cancel to rounding noise. The palm looks at what is held.
+        ahead = quat_rotate(quat_conjugate(_pose(hand, tip)[3:]), hand.palm.approach)
+        chosen = normal @ ahead > _AHEAD
+        if not chosen.any():
+            return Pad(tip, place.mean(axis=0), ahead, place)
+    look = normal[chosen].mean(axis=0)
+    return Pad(tip, place[chosen].mean(axis=0), look / max(float(np.linalg.norm(look)), 1e-9), place[chosen])
+
+
+def thinnest_fingertip(hand: HandModel) -> float:
+    """Least width of a fingertip in any direction [m]; 0 where one has no shape."""
+    ways, tips = spread_directions(_DIRECTIONS), []
+    for tip in hand.fingertips:
+        corners = [piece.vertices for piece in hand.pieces if piece.body == tip]
+        tips.append(float(np.ptp(np.concatenate(corners) @ ways.T, axis=0).min()) if corners else 0.0)
+    return min(tips, default=0.0)
+
+
+def _moved_ahead(hand: HandModel, tip: int, driven: int, place: Floats, normal: Floats) -> NDArray[np.bool_]:
+    """(P,) points of a tip that the joint of a body moves along their normals, and of those the fastest."""
+    dof = int(hand.dof[driven])
+    step = np.zeros(hand.dofs)
+    step[dof] = 1e-4 * (hand.closing[dof] or 1.0)
+    q = np.stack([hand.preshape, hand.preshape + step])
+    pose = body_poses(hand, np.tile(IDENTITY_POSE, (2, 1)), hand.expand(q))[:, tip]
+    moved = quat_rotate(pose[:, None, 3:], place[None]) + pose[:, None, :3]
+    move = quat_rotate(quat_conjugate(pose[0, 3:]), moved[1] - moved[0])
+    speed = np.linalg.norm(move, axis=1)
+    ahead = np.einsum("ij,ij->i", move / np.maximum(speed, 1e-12)[:, None], normal) > _AHEAD
+    far = speed >= speed.max() - PAD * np.ptp(speed)
+    return np.asarray(ahead & far if (ahead & far).any() else ahead)
+
+
+def _pose(hand: HandModel, body: int) -> Floats:
+    return np.asarray(body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0, body])

@@ -1,9 +1,9 @@
-"""A hand from its files: its description, meshes, and what is said of it in `asset.json` or `hand.json`."""
+"""A hand from its files: description, meshes, `asset.json` or `hand.json`, and gains where nobody states any."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -11,28 +11,33 @@ from typing import Any
 import numpy as np
 
 from service.model.digests import digest_files, digest_variant
-from service.model.errors import HandError, InputError, NotFoundError
+from service.model.errors import HandError, InputError, NotFoundError, did_you_mean
 from service.model.states import AssetKind
-from service.model.suggestions import did_you_mean
-from service.model.transforms import compose
+from service.model.transforms import Floats, compose
 from service.store.assets import builtin_files, builtin_names, unpack_file, without_common_folder
-from service.store.hand_files import files_of_hand
-from service.store.hand_main import hand_name, main_of
+from service.store.hand_files import files_of_hand, hand_name, main_of
 from worker.hands import collisions, guess, primitives, shapes
 from worker.hands.collisions import resting_neighbours
-from worker.hands.drive import with_drive
 from worker.hands.guess import complete
-from worker.hands.model import ConvexPiece, Drag, Floats, HandModel, PalmFrame
+from worker.hands.jaws import jaws_of, slides
+from worker.hands.model import ConvexPiece, Drag, HandModel, PalmFrame
 from worker.hands.mounting import mounting_tree
-from worker.hands.options import DEFAULT_EFFORT, DEFAULT_STIFFNESS, HandOptions, parse_options
+from worker.hands.options import (
+    DEFAULT_EFFORT,
+    DEFAULT_FORCE,
+    DEFAULT_LINEAR_STIFFNESS,
+    DEFAULT_STIFFNESS,
+    HandOptions,
+    parse_options,
+)
 from worker.hands.primitives import volume
-from worker.hands.read import read_robot
 from worker.hands.robot import Robot, chain_to
 from worker.hands.shapes import Hulls, make_pieces
 from worker.hands.tendons import tendons_of
 from worker.hands.tree import Tree, build_tree, joint_type
 from worker.hands.visuals import PlacedShape, Visuals
-from worker.objects.kept_arrays import recalling
+from worker.hands.xacro import read_robot
+from worker.objects.disk_cache import recalling
 from worker.run import ALONE, Run
 
 log = logging.getLogger(__name__)
@@ -286,3 +291,29 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
 
 
 __all__ = ["files_from_path", "hand_from_path", "load_hand"]
+
+
+def with_drive(hand: HandModel, stated: Collection[str], assumed: Sequence[str]) -> HandModel:
+    """The hand with the defaults of sliding joints and of jaws instead of those of revolute joints.
+
+    A dof that moves pads by v [m/rad or 1] along their line gets the gain k v^2, summed over the pads, and the limit
+    f v: at each pad that is k [N/m] and f [N], however the dof is geared to it.
+
+    Args:
+        hand: the hand with its palm and closing.
+        stated: dofs whose position gain somebody states: it stays.
+        assumed: dofs whose limit of torque or force nobody states.
+    """
+    slide, jaws = slides(hand), jaws_of(hand)
+    if jaws is None and not slide.any():
+        return hand
+    gain = np.where(slide, DEFAULT_LINEAR_STIFFNESS, hand.stiffness)
+    limit = np.where(slide, DEFAULT_FORCE, hand.effort)
+    if jaws is not None:
+        half = jaws.speed[len(jaws.speed) // 2]
+        moves = np.abs(half).sum(axis=1) > 0
+        gain = np.where(moves, DEFAULT_LINEAR_STIFFNESS * (half**2).sum(axis=1), gain)
+        limit = np.where(moves, DEFAULT_FORCE * np.abs(half).sum(axis=1), limit)
+    keeps = np.array([dof in stated for dof in hand.dof_names])
+    free = np.array([dof in assumed for dof in hand.dof_names])
+    return replace(hand, stiffness=np.where(keeps, hand.stiffness, gain), effort=np.where(free, limit, hand.effort))

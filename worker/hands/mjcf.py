@@ -171,10 +171,21 @@ class _Reader:
             limited, lower, upper = True, max(lower, least), min(upper, largest)
         kind_name = "prismatic" if slides else "revolute" if limited else "continuous"
         return Joint(
-            name, kind_name, parent, child, origin, axis, lower, upper, servo.effort, follows,
-            stiffness=servo.stiffness, armature=float(model.dof_armature[model.jnt_dofadr[joint]]),
-            dry_friction=float(model.dof_frictionloss[model.jnt_dofadr[joint]]), fault=fault,
-        )  # fmt: skip
+            name,
+            kind_name,
+            parent,
+            child,
+            origin,
+            axis,
+            lower,
+            upper,
+            servo.effort,
+            follows,
+            stiffness=servo.stiffness,
+            armature=float(model.dof_armature[model.jnt_dofadr[joint]]),
+            dry_friction=float(model.dof_frictionloss[model.jnt_dofadr[joint]]),
+            fault=fault,
+        )
 
     def _link(self, body: int, name: str) -> Link:
         model = self.model

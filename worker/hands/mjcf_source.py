@@ -14,8 +14,8 @@ from pathlib import PurePosixPath
 from typing import Final
 
 from service.model.errors import HandError, LimitError
-from service.store.mesh_names import one_like
-from worker.hands.xml_tree import parse_xml
+from service.store.mesh_files import one_like
+from worker.hands.urdf import parse_xml
 from worker.objects.stand_ins import refuse_stand_in
 
 MAX_BYTES: Final = 8 * 2**20
@@ -185,9 +185,13 @@ def _mesh_folder(root: Element) -> tuple[str, bool]:
 
 
 def _take_mesh(
-    element: Element, file: str, files: Mapping[str, bytes], main: str, where: tuple[str, bool],
+    element: Element,
+    file: str,
+    files: Mapping[str, bytes],
+    main: str,
+    where: tuple[str, bool],
     assets: dict[str, bytes],
-) -> None:  # fmt: skip
+) -> None:
     folder, strip = where
     wanted = PurePosixPath(file.replace("\\", "/")).name if strip else file
     base = posixpath.dirname(main)

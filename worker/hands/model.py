@@ -14,13 +14,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.hands.features import HandFeatures
+from service.model.transforms import Floats
+from worker.hands.primitives import HandFeatures
 from worker.hands.robot import Ints, Joint
 from worker.hands.tendons import Tendon
 from worker.hands.visuals import NO_VISUALS, Visuals
-from worker.objects.content import TOLD_IF_SET, content_of
-
-Floats = NDArray[np.float64]
+from worker.objects.disk_cache import TOLD_IF_SET, content_of
 
 
 class JointType(IntEnum):

@@ -14,8 +14,8 @@ from typing import Final
 
 import numpy as np
 
-from service.model.transforms import IDENTITY_POSE, compose, invert
-from worker.hands.model import Floats, HandModel
+from service.model.transforms import IDENTITY_POSE, Floats, compose, invert
+from worker.hands.model import HandModel
 from worker.hands.options import HandOptions
 from worker.hands.robot import Joint, Robot, chain_to
 from worker.hands.tree import LEAST_RANGE, Drive, Tree, joint_motion
@@ -59,9 +59,20 @@ def mounting_tree(robot: Robot, root: str, options: HandOptions) -> Tree | None:
     lower, upper, velocity = np.array([(j.lower, j.upper, j.velocity) for j in wrist]).reshape(-1, 3).T
     drives = {name: Drive(name, 1.0, 0.0) for name in moving}
     return Tree(
-        tuple(names), tuple(parents), tuple(joints), tuple(origins), links, drives, moving, moving, lower, upper,
-        velocity, (), frozenset(),
-    )  # fmt: skip
+        tuple(names),
+        tuple(parents),
+        tuple(joints),
+        tuple(origins),
+        links,
+        drives,
+        moving,
+        moving,
+        lower,
+        upper,
+        velocity,
+        (),
+        frozenset(),
+    )
 
 
 def _value(joint: Joint, options: HandOptions) -> float | None:

@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 
 from service.model import transforms
 from service.model.errors import HandError
-from service.model.transforms import IDENTITY_POSE, quat_rotate
+from service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
 from worker.hands import closing, guess, jaws, kinematics, primitives, surface
-from worker.hands import pads as pads_code
+from worker.hands import jaws as pads_code
 from worker.hands.closing import posture
+from worker.hands.jaws import Pad, fingertip_pad
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel
-from worker.hands.pads import Pad, fingertip_pad
+from worker.hands.model import HandModel
 from worker.hands.surface import sample_surface
-from worker.objects.kept_arrays import arrays_kept_or_made
+from worker.objects.disk_cache import arrays_kept_or_made
 
 #: Postures that are wanted, from so many times as many, and random steps that make them better.
 POSTURES: Final = 160
@@ -159,10 +159,13 @@ class _Seen:
         towards = -np.einsum("nfi,ni->nf", looks[:, others], axis).mean(axis=1)
         middle, ahead = 0.5 * (a + b), hand.palm.approach
         return cls(
-            axis=axis, middle=middle, width=width,
+            axis=axis,
+            middle=middle,
+            width=width,
             facing=np.minimum(np.einsum("ni,ni->n", looks[:, one], axis), towards),
-            square=np.abs(axis @ ahead), ahead=(middle - hand.palm.centre) @ ahead,
-        )  # fmt: skip
+            square=np.abs(axis @ ahead),
+            ahead=(middle - hand.palm.centre) @ ahead,
+        )
 
     def cost(self, wanted: Floats) -> Floats:
         """(N,) how far from an opposition of the widths `wanted` (N,)."""

@@ -16,13 +16,13 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from service.model import transforms
-from service.model.transforms import IDENTITY_POSE, quat_rotate
+from service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
 from worker.hands import closing, kinematics, oppositions, primitives, surface
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel, SurfacePoints
+from worker.hands.model import HandModel, SurfacePoints
 from worker.hands.oppositions import Oppositions, climbed, opposed_finger, random_postures
 from worker.hands.surface import farthest_points, sample_surface
-from worker.objects.kept_arrays import arrays_kept_or_made
+from worker.objects.disk_cache import arrays_kept_or_made
 
 #: Heights of objects that have postures of their own [m]; what is higher reaches the pads.
 HEIGHTS_M: Final = (0.005, 0.008, 0.012, 0.018)
@@ -81,9 +81,12 @@ def _pinches(hand: HandModel, height: float) -> Oppositions:
     q = climbed(hand, one, q, lambda tried: look.at(tried, one).cost(wanted))
     seen = look.at(q, one)
     good = np.flatnonzero(
-        (seen.short < 1.0) & (seen.facing > FACING) & (seen.square < SQUARE) & (seen.over > OVER_M)
+        (seen.short < 1.0)
+        & (seen.facing > FACING)
+        & (seen.square < SQUARE)
+        & (seen.over > OVER_M)
         & (seen.width > WIDTHS_M[0])
-    )  # fmt: skip
+    )
     good = good[np.argsort(seen.width[good], kind="stable")] if len(good) >= FEW else good[:0]
     return Oppositions(q[good], seen.axis[good], seen.middle[good], seen.width[good])
 
@@ -136,9 +139,13 @@ class _Look:
         others = np.setdiff1d(points.body, hand.fingertips).tolist()
         rest = np.concatenate([_spread(points, body, _OTHER_POINTS) for body in others])
         return cls(
-            hand, height, points.position[mine], points.normal[mine], points.position[rest],
+            hand,
+            height,
+            points.position[mine],
+            points.normal[mine],
+            points.position[rest],
             points.body[rest].astype(np.intp),
-        )  # fmt: skip
+        )
 
     def at(self, q: Floats, one: int) -> _Seen:
         """What postures (N, D) pinch between the finger `one` and the others."""
@@ -172,9 +179,10 @@ class _Look:
         width = -far - inner[:, one]
         across = np.cross(down, axis)
         middle = (
-            0.5 * (inner[:, one] - far)[:, None] * axis + (plane - 0.5 * self.height)[:, None] * down
+            0.5 * (inner[:, one] - far)[:, None] * axis
+            + (plane - 0.5 * self.height)[:, None] * down
             + np.einsum("ni,ni->n", end[:, one] + end[:, others].mean(axis=1), across)[:, None] * 0.5 * across
-        )  # fmt: skip
+        )
         rest = bodies[:, self.body]
         lowest = np.einsum("nvi,ni->nv", quat_rotate(rest[..., 3:], self.others) + rest[..., :3], down).max(axis=1)
         return _Seen(axis, middle, width, short, facing, np.abs(axis @ hand.palm.approach), plane - lowest)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from service.model.errors import HandError, LimitError
 from service.model.transforms import Floats
-from worker.objects.content import TOLD_IF_SET
+from worker.objects.disk_cache import TOLD_IF_SET
 
 Ints = NDArray[np.int32]
 

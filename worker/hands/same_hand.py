@@ -11,9 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import IDENTITY_POSE, apply, compose, invert, quat_from_axis_angle, quat_from_matrix
+from service.model.transforms import (
+    IDENTITY_POSE,
+    Floats,
+    apply,
+    compose,
+    invert,
+    quat_from_axis_angle,
+    quat_from_matrix,
+)
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 
 #: Random postures in which two models are compared.
 POSTURES: Final = 200
@@ -175,8 +183,9 @@ def _fit(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
     def residual(x: Floats) -> Floats:
         return np.concatenate([gap(x).ravel(), _PRIOR * (x[6:] - guess.ravel())])
 
-    found = least_squares(residual, np.concatenate([np.zeros(6), guess.ravel()]), xtol=1e-12, ftol=1e-12, gtol=1e-15,
-                          max_nfev=_LOOKS)  # fmt: skip
+    found = least_squares(
+        residual, np.concatenate([np.zeros(6), guess.ravel()]), xtol=1e-12, ftol=1e-12, gtol=1e-15, max_nfev=_LOOKS
+    )
     return pose_of(found.x), found.x[6:].reshape(-1, 3)
 
 

@@ -1,27 +1,36 @@
-"""Collision elements of a robot as convex pieces: primitives stay exact, meshes become reduced hulls."""
+"""Collision shapes of a robot as convex pieces: primitives stay exact, meshes become hulls, or several where one would
+hide what touches.
+
+The error of a mesh's pieces is how far its surface lies beneath them, along the shortest free way out: nine tenths of
+what can be seen from outside lie no deeper. Insides of housings do not count.
+"""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from service.model.digests import digest_json
 from service.model.errors import HandError, MeshError
-from service.model.transforms import IDENTITY_POSE, Floats, apply
-from worker.hands.hollows import parts_of
+from service.model.libraries import version_of
+from service.model.transforms import IDENTITY_POSE, Floats, apply, quat_to_matrix
 from worker.hands.model import ConvexPiece
-from worker.hands.primitives import new_hull, signed_distance, tessellate, volume
-from worker.hands.references import find_mesh
+from worker.hands.primitives import hull, new_hull, signed_distance, tessellate, triangle_areas, volume
 from worker.hands.robot import Ints, Shape
+from worker.hands.visuals import find_mesh
+from worker.objects.convex import TooMuchWork, coacd_parts, default_cache, keep_parts, load_parts
+from worker.objects.disk_cache import recalled
 from worker.objects.formats import read_mesh
-from worker.objects.kept_arrays import recalled
 
 #: A hull of V corners has at most 2 V - 4 triangles: 96 here. Every plane costs time in each distance query.
 MAX_HULL_VERTICES: Final = 50
+
 #: A link longer than this [m] is a mesh in millimetres without a scale.
 MAX_PIECE_M: Final = 2.0
-
 
 Hulls = dict[tuple[str, tuple[float, ...]], list[tuple[Floats, Ints]]]
 
@@ -120,3 +129,205 @@ def _outside(points: Floats, corners: Floats) -> Floats:
     if len(corners) < 4 or spread[2] < 1e-6 * spread[0]:
         return np.linalg.norm(points[:, None] - corners[None], axis=2).min(axis=1)
     return signed_distance("hull", (), *new_hull(corners), points)
+
+
+#: A hull whose error is larger than this [m] is taken apart: an object would rest that far off the finger.
+MAX_ERROR_M: Final = 4e-3
+
+#: Pieces of a link at most: each costs time in every distance query.
+MAX_PIECES: Final = 8
+
+_THRESHOLDS: Final = (0.1, 0.05)
+
+_COACD: Final = {
+    "preprocess_mode": "auto",
+    "preprocess_resolution": 40,
+    "resolution": 800,
+    "mcts_iterations": 20,
+    "mcts_nodes": 10,
+    "max_convex_hull": MAX_PIECES,
+    "seed": 1,
+}
+
+#: A mesh is simplified to so many faces before it is taken apart.
+_FACES: Final = 1200
+
+#: Computing that a run of CoACD may take [s]: twice what the most tangled of 1200 faces took (58 s).
+_CPU_S: Final = 120
+
+_POINTS: Final = 200
+
+_SHARE: Final = 0.9
+
+#: What lies no deeper beneath the hull makes no hollow [m].
+_FLAT_M: Final = 5e-4
+
+#: The six axes and the eight diagonals, a little turned: meshes have many faces along the axes.
+_TURN: Final = quat_to_matrix(np.array([0.9974, 0.0312, 0.0417, 0.0503]))
+
+_WAYS: Final = np.array([d for d in np.ndindex(3, 3, 3) if sum(k != 1 for k in d) in (1, 3)]) - 1.0
+
+_DIRECTIONS: Final = (_WAYS / np.linalg.norm(_WAYS, axis=1, keepdims=True)) @ _TURN.T
+
+#: A ray begins this far off its point [m].
+_START_M: Final = 1e-5
+
+_BLOCK: Final = 64
+
+#: Pieces thinner than this are splinters [m].
+_MIN_EXTENT_M: Final = 1e-3
+
+
+def parts_of(vertices: Floats, faces: Ints) -> tuple[Floats, ...]:
+    """Corners of the convex pieces that stand for a mesh: the mesh's own vertices where its hull is near enough.
+
+    Args:
+        vertices: (V, 3) in metres.
+        faces: (F, 3) triangles; they need not be closed.
+
+    Raises:
+        HandError: taking it apart needs more computing than a mesh may.
+    """
+    whole: tuple[Floats, ...] = (vertices,)
+    if _is_convex(vertices, faces):
+        return whole
+    shape = hashlib.sha256(np.ascontiguousarray(vertices).tobytes() + np.ascontiguousarray(faces).tobytes())
+    settings = [_COACD, list(_THRESHOLDS), MAX_ERROR_M, _POINTS, _FACES, version_of("coacd")]
+    file = default_cache() / f"hand-{digest_json({'shape': shape.hexdigest(), 'settings': settings})}.npz"
+    kept = load_parts(file) if file.is_file() else None
+    if kept:
+        return kept if len(kept) > 1 else whole
+    best, sure = _decomposed(vertices, faces)
+    if sure:
+        keep_parts(file, best if len(best) > 1 else (np.zeros((1, 3)),))
+    return best
+
+
+def _decomposed(vertices: Floats, faces: Ints) -> tuple[tuple[Floats, ...], bool]:
+    """The pieces, and whether CoACD has answered: what failed may succeed another time."""
+    light = _simplified(vertices, faces)
+    surface = _OpenSurface(*light)
+    best: tuple[Floats, ...] = (vertices,)
+    least, sure = surface.error(best), True
+    for threshold in _THRESHOLDS:
+        if least <= MAX_ERROR_M:
+            break
+        try:
+            made = coacd_parts(*light, {"threshold": threshold, **_COACD}, _CPU_S)
+        except TooMuchWork as limit:
+            # Other shapes than those of a faster machine would be another hand.
+            raise HandError(f"taking the mesh apart into convex pieces needs {limit}; simplify it") from None
+        sure &= bool(made)
+        parts = tuple(part for part in made if len(part) > 3 and np.ptp(part, axis=0).min() > _MIN_EXTENT_M)
+        if parts and (error := surface.error(parts)) < least:
+            best, least = parts, error
+        if len(made) >= MAX_PIECES:
+            # A finer threshold is merged back to as many pieces, at twice the time.
+            break
+    return best, sure
+
+
+def _is_convex(vertices: Floats, faces: Ints) -> bool:
+    """Whether nearly all of the surface lies on the hull: then there is nothing to look for."""
+    normals, offsets = _planes(vertices[np.unique(faces)])
+    depth = (offsets - _sample(vertices, faces) @ normals.T).min(axis=1)
+    return float(np.quantile(depth, _SHARE)) < _FLAT_M
+
+
+def _sample(vertices: Floats, faces: Ints) -> Floats:
+    """Area-uniform points (N, 3), the same every time."""
+    areas = triangle_areas(vertices, faces)
+    ladder = (np.arange(_POINTS) + 0.5) / _POINTS * areas.sum()
+    face = np.minimum(np.searchsorted(np.cumsum(areas), ladder), len(faces) - 1)
+    u, v = np.random.default_rng(0).random((2, _POINTS, 1))
+    a, b, c = np.moveaxis(vertices[faces[face]], 1, 0)
+    root = np.sqrt(u)
+    return a * (1 - root) + b * (root * (1 - v)) + c * (root * v)
+
+
+def hull_error(vertices: Floats, faces: Ints, parts: tuple[Floats, ...]) -> float:
+    """Error [m] of convex pieces, given by their corners, of a mesh."""
+    return _OpenSurface(*_simplified(vertices, faces)).error(parts)
+
+
+class _OpenSurface:
+    """Points on a mesh with the directions in which each is seen from outside."""
+
+    def __init__(self, vertices: Floats, faces: Ints) -> None:
+        corners, self._points = vertices[faces], _sample(vertices, faces)
+        # (D, P) whether nothing of the mesh lies in a direction from a point; along its own face a point sees nothing.
+        self._sees = np.array([~_hits(self._points, direction, corners) for direction in _DIRECTIONS])
+
+    def error(self, parts: tuple[Floats, ...]) -> float:
+        """Way [m] out of the union of the parts that nine tenths of the open surface keep."""
+        reached = self._sees.any(axis=0)
+        if not reached.any():
+            return 0.0
+        way = np.zeros((len(_DIRECTIONS), len(self._points)))
+        for part in parts:
+            np.maximum(way, _ways_out(part, self._points), out=way)
+        shortest = np.where(self._sees, way, np.inf).min(axis=0)
+        return float(np.quantile(shortest[reached], _SHARE))
+
+
+def _hits(points: Floats, direction: Floats, corners: Floats) -> NDArray[np.bool_]:
+    """(P,) whether a ray from a point meets one of the triangles (F, 3, 3) (Moeller and Trumbore 1997)."""
+    a, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    across = np.cross(direction, second)
+    determinant = np.einsum("ij,ij->i", first, across)
+    usable = np.abs(determinant) > 1e-14
+    a, first, second, across = a[usable], first[usable], second[usable], across[usable]
+    inverse = 1 / determinant[usable]
+    hit = np.zeros(len(points), dtype=bool)
+    # Seen along the ray a point must lie in a triangle's box: most pairs end there.
+    plane = np.linalg.svd(direction[None])[2][1:].T
+    seen, flat = points @ plane, corners[usable] @ plane
+    low, high = flat.min(axis=1) - _START_M, flat.max(axis=1) + _START_M
+    for block in range(0, len(points), _BLOCK):
+        inside = (seen[block : block + _BLOCK, None] >= low) & (seen[block : block + _BLOCK, None] <= high)
+        point, face = np.nonzero(inside.all(axis=2))
+        offset = points[block + point] - a[face]
+        u = np.einsum("kf,kf->k", offset, across[face]) * inverse[face]
+        beside = np.cross(offset, first[face])
+        v = beside @ direction * inverse[face]
+        t = np.einsum("kf,kf->k", beside, second[face]) * inverse[face]
+        hit[block + point[(u >= 0) & (v >= 0) & (u + v <= 1) & (t > _START_M)]] = True
+    return hit
+
+
+def _ways_out(part: Floats, points: Floats) -> Floats:
+    """(D, P) way from each point along each direction until it leaves the hull of a part; 0 outside of it."""
+    normals, offsets = _planes(part)
+    inside = offsets - points @ normals.T
+    rates = _DIRECTIONS @ normals.T
+    way = np.full((len(_DIRECTIONS), len(points)), np.inf)
+    for number, rate in enumerate(rates):
+        onward = rate > 1e-9
+        way[number] = (inside[:, onward] / rate[onward]).min(axis=1)
+    return np.where((inside < -_START_M).any(axis=1), 0.0, np.maximum(way, 0.0))
+
+
+def _planes(points: Floats) -> tuple[Floats, Floats]:
+    """Outward unit normals (P, 3) and offsets (P,) of the faces of a hull."""
+    corners, faces = hull(points)
+    a, b, c = np.moveaxis(corners[faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1)
+    keep = lengths > 1e-9 * lengths.max()
+    normals = normals[keep] / lengths[keep, None]
+    return normals, np.einsum("ij,ij->i", normals, a[keep])
+
+
+def _simplified(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
+    import trimesh  # slow to load, seldom needed
+
+    merged = trimesh.Trimesh(vertices, faces, process=True)
+    points, triangles = np.asarray(merged.vertices, float), np.asarray(merged.faces, np.int32)
+    if len(triangles) > _FACES:
+        import fast_simplification  # where something is new on the machine
+
+        light, kept = fast_simplification.simplify(
+            points.astype(np.float32), triangles, target_reduction=1 - _FACES / len(triangles)
+        )
+        points, triangles = np.asarray(light, float), np.asarray(kept, np.int32)
+    return points, triangles

@@ -18,14 +18,13 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from service.model import transforms
-from service.model.transforms import IDENTITY_POSE, quat_rotate
-from worker.hands import jacobian, kinematics, oppositions, primitives, surface
-from worker.hands.jacobian import generalized_forces
-from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel, SurfacePoints
+from service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
+from worker.hands import kinematics, oppositions, primitives, surface
+from worker.hands.kinematics import body_poses, generalized_forces
+from worker.hands.model import HandModel, SurfacePoints
 from worker.hands.oppositions import Oppositions, oppositions_of
 from worker.hands.surface import sample_surface
-from worker.objects.kept_arrays import arrays_kept_or_made
+from worker.objects.disk_cache import arrays_kept_or_made
 
 Ints = NDArray[np.intp]
 Size = Literal["small", "wide"]
@@ -67,7 +66,7 @@ def spans_of(hand: HandModel, size: Size) -> Oppositions:
     key = (hand.content, size)
     with _lock:
         if key not in _known:
-            code = (sys.modules[__name__], oppositions, jacobian, kinematics, primitives, surface, transforms)
+            code = (sys.modules[__name__], oppositions, kinematics, kinematics, primitives, surface, transforms)
             made = arrays_kept_or_made("spans", key, code, lambda: vars(_spans(hand, size)))
             _known[key] = Oppositions(**made)
         return _known[key]

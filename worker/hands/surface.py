@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from service.model import transforms
 from service.model.errors import HandError
-from service.model.transforms import IDENTITY_POSE, apply, invert, quat_rotate
+from service.model.transforms import IDENTITY_POSE, Floats, apply, invert, quat_rotate
 from worker.hands import kinematics, primitives
 from worker.hands.kinematics import body_poses
-from worker.hands.model import ConvexPiece, Floats, HandModel, SurfacePoints
-from worker.objects.content import content_of
-from worker.objects.kept_arrays import arrays_kept_or_made
+from worker.hands.model import ConvexPiece, HandModel, SurfacePoints
+from worker.objects.disk_cache import arrays_kept_or_made, content_of
 
 #: Candidates per wanted point; thinning keeps the one in five that spreads most evenly.
 OVERSAMPLING: Final = 5

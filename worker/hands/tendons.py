@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.model.errors import HandError
+from service.model.transforms import Floats
 from worker.hands.robot import Robot
-
-Floats = NDArray[np.float64]
 
 #: Coefficients smaller than this pull nothing.
 LEAST_PULL: Final = 1e-6

@@ -1,4 +1,4 @@
-"""Read a URDF written by a stranger: every value is checked here, so that nothing behind this module has to.
+"""URDF and XML from strangers, read with every value checked here, so that nothing behind this module has to.
 
 The common URDF libraries accept reversed limits, NaN, unknown mimics and several roots, and resolve mimic chains
 wrongly; this reader refuses each by name. It knows only what a hand needs: links with shapes and masses, and joints.
@@ -7,20 +7,26 @@ wrongly; this reader refuses each by name. It knows only what a hand needs: link
 from __future__ import annotations
 
 import math
+import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from typing import Final
+from xml.etree.ElementTree import Element, ParseError
 
 import numpy as np
+from defusedxml import ElementTree as SafeTree
+from defusedxml.common import DefusedXmlException
 
-from service.model.errors import HandError
+from service.model.errors import HandError, LimitError
 from service.model.transforms import Floats, quat_from_axis_angle, quat_multiply
+from service.store.hand_files import text_of
 from worker.hands.robot import MAX_LENGTH_M, MOVING, UNLIMITED_M, Joint, Link, Mimic, Robot, Shape, build_robot
-from worker.hands.xml_tree import parse_xml
 
 MAX_BYTES: Final = 4 * 2**20
+
 #: Visual elements beyond this many are not drawn.
 MAX_VISUALS: Final = 1024
+
 Colour = tuple[float, float, float]
 
 
@@ -131,9 +137,14 @@ def _moving(element: ElementTree.Element, still: Joint, what: str, notes: list[s
     else:
         lower, upper, effort = _follower_limits(element, still.type, what)
     return replace(
-        still, axis=_axis(element, what, notes), lower=lower, upper=upper, effort=effort, mimic=mimic,
+        still,
+        axis=_axis(element, what, notes),
+        lower=lower,
+        upper=upper,
+        effort=effort,
+        mimic=mimic,
         velocity=_velocity(element),
-    )  # fmt: skip
+    )
 
 
 def _velocity(element: ElementTree.Element) -> float:
@@ -245,3 +256,58 @@ def quat_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
         quat_from_axis_angle(axis, np.asarray(angle)) for axis, angle in zip(np.eye(3), (roll, pitch, yaw), strict=True)
     )
     return quat_multiply(z, quat_multiply(y, x))
+
+
+_PREFIX: Final = re.compile(r"[<\s/]([A-Za-z_][\w.-]{0,40}):[A-Za-z_]")
+
+_FIRST: Final = re.compile(r"<[A-Za-z_][\w:.-]*")
+
+_MAX_PREFIXES: Final = 100
+
+
+def parse_xml(data: bytes, name: str, what: str = "", root: str = "", *, limit_bytes: int) -> Element:
+    """The root element, its namespace taken off.
+
+    Args:
+        data: the file.
+        name: what it is called, for messages.
+        what: the kind of file, with its article.
+        root: name of its root element; empty: any.
+        limit_bytes: its largest size.
+
+    Raises:
+        HandError: it is empty, no XML, or has another root element.
+        LimitError: larger than the limit.
+    """
+    if len(data) > limit_bytes:
+        raise LimitError(f"{name}: {len(data)} bytes of XML; at most {limit_bytes} are taken")
+    text = text_of(data)
+    if not text:
+        raise HandError(f"{name} is empty; export it again")
+    try:
+        tree = _with_prefixes(text)
+    except DefusedXmlException:
+        raise HandError(f"{name}: XML entities are refused; write the text out") from None
+    except (ParseError, ValueError, LookupError) as error:
+        raise HandError(f"{name}: not well-formed XML ({error}); export it again") from None
+    space, _, local = tree.tag.rpartition("}")
+    if root and local != root:
+        raise HandError(f"{name}: the XML root is <{local[:40]}>, {what} begins with <{root}>")
+    if space:
+        for element in tree.iter():
+            element.tag = element.tag.removeprefix(space + "}")
+    return tree
+
+
+def _with_prefixes(text: str) -> Element:
+    """The tree of an XML text; prefixes of foreign elements (`drake:...`) that nobody declared are declared here."""
+    try:
+        tree: Element = SafeTree.fromstring(text)
+    except ParseError as error:
+        first = _FIRST.search(text)
+        if "unbound prefix" not in str(error) or first is None:
+            raise
+        prefixes = sorted(set(_PREFIX.findall(text)) - {"xml", "xmlns"})
+        declared = "".join(f' xmlns:{prefix}="urn:{prefix}"' for prefix in prefixes[:_MAX_PREFIXES])
+        tree = SafeTree.fromstring(text[: first.end()] + declared + text[first.end() :])
+    return tree

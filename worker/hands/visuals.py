@@ -1,4 +1,4 @@
-"""What a hand looks like: the visual elements of its links with their colours, read when somebody draws them.
+"""Visual elements of a hand's links with their colours and mesh files, read when somebody draws them.
 
 Nothing but pictures needs them, so none of them can make a hand unusable: what cannot be read is left out.
 """
@@ -13,11 +13,10 @@ from typing import Final
 
 import numpy as np
 
-from service.model.errors import InputError
+from service.model.errors import HandError, InputError
 from service.model.transforms import Floats, apply
-from service.store.mesh_looks import MAX_NAMES, beside, looks_of
+from service.store.mesh_files import MAX_NAMES, beside, looks_of, one_like, read_reference
 from worker.hands.primitives import tessellate
-from worker.hands.references import find_mesh
 from worker.hands.robot import Ints, Shape
 from worker.objects.formats import Nearby, Soup, read_mesh
 
@@ -161,3 +160,29 @@ def _file_of(item: PlacedShape, files: Mapping[str, bytes], base: str) -> str:
         return find_mesh(item.shape.filename, files, base, item.link)
     except InputError:
         return ""
+
+
+def find_mesh(filename: str, files: Mapping[str, bytes], base: str, link: str) -> str:
+    """Name in `files` of a mesh as the URDF writes it: see `read_reference`; last, where only one file is called so,
+    below any folder, or in other capitals.
+
+    Raises:
+        HandError: it is not there, or lies outside the upload.
+    """
+    try:
+        reference = read_reference(filename, base)
+    except InputError as error:
+        raise HandError(f"mesh {filename!r} of link {link!r} {error}") from None
+    for name in reference.names:
+        if name in files:
+            return name
+    for tail in reference.tails:
+        below = [file for file in files if file.endswith("/" + tail)]
+        if len(below) == 1:
+            return below[0]
+    for name in reference.names:
+        if like := one_like(name, files):
+            return like
+    hint = "unknown package: " if reference.scheme == "package" else ""
+    sought = (reference.tails or reference.names)[-1]
+    raise HandError(f"mesh {filename!r} of link {link!r} is not there ({hint}looked for {sought!r}); add the file")

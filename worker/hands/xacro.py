@@ -1,4 +1,4 @@
-"""Xacro expanded to URDF in a child process that can open no file, reach no network and start no command.
+"""A robot from its description in any format; xacro is expanded in a child process without files, network or commands.
 
 Xacro's expressions are Python. The child is given all files of the hand in memory, and then gives up what it could do
 harm with: see `worker.hands.xacro_child`.
@@ -17,14 +17,19 @@ from pathlib import PurePosixPath
 from typing import Final
 
 from service.model.errors import HandError
-from service.store.hand_main import text_of
-from worker.hands.urdf import MAX_BYTES
+from service.store.hand_files import format_of, text_of
+from worker.hands.robot import Robot
+from worker.hands.urdf import MAX_BYTES, read_urdf
+from worker.objects.stand_ins import refuse_stand_in
 
 #: Largest hands on arms take a tenth of it [s].
 CPU_LIMIT_S: Final = 10
+
 MEMORY_LIMIT_BYTES: Final = 2**30
+
 #: The limit above ends what computes; this one a child that waits, on however busy a machine [s].
 _WALL_LIMIT_S: Final = 1800.0
+
 #: What an expansion may read; meshes are only named.
 _READ: Final = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
 
@@ -44,20 +49,26 @@ def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) 
     if find_spec("xacro") is None:
         raise HandError(f"{main}: the package xacro is not installed: pip install 'graspd[worker]', or expand it first")
     given = {
-        "main": main, "arguments": dict(arguments), "names": sorted(files), "memory": MEMORY_LIMIT_BYTES,
-        "cpu": CPU_LIMIT_S, "limit": MAX_BYTES,
-        "texts": {
-            name: text_of(files[name])
-            for name in sorted(files) if PurePosixPath(name).suffix.lower() in _READ
-        },
-    }  # fmt: skip
+        "main": main,
+        "arguments": dict(arguments),
+        "names": sorted(files),
+        "memory": MEMORY_LIMIT_BYTES,
+        "cpu": CPU_LIMIT_S,
+        "limit": MAX_BYTES,
+        "texts": {name: text_of(files[name]) for name in sorted(files) if PurePosixPath(name).suffix.lower() in _READ},
+    }
     passed_on = {name: os.environ[name] for name in ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH") if name in os.environ}
     command = [sys.executable, "-m", "worker.hands.xacro_child"]
     try:
         done = subprocess.run(
-            command, input=json.dumps(given).encode(), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            timeout=_WALL_LIMIT_S, check=False, env={**passed_on, "PYTHONHASHSEED": "0"},
-        )  # fmt: skip
+            command,
+            input=json.dumps(given).encode(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            timeout=_WALL_LIMIT_S,
+            check=False,
+            env={**passed_on, "PYTHONHASHSEED": "0"},
+        )
     except subprocess.TimeoutExpired:
         raise TimeoutError(f"{main}: expanding it did not end in {_WALL_LIMIT_S:.0f} s; try again") from None
     if done.returncode == -signal.SIGKILL:
@@ -73,3 +84,26 @@ def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) 
     if error:
         raise HandError(f"{main}: {error}")
     return str(urdf).encode()
+
+
+def read_robot(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str] | None = None) -> Robot:
+    """Checked contents of the description called `main` among a hand's files; its root element tells the format.
+
+    Args:
+        files: all files of the hand.
+        main: the description.
+        arguments: values of a xacro file's arguments.
+
+    Raises:
+        HandError, LimitError: see the readers.
+    """
+    refuse_stand_in(main, files[main], HandError)
+    match format_of(main, files[main]):
+        case "mjcf":
+            from worker.hands.mjcf import read_mjcf
+
+            return read_mjcf(files, main)
+        case "xacro":
+            return read_urdf(expand(files, main, arguments or {}), main)
+        case _:
+            return read_urdf(files[main], main)

@@ -64,7 +64,7 @@ def _expand(given: dict[str, Any]) -> str:
     from defusedxml import minidom as safe
     from xacro import substitution_args
 
-    from service.store.mesh_names import one_like
+    from service.store.mesh_files import one_like
 
     texts: dict[str, str] = given["texts"]
     names: list[str] = given["names"]
@@ -135,9 +135,17 @@ def _expand(given: dict[str, Any]) -> str:
 
 
 _PLAIN: Final[dict[str, Any]] = {
-    "true": True, "false": False, "True": True, "False": False,
-    "list": list, "dict": dict, "map": map, "str": str, "float": float, "int": int,
-}  # fmt: skip
+    "true": True,
+    "false": False,
+    "True": True,
+    "False": False,
+    "list": list,
+    "dict": dict,
+    "map": map,
+    "str": str,
+    "float": float,
+    "int": int,
+}
 
 
 def _checked(expression: str) -> Any:

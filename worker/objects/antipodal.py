@@ -10,9 +10,8 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.objects.model import ObjectModel
-
-Floats = NDArray[np.float64]
 
 #: Points from which lines go into the object, and the standard deviation of their tilt from the normal [rad].
 _POINTS: Final = 768

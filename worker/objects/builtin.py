@@ -16,7 +16,7 @@ import manifold3d
 import numpy as np
 from manifold3d import CrossSection, Manifold
 
-from worker.objects.solid import from_manifold
+from worker.objects.mesh_geometry import from_manifold
 from worker.objects.topology import merge_vertices
 
 #: Corners of a full circle: the chord of the mug's outer wall stays within 0.05 mm.

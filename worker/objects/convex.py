@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service import user_cache
-
-Floats = NDArray[np.float64]
+from service.model.transforms import Floats
 
 log = logging.getLogger(__name__)
 

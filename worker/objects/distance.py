@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.objects.topology import Floats, Indices
+from service.model.transforms import Floats
+from worker.objects.topology import Indices
 
 #: Pieces into which a mesh is cut at least, so that a piece is small against the mesh.
 _PIECES = 10_000

@@ -8,10 +8,11 @@ import manifold3d
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.objects import solid, topology
+from service.model.transforms import Floats
+from worker.objects import mesh_geometry, topology
 from worker.objects.distance import MeshDistance, cut, surface_points
-from worker.objects.mass import signed_volume
-from worker.objects.topology import Floats, Indices
+from worker.objects.mesh_geometry import signed_volume
+from worker.objects.topology import Indices
 
 Mesh = tuple[Floats, Indices]
 
@@ -107,11 +108,11 @@ def untangle(vertices: Floats, faces: Indices) -> Mesh | None:
     The mesh is halved until no piece crosses itself, and the pieces are united: no vertex moves. It is safe if the
     result is closed, free of crossings and every point of its surface lies on the old surface.
     """
-    whole = solid.to_manifold(vertices, faces)
+    whole = mesh_geometry.to_manifold(vertices, faces)
     pieces = None if whole is None else _halved(whole, _HALVINGS)
     if pieces is None:
         return None
-    united = solid.from_manifold(manifold3d.Manifold.batch_boolean(pieces, manifold3d.OpType.Add))
+    united = mesh_geometry.from_manifold(manifold3d.Manifold.batch_boolean(pieces, manifold3d.OpType.Add))
     extent = float(np.ptp(vertices, axis=0).max())
     united = topology.compact(*topology.merge_vertices(*united, 1e-9 * extent))
     left = crossings(*united) if topology.is_closed(united[1]) else None
@@ -125,7 +126,7 @@ def _halved(piece: Any, halvings: int) -> list[Any] | None:
     """Parts of a solid that do not cross themselves and fill the same space; None if that takes too many cuts."""
     parts: list[Any] = []
     for part in piece.decompose():
-        mesh = solid.from_manifold(part)
+        mesh = mesh_geometry.from_manifold(part)
         crossed = crossings(*mesh)
         if crossed is None or part.volume() <= 0:
             return None

@@ -1,7 +1,7 @@
 """An object as the engine sees it: one closed, outward, simplified triangle mesh with its mass properties.
 
 Everything is in the object frame: the frame of the mesh as uploaded, in metres. `ObjectModel.centred` is the same
-object about its middle, which is what the engine works on; see `worker.objects.frames`.
+object about its middle, which is what the engine works on; see `worker.objects.mesh_geometry`.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from service.model.errors import MeshError
 from service.model.matter import FRICTION, MASS_KG, MOST_KG
-from worker.objects.content import TOLD_IF_SET, content_of
+from service.model.transforms import Floats
+from worker.objects.disk_cache import TOLD_IF_SET, content_of
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 

@@ -1,4 +1,4 @@
-"""What an object's `asset.json` may say beside the mesh."""
+"""Options of an object: the keys of its `asset.json`, and the mass and friction of a job."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from service.model.base import refusal
+from service.model.domain import JobOptions
 from service.model.errors import MeshError
 from service.model.matter import Density, Friction, Mass
-from service.model.refusals import refusal
+from worker.objects.model import ObjectModel
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
 #: Keys that decide how heavy and how slippery the object is, and not its shape.
 OF_MATTER: Final = ("density", "mass", "friction")
 
@@ -65,3 +68,14 @@ def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = 
         return ObjectOptions.model_validate({**stated, **given})
     except ValidationError as error:
         raise MeshError(f"asset.json: {refusal(error)}") from None
+
+
+def as_asked(obj: ObjectModel, request: JobOptions) -> ObjectModel:
+    """The object with the mass and friction that a job says, else its own; under level letter, the protocol's.
+
+    Raises:
+        MeshError: it would weigh more than 100 kg.
+    """
+    if request.referee == "letter":
+        return obj.published
+    return obj.weighing(mass=request.mass, density=request.density, friction=request.object_friction)

@@ -12,15 +12,15 @@ from typing import Final
 import numpy as np
 
 from service.model.errors import MeshError
+from service.model.transforms import Floats
 from worker.grasps import on_grid
-from worker.objects import solid, topology
+from worker.objects import mesh_geometry, topology
 from worker.objects.distance import MeshDistance, surface_points
 from worker.objects.formats import Soup
-from worker.objects.frames import Centred, centred
 from worker.objects.intersections import crossings, untangle
-from worker.objects.mass import signed_volume
+from worker.objects.mesh_geometry import Centred, centred, signed_volume
 from worker.objects.options import UNITS, ObjectOptions
-from worker.objects.topology import Floats, Indices
+from worker.objects.topology import Indices
 
 MAX_EXTENT_M: Final = 3.0
 MIN_EXTENT_M: Final = 1e-3
@@ -299,7 +299,7 @@ def _unite(
     turned_parts = sum(bool(a) and not c for a, c in zip(against, cavity, strict=True))
     positives = [p for p, hole in zip(parts, cavity, strict=True) if not hole]
     holes = [p for p, hole in zip(parts, cavity, strict=True) if hole]
-    united = solid.unite(positives, holes)
+    united = mesh_geometry.unite(positives, holes)
     if united is None:
         raise MeshError.with_fixes(
             "the mesh has components that are no solids",
@@ -310,7 +310,7 @@ def _unite(
         mesh = replace(mesh, repairs=(*mesh.repairs, f"winding of {turned_parts} components turned outward"))
     # A cavity is a shell of its own, of negative volume.
     pieces = [piece for piece in united.decompose() if piece.volume() > 0]
-    groups = solid.groups(pieces, JOINED_M)
+    groups = mesh_geometry.groups(pieces, JOINED_M)
     if len(groups) > 1 and not options.compound:
         if not options.keep_largest:
             raise MeshError.with_fixes(
@@ -319,15 +319,17 @@ def _unite(
                 {"keep_largest": True},
                 {"compound": True},
             )
-        best = united - solid.union([piece for group in groups[1:] for piece in group])
-        return mesh.but(*solid.from_manifold(best), f"kept the largest of {len(groups)} components")
+        best = united - mesh_geometry.union([piece for group in groups[1:] for piece in group])
+        return mesh.but(*mesh_geometry.from_manifold(best), f"kept the largest of {len(groups)} components")
     if len(pieces) > 1:
         how = "lie apart" if len(groups) > 1 else f"touch or lie within {1e3 * JOINED_M:g} mm"
         mesh = replace(mesh, notes=(*mesh.notes, f"{len(pieces)} parts that {how} are one rigid body"))
     before = sum(signed_volume(*p) for p in positives) - sum(signed_volume(*p) for p in holes)
     # Parts that share a face have the same volume apart and united: their faces within the solid go.
     if abs(united.volume() - before) > 1e-6 * before or len(pieces) < len(positives):
-        return mesh.but(*solid.from_manifold(united), f"united {len(parts)} touching or intersecting components")
+        return mesh.but(
+            *mesh_geometry.from_manifold(united), f"united {len(parts)} touching or intersecting components"
+        )
     return replace(mesh, vertices=_join_oriented(positives, holes)[0], faces=_join_oriented(positives, holes)[1])
 
 

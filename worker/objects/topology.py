@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from service.model.transforms import Floats
+
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 

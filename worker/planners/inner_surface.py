@@ -7,12 +7,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, apply, quat_rotate
+from service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel, SurfacePoints
 from worker.hands.surface import farthest_points, sample_surface
-
-Floats = NDArray[np.float64]
 
 #: Inside: the surface moves along its normal to within 45 degrees when the fingers close; the palm looks ahead.
 INSIDE_COS: Final = 0.7

@@ -15,9 +15,9 @@ from typing import Final, Generic, TypeVar
 import numpy as np
 import warp as wp
 from cachetools import LRUCache
-from numpy.typing import NDArray
 
 from service.model.fidelity import Fidelity
+from service.model.transforms import Floats
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -25,9 +25,8 @@ from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.selection import posture_of
 from worker.planners.fast_graspd.starts import sample_starts
 from worker.quality.postures import pregrasp, squeeze
-from worker.simulation.state import HandState
+from worker.simulation.data import HandState
 
-Floats = NDArray[np.float64]
 T = TypeVar("T")
 
 #: How finely peers see hand and object where their source does not say.

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from pydantic import ValidationError
 
-from service.model.errors import InputError
-from service.model.imports import imports
-from service.model.refusals import refusal
-from service.model.suggestions import known_names
+from service.model.base import refusal
+from service.model.errors import InputError, known_names
+from service.model.libraries import imports
 from worker.planners.port import Joined, Method, Options, Planner
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from typing import TypeVar
 import numpy as np
 import warp as wp
 
-from worker.engines.cuda_errors import is_out_of_memory
+from worker.engines.devices import is_out_of_memory
 from worker.run import Run
 
 log = logging.getLogger(__name__)

@@ -18,7 +18,7 @@ from importlib import import_module
 from multiprocessing.connection import Connection
 from typing import Any
 
-from service.model.imports import imports, own_process
+from service.model.libraries import imports, own_process
 
 
 @dataclass(frozen=True)

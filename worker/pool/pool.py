@@ -36,7 +36,8 @@ log = logging.getLogger(__name__)
 MODULES: Final = ("worker.quality.referee.judge", "worker.quality.table")
 #: What each process keeps of things that pieces of work share: two for a pair that is judged and measured.
 KEPT: Final = 8
-#: Memory that a process takes at the most, with the models of the pairs that it keeps [bytes]; see docs/explanation/performance.md.
+#: Memory that a process takes at the most, with the models of the pairs that it keeps [bytes]; see
+#: docs/explanation/performance.md.
 BYTES_PER_PROCESS: Final = 400 * 2**20
 #: Share of the machine's memory for them.
 MEMORY_SHARE: Final = 0.25

@@ -23,10 +23,10 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service import logs, tracing
+from service import telemetry
 from service.model.cores import available_memory
 from service.model.errors import BusyError, InputError, TaskRefused, UnavailableError
-from service.model.imports import own_process
+from service.model.libraries import own_process
 from service.model.states import Stage
 from service.pipeline.identity import check_service
 from service.queue.port import Report
@@ -40,8 +40,7 @@ from worker.process.runner import Runner
 from worker.process.selfcheck import check_engine
 from worker.run import Run
 from worker.stages import stage_table
-from worker.stages.context import StopReason, TaskContext
-from worker.stages.output import StageFunction
+from worker.stages.context import StageFunction, StopReason, TaskContext
 
 if TYPE_CHECKING:
     from service.settings import Settings
@@ -256,8 +255,8 @@ def main(table: Mapping[Stage, StageFunction] | None = None, check: Check | None
     own_process()
     connection = Connection(int(sys.argv[-1]))
     setup: Setup = connection.recv()
-    logs.set_up(setup.settings, "worker")
-    tracing.set_up("worker")
+    telemetry.set_up_logs(setup.settings, "worker")
+    telemetry.set_up_tracing("worker")
     Engine(connection, setup, table, check).serve()
     end()
 

@@ -27,12 +27,11 @@ from rq.job import JobStatus
 from rq.serializers import JSONSerializer
 from rq.worker import WorkerStatus
 
-from service.model.ability import own_ability
 from service.model.clock import timestamp
 from service.model.errors import QueueUnavailable, TaskRefused
 from service.model.states import Stage
 from service.model.version import PACKAGE_VERSION
-from service.model.worker_beat import WorkerBeat
+from service.model.workers import WorkerBeat, own_ability
 from service.queue import allowed
 from service.queue.connection import redis_url
 from service.queue.lists import queue_names

@@ -12,9 +12,8 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from service import logs, tracing
+from service import telemetry
 from service.model import names
-from service.model.ability import need_of, own_ability
 from service.model.clock import timestamp
 from service.model.errors import (
     DamagedError,
@@ -28,14 +27,14 @@ from service.model.errors import (
 from service.model.messages import IngestMessage, Origin, TaskMessage
 from service.model.records import AttemptRecord
 from service.model.states import Stage
+from service.model.workers import need_of, own_ability
 from service.queue.port import Event, EventKind, Message
 from service.store.manifests import ShardManifest, load_manifest, publish_shard, shard_exists
 from service.store.records import put_record
-from worker.engines.cuda_errors import DeviceLost, check_device
+from worker.engines.devices import DeviceLost, check_device
 from worker.pool.pool import ProcessLost
 from worker.process.fitness import Fitness, first_loss
-from worker.stages.context import StopReason, TaskContext
-from worker.stages.output import StageFunction, shard_of
+from worker.stages.context import StageFunction, StopReason, TaskContext, shard_of
 
 log = logging.getLogger(__name__)
 
@@ -82,7 +81,7 @@ class Runner:
         message = parse_message(raw)
         subjects = _subjects(message)
         parent = message.origin.traceparent if isinstance(message, TaskMessage) and message.origin else ""
-        with logs.bind(**subjects), tracing.span(f"task {message.stage}", parent=parent, **subjects) as facts:
+        with telemetry.bind(**subjects), telemetry.span(f"task {message.stage}", parent=parent, **subjects) as facts:
             event = self._run(message, raw, context)
             facts["graspd.outcome"] = event.kind.value if event is not None else "lost"
             return event

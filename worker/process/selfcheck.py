@@ -16,7 +16,7 @@ import numpy as np
 
 from service.model.domain import JobRequest
 from service.model.errors import GraspdError
-from service.model.imports import imports
+from service.model.libraries import imports
 from service.model.states import Stage
 
 if TYPE_CHECKING:
@@ -98,8 +98,8 @@ def _ball() -> ObjectModel:
     from manifold3d import Manifold
 
     from worker.objects.builtin import stl_bytes
+    from worker.objects.mesh_geometry import from_manifold
     from worker.objects.prepare import load_object
-    from worker.objects.solid import from_manifold
 
     mesh = stl_bytes(*from_manifold(Manifold.sphere(_RADIUS_M, 12)))
     return load_object({"ball.stl": mesh}, name="ball", digest="", face_error_m=0.0)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.diversity import BANDS, SECTORS
+from service.model.metrics import BANDS, SECTORS
 from service.model.transforms import quat_rotate
 from worker.hands.model import HandModel
 

@@ -8,10 +8,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.simulation.kernels import balance as kernels
 from worker.simulation.launches import launch
-
-Floats = NDArray[np.float64]
 
 
 def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:

@@ -11,19 +11,16 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.model.matter import ACCELERATION
-from service.model.transforms import cross
+from service.model.transforms import Floats, cross
 from worker.grasps import Posture
-from worker.hands.jacobian import generalized_forces
+from worker.hands.kinematics import generalized_forces
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.contact import choose_contacts
 from worker.quality.posed import posing_of
 from worker.quality.wrench_space import EDGES, cone_edges
-
-Floats = NDArray[np.float64]
 
 _POINTS: Final = 600
 #: Hand points that are nearer may come to press while the hand closes [m]; as many at most, those that spread most.

@@ -7,13 +7,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import apply
+from service.model.transforms import Floats, apply
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.hands.surface import sample_surface
-
-Floats = NDArray[np.float64]
 
 #: Points of the hand's surface by which two postures are compared, spread evenly over it.
 POINTS: Final = 64

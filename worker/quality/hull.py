@@ -9,10 +9,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.simulation.kernels import hull as kernels
 from worker.simulation.launches import launch
-
-Floats = NDArray[np.float64]
 
 #: Points are moved at random by this share of the largest coordinate, so that no 7 of them lie in one hyperplane. Less
 #: leaves slivers whose planes are rounding errors, more is an error itself; on cubes this one is off by 4e-8 in volume.

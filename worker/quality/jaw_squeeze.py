@@ -5,15 +5,12 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from service.model.transforms import apply
+from service.model.transforms import Floats, apply
 from worker.grasps import Posture
 from worker.hands.jaws import Jaws
 from worker.hands.kinematics import body_poses
 from worker.quality.probe import Probe
-
-Floats = NDArray[np.float64]
 
 #: A pad that is farther from the object than this is not waited for [m].
 GAP_M: Final = 0.005

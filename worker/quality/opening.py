@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.model.transforms import quat_rotate
+from service.model.transforms import Floats, quat_rotate
 from worker.grasps import Posture
 from worker.hands.jaws import jaws_of, slides
 from worker.hands.model import HandModel
@@ -18,8 +18,6 @@ from worker.quality.contact import finger_of_body
 from worker.quality.posed import Posing
 from worker.simulation.kernels import distance, jamming, opening, optimizers
 from worker.simulation.launches import Launches, launch
-
-Floats = NDArray[np.float64]
 
 #: Fingers open until this far from the object [m]: enough for the errors of a calibrated arm, and what opens farther
 #: comes back faster and kicks the object away more often.

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.quality.probe import Distances
-
-Floats = NDArray[np.float64]
 
 
 def penetration_depth(found: Distances) -> Floats:

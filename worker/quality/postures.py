@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.matter import ACCELERATION
+from service.model.transforms import Floats
 from worker.grasps import Posture
 from worker.hands.jaws import jaws_of
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.jaw_squeeze import jaw_squeeze
 from worker.quality.opening import Blocked, Openings, count_fingers, fingers_of_bodies, fingers_of_dofs

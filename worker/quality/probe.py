@@ -14,21 +14,18 @@ import warp as wp
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import compose, quat_to_matrix
-from worker.engines.binaries import binary_name
+from service.model.transforms import Floats, compose, quat_to_matrix
+from worker.engines.backend import binary_name
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel, SurfacePoints
 from worker.hands.surface import sample_surface
-from worker.objects.kept_arrays import arrays_kept_or_made
+from worker.objects.disk_cache import arrays_kept_or_made
 from worker.objects.model import ObjectModel
-from worker.simulation.device import DeviceHand, to_xyzw
+from worker.simulation.device import DeviceHand, PosedBodies, to_xyzw
 from worker.simulation.kernels import distance as kernels
 from worker.simulation.launches import launch
-from worker.simulation.posed import PosedBodies
 from worker.simulation.sampling import object_samples
-
-Floats = NDArray[np.float64]
 
 #: Hand points that contact area and penetration are measured with; the optimiser's own points use other seeds.
 HAND_POINTS: Final = 2000

@@ -8,14 +8,12 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.grasps import Posture
 from worker.hands.model import HandModel
 from worker.simulation.obstacles import obstacle_room
 from worker.simulation.surroundings import CLEAR_M, Placed
-
-Floats = NDArray[np.float64]
 
 #: Room that the open hand has, and that it has while it closes [m]: a little more than is asked for, since ways are
 #: looked at in steps.

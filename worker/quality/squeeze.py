@@ -11,16 +11,14 @@ from typing import Any, Final
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.grasps import Posture
 from worker.quality.balance import solved
 from worker.quality.posed import Posing
 from worker.quality.probe import FACING_COS
 from worker.simulation.kernels import touching
 from worker.simulation.launches import launch
-
-Floats = NDArray[np.float64]
 
 #: Weight of each edge's own size: spreads the load over contacts that would do equally well.
 SPREAD: Final = 0.1

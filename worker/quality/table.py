@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError
 from service.model.metrics import GRASP_METRICS
+from service.model.transforms import Floats
 from service.store.manifests import INDEX_THRESHOLD_M
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
-from worker.objects.content import content_of
+from worker.objects.disk_cache import content_of
 from worker.objects.model import ObjectModel
 from worker.quality.approach import approach_cells
 from worker.quality.contact import MAX_CONTACTS, contact_area_cm2, contact_links, spread_contacts
@@ -31,7 +32,6 @@ from worker.quality.volume import SharedVolume
 from worker.quality.wrench_space import Norm, measure_spaces, wrenches
 from worker.run import ALONE, Count, Run
 
-Floats = NDArray[np.float64]
 Columns = dict[str, NDArray[np.generic]]
 
 #: Contact thresholds [m]: the literature's tight one, the paper's (Table 2), and DDGC's.

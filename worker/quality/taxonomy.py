@@ -21,13 +21,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.diversity import GraspType
 from service.model.integers import distinct_values
+from service.model.metrics import GraspType
+from service.model.transforms import Floats
 from worker.hands.model import HandModel, JointType
 from worker.quality.contact import LINK_CONTACT_M, finger_of_body
 from worker.quality.probe import Distances, Probe
-
-Floats = NDArray[np.float64]
 
 #: Cosine between a digit's surface and its axis of flexion above which the surface is a side: 45 degrees.
 SIDE_COS: Final = float(np.sqrt(0.5))

@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import cross
+from service.model.transforms import Floats, cross
 from worker.quality.hull import MAX_POINTS, measure_hulls
 
-Floats = NDArray[np.float64]
 Norm = Literal["l1", "linf"]
 
 EDGES: Final = 8

@@ -12,11 +12,12 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from service.model.colours import hexadecimal, linear
+from service.model.transforms import Floats
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 from worker.hands.robot import Ints
 from worker.hands.visuals import NO_VISUALS, VisualMesh
-from worker.objects.normals import corner_normals
+from worker.objects.mesh_geometry import corner_normals
 from worker.rendering.scenery import Look, Solid
 
 _HAND: Final = Look(hexadecimal("#59636e"), roughness=0.42, metalness=0.35)

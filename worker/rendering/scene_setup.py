@@ -16,14 +16,24 @@ from cachetools import LRUCache
 from service.model.colours import Colour, hexadecimal, linear
 from service.model.scene_spec import Box as BoxSupport
 from service.model.scene_spec import HalfSpace
-from service.model.transforms import apply
-from worker.objects.model import Floats, ObjectModel
-from worker.rendering.camera_file import SAMPLED, GivenCameras
-from worker.rendering.cameras import intrinsics, narrow_field, sample_hemisphere, stereo_pair
+from service.model.transforms import Floats, apply
+from worker.objects.model import ObjectModel
+from worker.rendering.cameras import SAMPLED, GivenCameras, intrinsics, narrow_field, sample_hemisphere, stereo_pair
 from worker.rendering.hands import DrawnHand
 from worker.rendering.kernels.shading import GRAIN, PLAIN, SPECKLE, TILES
-from worker.rendering.scenery import Box, Lamp, Look, Pictures, Shot, Solid
-from worker.rendering.standing import TABLE, Supports, seen_share, slab_poses, slabs
+from worker.rendering.scenery import (
+    TABLE,
+    Box,
+    Lamp,
+    Look,
+    Pictures,
+    Shot,
+    Solid,
+    Supports,
+    seen_share,
+    slab_poses,
+    slabs,
+)
 from worker.rendering.tracer import Tracer
 from worker.run import Run
 

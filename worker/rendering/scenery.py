@@ -1,14 +1,17 @@
-"""What stands before the cameras: solids, materials, lights; and what a shot asks for and gives."""
+"""What stands before the cameras: solids, supports as boxes, materials, lights; and what a shot asks for and gives."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.rendering.cameras import Floats
+from service.model.scene_spec import Box as BoxSupport
+from service.model.scene_spec import HalfSpace
+from service.model.transforms import Floats, compose, invert, quat_from_axis_angle, quat_rotate
 from worker.rendering.kernels.shading import PLAIN
 
 
@@ -87,3 +90,78 @@ class Shot:
     """Whether the pictures come with normals."""
     shaded: bool = True
     """False: rays are traced but no colour is made of them. What that costs is the price of the bare ray tracer."""
+
+
+Supports = Sequence[HalfSpace | BoxSupport]
+
+#: A half-space is drawn as a slab whose top is its plane [m].
+TABLE_SIZE: Final = (1.2, 0.9, 0.04)
+
+#: What objects stand on where nothing else is said.
+TABLE: Final = (HalfSpace(),)
+
+#: A slab lies below the origin; below the object where that lies farther off [m].
+_FAR_M: Final = 0.35
+
+
+def slabs(supports: Supports) -> list[Box]:
+    """A box for each support."""
+    return [Box(s.size if isinstance(s, BoxSupport) else TABLE_SIZE) for s in supports]
+
+
+def slab_poses(supports: Supports, middle: Floats, yaw: float) -> Floats:
+    """(P, 7) of the boxes of `slabs` in the scene frame.
+
+    Args:
+        supports: of the scene.
+        middle: (3,) where the object is.
+        yaw: by which slabs of half-spaces are turned about their normal [rad].
+    """
+    poses = [_box_pose(s) if isinstance(s, BoxSupport) else _slab_pose(s, middle, yaw) for s in supports]
+    return np.array(poses).reshape(-1, 7)
+
+
+def _box_pose(box: BoxSupport) -> Floats:
+    pose = np.asarray(box.pose, float)
+    pose[3:] /= np.linalg.norm(pose[3:])
+    return pose
+
+
+def _slab_pose(plane: HalfSpace, middle: Floats, yaw: float) -> Floats:
+    normal = np.asarray(plane.normal, float)
+    length = float(np.linalg.norm(normal))
+    normal, offset = normal / length, plane.offset / length
+    beside = middle - (normal @ middle) * normal
+    about = np.zeros(3) if np.linalg.norm(beside) < _FAR_M else beside
+    tilt = np.arctan2(np.hypot(normal[0], normal[1]), normal[2])
+    axis = np.array([-normal[1], normal[0], 0.0])
+    axis = axis / np.linalg.norm(axis) if np.linalg.norm(axis) > 1e-9 else np.array([1.0, 0, 0])
+    at = about + (offset - normal @ about) * normal
+    up = np.concatenate([at, quat_from_axis_angle(axis, np.asarray(tilt))])
+    return compose(up, np.array([0, 0, -0.5 * TABLE_SIZE[2], np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]))
+
+
+def seen_share(supports: Supports, eye: Floats, points: Floats) -> float:
+    """Share of the points (P, 3) that no support hides from an eye (3,): lines against half-spaces and boxes."""
+    hidden = np.zeros(len(points), bool)
+    for support in supports:
+        if isinstance(support, HalfSpace):
+            # What lies on the plane is seen; an eye below it sees nothing.
+            normal, length = np.asarray(support.normal), float(np.linalg.norm(support.normal))
+            hidden |= bool(normal @ eye < support.offset - 1e-9 * length)
+        else:
+            hidden |= _crosses(eye, points, _box_pose(support), np.asarray(support.size) / 2)
+    return 1.0 - float(hidden.mean())
+
+
+def _crosses(eye: Floats, points: Floats, pose: Floats, half: Floats) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Whether the lines from the eye to points go through a box (slabs test of Kay and Kajiya 1986)."""
+    inside = invert(pose)
+    start = quat_rotate(inside[3:], eye) + inside[:3]
+    along = quat_rotate(inside[3:], points) + inside[:3] - start
+    step = np.where(np.abs(along) < 1e-12, 1e-12, along)
+    first, second = (-half - start) / step, (half - start) / step
+    enter = np.minimum(first, second).max(axis=1)
+    leave = np.maximum(first, second).min(axis=1)
+    # Points that touch a support are not behind it.
+    return np.asarray((enter < leave) & (leave > 0) & (enter < 1 - 1e-3))

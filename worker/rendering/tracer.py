@@ -16,10 +16,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.model.transforms import apply, pose_from_matrix, quat_from_axis_angle, quat_rotate, quat_to_matrix
+from service.model.transforms import Floats, apply, pose_from_matrix, quat_from_axis_angle, quat_rotate, quat_to_matrix
 from worker.engines import backend
 from worker.rendering.annotate import box_corners
-from worker.rendering.cameras import Floats
 from worker.rendering.kernels import exposure, rays
 from worker.rendering.kernels.shading import Light, Material
 from worker.rendering.scenery import Box, Look, Pictures, Shot, Solid

@@ -10,17 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import apply
-from worker.objects.frames import to_centre
-from worker.objects.model import Floats, ObjectModel
-from worker.rendering.annotate import box_corners, in_camera, loose_boxes, tight_boxes
-from worker.rendering.camera_file import SAMPLED, GivenCameras
-from worker.rendering.cameras import BASELINE_M, Cameras
-from worker.rendering.channels import occlusion_ratio, ray_distance
+from service.model.transforms import Floats, apply
+from worker.objects.mesh_geometry import to_centre
+from worker.objects.model import ObjectModel
+from worker.rendering.annotate import box_corners, in_camera, loose_boxes, occlusion_ratio, ray_distance, tight_boxes
+from worker.rendering.cameras import BASELINE_M, SAMPLED, Cameras, GivenCameras
 from worker.rendering.hands import DrawnHand
 from worker.rendering.scene_setup import CameraPlan, Setting
-from worker.rendering.scenery import Pictures
-from worker.rendering.standing import TABLE, TABLE_SIZE, Supports
+from worker.rendering.scenery import TABLE, TABLE_SIZE, Pictures, Supports
 from worker.run import ALONE, Run
 from worker.scenes.neighbours import Neighbours
 

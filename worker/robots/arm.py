@@ -1,22 +1,25 @@
-"""An arm that carries a hand: the joints between its base and the link that the hand is mounted on."""
+"""An arm that carries a hand: the joints up to the hand's mount, and the frames and couplings of its description."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from service.model.digests import digest_files
 from service.model.errors import InputError
 from service.model.states import AssetKind
+from service.model.transforms import Floats
 from worker.hands.collisions import resting_neighbours
 from worker.hands.load import body_model, files_from_path, main_file
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 from worker.hands.options import HandOptions, parse_options
-from worker.hands.read import read_robot
 from worker.hands.robot import FREE, MOVING, Robot, chain_to
 from worker.hands.tree import build_tree
+from worker.hands.xacro import read_robot
 
 
 @dataclass(frozen=True)
@@ -82,3 +85,27 @@ def _others(robot: Robot, moving: list[str], mount: str) -> list[str]:
 def _rest(robot: Robot, joint: str) -> float:
     limits = robot.joints[joint]
     return float(np.clip(0.0, limits.lower, limits.upper))
+
+
+@dataclass(frozen=True)
+class Description:
+    """Facts on a hand's links and joints."""
+
+    links: Mapping[str, tuple[int, Floats]]
+    """Each link below the root: its body, and its pose (7,) in the body's frame."""
+    mimics: frozenset[str]
+    """Joints that the description itself couples to others: whoever reads it moves them by itself."""
+
+
+def describe(files: Mapping[str, bytes], options: Mapping[str, Any] | None = None) -> Description:
+    """The description of a hand's files; see `load_hand`.
+
+    Raises:
+        HandError: the files describe no usable hand.
+    """
+    settings = parse_options(files, options)
+    robot = read_robot(files, main_file(files, settings), settings.xacro)
+    tree = build_tree(robot, settings)
+    return Description(
+        dict(tree.links), frozenset(name for name in tree.joint_names if robot.joints[name].mimic is not None)
+    )

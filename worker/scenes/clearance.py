@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import compose
+from service.model.transforms import Floats, compose
 from worker.grasps import Posture
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 from worker.scenes.neighbours import Neighbours, neighbour_clearance
 from worker.simulation.mounting import mounting_room, wrist_room
 from worker.simulation.obstacles import PosedFeatures

@@ -6,19 +6,15 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.model.errors import SceneError
-from service.model.scene_kinds import BIN_SIZE, SHELF_SIZE, supports_in
-from service.model.scene_spec import MOST_TOUCH, Box, SceneSpec
-from service.model.transforms import compose, quat_from_axis_angle, quat_rotate
+from service.model.scene_spec import BIN_SIZE, MOST_TOUCH, SHELF_SIZE, Box, SceneSpec, supports_in
+from service.model.transforms import Floats, compose, quat_from_axis_angle, quat_rotate
 from worker.grasps import moved
 from worker.objects.model import ObjectModel
 from worker.scenes.rest import lay_flat, resting_faces
 from worker.scenes.simulate import drop, reference_share, rest_probability
 from worker.simulation.surroundings import Obstacle
-
-Floats = NDArray[np.float64]
 
 #: Least gap between an object and a wall [m].
 GAP: Final = 0.01

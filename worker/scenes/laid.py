@@ -11,18 +11,15 @@ from typing import Any, Final
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from service.model.errors import SceneError
-from service.model.transforms import compose, quat_from_axis_angle, quat_rotate
+from service.model.transforms import Floats, compose, quat_from_axis_angle, quat_rotate
 from worker.grasps import moved
 from worker.objects.model import ObjectModel
 from worker.scenes.kinds import GAP, SUNK
 from worker.scenes.neighbours import add_hull
 from worker.scenes.simulate import drop
 from worker.simulation.surroundings import Obstacle
-
-Floats = NDArray[np.float64]
 
 #: Least gap between two objects [m]; from walls it is that of the object, `GAP`.
 BETWEEN: Final = 0.005

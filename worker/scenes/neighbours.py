@@ -14,12 +14,12 @@ import mujoco
 import numpy as np
 
 from service.model.errors import InputError, MeshError
-from service.model.transforms import compose, quat_rotate
+from service.model.transforms import Floats, compose, quat_rotate
 from worker.engines.mujoco_warnings import void
 from worker.grasps import Posture, moved
 from worker.hands.kinematics import body_poses
-from worker.hands.model import ConvexPiece, Floats, HandModel
-from worker.objects.frames import to_centre, to_file
+from worker.hands.model import ConvexPiece, HandModel
+from worker.objects.mesh_geometry import to_centre, to_file
 from worker.objects.model import ObjectModel
 from worker.scenes.rest import RestingFaces, lay_flat, resting_faces, settle
 from worker.scenes.simulate import (

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from service.model.errors import MeshError
-from service.model.transforms import quat_from_axis_angle, quat_multiply, quat_rotate
-from worker.objects.model import Floats, Ints, ObjectModel
+from service.model.transforms import Floats, quat_from_axis_angle, quat_multiply, quat_rotate
+from worker.objects.model import Ints, ObjectModel
 
 if TYPE_CHECKING:
     import trimesh

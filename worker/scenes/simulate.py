@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError, MeshError
 from service.model.libraries import version_of
-from service.model.transforms import quat_rotate
+from service.model.transforms import Floats, quat_rotate
 from worker.engines.mujoco_warnings import void
 from worker.grasps import moved
-from worker.objects.frames import to_file
-from worker.objects.kept_arrays import arrays_kept_or_made
-from worker.objects.model import Floats, ObjectModel
+from worker.objects.disk_cache import arrays_kept_or_made
+from worker.objects.mesh_geometry import to_file
+from worker.objects.model import ObjectModel
 from worker.scenes import rest as resting
 from worker.scenes.rest import RestingFaces, lay_flat, resting_faces, same_face, settle
 

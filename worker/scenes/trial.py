@@ -1,5 +1,5 @@
-"""The trial that candidates of a grasp go through: in their scene a short lift, and a free way in and out; around a
-free object short pushes (`worker.quality.referee.short`). What passes goes through the referee's own test."""
+"""Pre-screening of candidates: in a scene clearance and a short lift, around a free object short pushes
+(`worker.quality.referee.short`). What passes goes through the validator's own test."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -21,20 +22,20 @@ from worker.quality.referee.lift import LiftOutcome
 from worker.quality.referee.lifting import KnownLifts, LiftLevel, judge_lifts
 from worker.quality.referee.short import SLIPS, ShortLifts, push_trial
 from worker.run import Run
-from worker.scenes.verdicts import lift_level
 from worker.scenes.way import plan_way
-from worker.simulation.surroundings import Placed
-
-Floats = NDArray[np.float64]
+from worker.simulation.surroundings import Placed, Scenes
 
 #: Added to the score of a hand that would lift but cannot come: worse than any that can and lets the object fall, since
 #: most of these come freely, better than what is lost.
 BLOCKED: Final = 8.0
+
 #: Added where only the referee sees the hand touch on its way, for the object's convex pieces stand out from it:
 #: the letter does not ask for the way.
 TOUCHES: Final = 2.0
+
 #: What a hand that holds for the short time of a trial but does not lift is worse than one that lifts.
 FALLS: Final = 0.4
+
 #: Highest score of what lifts at half the friction.
 BEST: Final = 0.99
 
@@ -61,9 +62,13 @@ def trial_on(
 
 
 def hold_trial(
-    hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, known: KnownTrials | None = None,
+    hand: HandModel,
+    obj: ObjectModel,
+    pieces: Callable[[], ConvexPieces],
+    *,
+    known: KnownTrials | None = None,
     level: Level = "certificate",
-) -> Callable[[GraspSet, Placed | None, Floats], Floats]:  # fmt: skip
+) -> Callable[[GraspSet, Placed | None, Floats], Floats]:
     """A trial of free grasps as `worker.planners.Wanted` takes it: (N,) scores of short pushes, below 2 for grasps that
     hold the object against the six pushes as well.
 
@@ -90,9 +95,14 @@ def hold_trial(
 
 
 def lift_trial(
-    hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1,
-    known: KnownLifts | None = None, level: LiftLevel = "lift",
-) -> Callable[[GraspSet, Placed | None, Floats], Floats]:  # fmt: skip
+    hand: HandModel,
+    obj: ObjectModel,
+    pieces: Callable[[], ConvexPieces],
+    *,
+    threads: int = 1,
+    known: KnownLifts | None = None,
+    level: LiftLevel = "lift",
+) -> Callable[[GraspSet, Placed | None, Floats], Floats]:
     """A trial as `worker.planners.Wanted` takes it: (N,) scores, below 1 for grasps that lift the object at half the
     friction, and below 2 at the whole of it, and whose way is clear.
 
@@ -144,3 +154,79 @@ def lift_trial(
         return out
 
     return trial
+
+
+Arrays = dict[str, NDArray[Any]]
+
+#: Clearances beyond this are not told apart [m].
+FARTHEST_M: Final = 1.0
+
+
+def lift_level(referee: str) -> LiftLevel:
+    """The level of the lift test at which a job's referee judges in scenes: the letter is the letter there too."""
+    return "letter" if referee == "letter" else "lift"
+
+
+def scene_verdicts(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    scenes: Scenes,
+    *,
+    level: LiftLevel,
+    pieces: ConvexPieces | None,
+    known: KnownLifts | None = None,
+    run: Run,
+) -> tuple[GraspSet, Arrays, dict[str, int]]:
+    """Plan the way of grasps in their scenes, and judge those that are clear.
+
+    A grasp that does not lift is not lifted at half the friction.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        grasps: N grasps with `scene`.
+        scenes: the scenes.
+        level: of the lift test.
+        pieces: the object's convex pieces; None: nobody judges, and grasps are only told clear or not.
+        known: see `judge_lifts`.
+        run: told of grasps judged; asked between grasps whether to stop.
+
+    Returns:
+        The grasps with `approach`, `coming`, `lift` and `wrist`; columns of the base shard, `quality/success` being the
+        verdict of the lift (-1: not clear); how many are clear, lift, and lift_hard.
+    """
+    assert grasps.scene is not None
+    placed = scenes.placed(grasps.scene)
+    way = plan_way(hand, obj, grasps, placed)
+    wrist = way.wrist if way.wrist.shape[1] else None
+    grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift, wrist=wrist)
+    count, clear = len(grasps), np.flatnonzero(way.clear)
+    columns: Arrays = {"quality/clearance_m": np.minimum(way.least, FARTHEST_M)}
+    counts = {"clear": len(clear), "lift": 0, "lift_hard": 0}
+    success = np.where(way.clear, 0, -1).astype(np.int8)
+    columns["quality/success"] = success
+    if pieces is None:
+        return grasps, columns, counts
+    common: dict[str, Any] = {"pieces": pieces, "run": run}
+    lifts = judge_lifts(hand, obj, grasps.take(clear), placed.take(clear), level=level, known=known, **common)
+    success[clear] = lifts.success
+    outcome, margin = np.zeros(count, np.uint8), np.full(count, np.nan)
+    outcome[clear], margin[clear] = lifts.outcome, lifts.margin
+    lifted = clear[outcome[clear] == LiftOutcome.LIFTED]
+    hard = np.full(count, -1, np.int8)
+    if len(lifted):
+        hard[lifted] = judge_lifts(
+            hand, obj, grasps.take(lifted), placed.take(lifted), level=level, hard=True, known=known, **common
+        ).success
+    counts |= {"lift": len(lifted), "lift_hard": int((hard == 1).sum())}
+    return (
+        grasps,
+        columns
+        | {
+            "quality/lift_outcome": outcome,
+            "quality/lift_hard": hard,
+            "quality/verdict_margin": margin,
+        },
+        counts,
+    )

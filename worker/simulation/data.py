@@ -1,4 +1,4 @@
-"""The data of a simulation: arrays for a capacity of hands, and the tables that tell what each iteration takes.
+"""The data of a simulation: hands to the device and back, arrays for a capacity of hands, tables of each iteration.
 
 All per-iteration values (dilation, weights, rates) lie in tables on the device, read at a counter on the device, so an
 iteration is the same list of launches each time.
@@ -6,16 +6,17 @@ iteration is the same list of launches each time.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.simulation.device import joint_units, to_wxyz, to_xyzw
 from worker.simulation.kernels import contact, packing, penalties
 from worker.simulation.model import MAX_DILATION, REFERENCE_POINTS, Model
-from worker.simulation.state import Floats, HandState, Schedule, still_schedule
 
 
 class Tables:
@@ -197,3 +198,36 @@ def _solver_states(model: Model, capacity: int) -> Any:
         return None
     kept = model.count if options.contact_solver == "gauss_seidel" else options.passes
     return wp.zeros((capacity, options.velocities, kept), dtype=contact.vec6)
+
+
+@dataclass
+class HandState:
+    """State of B hands: pivot (B, 3) = palm centre relative to the object's centre of mass, rotation (B, 4) w x y z,
+    q (B, D)."""
+
+    pivot: Floats
+    rotation: Floats
+    q: Floats
+
+    def __getitem__(self, index: Any) -> HandState:
+        return HandState(self.pivot[index], self.rotation[index], self.q[index])
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Per-iteration values, arrays of length I; rates (I, 3) for translation [m], rotation [rad], joints."""
+
+    dilation: Floats
+    penetration: Floats
+    object_penetration: Floats
+    self_penetration: Floats
+    rates: Floats
+
+    def __len__(self) -> int:
+        return len(self.dilation)
+
+
+def still_schedule() -> Schedule:
+    """Tables for telling distances and depths only: no dilation, no weights, no step."""
+    zero = np.zeros(1)
+    return Schedule(zero, zero, zero, zero, np.zeros((1, 3)))

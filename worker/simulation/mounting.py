@@ -11,7 +11,7 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, apply, quat_conjugate, quat_rotate, spread_directions
+from service.model.transforms import IDENTITY_POSE, Floats, apply, quat_conjugate, quat_rotate, spread_directions
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
@@ -19,8 +19,6 @@ from worker.hands.mounting import wrist_positions
 from worker.hands.surface import farthest_points
 from worker.simulation.obstacles import MARGIN_M, obstacle_room
 from worker.simulation.surroundings import CLEAR_M, Surroundings
-
-Floats = NDArray[np.float64]
 
 #: Points of a mounting: the outermost in so many directions, then so many corners spread over it.
 OUTERMOST: Final = 20

@@ -12,20 +12,17 @@ import warp as wp
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import quat_rotate
+from service.model.transforms import Floats, quat_rotate
 from worker.grasps import Posture
-from worker.hands.features import HandFeatures
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
-from worker.simulation.device import DeviceHand, to_xyzw
+from worker.hands.primitives import HandFeatures
+from worker.simulation.device import DeviceHand, PosedBodies, to_xyzw
 from worker.simulation.kernels import chain as chain_kernels
 from worker.simulation.kernels import obstacles as kernels
 from worker.simulation.kernels import solids as solid_kernels
 from worker.simulation.launches import launch
-from worker.simulation.posed import PosedBodies
 from worker.simulation.surroundings import CLEAR_M, Obstacle, Surroundings
-
-Floats = NDArray[np.float64]
 
 #: Distance that a hand keeps from obstacles [m]: twice what a scene's certificate asks, for the way is swept in steps.
 MARGIN_M: Final = 0.004

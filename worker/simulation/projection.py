@@ -7,18 +7,15 @@ from typing import Any, Final
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
-from worker.simulation.data import Data
+from service.model.transforms import Floats
+from worker.simulation.data import Data, HandState, still_schedule
 from worker.simulation.device import to_wxyz, to_xyzw
 from worker.simulation.kernels import obstacles, solids
 from worker.simulation.kernels import projection as kernels
 from worker.simulation.launches import Launches
 from worker.simulation.model import Model
 from worker.simulation.record import record_placement
-from worker.simulation.state import HandState, still_schedule
-
-Floats = NDArray[np.float64]
 
 #: Residuals kept per grasp and iteration.
 CAPACITY: Final = 1024

@@ -5,14 +5,12 @@ from __future__ import annotations
 import sys
 
 import numpy as np
-from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.hands import surface
 from worker.hands.surface import farthest_points
-from worker.objects.kept_arrays import arrays_kept_or_made
+from worker.objects.disk_cache import arrays_kept_or_made
 from worker.objects.model import ObjectModel
-
-Floats = NDArray[np.float64]
 
 #: Edges between faces that turn by more than this carry samples of their own: they enter links between surface samples.
 SHARP_EDGE_COS = np.cos(np.radians(35.0))

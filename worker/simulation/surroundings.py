@@ -16,11 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import compose, invert, quat_conjugate, quat_rotate, quat_to_matrix
-from worker.objects.frames import to_centre
+from service.model.transforms import Floats, compose, invert, quat_conjugate, quat_rotate, quat_to_matrix
+from worker.objects.mesh_geometry import to_centre
 from worker.objects.model import ObjectModel
-
-Floats = NDArray[np.float64]
 
 #: Direction against gravity in the scene frame.
 UP: Final = np.array([0.0, 0.0, 1.0])

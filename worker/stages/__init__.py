@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from service.model.states import Stage
 
 if TYPE_CHECKING:
-    from worker.stages.context import TaskContext
-    from worker.stages.output import Output, StageFunction
+    from worker.stages.context import Output, StageFunction, TaskContext
 
 _MODULES: Final = {
     Stage.INGEST: "worker.stages.ingest",

@@ -1,5 +1,6 @@
-"""Hands, objects and networks of the tasks, loaded from the store once and kept while the worker goes on with the same
-pair. Objects are repaired and simplified once, by the worker that meets them first, and lie prepared in the store."""
+"""Inputs of tasks: hands, objects, networks, convex pieces and shards from the store, kept while a worker goes on with
+one pair. Objects are repaired and simplified once, by the worker that meets them first, and lie prepared in the
+store."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ import threading
 import zipfile
 from collections.abc import Callable, Hashable
 from contextlib import suppress
+from pathlib import Path
 from typing import TypeVar, cast
 
 from cachetools import LRUCache
@@ -15,29 +17,36 @@ from service.model import names
 from service.model.digests import digest_json
 from service.model.errors import DamagedError, MeshError, NotFoundError
 from service.model.messages import TaskMessage
-from service.model.states import AssetKind
+from service.model.states import AssetKind, Stage
 from service.model.version import STAGE_REVISIONS
-from service.store.attributes import Attribute
+from service.store.columns import Attribute
+from service.store.hand_files import format_of
+from service.store.integrity import get_document, get_sealed, put_document, put_sealed
 from service.store.library import load_asset_files
-from service.store.network_check import network_bytes
-from service.store.network_file import ProposalNetwork, from_bytes
-from service.store.seals import get_sealed, put_sealed
+from service.store.manifests import load_shard
+from service.store.network_file import ProposalNetwork, from_bytes, network_bytes
+from service.store.shards import Shard
 from service.store.store import Store
-from worker.files.of_shard import NEIGHBOUR_FACE_ERROR_M
-from worker.hands.load import load_hand
+from service.user_cache import write_whole
+from worker.files.provenance import NEIGHBOUR_FACE_ERROR_M
+from worker.hands.load import load_hand, main_file
 from worker.hands.model import HandModel
-from worker.objects import packed
-from worker.objects.matter import as_asked
+from worker.hands.options import parse_options
+from worker.hands.xacro import expand
+from worker.objects import prepare
 from worker.objects.model import ObjectModel
+from worker.objects.options import as_asked
 from worker.objects.prepare import load_object
 from worker.planners.learned.known import keep
-from worker.stages.hand_files import load_hand_files
+from worker.quality.referee.decomposition import ConvexPieces, decompose, piece_file
+from worker.stages.context import TaskContext
 from worker.stages.models import SHOWN_ERROR_M, publish_model
-from worker.stages.pieces import pieces_of
 
 T = TypeVar("T")
+
 #: Loaded assets kept: a worker in a hands x objects dataset alternates between a few.
 _cache: LRUCache[Hashable, object] = LRUCache(16)
+
 _lock = threading.RLock()
 
 
@@ -131,14 +140,14 @@ def prepared_object(store: Store, digest: str, *, name: str, face_error_m: float
     """
     key = names.object_prepared(digest, _address(face_error_m))
     try:
-        return packed.from_bytes(get_sealed(store, key), name=name, digest=digest)
+        return prepare.from_bytes(get_sealed(store, key), name=name, digest=digest)
     except NotFoundError:
         pass
     except (DamagedError, ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
         # What cannot be read is made again; it cannot be replaced, and costs no more than it did without a store.
         return _load(store, digest, name=name, face_error_m=face_error_m)
     obj = _load(store, digest, name=name, face_error_m=face_error_m)
-    put_sealed(store, key, packed.to_bytes(obj))
+    put_sealed(store, key, prepare.to_bytes(obj))
     return obj
 
 
@@ -150,3 +159,57 @@ def _address(face_error_m: float) -> str:
 def _load(store: Store, digest: str, *, name: str, face_error_m: float) -> ObjectModel:
     files = load_asset_files(store, AssetKind.OBJECT, digest)
     return load_object(files, name=name, digest=digest, face_error_m=face_error_m)
+
+
+_pieces_lock = threading.Lock()
+
+
+def pieces_of(store: Store, obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
+    """The pieces of an object: this machine's, else those in the store, else made now and put there.
+
+    Raises:
+        MeshError: the object has no usable pieces.
+        StoreUnavailable: the store does not answer.
+    """
+    file = piece_file(obj, cache)
+    key = names.object_pieces(obj.digest, file.stem)
+    with _pieces_lock:  # tasks of one object start at once: one of them makes the pieces
+        if not file.is_file():
+            _fetch(store, key, file)
+        pieces = decompose(obj, cache=cache)
+        if file.is_file() and not store.exists(key):
+            put_sealed(store, key, file.read_bytes())
+        return pieces
+
+
+def _fetch(store: Store, key: str, file: Path) -> None:
+    try:
+        data = get_sealed(store, key)
+    except (NotFoundError, DamagedError):
+        return
+    # A folder that cannot be written only costs time.
+    with suppress(OSError):
+        write_whole(file, data)
+
+
+def input_of(message: TaskMessage, context: TaskContext, stage: Stage) -> Shard:
+    """The shard that `stage` made for a task; raises what `load_shard` does."""
+    return load_shard(context.store, stage, message.inputs[0])
+
+
+def load_hand_files(store: Store, digest: str) -> dict[str, bytes]:
+    """All files of a hand; in place of a xacro file the URDF that it expanded to at its first use.
+
+    Raises:
+        HandError: the options or the xacro file cannot be used.
+        NotFoundError, DamagedError: see `load_asset_files`.
+    """
+    files = load_asset_files(store, AssetKind.HAND, digest)
+    settings = parse_options(files)
+    main = main_file(files, settings)
+    if format_of(main, files[main]) != "xacro":
+        return files
+    key = names.hand_expanded(digest)
+    if not store.exists(key):
+        put_document(store, key, {"urdf": expand(files, main, settings.xacro).decode()})
+    return {**files, main: str(get_document(store, key)["urdf"]).encode()}

@@ -1,15 +1,29 @@
-"""What a stage knows of the task it does: where to read, where to say how far it is, and whether to stop."""
+"""What a stage knows of the task it does: where to read, where to say how far it is, and whether to stop.
+
+What a stage hands back, and how that becomes a shard with its manifest.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.clock import timestamp
+from service.model.digests import digest_json
 from service.model.errors import TaskCancelled
+from service.model.messages import TaskMessage
+from service.model.names import SHARD_KINDS
+from service.model.version import PACKAGE_VERSION
+from service.store.columns import Attribute
+from service.store.manifests import ShardManifest, manifest_of
+from service.store.shards import check_columns, json_attribute, write_shard
 from worker.run import ALONE, Run
 
 if TYPE_CHECKING:
@@ -73,3 +87,78 @@ class TaskContext:
     @property
     def stop_reason(self) -> StopReason | None:
         return self._reason
+
+
+@dataclass(frozen=True)
+class Output:
+    """The columns of a shard, what is special about it, and what the manifest should keep besides."""
+
+    arrays: Mapping[str, NDArray[np.generic]]
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)
+    info: Mapping[str, Any] = field(default_factory=dict)
+
+
+def shard_of(
+    message: TaskMessage,
+    output: Output,
+    *,
+    device: str,
+    seconds: float,
+    worker: str,
+    lost: ShardManifest | None = None,
+) -> tuple[ShardManifest, bytes]:
+    """The shard that a stage made: its manifest and its HDF5 bytes.
+
+    Args:
+        lost: manifest of the file that this one takes the place of: what tells when and by whom is then as it was.
+
+    Raises:
+        InputError: the columns do not fit the schema.
+    """
+    kind = SHARD_KINDS[message.stage]
+    request = message.request
+    attributes: dict[str, Attribute] = {
+        "hand": request.hand,
+        "hand_digest": message.hand_digest,
+        "object": request.object,
+        "object_digest": message.object_digest,
+        "method": request.method,
+        "fidelity": json_attribute(request.knobs.model_dump(mode="json")),
+        "seed": request.seed,
+        "batch": message.batch,
+        "device": device,
+        "seconds": lost.seconds if lost is not None else round(seconds, 4),
+        "created": lost.created if lost is not None else timestamp(),
+        "code_version": lost.code_version if lost is not None else PACKAGE_VERSION,
+        "shard_id": message.output,
+        "inputs": list(message.inputs),
+        **output.attributes,
+    }
+    counts = check_columns(kind, output.arrays)  # type: ignore[arg-type]
+    data = write_shard(kind, output.arrays, attributes)  # type: ignore[arg-type]
+    manifest = manifest_of(
+        message,
+        data,
+        output.arrays,
+        attributes,
+        counts,
+        device=device,
+        seconds=seconds,
+        worker=worker,
+        info=output.info,
+    )
+    return manifest, data
+
+
+def batch_seed(message: TaskMessage) -> int:
+    """Seed of this stage of this batch.
+
+    Batches, hands and objects must not repeat each other's materials, lamps and cameras. Methods do: when grasps of two
+    of them stand in the same pictures, what a network learns of either can be compared.
+    """
+    pair = [message.hand_digest, message.object_digest]
+    return int(digest_json([message.request.seed, message.stage, message.batch, *pair])[:8], 16) % 2**31
+
+
+#: What a stage is: it makes the arrays of a shard, or, as ingest does, writes what it found itself.
+StageFunction = Callable[[Any, TaskContext], Output | None]

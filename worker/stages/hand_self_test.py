@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from service.model.domain import BATCH_SIZE, JobOptions
 from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
-from service.model.transforms import apply
+from service.model.transforms import Floats, apply
 from worker.certified import Certified, certified_grasps
 from worker.grasps import Posture, joined
-from worker.hands.jaws import jaws_of
+from worker.hands.jaws import fingertip_pad, jaws_of
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 from worker.hands.oppositions import oppositions_of
-from worker.hands.pads import fingertip_pad
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object
 from worker.quality.postures import squeeze

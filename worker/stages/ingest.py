@@ -20,9 +20,9 @@ from service.model.errors import HandError
 from service.model.messages import IngestMessage
 from service.model.states import AssetKind
 from service.store.assets import pack, unpack
+from service.store.integrity import put_document, put_sealed
 from service.store.library import UNPACKED_LIMIT_BYTES, load_asset, load_asset_files
-from service.store.network_check import check_network
-from service.store.seals import put_document, put_sealed
+from service.store.network_file import check_network
 from worker.stages.context import TaskContext
 
 #: Address space of the child [bytes]: the largest meshes that are taken need about a tenth of it.
@@ -52,7 +52,7 @@ def run(message: IngestMessage, context: TaskContext) -> None:
 
 def _files(message: IngestMessage, context: TaskContext) -> dict[str, bytes]:
     if message.kind is AssetKind.HAND:
-        from worker.stages.hand_files import load_hand_files
+        from worker.stages.assets import load_hand_files
 
         # What cannot be expanded is refused by the check, which says why.
         with contextlib.suppress(HandError):

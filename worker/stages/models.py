@@ -1,27 +1,43 @@
-"""The models that viewers show: made beside the check of an upload, or when a task first loads a hand or an object.
+"""Models for viewers: hands and objects as binary glTF, made beside the check of an upload or at first use.
 
 ``python -m worker.stages.models`` writes those of the built-in hands and objects into `service/builtin/models/`.
+
+The joint tree stands in the `extras` of the nodes, so a viewer poses the hand from the joint positions of a shard:
+a node's pose is parent * rest pose * motion about `axis`. Points of the hand's surface come as POINTS primitives.
+Of a body that is shown by visual meshes, `extras` name the mesh of its collision shapes, which no node draws. The
+document's `extras` say what was found of the hand: facts, frames of its links, what drives its joints, its pads.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+import numpy as np
 
 from service.model import names
+from service.model.colours import Colour, linear
 from service.model.fidelity import Fidelity
 from service.model.states import AssetKind
+from service.model.transforms import Floats
 from service.store.assets import builtin_files, builtin_names
-from service.store.seals import put_sealed
+from service.store.integrity import put_sealed
 from service.store.store import Store
+from worker.hands.check import model_facts
+from worker.hands.jaws import pads_of
 from worker.hands.load import load_hand
-from worker.hands.model import HandModel
+from worker.hands.model import HandModel, JointType
+from worker.hands.robot import Ints
+from worker.hands.surface import sample_surface
+from worker.hands.visuals import VisualMesh, lighter
+from worker.objects.glb_document import Document, plain
+from worker.objects.mesh_geometry import corner_normals
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object
-from worker.stages.glb import hand_glb, object_glb
 
 #: Simplification of a shown object [m]: that of the standard fidelity, so that people see what is grasped.
 SHOWN_ERROR_M: Final = Fidelity().face_error_m
+
 _BUILTIN: Final = Path(__file__).parents[2] / "service" / "builtin" / "models"
 
 
@@ -45,6 +61,115 @@ def write_builtins(folder: Path = _BUILTIN) -> None:
     for kind in AssetKind:
         for name in builtin_names(kind):
             (folder / f"{kind.value}-{name}.glb").write_bytes(model_of(kind, name, builtin_files(kind, name)))
+
+
+#: Points on the hand from which a viewer measures its distance to the object.
+SURFACE_POINTS: Final = 3000
+
+#: Triangles of a hand's visual meshes together: a browser draws them at once.
+MAX_FACES: Final = 60_000
+
+#: Points of a pad at most.
+PAD_POINTS: Final = 60
+
+#: sRGB of parts without a colour beside parts with one.
+_GREY: Final = (0.45, 0.5, 0.55)
+
+
+def hand_glb(hand: HandModel) -> bytes:
+    """The hand at joint positions zero, root link at the origin; metres."""
+    document = Document()
+    points = sample_surface(hand, SURFACE_POINTS)
+    nodes: list[dict[str, Any]] = []
+    visuals = _light_visuals(hand)
+    joint_of_body = dict(zip(hand.joint_body.tolist(), hand.joint_names, strict=True))
+    for body in range(hand.bodies):
+        node: dict[str, Any] = {"name": hand.body_names[body], "extras": {"fingertip": body in hand.fingertips}}
+        if body:
+            node["translation"] = plain(hand.origin[body, :3])
+            node["rotation"] = plain(np.roll(hand.origin[body, 3:], -1))  # glTF: x y z w
+            kind = "prismatic" if hand.joint_type[body] == JointType.PRISMATIC else "revolute"
+            node["extras"] |= {"joint": joint_of_body[body], "type": kind, "axis": plain(hand.axis[body])}
+        primitives = _body_primitives(document, hand, body, visuals)
+        if any(mesh.body == body for mesh in visuals) and (pieces := _piece_primitive(document, hand, body)):
+            node["extras"]["collision"] = document.mesh([pieces])
+        if (on_body := points.position[points.body == body]).size:
+            primitives.append(document.points(on_body))
+        if primitives:
+            node["mesh"] = document.mesh(primitives)
+        if children := [child for child in range(1, hand.bodies) if hand.parent[child] == body]:
+            node["children"] = children
+        nodes.append(node)
+    preshape = dict(zip(hand.joint_names, plain(hand.expand(hand.preshape)), strict=True))
+    palm = {"centre": plain(hand.palm.centre), "approach": plain(hand.palm.approach)}
+    extras = {"kind": "hand", "name": hand.name, "preshape": preshape, "palm": palm, **_found(hand)}
+    return document.bytes(nodes, extras)
+
+
+def object_glb(obj: ObjectModel) -> bytes:
+    """The prepared mesh in the object's own frame; metres. Its node has the middle of the mesh as its translation, for
+    the numbers of a mesh have 32 bits."""
+    document = Document()
+    primitive = document.triangles(obj.centred.vertices, obj.faces, obj.corner_normals)
+    extras = {"kind": "object", "name": obj.name, "centre_of_mass": plain(obj.centre_of_mass)}
+    node = {"name": obj.name, "mesh": document.mesh([primitive]), "translation": list(obj.centre)}
+    return document.bytes([node], extras)
+
+
+def _found(hand: HandModel) -> dict[str, Any]:
+    """What a user looks at and corrects."""
+    drives = {
+        joint: {
+            "dof": hand.dof_names[hand.dof[body]],
+            "times": float(hand.multiplier[body]),
+            "plus": float(hand.offset[body]),
+        }
+        for body, joint in zip(hand.joint_body.tolist(), hand.joint_names, strict=True)
+    }
+    pads = []
+    for pad in pads_of(hand):
+        few = pad.points[:: max(1, -(-len(pad.points) // PAD_POINTS))]
+        pads.append({"body": pad.body, "normal": plain(pad.normal), "points": [plain(point) for point in few]})
+    links = {link: {"body": body, "pose": plain(pose)} for link, (body, pose) in hand.frames.items()}
+    return {"facts": model_facts(hand), "links": links, "drives": drives, "pads": pads}
+
+
+def _piece_primitive(document: Document, hand: HandModel, body: int) -> dict[str, Any] | None:
+    return _joined(document, [(p.vertices, p.faces, None) for p in hand.pieces if p.body == body])
+
+
+def _body_primitives(
+    document: Document, hand: HandModel, body: int, visuals: tuple[VisualMesh, ...]
+) -> list[dict[str, Any]]:
+    """The visual meshes in their colours; of a body without any, its pieces, which viewers colour themselves."""
+    meshes: list[tuple[Floats, Ints, Colour | None]] = [
+        (mesh.vertices, mesh.faces, mesh.colour) for mesh in visuals if mesh.body == body
+    ]
+    primitive = _joined(document, meshes) if meshes else _piece_primitive(document, hand, body)
+    return [primitive] if primitive else []
+
+
+def _joined(document: Document, meshes: list[tuple[Floats, Ints, Colour | None]]) -> dict[str, Any] | None:
+    """One primitive of vertices, faces and sRGB colours."""
+    if not meshes:
+        return None
+    starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in meshes)])
+    colours = None
+    if any(colour for _, _, colour in meshes):
+        colours = np.concatenate([np.tile(linear(*(colour or _GREY)), (len(faces), 1)) for _, faces, colour in meshes])
+    return document.triangles(
+        np.concatenate([vertices for vertices, _, _ in meshes]),
+        np.concatenate([faces + start for (_, faces, _), start in zip(meshes, starts, strict=False)]),
+        np.concatenate([corner_normals(vertices, faces) for vertices, faces, _ in meshes]),
+        face_colours=colours,
+    )
+
+
+def _light_visuals(hand: HandModel) -> tuple[VisualMesh, ...]:
+    """The visual meshes, with `MAX_FACES` triangles together at most."""
+    meshes = hand.visuals.meshes
+    excess = sum(len(mesh.faces) for mesh in meshes) / MAX_FACES
+    return meshes if excess <= 1 else tuple(lighter(mesh, excess) for mesh in meshes)
 
 
 if __name__ == "__main__":

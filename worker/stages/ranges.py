@@ -16,7 +16,7 @@ from service.model.messages import TaskMessage
 from service.model.names import SHARD_KINDS
 from service.store.columns import SCHEMAS
 from service.store.shards import Shard, json_attribute
-from worker.stages.output import Output
+from worker.stages.context import Output
 
 #: Axes whose rows are those of one batch after the other; what has another axis is common to all.
 _ROWS: Final = ("N", "S", "K")

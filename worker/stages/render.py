@@ -5,21 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from service.model.messages import TaskMessage
-from service.model.scene_kinds import supports_in
+from service.model.scene_spec import supports_in
 from service.model.states import Stage
 from service.model.transforms import compose
 from service.readers.ways import wrists_of
-from service.store import standing
-from service.store.attributes import Attribute
+from service.store import validity
+from service.store.columns import Attribute
 from service.store.shards import Shard, json_attribute
 from worker.rendering import Extras, render
 from worker.rendering.hands import DrawnHand
 from worker.rendering.pages.sheets import best_in_scenes
 from worker.scenes.neighbours import Neighbours
-from worker.stages.assets import beside_attributes, hand_of, neighbours_of, object_of
-from worker.stages.context import TaskContext
-from worker.stages.inputs import input_of
-from worker.stages.output import Output, batch_seed
+from worker.stages.assets import beside_attributes, hand_of, input_of, neighbours_of, object_of
+from worker.stages.context import Output, TaskContext, batch_seed
 
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
@@ -63,7 +61,7 @@ def _beside(base: Shard, message: TaskMessage, context: TaskContext) -> Neighbou
 def _drawn(base: Shard, message: TaskMessage, context: TaskContext) -> DrawnHand | None:
     """The best valid grasp of each scene; None where there is no grasp at all."""
     hand = hand_of(context.store, message)
-    among = standing.chosen(base.arrays, unjudged=message.request.referee == "none")
+    among = validity.chosen(base.arrays, unjudged=message.request.referee == "none")
     rows = best_in_scenes(base.arrays, among)
     if not len(among):
         return None

@@ -10,17 +10,15 @@ from numpy.typing import NDArray
 from service.model.errors import MeshError, SceneError
 from service.model.messages import TaskMessage
 from service.model.states import Stage
-from service.store.attributes import Attribute
+from service.store.columns import Attribute
 from service.store.shards import Shard, json_attribute
-from worker.files.base_attributes import wrist_attributes
+from worker.files.provenance import wrist_attributes
 from worker.grasps import Posture
 from worker.scenes import drop, transfer
 from worker.scenes.beside import scenes_of
 from worker.scenes.clearance import count_rejections
-from worker.stages.assets import beside_attributes, hand_of, neighbours_of, object_of
-from worker.stages.context import TaskContext
-from worker.stages.inputs import input_of
-from worker.stages.output import Output, batch_seed
+from worker.stages.assets import beside_attributes, hand_of, input_of, neighbours_of, object_of
+from worker.stages.context import Output, TaskContext, batch_seed
 from worker.stages.ranges import base_rows, batches_of, joined
 
 #: Columns of carried-over grasps in a shard of scenes that grasps are yet to be planned in.

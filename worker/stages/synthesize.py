@@ -13,20 +13,17 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError, LoadError, SceneError
 from service.model.messages import TaskMessage
-from service.model.outcomes import told, totals
+from service.model.planning import told, totals
 from service.model.states import Stage
-from service.store.attributes import Attribute
+from service.store.columns import Attribute
 from worker.certified import Certified
-from worker.files.base_attributes import base_attributes
+from worker.files.provenance import base_attributes
 from worker.planners import NoPlace, planner
 from worker.scenes.beside import neighbour_of
 from worker.scenes.kinds import supports_of
 from worker.simulation.surroundings import Scenes
-from worker.stages.assets import beside_attributes, hand_of, keep_network, neighbours_of, object_of
-from worker.stages.context import TaskContext
-from worker.stages.inputs import input_of
-from worker.stages.output import Output
-from worker.stages.pieces import pieces_of
+from worker.stages.assets import beside_attributes, hand_of, input_of, keep_network, neighbours_of, object_of, pieces_of
+from worker.stages.context import Output, TaskContext
 from worker.stages.ranges import joined, sizes_of
 from worker.together import certified_batches
 

@@ -10,17 +10,15 @@ import numpy as np
 from PIL import Image
 
 from service.model.fidelity import FIDELITIES
-from service.model.transforms import apply
+from service.model.transforms import Floats, apply
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel
+from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners import Wanted, synthesize
-from worker.rendering.camera_file import GivenCameras
-from worker.rendering.cameras import FIELD_OF_VIEW, distance_to_fill, look_at
+from worker.rendering.cameras import FIELD_OF_VIEW, GivenCameras, distance_to_fill, look_at
 from worker.rendering.hands import DrawnHand
-from worker.rendering.pages.sheets import label_page, scene_cells
-from worker.rendering.pages.typography import with_palette
+from worker.rendering.pages.sheets import label_page, scene_cells, with_palette
 from worker.rendering.views import Extras, render
 from worker.run import Run
 from worker.scenes import Neighbours, drop, drop_together, transfer

@@ -17,11 +17,10 @@ from worker.planners.fast_graspd.schedule import coarse_schedule, fine_schedule
 from worker.planners.fast_graspd.starts import sample_starts
 from worker.planners.port import Wanted
 from worker.run import Run
-from worker.simulation.data import Data
+from worker.simulation.data import Data, HandState, Schedule
 from worker.simulation.launches import kernel_seconds
 from worker.simulation.model import Model
 from worker.simulation.record import record_iteration
-from worker.simulation.state import HandState, Schedule
 
 #: Iterations timed, launch by launch, from the middle of a phase.
 SAMPLED: Final = 12

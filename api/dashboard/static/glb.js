@@ -1,4 +1,4 @@
-// Reads the binary glTF that graspd writes (worker/stages/glb.py): nodes, triangles with normals, points. Nothing more.
+// Reads the binary glTF that graspd writes (worker/stages/models.py): nodes, triangles with normals, points. Nothing more.
 import { BufferAttribute, BufferGeometry } from "./vendor/three.min.js";
 
 const TYPES = { 5120: Int8Array, 5121: Uint8Array, 5123: Uint16Array, 5125: Uint32Array, 5126: Float32Array };

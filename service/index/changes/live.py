@@ -9,12 +9,11 @@ from typing import Any
 from sqlalchemy import Connection, delete, select, update
 
 from service.index.bulk import update_rows, upsert
-from service.index.changes.rows import clean
-from service.index.changes.states import settle
+from service.index.changes.rows import clean, settle
 from service.index.database import Database, chunks
 from service.index.tables import assets, jobs, tasks, workers
 from service.model.states import State
-from service.model.worker_beat import WorkerBeat
+from service.model.workers import WorkerBeat
 
 _UNFINISHED = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
 

@@ -11,6 +11,7 @@ from sqlalchemy import Connection, delete, select, update
 
 from service.index.bulk import upsert
 from service.index.changes.rows import (
+    ENTERING,
     Row,
     asset_row,
     attempt_row,
@@ -18,10 +19,11 @@ from service.index.changes.rows import (
     clean,
     grasp_rows,
     job_row,
+    settle,
+    settle_batches,
     shard_row,
     task_rows,
 )
-from service.index.changes.states import ENTERING, settle, settle_batches
 from service.index.database import Database, chunks
 from service.index.tables import (
     assets,
@@ -36,10 +38,9 @@ from service.index.tables import (
     shards,
     tasks,
 )
-from service.model.dataset_records import DatasetEvent, DatasetRecord, ObjectSet, Snapshot
 from service.model.domain import Asset
 from service.model.planning import ranges_of
-from service.model.records import AttemptRecord, JobEvent, JobRecord
+from service.model.records import AttemptRecord, DatasetEvent, DatasetRecord, JobEvent, JobRecord, ObjectSet, Snapshot
 from service.model.states import State
 from service.store.manifests import ShardManifest
 

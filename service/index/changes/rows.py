@@ -1,21 +1,32 @@
-"""From the records in the store to the rows of the index."""
+"""From records of the store to rows of the index, and the states of tasks and jobs that follow, in one transaction."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import groupby
 from typing import Any, Final
 
+from sqlalchemy import ColumnElement, Connection, exists, func, literal, select, tuple_, update
+
+from service.index.database import chunks
+from service.index.outbox import note_ends
+from service.index.tables import attempts, jobs, notes, tasks
 from service.model.domain import Asset, JobOptions
-from service.model.planning import plan, stages_of
+from service.model.errors import LoadError, SceneError
+from service.model.planning import TaskFacts, batch_ready, batch_states, job_state, plan, stages_of
 from service.model.records import AttemptRecord, JobRecord
 from service.model.states import State
 from service.store.manifests import ShardManifest
 
 Row = dict[str, Any]
+
 #: Facts, repairs and message of a hand or object stand in every list, and follow from files of a stranger's.
 _MOST_FACTS: Final = 64 << 10
+
 _MOST_REPAIRS: Final = 100
+
 _LONGEST_TEXT: Final = 2000
 
 
@@ -180,3 +191,144 @@ def _short(facts: dict[str, Any]) -> dict[str, Any]:
     if len(json.dumps(facts)) <= _MOST_FACTS:
         return facts
     return {name[:100]: value for name, value in list(facts.items())[:100] if isinstance(value, int | float)}
+
+
+#: Jobs whose states are derived in one go.
+_JOBS_AT_ONCE: Final = 200
+
+_FACTS = (
+    tasks.c.id,
+    tasks.c.batch,
+    tasks.c.stage,
+    tasks.c.state,
+    tasks.c.ready,
+    tasks.c.done,
+    tasks.c.last_attempt,
+    tasks.c.exhausted,
+    tasks.c.retried_upto,
+)
+
+#: Option of a connection on which nothing that ends is told.
+QUIET: Final = "graspd_quiet"
+
+#: Beginning of the name of a note: tasks of the job whose id follows are yet to be entered.
+ENTERING: Final = "entering "
+
+_WHOSE: Final = (jobs.c.project, jobs.c.owner)
+
+
+def settle(connection: Connection, job_id: str, batches: Collection[int] | None = None) -> State:
+    """Derive the states of a job's tasks, of some batches or all, then the job's own.
+
+    Returns:
+        the job's state.
+    """
+    return settle_batches(connection, {job_id: batches})[job_id]
+
+
+def settle_batches(connection: Connection, touched: Mapping[str, Collection[int] | None]) -> dict[str, State]:
+    """The same for some batches, or all (None), of many jobs at once.
+
+    Where the first batch found no grasp in its scenes, the job's other batches are not made: they end as if cancelled.
+
+    Returns:
+        the states of these jobs.
+    """
+    states: dict[str, State] = {}
+    for some in chunks(list(touched), _JOBS_AT_ONCE):
+        _settle_tasks(connection, {job: touched[job] for job in some})
+        states |= _settle_jobs(connection, some)
+    return states
+
+
+def _settle_tasks(connection: Connection, touched: Mapping[str, Collection[int] | None]) -> None:
+    query = select(jobs.c.id, jobs.c.cancelled, _hopeless()).where(jobs.c.id.in_(list(touched)))
+    facts = {row.id: row for row in connection.execute(query)}
+    cancelled = {job for job, row in facts.items() if row.cancelled or row.hopeless}
+    whole = [job for job, batches in touched.items() if batches is None or (job in facts and facts[job].hopeless)]
+    pairs = [
+        (job, batch) for job, batches in touched.items() if job not in whole for batch in sorted(set(batches or ()))
+    ]
+    rows: list[Any] = []
+    for wanted in (
+        *(tasks.c.job_id.in_(some) for some in chunks(whole)),
+        *(tuple_(tasks.c.job_id, tasks.c.batch).in_(some) for some in chunks(pairs)),
+    ):
+        query = select(tasks.c.job_id, *_FACTS).where(wanted).order_by(tasks.c.job_id, tasks.c.batch, tasks.c.position)
+        rows += connection.execute(query).mappings()
+    changes: defaultdict[tuple[str, bool], list[str]] = defaultdict(list)
+    for (job, _), chain in groupby(rows, key=lambda row: (row["job_id"], row["batch"])):
+        for task, state, ready in _changes(list(chain), cancelled=job in cancelled):
+            changes[state, ready].append(task)
+    for (state, ready), ids in changes.items():
+        for some in chunks(ids):
+            connection.execute(update(tasks).where(tasks.c.id.in_(some)).values(state=state, ready=ready))
+
+
+def _hopeless() -> ColumnElement[bool]:
+    """Whether the first batch of a job ended because of its scenes, or of the weight."""
+    last = (attempts.c.task_id == tasks.c.id) & (attempts.c.number == tasks.c.last_attempt)
+    failed = (tasks.c.done.is_(False), tasks.c.exhausted.is_(True), tasks.c.last_attempt > tasks.c.retried_upto)
+    first = (tasks.c.job_id == jobs.c.id, tasks.c.batch == 0)
+    return (
+        exists()
+        .select_from(tasks.join(attempts, last))
+        .where(*first, *failed, attempts.c.kind.in_([SceneError.__name__, LoadError.__name__]))
+        .correlate(jobs)
+        .label("hopeless")
+    )
+
+
+def _changes(chain: Sequence[Any], *, cancelled: bool) -> list[tuple[str, str, bool]]:
+    """Tasks of a batch whose state, or whether they may start, is not what follows from the facts; with both."""
+    facts = [
+        TaskFacts(
+            stage=row["stage"],
+            done=row["done"],
+            last_attempt=row["last_attempt"],
+            exhausted=row["exhausted"],
+            retried_upto=row["retried_upto"],
+            running=row["state"] == State.RUNNING,
+        )
+        for row in chain
+    ]
+    states = batch_states(facts, job_cancelled=cancelled)
+    return [
+        (row["id"], state.value, ready)
+        for row, state, ready in zip(chain, states, batch_ready(states), strict=True)
+        if (row["state"], row["ready"]) != (state.value, ready)
+    ]
+
+
+def _settle_jobs(connection: Connection, ids: Sequence[str]) -> dict[str, State]:
+    # Six probes of an index; to collect the distinct states would read every task of the job.
+    of_job = tasks.c.job_id == jobs.c.id
+    probes = [exists().where(of_job, tasks.c.state == state.value).label(state.value) for state in State]
+    probes.append(exists().where(notes.c.name == literal(ENTERING) + jobs.c.id).label("entering"))
+    query = select(jobs.c.id, jobs.c.state.label("now"), jobs.c.finished, jobs.c.reason, *_WHOSE, *probes)
+    known = {row["id"]: row for row in connection.execute(query.where(jobs.c.id.in_(ids))).mappings()}
+    states: dict[str, State] = {}
+    ended: list[dict[str, Any]] = []
+    for job in ids:
+        row = known.get(job)
+        found = [state for state in State if row is not None and row[state.value]]
+        found += [State.QUEUED] if row is not None and row["entering"] else []
+        state = states[job] = job_state(found)
+        if row is None:
+            continue
+        values: dict[str, Any] = {"state": state.value, "finished": None, "reason": None}
+        if state.is_final:
+            values["finished"] = connection.scalar(select(func.max(tasks.c.finished)).where(tasks.c.job_id == job))
+        if State.FAILED in found:
+            first = select(tasks.c.reason).where(tasks.c.job_id == job, tasks.c.state == State.FAILED.value)
+            values["reason"] = connection.scalar(first.order_by(tasks.c.batch, tasks.c.position).limit(1))
+        # Most often a job goes on as it was: then its row is left alone.
+        if values != {"state": row["now"], "finished": row["finished"], "reason": row["reason"]}:
+            connection.execute(update(jobs).where(jobs.c.id == job).values(**values))
+            if state.is_final and state != row["now"]:
+                about = {"kind": "job", "subject": job, "state": state.value}
+                ended.append(about | {"project": row["project"], "owner": row["owner"]})
+    # A rebuild tells nobody of what ended long ago.
+    if not connection.get_execution_options().get(QUIET):
+        note_ends(connection, ended)
+    return states

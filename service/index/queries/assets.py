@@ -8,16 +8,14 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, and_, case, or_, select, tuple_
 
+from service.index import project_scope
 from service.index.database import Database, chunks
-from service.index.dataset_views import ObjectSetView
 from service.index.project_scope import nearest_asset, seen_assets, seen_sets
-from service.index.queries import cursors
 from service.index.tables import assets, object_sets
-from service.index.views import AssetView, Page
-from service.model.errors import NotFoundError
+from service.index.views import AssetView, ObjectSetView, Page
+from service.model.errors import SEARCHED, NotFoundError, known_names
 from service.model.projects import EVERYTHING, ProjectScope
 from service.model.states import AssetKind
-from service.model.suggestions import SEARCHED, known_names
 
 
 @dataclass(frozen=True)
@@ -36,18 +34,18 @@ class Assets:
         scope: ProjectScope = EVERYTHING,
     ) -> Page[AssetView]:
         """Hands or objects, all versions, newest first; those that the check refused only where asked for."""
-        size = cursors.page_size(limit)
+        size = project_scope.page_size(limit)
         query = select(assets).where(assets.c.kind == kind.value, *seen_assets(scope))
         if not refused:
             query = query.where(_not_refused())
         query = query.order_by(assets.c.created.desc(), assets.c.digest.desc()).limit(size + 1)
         if cursor is not None:
-            query = query.where(tuple_(assets.c.created, assets.c.digest) < cursors.decode(cursor, str, str))
+            query = query.where(tuple_(assets.c.created, assets.c.digest) < project_scope.decode(cursor, str, str))
         with self.database.reading() as connection:
             rows = connection.execute(query).mappings().all()
         views = [_asset_view(row) for row in rows[:size]]
         last = views[-1] if len(rows) > size else None
-        return Page(items=views, next=last and cursors.encode(last.created, last.digest))
+        return Page(items=views, next=last and project_scope.encode(last.created, last.digest))
 
     def get(self, kind: AssetKind, name_or_digest: str, *, scope: ProjectScope = EVERYTHING) -> AssetView:
         """A hand or object by its digest, or the newest of its name that was not refused, those of the scope's own

@@ -9,21 +9,18 @@ from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, literal, select, tuple_
 
+from service.index import project_scope
 from service.index.database import Database
-from service.index.dataset_views import CellView, DatasetView, SnapshotView
 from service.index.project_scope import seen_datasets
-from service.index.queries import cursors
-from service.index.queries.outcomes import outcomes_of
+from service.index.queries.jobs import outcomes_of
 from service.index.tables import attempts, dataset_cells, dataset_snapshots, datasets, jobs, shards, tasks
-from service.index.views import Page
-from service.model.dataset_records import SnapshotShard
+from service.index.views import CellView, DatasetView, Page, SnapshotView
 from service.model.domain import JobOptions
-from service.model.errors import NotFoundError
-from service.model.outcomes import shortfall
-from service.model.planning import job_state, ranges_of, stages_of
+from service.model.errors import SEARCHED, NotFoundError, known_names
+from service.model.planning import job_state, ranges_of, shortfall, stages_of
 from service.model.projects import EVERYTHING, ProjectScope
+from service.model.records import SnapshotShard
 from service.model.states import Stage, State
-from service.model.suggestions import SEARCHED, known_names
 
 _SHARE: Final[ColumnElement[float]] = case(
     (tasks.c.state == State.SUCCEEDED.value, 1.0),
@@ -43,16 +40,16 @@ class Datasets:
         self, *, limit: int = 50, cursor: str | None = None, scope: ProjectScope = EVERYTHING
     ) -> Page[DatasetView]:
         """Datasets, newest first."""
-        size = cursors.page_size(limit)
+        size = project_scope.page_size(limit)
         query = select(datasets).where(*seen_datasets(scope))
         query = query.order_by(datasets.c.created.desc(), datasets.c.name.desc()).limit(size + 1)
         if cursor is not None:
-            query = query.where(tuple_(datasets.c.created, datasets.c.name) < cursors.decode(cursor, str, str))
+            query = query.where(tuple_(datasets.c.created, datasets.c.name) < project_scope.decode(cursor, str, str))
         with self.database.reading() as connection:
             rows = connection.execute(query).mappings().all()
             views = [_dataset_view(connection, row) for row in rows[:size]]
         last = views[-1] if len(rows) > size else None
-        return Page(items=views, next=last and cursors.encode(last.created, last.name))
+        return Page(items=views, next=last and project_scope.encode(last.created, last.name))
 
     def get(self, name: str, *, scope: ProjectScope = EVERYTHING) -> DatasetView:
         """A dataset; NotFoundError if there is none."""
@@ -85,7 +82,7 @@ class Datasets:
         scope: ProjectScope = EVERYTHING,
     ) -> Page[CellView]:
         """Cells of a dataset by their position."""
-        size = cursors.page_size(limit)
+        size = project_scope.page_size(limit)
         with self.database.reading() as connection:
             dataset = _dataset_row(connection, name, scope)
             now = _cell_state(dataset["cancelled"])
@@ -105,10 +102,10 @@ class Datasets:
             if state is not None:
                 query = query.where(now == state.value)
             if cursor is not None:
-                query = query.where(dataset_cells.c.position > cursors.decode(cursor, int)[0])
+                query = query.where(dataset_cells.c.position > project_scope.decode(cursor, int)[0])
             rows = connection.execute(query).mappings().all()
             views = _cell_views(connection, rows[:size], JobOptions.model_validate(dataset["options"]))
-        return Page(items=views, next=cursors.encode(views[-1].position) if len(rows) > size else None)
+        return Page(items=views, next=project_scope.encode(views[-1].position) if len(rows) > size else None)
 
     def shards(self, name: str) -> list[SnapshotShard]:
         """All shards of a dataset: cell by cell, batch by batch, stage by stage."""
@@ -128,17 +125,17 @@ class Datasets:
         self, name: str, *, limit: int = 50, cursor: str | None = None, scope: ProjectScope = EVERYTHING
     ) -> Page[SnapshotView]:
         """Snapshots of a dataset, newest first."""
-        size = cursors.page_size(limit)
+        size = project_scope.page_size(limit)
         key = (dataset_snapshots.c.created, dataset_snapshots.c.digest)
         query = select(dataset_snapshots).where(dataset_snapshots.c.dataset == name)
         query = query.order_by(*(part.desc() for part in key)).limit(size + 1)
         if cursor is not None:
-            query = query.where(tuple_(*key) < cursors.decode(cursor, str, str))
+            query = query.where(tuple_(*key) < project_scope.decode(cursor, str, str))
         with self.database.reading() as connection:
             _dataset_row(connection, name, scope)
             views = [SnapshotView(**row) for row in connection.execute(query).mappings()]
         last = views[size - 1] if len(views) > size else None
-        return Page(items=views[:size], next=last and cursors.encode(last.created, last.digest))
+        return Page(items=views[:size], next=last and project_scope.encode(last.created, last.digest))
 
 
 def _dataset_row(connection: Connection, name: str, scope: ProjectScope = EVERYTHING) -> Any:

@@ -1,25 +1,66 @@
-"""Queries on grasps."""
+"""Queries on grasps: their filters, and the search in the order of a metric, bounded in time at millions of rows.
+
+The choice of an index is made here and not left to the database: SQLite does not know how the values are spread, and
+takes an order's index to the end for a filter that almost nothing passes. There are three ways:
+
+1. A condition leaves few rows: its index gives them, and they are sorted.
+2. Else the rows are looked at in the wanted order, a bounded number of them, until the page is full.
+3. A filter that hardly any row passes, though many pass each of its conditions: all rows are read, once.
+
+The language that chooses grasps (`service.model.where`) is asked of the rows by `truth`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import operator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal
 
-from sqlalchemy import select, tuple_
+from pydantic import Field
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Float,
+    Select,
+    String,
+    Subquery,
+    and_,
+    exists,
+    func,
+    not_,
+    or_,
+    select,
+    tuple_,
+)
+from sqlalchemy.sql.operators import in_op, is_
 
+from service.index import project_scope
 from service.index.database import Database, chunks
-from service.index.filters import GraspFilter, GraspSort
 from service.index.project_scope import seen_shards
-from service.index.queries import cursors
-from service.index.queries.grasp_search import search, sql_conditions
-from service.index.tables import grasps
+from service.index.tables import dataset_cells, grasps, jobs, shards, tagged, tasks
 from service.index.views import GraspView, Page
-from service.model.errors import NotFoundError
+from service.model.base import Model
+from service.model.errors import InputError, NotFoundError
+from service.model.metric_fields import SortedName
+from service.model.metrics import indexed
 from service.model.projects import EVERYTHING, ProjectScope
-from service.model.tags import Grasp
+from service.model.records import Grasp
+from service.model.states import Stage
+from service.model.where import Flag, Joined, Node, Not, OfMetric, OfType, parsed
+
+Metric = SortedName
+
+
+class GraspSort(Model):
+    """Order of grasps; those without the metric come last."""
+
+    by: Metric | Literal["created"] = "epsilon"
+    descending: bool = True
+
 
 _BEST_FIRST = GraspSort()
+
 #: Grasps that one statement names: two parameters each.
 _AT_ONCE: Final = 400
 
@@ -39,13 +80,13 @@ class Grasps:
         cursor: str | None = None,
     ) -> Page[GraspView]:
         """Grasps in the order of a metric; those without it come last."""
-        size = cursors.page_size(limit)
-        start = None if cursor is None else cursors.decode(cursor, (float, int, str, type(None)), str, int)
+        size = project_scope.page_size(limit)
+        start = None if cursor is None else project_scope.decode(cursor, (float, int, str, type(None)), str, int)
         with self.database.reading() as connection:
             rows = search(connection, where, sort, size + 1, start)
         views = [_view(row) for row in rows[:size]]
         last = rows[size - 1] if len(rows) > size else None
-        return Page(items=views, next=last and cursors.encode(last[sort.by], last["shard_id"], last["row"]))
+        return Page(items=views, next=last and project_scope.encode(last[sort.by], last["shard_id"], last["row"]))
 
     def get(self, shard_id: str, row: int, *, scope: ProjectScope = EVERYTHING) -> GraspView:
         """One grasp by its shard and row; NotFoundError if there is none."""
@@ -74,3 +115,343 @@ class Grasps:
 
 def _view(row: Any) -> GraspView:
     return GraspView(**{name: row[name] for name in GraspView.model_fields})
+
+
+#: So many rows are fetched by an index and sorted in less time than all of a million are read.
+SORTED_AT_ONCE: Final = 40_000
+
+#: Rows looked at in the wanted order: a few first, since most filters fill a page from them.
+LOOKED_AT: Final = (1000, 20_000)
+
+#: Columns by name, of the table of grasps or of rows drawn from it.
+Columns = Any
+
+_METRICS: Final = frozenset(metric.name for metric in indexed())
+
+_OPERATORS: Final[dict[str, Callable[[Any, Any], ColumnElement[bool]]]] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "=": operator.eq,
+    "!=": operator.ne,
+}
+
+_FLAGS: Final[dict[str, Callable[[Columns], ColumnElement[bool]]]] = {
+    "judged": lambda grasps: grasps.success.is_not(None),
+    "valid": lambda grasps: grasps.valid.is_(True),
+    "held": lambda grasps: grasps.success.is_(True),
+    # What judges a grasp that was planned in a scene is the lift.
+    "lift": lambda grasps: and_(grasps.scene_kind != "free", grasps.success.is_(True)),
+    "lift_hard": lambda grasps: grasps.lift_hard.is_(True),
+}
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A test of one column. Conditions of one group are served by one index."""
+
+    group: str
+    column: ColumnElement[Any]
+    operator: Callable[[Any, Any], Any]
+    value: Any
+
+    def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
+        """The test; of a group that is not listed in a form that no index serves (None: all are)."""
+        return self._of(self.column if groups is None or self.group in groups else _plain(self.column))
+
+    def on(self, rows: Subquery) -> ColumnElement[bool]:
+        """The same test of grasps that were drawn from the table."""
+        return self._of(rows.c[str(self.column.key)])
+
+    def _of(self, column: ColumnElement[Any]) -> ColumnElement[bool]:
+        test: ColumnElement[bool] = self.operator(column, self.value)
+        return test
+
+
+@dataclass(frozen=True)
+class Tagged:
+    """Grasps that have a tag."""
+
+    tag: str
+    group: str = "tag"
+
+    def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
+        if groups is not None and self.group not in groups:
+            return self._of(grasps.c)
+        those = select(tagged.c.shard_id, tagged.c.row).where(tagged.c.tag == self.tag)
+        return tuple_(grasps.c.shard_id, grasps.c.row).in_(those)
+
+    def on(self, rows: Subquery) -> ColumnElement[bool]:
+        return self._of(rows.c)
+
+    def _of(self, columns: Any) -> ColumnElement[bool]:
+        same = (tagged.c.tag == self.tag, tagged.c.shard_id == columns.shard_id, tagged.c.row == columns.row)
+        return exists().where(*same)
+
+
+@dataclass(frozen=True)
+class Where:
+    """Grasps of which an expression is true; it is served by no index."""
+
+    node: Node
+    group: str = "flag"
+
+    def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
+        return truth(self.node, grasps.c)
+
+    def on(self, rows: Subquery) -> ColumnElement[bool]:
+        return truth(self.node, rows.c)
+
+
+Test = Condition | Tagged | Where
+
+
+def conditions(where: GraspFilter | None) -> list[Test]:
+    """A filter as conditions that all must hold.
+
+    Raises:
+        InputError: its expression is none, or asks for what the index does not hold.
+    """
+    where = where or GraspFilter()
+    found: list[Test] = []
+    if where.shard is not None:
+        found.append(Condition("shard", grasps.c.shard_id, operator.eq, where.shard))
+    if where.job is not None:
+        of_job = (tasks.c.job_id == where.job, tasks.c.stage == Stage.SYNTHESIZE.value)
+        found.append(Condition("job", grasps.c.shard_id, in_op, select(tasks.c.shard_id).where(*of_job)))
+    if where.dataset is not None:
+        made = _of_dataset(where.dataset).with_only_columns(tasks.c.shard_id)
+        found.append(Condition("dataset", grasps.c.shard_id, in_op, made))
+    if where.tag is not None:
+        found.append(Tagged(where.tag))
+    if where.where is not None:
+        found.append(Where(parsed(where.where)))
+    if where.project is not None:
+        found.append(
+            Condition(
+                "project", grasps.c.shard_id, in_op, _of_project(where.project).with_only_columns(tasks.c.shard_id)
+            )
+        )
+    for name, wanted in (("hand", where.hand), ("object", where.object)):
+        if wanted is not None:
+            found.append(Condition("pair", grasps.c[name], operator.eq, wanted))
+    flags = {name: getattr(where, name) for name in ("valid", "success", "lift_hard")}
+    found += [Condition("flag", grasps.c[name], is_, flag) for name, flag in flags.items() if flag is not None]
+    # What nobody judged was not rejected.
+    judged = True if where.valid is False else where.judged
+    if judged is not None:
+        found.append(Condition("flag", grasps.c.success, operator.ne if judged else operator.eq, None))
+    if where.scene is not None:
+        anyone = where.scene == "any"
+        compared, kind = (operator.ne, "free") if anyone else (operator.eq, where.scene)
+        found.append(Condition("flag", grasps.c.scene_kind, compared, kind))
+    if where.robust_weakest is not None:
+        found.append(Condition("flag", grasps.c.robust_weakest, operator.eq, where.robust_weakest))
+    if where.neighbours is not None:
+        found.append(Condition("flag", grasps.c.neighbours, operator.gt if where.neighbours else operator.eq, 0))
+    found += [Condition(name, grasps.c[name], operator.ge, bound) for name, bound in where.at_least.items()]
+    found += [Condition(name, grasps.c[name], operator.le, bound) for name, bound in where.at_most.items()]
+    return found
+
+
+def sql_conditions(where: GraspFilter | None) -> list[ColumnElement[bool]]:
+    """A filter in SQL; the database chooses the index."""
+    return [condition.sql(None) for condition in conditions(where)]
+
+
+def search(
+    connection: Connection, where: GraspFilter | None, sort: GraspSort, size: int, start: tuple[Any, ...] | None
+) -> list[Any]:
+    """The first `size` rows behind a position; rows without the metric come last.
+
+    Args:
+        start: metric, shard id and row of the last grasp before.
+    """
+    wanted = conditions(where)
+    few = _few(connection, where, wanted)
+    rows: list[Any] = []
+    # Databases differ on where NULL sorts, so rows with the metric and rows without are two queries.
+    if start is None or start[0] is not None:
+        rows = _with_metric(connection, wanted, few, sort, size, start)
+    if len(rows) < size:
+        by = grasps.c[sort.by]
+        query = select(grasps).where(by.is_(None), *(c.sql([few] if few else None) for c in wanted))
+        after = start[1:] if start is not None and start[0] is None else None
+        key = (grasps.c.shard_id, grasps.c.row)
+        rows += connection.execute(_slice(query, key, sort, size - len(rows), after)).mappings()
+    return rows
+
+
+def _with_metric(
+    connection: Connection,
+    wanted: Sequence[Test],
+    few: str | None,
+    sort: GraspSort,
+    size: int,
+    start: tuple[Any, ...] | None,
+) -> list[Any]:
+    by = grasps.c[sort.by]
+    if few is not None and few != sort.by:
+        return _sorted(connection, [c.sql([few]) for c in wanted], sort, size, start)
+    # An index of the order may serve some conditions besides: those of its own metric, or of hand and object.
+    served = [sort.by, "pair"] if sort.by == "epsilon" else [sort.by]
+    inside = [c.sql(served) for c in wanted if c.group in served]
+    outside = [c for c in wanted if c.group not in served]
+    ordered = select(grasps).where(by.is_not(None), *inside)
+    key = (by, grasps.c.shard_id, grasps.c.row)
+    if not outside:
+        return list(connection.execute(_slice(ordered, key, sort, size, start)).mappings())
+    for number in LOOKED_AT:
+        looked = _slice(ordered, key, sort, number, start).subquery()
+        query = select(looked).where(*(c.on(looked) for c in outside))
+        same_key = tuple(looked.c[str(column.key)] for column in key)
+        rows = list(connection.execute(_slice(query, same_key, sort, size, None)).mappings())
+        if len(rows) >= size or _count(connection, looked) < number:
+            return rows
+    # PostgreSQL can join indexes; SQLite would follow one of them row by row, which takes longer than to read all.
+    groups: list[str] | None = None if connection.dialect.name == "postgresql" else []
+    return _sorted(connection, [c.sql(groups) for c in wanted], sort, size, start)
+
+
+def _sorted(
+    connection: Connection,
+    tests: Sequence[ColumnElement[bool]],
+    sort: GraspSort,
+    size: int,
+    start: tuple[Any, ...] | None,
+) -> list[Any]:
+    """Rows that pass, sorted without the order's index."""
+    by = _plain(grasps.c[sort.by])
+    query = select(grasps).where(by.is_not(None), *tests)
+    return list(connection.execute(_slice(query, (by, grasps.c.shard_id, grasps.c.row), sort, size, start)).mappings())
+
+
+def _few(connection: Connection, where: GraspFilter | None, wanted: Sequence[Test]) -> str | None:
+    """The group of conditions that leaves the fewest rows, if these can be sorted at once."""
+    numbers: dict[str, int] = {}
+    for group in dict.fromkeys(condition.group for condition in wanted):
+        if group == "shard":
+            return group
+        if group != "flag":
+            numbers[group] = _number(connection, where or GraspFilter(), group, wanted)
+    few = min(numbers, key=lambda name: numbers[name], default=None)
+    return few if few is not None and numbers[few] <= SORTED_AT_ONCE else None
+
+
+def _number(connection: Connection, where: GraspFilter, group: str, wanted: Sequence[Test]) -> int:
+    """Rows that pass the conditions of a group; of a metric's no more are counted than matter."""
+    query: Select[Any]
+    if group == "job":
+        query = select(func.sum(tasks.c.count)).where(
+            tasks.c.job_id == where.job, tasks.c.stage == Stage.SYNTHESIZE.value
+        )
+    elif group == "project":
+        query = _of_project(where.project or "").with_only_columns(func.sum(tasks.c.count))
+    elif group == "dataset":
+        query = _of_dataset(where.dataset or "").with_only_columns(func.sum(tasks.c.count))
+    elif group == "tag":
+        query = select(func.count()).where(tagged.c.tag == where.tag)
+    elif group == "pair":
+        pair = {"hand": where.hand, "object": where.object}
+        tests = [shards.c[name] == value for name, value in pair.items() if value is not None]
+        query = select(func.sum(shards.c.count)).where(shards.c.kind == "base", *tests)
+    else:
+        some = select(grasps.c[group]).where(*(c.sql(None) for c in wanted if c.group == group))
+        return _count(connection, some.limit(SORTED_AT_ONCE + 1).subquery())
+    return int(connection.scalar(query) or 0)
+
+
+def _of_project(project: str) -> Select[Any]:
+    """Tasks that make grasps for the jobs of a project."""
+    joined = select(tasks.c.id).join(jobs, jobs.c.id == tasks.c.job_id)
+    return joined.where(jobs.c.project == project, tasks.c.stage == Stage.SYNTHESIZE.value)
+
+
+def _of_dataset(dataset: str) -> Select[Any]:
+    """Tasks that make grasps for the cells of a dataset."""
+    joined = select(tasks.c.id).join(dataset_cells, dataset_cells.c.job_id == tasks.c.job_id)
+    return joined.where(dataset_cells.c.dataset == dataset, tasks.c.stage == Stage.SYNTHESIZE.value)
+
+
+def _count(connection: Connection, rows: Subquery) -> int:
+    return int(connection.scalar(select(func.count()).select_from(rows)) or 0)
+
+
+def _slice(
+    query: Select[Any], key: tuple[ColumnElement[Any], ...], sort: GraspSort, size: int, start: tuple[Any, ...] | None
+) -> Select[Any]:
+    if start is not None:
+        position = tuple_(*key)
+        query = query.where(position < start if sort.descending else position > start)
+    return query.order_by(*(part.desc() if sort.descending else part for part in key)).limit(size)
+
+
+def _plain(column: ColumnElement[Any]) -> ColumnElement[Any]:
+    """The same value in a form that no index is on."""
+    if isinstance(column.type, Float):
+        return column + 0.0
+    return column.concat("") if isinstance(column.type, String) else column
+
+
+def truth(node: Node, grasps: Columns) -> ColumnElement[bool]:
+    """An expression in SQL: true or false of each row, never unknown, so that `not` is what is not so.
+
+    Raises:
+        InputError: it asks for what the index does not hold.
+    """
+    if isinstance(node, Joined):
+        return (or_ if node.word == "or" else and_)(*(truth(part, grasps) for part in node.parts))
+    if isinstance(node, Not):
+        return not_(truth(node.part, grasps))
+    if isinstance(node, Flag):
+        if node.name not in _FLAGS:
+            raise _unknown(node.name)
+        # A test for truth is false of NULL.
+        return _FLAGS[node.name](grasps)
+    if isinstance(node, OfMetric):
+        if node.name not in _METRICS:
+            raise _unknown(node.name)
+        return _known(grasps[node.name], node.op, node.bound)
+    if isinstance(node, OfType):
+        return _known(grasps.grasp_type, node.op, int(node.kind))
+    return _OPERATORS[node.op](grasps[node.name], node.word)
+
+
+def _known(column: Any, op: str, value: float) -> ColumnElement[bool]:
+    return and_(column.is_not(None), _OPERATORS[op](column, value))
+
+
+def _unknown(name: str) -> InputError:
+    return InputError(f"the index does not hold {name!r}, the shards do: `graspd grasps where` reads them")
+
+
+class GraspFilter(Model):
+    """All conditions hold at once. `at_least` and `at_most` bound metrics, inclusive; a missing value never matches."""
+
+    hand: str | None = None
+    object: str | None = None
+    job: str | None = None
+    shard: str | None = None
+    dataset: str | None = None
+    """Of its cells."""
+    tag: str | None = None
+    """Id of a tag that they have."""
+    where: str | None = None
+    """An expression of `service.model.where`."""
+    project: str | None = None
+    """Of whose jobs; None: of everybody's."""
+    judged: bool | None = None
+    """Whether the referee gave a verdict."""
+    valid: bool | None = None
+    """False: judged, and not valid."""
+    success: bool | None = None
+    scene: str | None = None
+    """Kind of the scene that it was planned in; any: whichever, but not free."""
+    neighbours: bool | None = None
+    """Whether other objects stood in that scene."""
+    lift_hard: bool | None = None
+    robust_weakest: str | None = None
+    """Axis of the first model in which it does not hold."""
+    at_least: dict[Metric, float] = Field(default_factory=dict)
+    at_most: dict[Metric, float] = Field(default_factory=dict)

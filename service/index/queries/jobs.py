@@ -1,22 +1,24 @@
-"""Queries on jobs, tasks and attempts."""
+"""Queries on jobs, tasks and attempts, and the outcomes of a job's candidates.
+
+Queries on shards.
+"""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final, Literal
 
 from sqlalchemy import ColumnElement, Connection, Float, and_, case, cast, func, select, tuple_
 
+from service.index import project_scope
 from service.index.database import Database, chunks
-from service.index.project_scope import seen_jobs, seen_tasks
-from service.index.queries import cursors
-from service.index.queries.outcomes import outcomes_of
+from service.index.project_scope import seen_jobs, seen_shards, seen_tasks
 from service.index.tables import attempts, jobs, shards, tasks
-from service.index.views import AttemptView, JobView, Page, StageProgress, TaskView
+from service.index.views import AttemptView, JobView, Page, ShardView, StageProgress, TaskView
 from service.model.errors import NotFoundError
-from service.model.planning import ranges_of
+from service.model.planning import ranges_of, totals
 from service.model.projects import EVERYTHING, ProjectScope
 from service.model.states import Stage, State
 
@@ -38,17 +40,17 @@ class Jobs:
         scope: ProjectScope = EVERYTHING,
     ) -> Page[JobView]:
         """Jobs, newest first."""
-        size = cursors.page_size(limit)
+        size = project_scope.page_size(limit)
         query = select(jobs).where(*seen_jobs(scope)).order_by(jobs.c.created.desc(), jobs.c.id.desc()).limit(size + 1)
         for column, wanted in ((jobs.c.state, state), (jobs.c.hand, hand), (jobs.c.object, object)):
             if wanted is not None:
                 query = query.where(column == wanted)
         if cursor is not None:
-            query = query.where(tuple_(jobs.c.created, jobs.c.id) < cursors.decode(cursor, str, str))
+            query = query.where(tuple_(jobs.c.created, jobs.c.id) < project_scope.decode(cursor, str, str))
         with self.database.reading() as connection:
             rows = connection.execute(query).mappings().all()
             views = _job_views(connection, rows[:size])
-        last = cursors.encode(views[-1].created, views[-1].id) if len(rows) > size else None
+        last = project_scope.encode(views[-1].created, views[-1].id) if len(rows) > size else None
         return Page(items=views, next=last)
 
     def get(self, job_id: str, *, scope: ProjectScope = EVERYTHING) -> JobView:
@@ -81,19 +83,19 @@ class Jobs:
         cursor: str | None = None,
     ) -> Page[TaskView]:
         """Tasks by job, batch and stage."""
-        size = cursors.page_size(limit)
+        size = project_scope.page_size(limit)
         key = (tasks.c.job_id, tasks.c.batch, tasks.c.position)
         query = select(tasks).order_by(*key).limit(size + 1)
         for column, wanted in ((tasks.c.job_id, job), (tasks.c.stage, stage), (tasks.c.state, state)):
             if wanted is not None:
                 query = query.where(column == wanted)
         if cursor is not None:
-            query = query.where(tuple_(*key) > cursors.decode(cursor, str, int, int))
+            query = query.where(tuple_(*key) > project_scope.decode(cursor, str, int, int))
         with self.database.reading() as connection:
             rows = connection.execute(query).mappings().all()
         views = [_task_view(row) for row in rows[:size]]
         last = rows[size - 1] if len(rows) > size else None
-        return Page(items=views, next=last and cursors.encode(last["job_id"], last["batch"], last["position"]))
+        return Page(items=views, next=last and project_scope.encode(last["job_id"], last["batch"], last["position"]))
 
     def task(self, task_id: str, *, scope: ProjectScope = EVERYTHING) -> TaskView:
         """A task; NotFoundError if there is none."""
@@ -121,7 +123,7 @@ class Jobs:
         if task is not None:
             query = query.where(attempts.c.task_id == task)
         with self.database.reading() as connection:
-            rows = connection.execute(query.limit(cursors.page_size(limit))).mappings().all()
+            rows = connection.execute(query.limit(project_scope.page_size(limit))).mappings().all()
         return [AttemptView(**{name: row[name] for name in AttemptView.model_fields}) for row in rows]
 
 
@@ -215,3 +217,84 @@ def _task_view(row: Any) -> TaskView:
         seconds=row["seconds"],
         finished=row["finished"],
     )
+
+
+#: Shards that are read at most: enough to say why, and a page stays quick.
+MOST_SHARDS: Final = 1000
+
+
+def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool]) -> dict[str, int]:
+    """Candidates that were not kept, by outcome, in the first `MOST_SHARDS` shards of the jobs whose tasks fit."""
+    query = (
+        select(shards.c.manifest["info"]["outcomes"])
+        .join(tasks, tasks.c.shard_id == shards.c.id)
+        .where(of_jobs, tasks.c.stage == Stage.SYNTHESIZE.value)
+        .limit(MOST_SHARDS)
+    )
+    return totals(one for one in connection.scalars(query) if isinstance(one, dict))
+
+
+@dataclass(frozen=True)
+class Shards:
+    """Reads on shards."""
+
+    database: Database
+
+    def page(
+        self,
+        *,
+        job: str | None = None,
+        kind: Literal["base", "scene", "views"] | None = None,
+        hand: str | None = None,
+        object: str | None = None,
+        limit: int = 50,
+        cursor: str | None = None,
+        scope: ProjectScope = EVERYTHING,
+    ) -> Page[ShardView]:
+        """Shards, newest first, without their manifests."""
+        size = project_scope.page_size(limit)
+        query = (
+            select(shards)
+            .where(*seen_shards(scope, shards.c.id))
+            .order_by(shards.c.created.desc(), shards.c.id.desc())
+            .limit(size + 1)
+        )
+        for column, wanted in ((shards.c.kind, kind), (shards.c.hand, hand), (shards.c.object, object)):
+            if wanted is not None:
+                query = query.where(column == wanted)
+        if job is not None:
+            query = query.where(shards.c.id.in_(select(tasks.c.shard_id).where(tasks.c.job_id == job)))
+        if cursor is not None:
+            query = query.where(tuple_(shards.c.created, shards.c.id) < project_scope.decode(cursor, str, str))
+        with self.database.reading() as connection:
+            rows = connection.execute(query).mappings().all()
+        views = [_shard_view(row, whole=False) for row in rows[:size]]
+        last = views[-1] if len(rows) > size else None
+        return Page(items=views, next=last and project_scope.encode(last.created, last.id))
+
+    def assets_of(self, ids: Collection[str]) -> dict[str, tuple[str, str]]:
+        """Digests of hand and object of each of these shards."""
+        query = select(shards.c.id, shards.c.hand_digest, shards.c.object_digest).where(shards.c.id.in_(ids))
+        with self.database.reading() as connection:
+            return {shard: (hand, obj) for shard, hand, obj in connection.execute(query)}
+
+    def job_of(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> str | None:
+        """A job in scope that wanted this shard; several may, and a pruned index may know none."""
+        with self.database.reading() as connection:
+            query = select(tasks.c.job_id).where(tasks.c.shard_id == shard_id, *seen_tasks(scope)).limit(1)
+            found: str | None = connection.scalar(query)
+        return found
+
+    def get(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> ShardView:
+        """A shard with its manifest; NotFoundError if there is none."""
+        with self.database.reading() as connection:
+            seen = seen_shards(scope, shards.c.id)
+            row = connection.execute(select(shards).where(shards.c.id == shard_id, *seen)).mappings().first()
+        if row is None:
+            raise NotFoundError(f"there is no shard {shard_id!r}")
+        return _shard_view(row, whole=True)
+
+
+def _shard_view(row: Any, *, whole: bool) -> ShardView:
+    values = {name: row[name] for name in ShardView.model_fields if name != "manifest"}
+    return ShardView(**values, manifest=row["manifest"] if whole else {})

@@ -1,19 +1,21 @@
-"""Queries on workers and the service as a whole."""
+"""Queries on workers and the service as a whole; those of a scrape have a bound that does not grow with the index."""
 
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Select, and_, case, func, select
 
+from service.index import project_scope
 from service.index.database import Database
 from service.index.project_scope import seen_attempts, seen_jobs, seen_shards, seen_tasks
-from service.index.queries import cursors
-from service.index.tables import attempts, jobs, shards, tasks, workers
+from service.index.tables import attempts, damage, jobs, shards, tasks, workers
 from service.index.views import FailureGroup, MatrixCell, Stats, Throughput, WorkerView
+from service.model.clock import age_of
 from service.model.projects import EVERYTHING, ProjectScope
 from service.model.states import State
 
@@ -91,7 +93,7 @@ class Overview:
             .where(*seen)
             .group_by(attempts.c.stage, attempts.c.kind)
             .order_by(count.desc(), newest.desc())
-            .limit(cursors.page_size(limit))
+            .limit(project_scope.page_size(limit))
         )
         groups = []
         with self.database.reading() as connection:
@@ -139,9 +141,12 @@ class Overview:
 
 
 _CELL: Final = ("jobs", "queued", "running", "failed", "grasps", "valid", "tried", "judged")
+
 #: Seconds of an interval, and how many characters of a time tell such intervals apart.
 _UNITS: Final = ((3600, 13), (60, 16), (1, 19))
+
 _REST_OF_TIME: Final = "0000-00-00T00:00:00Z"
+
 _MADE = (func.sum(shards.c.count), func.sum(shards.c.valid), func.sum(shards.c.tried), func.sum(shards.c.judged))
 
 
@@ -160,3 +165,60 @@ def _bucket(created: str, bucket_s: int) -> str:
     return (
         datetime.fromtimestamp(seconds - seconds % bucket_s, UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
     )
+
+
+#: Unfinished jobs are counted up to here.
+MOST_JOBS: Final = 10_000
+
+RATE_WINDOW_S: Final = 60
+
+UNFINISHED: Final = (State.QUEUED, State.RUNNING)
+
+
+@dataclass(frozen=True)
+class IndexNow:
+    """Unfinished jobs, and what was made in the last minute."""
+
+    jobs: Mapping[State, int]
+    oldest_s: Mapping[State, float]
+    grasps_per_s: float
+    valid_per_s: float
+    damaged: int
+    """Objects of the store that are known to be damaged or missing, counted up to `MOST_JOBS`."""
+
+
+def read_index(database: Database) -> IndexNow:
+    """Unfinished jobs up to `MOST_JOBS`, the oldest of each state, and the shards of the last minute."""
+    since = datetime.now(UTC) - timedelta(seconds=RATE_WINDOW_S)
+    counted, oldest = {}, {}
+    with database.reading() as connection:
+        for state in UNFINISHED:
+            counted[state] = int(connection.scalar(count_jobs(state)) or 0)
+            first = connection.scalar(oldest_job(state))
+            oldest[state] = (first and age_of(first)) or 0.0
+        damaged = int(connection.scalar(count_damage()) or 0)
+        made, valid = connection.execute(made_since(since)).one()
+    return IndexNow(counted, oldest, int(made or 0) / RATE_WINDOW_S, int(valid or 0) / RATE_WINDOW_S, damaged)
+
+
+def count_jobs(state: State) -> Select[Any]:
+    """Number of jobs in a state, up to `MOST_JOBS`."""
+    some = select(jobs.c.id).where(jobs.c.state == state.value).limit(MOST_JOBS).subquery()
+    return select(func.count()).select_from(some)
+
+
+def count_damage() -> Select[Any]:
+    """Number of damaged objects, up to `MOST_JOBS`."""
+    return select(func.count()).select_from(select(damage.c.key).limit(MOST_JOBS).subquery())
+
+
+def oldest_job(state: State) -> Select[Any]:
+    """When the oldest job in a state was submitted."""
+    return select(jobs.c.created).where(jobs.c.state == state.value).order_by(jobs.c.created).limit(1)
+
+
+def made_since(when: datetime) -> Select[Any]:
+    """Grasps and valid grasps of the base shards made since."""
+    text = when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    base = (shards.c.kind == "base", shards.c.created >= text)
+    return select(func.sum(shards.c.count), func.sum(shards.c.valid)).where(*base)

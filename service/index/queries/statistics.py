@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from sqlalchemy import ColumnElement, Connection, Integer, cast, func, select
 
 from service.index.database import Database
-from service.index.filters import GraspFilter, Metric
-from service.index.queries.grasp_search import conditions, sql_conditions
+from service.index.queries.grasps import GraspFilter, Metric, conditions, sql_conditions
 from service.index.tables import dataset_cells, grasps, shards, tasks
 
 

@@ -1,17 +1,21 @@
-"""What projects used, day by day."""
+"""Queries on usage: what projects used day by day, and what finished batches cost."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from sqlalchemy import ColumnElement, case, func, select
 
 from service.index.database import Database
+from service.index.project_scope import seen_shards
 from service.index.tables import shards, spent
 from service.index.views import UsageDay
+from service.model.domain import JobRequest
+from service.model.names import SHARD_KINDS
 from service.model.projects import EVERYTHING, ProjectScope
+from service.model.states import Stage
 
 
 @dataclass(frozen=True)
@@ -77,3 +81,48 @@ def _seconds_on(device: str) -> str:
 
 def _number(day: str) -> int:
     return int(day.replace("-", ""))
+
+
+#: Tasks looked at of each stage, the newest first: what a machine did long ago says less.
+_NEWEST: Final = 2000
+
+
+@dataclass(frozen=True)
+class BatchCost:
+    """The finished batches of a task: what was asked, what they took, what came out."""
+
+    hand: str
+    object: str
+    device: str
+    request: JobRequest
+    seconds: float
+    count: int
+    valid: int
+    tried: int
+    size_bytes: int
+    batches: int = 1
+
+    @property
+    def kept(self) -> int:
+        """Grasps that count towards those asked for: valid ones, or where nobody judged all that stayed."""
+        return self.valid if self.request.counted == "valid" else self.count
+
+
+@dataclass(frozen=True)
+class Costs:
+    """Reads on costs."""
+
+    database: Database
+
+    def of_batches(self, stage: Stage, *, limit: int = _NEWEST, scope: ProjectScope = EVERYTHING) -> list[BatchCost]:
+        """The newest finished batches of a stage, those of at most `limit` tasks."""
+        columns = [shards.c[name] for name in BatchCost.__dataclass_fields__ if name != "request"]
+        query = (
+            select(*columns, shards.c.manifest["request"].label("request"))
+            .where(shards.c.kind == SHARD_KINDS[stage], *seen_shards(scope, shards.c.id))
+            .order_by(shards.c.created.desc(), shards.c.id.desc())
+            .limit(limit)
+        )
+        with self.database.reading() as connection:
+            rows = connection.execute(query).mappings().all()
+        return [BatchCost(**{**row, "request": JobRequest.model_validate(row["request"])}) for row in rows]

@@ -7,24 +7,30 @@ from typing import Literal
 
 from sqlalchemy import Connection
 
-from service.index.dataset_views import DatasetView, ObjectSetView
+from service.index.views import DatasetView, ObjectSetView
 from service.model import names
 from service.model.clock import timestamp
-from service.model.dataset_records import DatasetRecord, Member, ObjectSet, Snapshot, object_set_of
 from service.model.digests import digest_json
 from service.model.domain import JobOptions
 from service.model.errors import ConflictError, InputError, LimitError, NotFoundError
 from service.model.projects import EVERYTHING, ProjectScope
-from service.model.scene_options import NamedNeighbour, SceneDocument
+from service.model.records import DatasetRecord, Member, ObjectSet, Snapshot, object_set_of
+from service.model.scene_spec import NamedNeighbour, SceneDocument
 from service.model.states import AssetKind, State
 from service.pipeline.backends import Services
 from service.pipeline.datasets.spec import MAX_CELLS, DatasetRequest, Matrix, describe
 from service.pipeline.fidelity_choice import Resolver
 from service.pipeline.recording import recording
 from service.pipeline.usable import usable, with_neighbours, with_network
-from service.store.datasets import add_dataset_event, dataset_events, load_dataset, load_snapshot
-from service.store.deletions import refuse_pending
-from service.store.records import Put, read_record
+from service.store.records import (
+    Put,
+    add_dataset_event,
+    dataset_events,
+    load_dataset,
+    load_snapshot,
+    read_record,
+    refuse_pending,
+)
 
 
 def create(

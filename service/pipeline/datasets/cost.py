@@ -18,12 +18,12 @@ from functools import partial
 from typing import Final
 
 from service.index.index import Index
-from service.index.queries.costs import BatchCost
-from service.model.dataset_records import request_of
+from service.index.queries.usage import BatchCost
 from service.model.domain import BATCH_SIZE, JobOptions, JobRequest
 from service.model.errors import LimitError
 from service.model.planning import stages_of
 from service.model.projects import EVERYTHING, ProjectScope
+from service.model.records import request_of
 from service.model.states import AssetKind, Stage
 from service.pipeline.datasets.estimate import Estimate, RateUsed, WorkersPlan
 from service.pipeline.datasets.spec import MAX_CELLS, Matrix

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
-from service.model.dataset_records import Snapshot, SnapshotShard
 from service.model.errors import InputError
+from service.model.records import Snapshot, SnapshotShard
 from service.store.integrity import check_digest
 
 #: Bytes of a shard, in chunks: from the API or from the store.

@@ -11,9 +11,9 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from service.index.queries.dataset_feed import DatasetWork
-from service.model.dataset_records import job_of
+from service.index.queries.feed import DatasetWork
 from service.model.errors import ConflictError
+from service.model.records import job_of
 from service.model.states import State
 from service.pipeline import job_actions
 from service.pipeline.backends import Services

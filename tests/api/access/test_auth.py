@@ -13,7 +13,7 @@ from starlette.testclient import TestClient
 
 from api.access.keys import KeyFile, KeyLimits, Scope
 from api.app import create_app
-from api.client.key_commands import duration
+from api.client.access_commands import duration
 from service.model.errors import ConflictError, InputError, NotFoundError, QueueUnavailable
 from service.pipeline.backends import Services
 from service.settings import Settings

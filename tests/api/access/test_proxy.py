@@ -11,9 +11,8 @@ import pytest
 from pydantic import SecretStr
 from starlette.testclient import TestClient
 
-from api.access.auth import SESSION_COOKIE
+from api.access.auth import SESSION_COOKIE, Proxy
 from api.access.keys import KeyFile, Scope
-from api.access.proxy import Proxy
 from api.app import create_app
 from service.model.errors import InputError, UnavailableError
 from service.pipeline.backends import Services

@@ -18,9 +18,8 @@ from api.access.quotas import Quotas
 from api.app import create_app
 from service.index.rebuild import differences
 from service.model import names
-from service.model.dataset_records import ObjectSet, object_set_of
 from service.model.errors import ConflictError, QuotaError
-from service.model.records import JobRecord
+from service.model.records import JobRecord, ObjectSet, object_set_of
 from service.model.webhooks import MOST_HOOKS
 from service.pipeline.backends import Services
 from service.pipeline.datasets.rounds import DatasetRounds

@@ -7,8 +7,8 @@ import io
 import pytest
 from rich.console import Console
 
-from api.catalog.progress import Paces, eta_of_job, stage_statuses
-from api.client.watching import JobDisplay
+from api.catalog.jobs import Paces, eta_of_job, stage_statuses
+from api.client.reports import JobDisplay
 from api.formatting import duration, metric, percent, size
 from api.models import Job
 from service.index.views import JobView, StageProgress, TaskView

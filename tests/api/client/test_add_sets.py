@@ -10,7 +10,7 @@ import typer
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from api.client import add_sets
+from api.client import add_commands
 from api.client.add_commands import add_object
 from api.client.client import Client
 from service.model.errors import InputError
@@ -37,7 +37,7 @@ def add(monkeypatch: pytest.MonkeyPatch, http: TestClient, *arguments: str) -> t
     client = Client("http://127.0.0.1:8000")
     client._http = http
     monkeypatch.setattr(client, "close", lambda: None)
-    monkeypatch.setattr(add_sets, "open_client", lambda url: client)
+    monkeypatch.setattr(add_commands, "open_client", lambda url: client)
     app = typer.Typer()
     app.command()(add_object)
     result = CliRunner().invoke(app, [*arguments, "--no-wait", "--json"])

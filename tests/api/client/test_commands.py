@@ -26,8 +26,8 @@ from service.run.supervisor import Supervisor
 from service.settings import Settings
 from service.store.library import load_asset_files
 from service.store.network_file import to_bytes
+from service.store.records import publish
 from service.store.store import open_store
-from service.store.study_records import publish
 from tests.networks import random_network
 from tests.service.pipeline.test_fidelity_choice import scene_chart
 from tests.waiting import PATIENCE_S

@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from api.client.dataset_reports import print_cells, print_dataset, print_estimate
+from api.client.reports import print_cells, print_dataset, print_estimate
 from service.model.domain import JobOptions
 from service.pipeline.backends import Services
 from service.pipeline.datasets import actions

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from api.client.dataset_specs import Wanted, read_spec, wanted
+from api.client.job_options import Wanted, read_spec, wanted
 from service.model.errors import InputError
 from service.pipeline.datasets.spec import MAX_CELLS
 

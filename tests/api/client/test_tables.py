@@ -11,7 +11,7 @@ import pytest
 from rich.progress import Progress
 from typer.testing import CliRunner
 
-from api.client.watching import JobDisplay
+from api.client.reports import JobDisplay
 from graspd.cli import build
 from service.cli import plain_console, plain_table
 from service.model.domain import JobOptions
@@ -84,7 +84,7 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
     def opened(_: str | None) -> Iterator[Service]:
         yield Service()
 
-    for module in ("commands", "dataset_commands", "tag_commands", "webhook_commands"):
+    for module in ("commands", "dataset_commands", "tag_commands", "access_commands"):
         monkeypatch.setattr(f"api.client.{module}.open_client", opened)
 
     def run(*arguments: str) -> list[str]:

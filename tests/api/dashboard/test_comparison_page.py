@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 from starlette.testclient import TestClient
 
-from api.catalog.comparison import Comparisons, Pair
-from api.catalog.datasets import Datasets
-from service.index.filters import GraspFilter
+from api.catalog.datasets import Comparisons, Datasets, Pair
+from service.index.queries.grasps import GraspFilter
 from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
@@ -71,7 +70,7 @@ def test_a_cell_that_only_one_has_makes_no_difference() -> None:
 
 def test_more_cells_than_anybody_reads_are_left_out(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
     _two(services)
-    monkeypatch.setattr("api.catalog.comparison.MOST_CELLS", 1)
+    monkeypatch.setattr("api.catalog.datasets.MOST_CELLS", 1)
     datasets = Datasets(services, None)  # type: ignore[arg-type]
     assert Comparisons(services, datasets).of("rough", "fine").pairs == []
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from starlette.testclient import TestClient
 
-from api.dashboard.figures.matrix import of_service
+from api.dashboard.figures import of_service
 from service.index.views import MatrixCell
 from service.model.states import State
 from service.pipeline.backends import Services

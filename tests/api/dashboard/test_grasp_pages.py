@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 from starlette.testclient import TestClient
 
-from api.catalog.grasp_files import OUTCOMES, judged_by
-from service.model.robust import MEANINGS, Axis
+from api.catalog.grasps import OUTCOMES, judged_by
+from service.model.metrics import AXIS_MEANINGS, Axis
 from service.pipeline.backends import Services
 from service.store.shards import Shard, read_shard
 from tests.api.factories import JOINTS, add_job, finish_all
@@ -129,7 +129,7 @@ def test_robust_grasps_are_found_by_their_share_and_by_what_they_fail_of_first(
     assert found(robust_weakest="friction") == set(np.flatnonzero(weakest == Axis.FRICTION).tolist())
     assert http.get("/v1/grasps", params={"robust_weakest": "luck"}).status_code == 422
     page = http.get(f"/grasps/{manifest.shard_id}/{row}").text
-    assert "Models survived" in page and f"first lost to {MEANINGS[Axis(int(weakest[row]))]}" in page
+    assert "Models survived" in page and f"first lost to {AXIS_MEANINGS[Axis(int(weakest[row]))]}" in page
     listed = http.get("/grasps", params={"min_robust_share": 0.75, "view": "table"}).text
     assert 'name="min_robust_share"' in listed and "Fails first along" in listed
 

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 from starlette.testclient import TestClient
 
-from service.index.damage import Damage
 from service.index.database import Database
+from service.index.notes import Damage
 from service.index.queries.jobs import Jobs
 from service.index.queries.overview import Overview
 from service.model.errors import IndexUnavailable, QueueUnavailable

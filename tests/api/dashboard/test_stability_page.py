@@ -7,10 +7,10 @@ import math
 import pytest
 from starlette.testclient import TestClient
 
-from api.dashboard.figures.stability import PITCH, draw
-from service.model.stability import MapCell, Outcome, Stability, StabilityMap
+from api.dashboard.figures import PITCH, draw
+from service.model.studies import MapCell, Outcome, Stability, StabilityMap
 from service.pipeline.backends import Services
-from service.store.study_records import publish
+from service.store.records import publish
 
 
 def a_map(name: str = "stiffness", **changes: object) -> StabilityMap:

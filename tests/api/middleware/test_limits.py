@@ -14,7 +14,7 @@ from starlette.testclient import TestClient
 from api.access.keys import KeyFile, KeyLimits, Scope
 from api.app import create_app
 from api.middleware.body_limit import BodyLimit
-from api.middleware.rates import Allowance, Rates
+from api.middleware.rate_limit import Allowance, Rates
 from service.model import names
 from service.model.records import JobRecord
 from service.pipeline.backends import Services
@@ -32,7 +32,7 @@ Twins = Callable[..., tuple[TestClient, TestClient]]
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a busy machine Redis may be slow to answer, and what is not counted is let in."""
-    monkeypatch.setattr("api.middleware.rates._ANSWER_S", PATIENCE_S)
+    monkeypatch.setattr("api.middleware.rate_limit._ANSWER_S", PATIENCE_S)
 
 
 @pytest.fixture

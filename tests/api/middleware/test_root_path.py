@@ -14,7 +14,7 @@ from starlette.testclient import TestClient
 from api.access.keys import KeyFile, Scope
 from api.app import create_app
 from api.client.client import Client
-from api.middleware.root_path import RootPath, with_prefix
+from api.middleware.request_context import RootPath, with_prefix
 from service.model.errors import InputError
 from service.pipeline.backends import Services
 from service.settings import Settings

@@ -16,7 +16,7 @@ from service.model.states import AssetKind
 from service.pipeline.backends import Services
 from service.settings import Settings
 from service.store.assets import builtin_files
-from service.store.hand_corrections import MAX_ENTRIES
+from service.store.descriptions import MAX_ENTRIES
 from service.store.library import load_asset, load_asset_files
 from tests.api.conftest import BASE_URL
 

@@ -10,10 +10,10 @@ from starlette.testclient import TestClient
 
 from api.client.client import events_of
 from service.model.clock import timestamp
-from service.model.diversity import GraspType
+from service.model.metrics import GraspType
 from service.model.planning import plan
 from service.pipeline.backends import Services
-from service.store.study_records import publish
+from service.store.records import publish
 from tests.api.factories import add_job, fail, finish, finish_all
 from tests.service.pipeline.test_fidelity_choice import scene_chart
 from tests.waiting import until

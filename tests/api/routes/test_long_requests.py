@@ -10,7 +10,7 @@ import pytest
 from fastapi import FastAPI
 
 from api.routes import assets
-from api.routes.long_requests import Turns
+from api.routes.dependencies import Turns
 from service.model.errors import UnavailableError
 from tests.waiting import PATIENCE_S
 

@@ -18,8 +18,7 @@ from service.model.states import AssetKind
 from service.pipeline.backends import Services
 from service.store import network_file
 from service.store.library import load_asset_files
-from service.store.network_check import NETWORK_FILE
-from service.store.network_file import to_bytes
+from service.store.network_file import NETWORK_FILE, to_bytes
 from service.store.records import read_record
 from tests.networks import random_network
 from tests.service.store.test_network_file import HOSTILE

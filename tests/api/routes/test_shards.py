@@ -9,7 +9,7 @@ import h5py
 import pytest
 from starlette.testclient import TestClient
 
-from api.dashboard.pictures import Pictures
+from api.dashboard.job_pages import Pictures
 from api.routes.shards import parse_range
 from service.pipeline.backends import Services
 from service.store.store import Store

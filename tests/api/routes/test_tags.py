@@ -17,7 +17,7 @@ from api.access.keys import KeyFile, Scope
 from api.app import create_app
 from service.index.rebuild import differences, rebuild
 from service.model import names
-from service.model.tags import MOST_TAGGED
+from service.model.records import MOST_TAGGED
 from service.pipeline.backends import Services
 from service.readers.where import parse
 from service.store.manifests import ShardManifest

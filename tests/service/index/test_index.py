@@ -15,18 +15,17 @@ from pydantic import SecretStr
 from sqlalchemy import delete, update
 
 from service.index import tables
-from service.index.filters import GraspFilter, GraspSort
 from service.index.index import Index
+from service.index.queries.grasps import GraspFilter, GraspSort
 from service.index.rebuild import differences, rebuild
 from service.index.views import GraspView
 from service.model import names
 from service.model.clock import timestamp
 from service.model.errors import ConflictError, IndexUnavailable, InputError, NotFoundError, StoreUnavailable
 from service.model.messages import Origin
-from service.model.planning import message_of, plan
+from service.model.planning import Turns, message_of, plan
 from service.model.records import AttemptRecord, JobRecord
 from service.model.states import AssetKind, Lane, Stage, State
-from service.model.turns import Turns
 from service.model.version import STAGE_REVISIONS
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
@@ -401,7 +400,7 @@ def test_a_rebuild_that_breaks_off_leaves_the_old_rows(services: Services, monke
 def test_a_pair_is_found_whichever_way_the_database_goes(
     services: Services, monkeypatch: pytest.MonkeyPatch, sorted_at_once: int
 ) -> None:
-    monkeypatch.setattr("service.index.queries.grasp_search.SORTED_AT_ONCE", sorted_at_once)
+    monkeypatch.setattr("service.index.queries.grasps.SORTED_AT_ONCE", sorted_at_once)
     job, _ = job_actions.submit(services, request())
     run_all(services, job.id)
     sort = GraspSort(by="penetration_depth_mm", descending=False)
@@ -434,8 +433,8 @@ def test_every_way_of_searching_finds_the_same(
             and all(getattr(grasp, name) >= bound for name, bound in where.at_least.items())
             and all(getattr(grasp, name) <= bound for name, bound in where.at_most.items())
         ]
-        monkeypatch.setattr("service.index.queries.grasp_search.SORTED_AT_ONCE", sorted_at_once)
-        monkeypatch.setattr("service.index.queries.grasp_search.LOOKED_AT", looked_at)
+        monkeypatch.setattr("service.index.queries.grasps.SORTED_AT_ONCE", sorted_at_once)
+        monkeypatch.setattr("service.index.queries.grasps.LOOKED_AT", looked_at)
         found: list[GraspView] = []
         cursor = None
         while True:

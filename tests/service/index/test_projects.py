@@ -7,11 +7,10 @@ from service.index.views import UsageDay
 from service.model import names
 from service.model.clock import timestamp
 from service.model.messages import Origin
-from service.model.planning import message_of, plan
+from service.model.planning import Turns, message_of, plan
 from service.model.projects import ProjectScope
 from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane
-from service.model.turns import Turns
 from service.pipeline.backends import Services
 from service.store.records import put_record
 from tests.fakes import make_shard, request

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from benchmarks.large_index import fill
 from service.index import database
-from service.index.filters import GraspSort
 from service.index.index import Index
+from service.index.queries.grasps import GraspSort
 from service.index.tables import metadata
 from service.model.errors import IndexUnavailable
 from service.model.metrics import indexed

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from sqlalchemy import insert
 
-from service.index.filters import GraspFilter
 from service.index.index import Index
+from service.index.queries.grasps import GraspFilter
 from service.index.tables import METRICS, grasps, shards
 from tests.indexes import empty_index
 

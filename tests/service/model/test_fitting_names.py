@@ -6,8 +6,8 @@ import pytest
 
 from api.uploads import name_of_upload
 from service.model.errors import InputError
-from service.model.fitting_names import fitted
-from worker.files.exchange.names import plain_name
+from service.model.names import fitted
+from worker.files.exchange.lots import plain_name
 
 LONG = "mujoco-Office_Depot_Canon_CL211XL_Remanufactured_Ink_Cartridge_TriColor"
 

@@ -8,8 +8,8 @@ import pytest
 from pydantic import ValidationError
 
 from service.model.digests import job_id, shard_id
-from service.model.diversity import MIN_DISTANCE_M
 from service.model.domain import JobOptions, JobRequest
+from service.model.metrics import MIN_DISTANCE_M
 from service.model.states import Stage
 
 HAND, OBJECT = "a" * 32, "b" * 32

@@ -9,13 +9,12 @@ from pydantic import ValidationError
 
 from service.index.index import Index
 from service.index.sample import look
-from service.logs import JsonLines, _TextLines
-from service.model.errors import GraspdError, InputError
-from service.model.redaction import without_secrets
+from service.model.errors import GraspdError, InputError, without_secrets
 from service.queue.connection import connect
-from service.run.joining import Joining
+from service.run.address import Joining
 from service.settings import Settings
 from service.store.store import open_store
+from service.telemetry import JsonLines, _TextLines
 
 SECRET = "s3cr3t"
 QUOTING = [

@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from service.model.digests import job_id
 from service.model.domain import JobRequest
-from service.model.robust import MEANINGS, MODELS, Axis, axis_word
+from service.model.metrics import AXIS_MEANINGS, ROBUST_MODELS, Axis, axis_word
 
 
 def request(**options: object) -> JobRequest:
@@ -15,8 +15,8 @@ def request(**options: object) -> JobRequest:
 
 
 def test_a_wanted_share_is_of_eight_models_unless_told() -> None:
-    assert (request().models, request(robust=0.9).models) == (0, MODELS)
-    assert request(robust=0.9, scene="table").models == MODELS, "in scenes as around free objects"
+    assert (request().models, request(robust=0.9).models) == (0, ROBUST_MODELS)
+    assert request(robust=0.9, scene="table").models == ROBUST_MODELS, "in scenes as around free objects"
     assert request(robust=0.9, robust_models=16).models == request(robust_models=16).models == 16
 
 
@@ -43,5 +43,5 @@ def test_what_cannot_be_judged_is_refused(options: dict[str, object], words: str
 
 
 def test_every_axis_has_its_words_and_no_other_number_has() -> None:
-    assert set(MEANINGS) == set(Axis) - {Axis.NONE}
+    assert set(AXIS_MEANINGS) == set(Axis) - {Axis.NONE}
     assert [axis_word(number) for number in (0, 1, 9, 10, 255)] == [None, "shapes", "order", None, None]

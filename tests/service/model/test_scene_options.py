@@ -8,11 +8,10 @@ import pytest
 from pydantic import ValidationError
 
 from service.model.clock import timestamp
-from service.model.dataset_records import Member
 from service.model.digests import digest_json, job_id, shard_id
 from service.model.domain import SCENES, JobOptions, JobRequest
 from service.model.planning import message_of, plan
-from service.model.records import JobRecord
+from service.model.records import JobRecord, Member
 from service.model.states import Lane, Stage
 from service.model.version import STAGE_REVISIONS
 from service.pipeline.datasets.spec import describe

@@ -9,8 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from service.model.errors import InputError
-from service.model.scene_options import scene_option
-from service.model.scene_spec import MAX_FILE_BYTES, SceneSpec, parse_scene
+from service.model.scene_spec import MAX_FILE_BYTES, SceneSpec, parse_scene, scene_option
 
 TABLE = {"supports": [{"kind": "half_space"}]}
 

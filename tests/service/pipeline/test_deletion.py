@@ -11,16 +11,16 @@ from service.index.changes.removals import Removals
 from service.index.rebuild import differences
 from service.model import names
 from service.model.errors import ConflictError, NotFoundError
+from service.model.records import tag_id
 from service.model.states import AssetKind, State
-from service.model.tags import tag_id
 from service.pipeline import job_actions, tagging
 from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.deletion import delete_asset, delete_dataset, delete_job, restore
 from service.pipeline.garbage_collector import GarbageCollector
-from service.store.deletions import deletions, pending
 from service.store.library import publish_asset
+from service.store.records import deletions, pending
 from tests.fakes import OBJECT_FILES, make_shard, request
 from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import fail

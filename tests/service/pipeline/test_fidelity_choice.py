@@ -14,9 +14,8 @@ from service.model.scene_spec import SceneSpec
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
 from service.pipeline.fidelity_choice import cheapest, parse_target
-from service.store.records import read_record
+from service.store.records import charts_of, latest, publish, read_record, scene_kinds
 from service.store.store import open_store
-from service.store.study_records import charts_of, latest, publish, scene_kinds
 from tests.fakes import request
 
 

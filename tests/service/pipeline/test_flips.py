@@ -13,11 +13,9 @@ import pytest
 from service.index.rebuild import rebuild
 from service.model import names
 from service.model.clock import timestamp
-from service.model.dataset_records import ObjectSet
 from service.model.errors import DamagedError
-from service.model.records import AttemptRecord, JobRecord
+from service.model.records import AttemptRecord, JobRecord, ObjectSet, Tag
 from service.model.states import AssetKind, Stage
-from service.model.tags import Tag
 from service.model.webhooks import Webhook
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
@@ -27,12 +25,19 @@ from service.pipeline.identity import ServiceRecord
 from service.pipeline.integrity import FOLDERS, examine, scan
 from service.pipeline.repair import repair
 from service.store.assets import pack as pack_files
-from service.store.deletions import Deletion, Released, removed_folder
+from service.store.integrity import put_document, put_sealed
 from service.store.library import builtin_assets, load_check, publish_builtins, store_files
 from service.store.manifests import load_manifest
-from service.store.records import add_job_event, put_record, read_record
-from service.store.seals import put_document, put_sealed
-from service.store.study_records import latest, publish
+from service.store.records import (
+    Deletion,
+    Released,
+    add_job_event,
+    latest,
+    publish,
+    put_record,
+    read_record,
+    removed_folder,
+)
 from tests.damage import flipped, overwrite
 from tests.fakes import HAND_FILES, OBJECT_FILES, make_shard, request
 from tests.packs import tasks_of

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from service.model.ability import own_ability
 from service.model.clock import timestamp
 from service.model.states import Lane, Stage, State
-from service.model.worker_beat import WorkerBeat
+from service.model.workers import WorkerBeat, own_ability
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
 from service.pipeline.controller import Controller

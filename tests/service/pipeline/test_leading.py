@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from service.heartbeat_file import HeartbeatFile
 from service.model.errors import QueueUnavailable
 from service.pipeline.leading import Leadership
+from service.telemetry import HeartbeatFile
 from tests.memory_queue import MemoryQueue
 from tests.waiting import PATIENCE_S, until
 

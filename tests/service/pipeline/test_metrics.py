@@ -12,8 +12,8 @@ import pytest
 from sqlalchemy.dialects import sqlite
 
 from api.metrics import Metrics, Snapshot
-from service.index import at_scrape
-from service.index.damage import Damage
+from service.index.notes import Damage
+from service.index.queries import overview
 from service.model.messages import TaskMessage
 from service.model.states import Lane, Stage, State
 from service.pipeline.backends import Services
@@ -50,9 +50,9 @@ def tasks(count: int) -> list[TaskMessage]:
 @pytest.mark.parametrize(
     "query",
     [
-        at_scrape.count_jobs(State.QUEUED),
-        at_scrape.oldest_job(State.RUNNING),
-        at_scrape.made_since(datetime.now(UTC)),
+        overview.count_jobs(State.QUEUED),
+        overview.oldest_job(State.RUNNING),
+        overview.made_since(datetime.now(UTC)),
     ],
 )
 def test_no_read_of_the_index_for_metrics_scans_a_table(tmp_path: Path, query: Any) -> None:
@@ -67,11 +67,11 @@ def test_no_read_of_the_index_for_metrics_scans_a_table(tmp_path: Path, query: A
 
 
 def test_damage_of_the_store_is_told(services: Services) -> None:
-    assert at_scrape.read_index(services.index.database).damaged == 0
+    assert overview.read_index(services.index.database).damaged == 0
     services.index.damage.mark([Damage("shards/base/a.h5", "its file is gone", "a")])
-    assert at_scrape.read_index(services.index.database).damaged == 1
+    assert overview.read_index(services.index.database).damaged == 1
     shown = Snapshot()
-    shown.add_index(at_scrape.read_index(services.index.database))
+    shown.add_index(overview.read_index(services.index.database))
     assert b"graspd_store_damaged 1.0" in Metrics().render(shown)
 
 
@@ -79,7 +79,7 @@ def test_unfinished_jobs_and_the_yield_of_the_last_minute_are_told(services: Ser
     submit(services, request(grasps=32))
     manifest = make_shard(services.store, message_for())
     services.index.write.add_manifest(manifest)
-    found = at_scrape.read_index(services.index.database)
+    found = overview.read_index(services.index.database)
     assert found.jobs[State.QUEUED] == 1
     assert 0 <= found.oldest_s[State.QUEUED] < 60
     assert found.grasps_per_s == pytest.approx(manifest.count / 60)

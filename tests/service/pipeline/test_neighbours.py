@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from service.index.filters import GraspFilter
+from service.index.queries.grasps import GraspFilter
 from service.index.rebuild import differences
 from service.model import names
 from service.model.errors import ConflictError, InputError, NotFoundError, SceneError

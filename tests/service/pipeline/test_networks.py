@@ -23,7 +23,7 @@ from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.deletion import delete_asset
 from service.pipeline.garbage_collector import GarbageCollector
 from service.store.library import publish_asset
-from service.store.network_check import check_network
+from service.store.network_file import check_network
 from service.store.records import read_record
 from tests.api.factories import fail
 from tests.fakes import request

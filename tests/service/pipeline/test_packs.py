@@ -13,9 +13,8 @@ from typer.testing import CliRunner
 from service.index.rebuild import differences
 from service.model import names
 from service.model.clock import timestamp
-from service.model.dataset_records import Snapshot
 from service.model.errors import InputError
-from service.model.records import JobRecord
+from service.model.records import JobRecord, Snapshot
 from service.model.states import Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Services

@@ -18,7 +18,7 @@ from service.model.planning import message_of, plan
 from service.model.records import JobRecord
 from service.model.states import AssetKind, Lane, Stage, State
 from service.model.version import SCHEMA_OF_RANGES, STAGE_REVISIONS, TASK_SCHEMA
-from service.model.worker_beat import WorkerBeat
+from service.model.workers import WorkerBeat
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
@@ -30,8 +30,7 @@ from service.store.manifests import ShardManifest, publish_shard
 from tests.fakes import OBJECT_FILES, fake_stages, request
 from tests.planning import plan_all
 from tests.service.pipeline.test_controller import Bench
-from worker.stages.context import TaskContext
-from worker.stages.output import shard_of
+from worker.stages.context import TaskContext, shard_of
 
 
 @pytest.fixture

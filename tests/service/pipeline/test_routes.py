@@ -7,11 +7,10 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from service.model.ability import FIRST_SCHEMA, Need, own_ability
 from service.model.domain import JobRequest
 from service.model.planning import needed_schema
 from service.model.states import Lane, Stage
-from service.model.worker_beat import WorkerBeat
+from service.model.workers import FIRST_SCHEMA, Need, WorkerBeat, own_ability
 from service.pipeline.routes import Place, Routes
 from service.queue import entries
 from service.queue.lists import known_lists, queue_name, queue_names

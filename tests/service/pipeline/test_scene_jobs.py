@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.index.filters import GraspFilter, GraspSort
+from service.index.queries.grasps import GraspFilter, GraspSort
 from service.model import names
 from service.model.clock import timestamp
 from service.model.planning import message_of, plan

@@ -14,7 +14,7 @@ from rq.serializers import JSONSerializer
 from service.model.clock import timestamp
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Lane, Stage
-from service.model.worker_beat import WorkerBeat
+from service.model.workers import WorkerBeat
 from service.queue.lists import queue_names
 from service.queue.port import BULK_EVERY, Event, EventKind
 from service.queue.rq_queue import LEAD, RqQueue, lease_state, list_worker, renew_lease, worker_key

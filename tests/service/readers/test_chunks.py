@@ -10,7 +10,7 @@ import pytest
 
 from service.model.errors import DamagedShard
 from service.readers import Pictures, open_shards
-from service.readers.chunks import RowTable, read_file
+from service.readers.ranges import RowTable, read_file
 from service.store.columns import SCHEMAS
 from tests.service.readers import box_scenes
 

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.model.dataset_records import Snapshot, SnapshotShard
 from service.model.errors import DamagedShard, InputError, NotFoundError
 from service.model.names import dataset_snapshot, shard_file
-from service.model.records import JobRecord
+from service.model.records import JobRecord, Snapshot, SnapshotShard
 from service.model.transforms import compose, pose_from_matrix
 from service.pipeline.backends import Services
 from service.readers import Grasps, Pictures, ShardCache, Shards, open_shards

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from service.model.errors import GraspdError, InputError, UnavailableError
-from service.run.joining import joining
+from service.run.address import joining
 from service.settings import Settings
 from tests.servers import free_ports
 

@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from service.run.address import record_address, recorded_address
-from service.run.children import Child, end_leftovers
-from service.run.processes import start_of
+from service.run.children import Child, end_leftovers, start_of
 from tests.waiting import until
 
 _WAIT = "import signal; signal.pause()"

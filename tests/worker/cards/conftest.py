@@ -12,10 +12,9 @@ import pytest
 from service.pipeline.datasets.export import export_shards
 from tests.worker.cards.makers import Made, dataset
 from worker.cards.card import write_card
-from worker.cards.contents import Contents, contents_of_store
+from worker.cards.contents import Contents, contents_of_store, pieces
 from worker.cards.numbers import numbers
 from worker.cards.page import page
-from worker.cards.reading import pieces
 from worker.cards.tally import tally_of
 
 

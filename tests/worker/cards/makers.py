@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from service.model import names
 from service.model.clock import timestamp
-from service.model.dataset_records import Snapshot
 from service.model.planning import message_of, plan
-from service.model.records import AttemptRecord, JobRecord
+from service.model.records import AttemptRecord, JobRecord, Snapshot
 from service.model.states import Stage
 from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
@@ -28,7 +27,7 @@ from tests.api.factories import add_builtins, poses, scene_columns
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 from tests.planning import plan_all
-from worker.stages.output import Output, shard_of
+from worker.stages.context import Output, shard_of
 
 HANDS = ("allegro", "barrett")
 OBJECTS = ("block", "mug")

@@ -19,7 +19,7 @@ from tests.worker.cards.makers import HANDS, OBJECTS, dataset
 from worker.cards.card import write_card
 from worker.cards.contents import contents_of_folder, contents_of_store, with_provenance
 from worker.cards.findings import _qualities
-from worker.commands.card import app
+from worker.commands.curate import app
 
 
 def test_the_head_of_the_page_is_yaml_that_says_licence_and_size(kitchen: Case) -> None:
@@ -198,7 +198,7 @@ def test_a_mistake_is_one_line_and_exit_2(
     kitchen: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], words: str
 ) -> None:
     monkeypatch.setenv("GRASPD_DATA_DIR", str(kitchen.folder.parent))
-    done = CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "out")])
+    done = CliRunner().invoke(app, ["card", *arguments, "-o", str(tmp_path / "out")])
     assert done.exit_code == 2 and len(done.stderr.strip().splitlines()) == 1
     assert words in done.stderr and not (tmp_path / "out").exists()
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.model.diversity import BANDS, SECTORS, evenness
+from service.model.metrics import BANDS, SECTORS, evenness
 from service.model.states import Stage
 from service.model.transforms import quat_from_axis_angle
 from service.readers import Grasps
@@ -16,10 +16,9 @@ from service.store.manifests import load_manifest
 from service.store.shards import read_shard
 from tests.worker.cards.conftest import Case, case
 from tests.worker.cards.makers import SECONDS, STILL_HAND, STILL_JOINT, Array
-from worker.cards.directions import cell_counts, elevations
 from worker.cards.findings import findings
 from worker.cards.numbers import share
-from worker.cards.tally import JointUse
+from worker.cards.tally import JointUse, cell_counts, elevations
 
 
 def changed(tmp_path: Path, change: Any, **options: Any) -> Case:

@@ -14,12 +14,12 @@ from service.model.scene_spec import SceneSpec
 from service.store.shards import json_attribute, read_shard, write_shard
 from worker.commands import grasp_sheet, render
 from worker.commands.exchange import app as exchange
-from worker.commands.grasp_animation import AFTER_S, BEFORE_S
+from worker.commands.grasp_sheet import AFTER_S, BEFORE_S
 from worker.commands.render import app as rendering
 from worker.commands.scene import app as scenes
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
-from worker.robots.timing import SHORTEST_S
+from worker.robots.execution import SHORTEST_S
 
 GRASPS = 3
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from worker.engines import baked
+from worker.engines import backend
 
 MODULE = "worker.simulation.kernels.optimizers"
 START = """
@@ -73,14 +73,14 @@ def test_a_cache_keeps_what_it_has(kernels: Path, tmp_path: Path, monkeypatch: p
     kept = tmp_path / source.parent.name / source.name
     kept.parent.mkdir()
     kept.write_bytes(b"ours")
-    monkeypatch.setenv(baked.VARIABLE, str(kernels))
-    assert baked.lay_out(tmp_path) == len([file for file in kernels.rglob("*") if file.is_file()]) - 1
+    monkeypatch.setenv(backend.VARIABLE, str(kernels))
+    assert backend.lay_out(tmp_path) == len([file for file in kernels.rglob("*") if file.is_file()]) - 1
     assert kept.read_bytes() == b"ours"
 
 
 def test_every_module_of_kernels_is_known() -> None:
     # Modules are found by their names: one with a kernel under another name would be compiled at first use.
-    sources = Path(baked.__file__).parents[1].rglob("*.py")
+    sources = Path(backend.__file__).parents[1].rglob("*.py")
     having = {file for file in sources if "@wp.kernel" in file.read_text()}
-    assert {file.stem for file in having} <= {part for name in baked.modules() for part in name.split(".")}
-    assert len(having) == len(baked.modules())
+    assert {file.stem for file in having} <= {part for name in backend.modules() for part in name.split(".")}
+    assert len(having) == len(backend.modules())

@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 
 from service.model.fidelity import FIDELITIES
-from worker.engines.cuda_errors import DeviceLost, check_device, is_out_of_memory
+from worker.engines.devices import DeviceLost, check_device, is_out_of_memory
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize

@@ -7,7 +7,7 @@ import pytest
 
 from service.model.errors import InputError
 from service.store.shards import Shard
-from worker.files.choice import choose
+from worker.files.subsets import choose
 
 
 def shard(valid: list[int], sound: list[int], success: list[int] | None) -> Shard:

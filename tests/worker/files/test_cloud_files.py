@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from service.readers import Pictures, open_shards
 from service.readers.clouds import OF_GRASPS
 from tests.service.readers import box_scenes
-from worker.commands.clouds import app
+from worker.commands.exchange import app
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_files_hold_every_sample_whole(folder: Path, tmp_path: Path) -> None:
     said = ["--points", "200", "--noise", "stereo", "--seed", "4", "-o", str(tmp_path / "out"), "--json"]
-    done = CliRunner().invoke(app, [str(folder), *said])
+    done = CliRunner().invoke(app, ["clouds", str(folder), *said])
     assert done.exit_code == 0, done.output
     assert json.loads(done.output) == {"folder": str(tmp_path / "out"), "files": 1, "clouds": 6, "empty": 0}
     samples = Pictures(open_shards(folder)).clouds(200, noise="stereo", seed=4)
@@ -49,7 +49,7 @@ def test_what_cannot_be_written_is_told_in_a_line(folder: Path, tmp_path: Path) 
         (tmp_path / "none", tmp_path / "new", "has no pictures"),
         (tmp_path / "away", tmp_path / "new", "does not exist"),
     ):
-        done = CliRunner().invoke(app, [str(source), "-o", str(out)])
+        done = CliRunner().invoke(app, ["clouds", str(source), "-o", str(out)])
         assert done.exit_code == 2
         assert words in done.output and len(done.output.strip().splitlines()) == 1
     assert not (tmp_path / "new").exists()

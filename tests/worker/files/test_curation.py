@@ -14,8 +14,8 @@ from service.model.errors import InputError
 from service.readers import Grasps, open_shards
 from service.store.shards import read_shard, write_shard
 from worker.commands.curate import app
-from worker.files.balance import Balance, faces
 from worker.files.cases import expand
+from worker.files.curation import Balance, faces
 
 COUNT = 40
 

@@ -21,7 +21,7 @@ from worker.files.evaluate import evaluate
 from worker.files.synthesis import Synthesized, synthesized
 from worker.objects.prepare import object_from_path
 from worker.rendering.pages.pictures import grasp_pictures
-from worker.stages.glb import object_glb
+from worker.stages.models import object_glb
 
 PLACES = {"origin": (0.0, 0.0, 0.0), "6 m": (5.0, -3.0, 2.0), "UTM": (500_000.0, 4_500_000.0, 300.0)}
 AWAY = pytest.mark.parametrize("place", ["6 m", "UTM"])

@@ -39,11 +39,14 @@ def write_all(folder: Path) -> None:
     write_my_hand(folder)
     urdf = package(folder / "my_description", "../meshes/finger.stl", manifest=True, urdf="urdf/my_hand.urdf")
     (urdf.parent / "my_hand.urdf.xacro").write_text(
-        urdf.read_text().replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ', 1).replace(
-            '<link name="palm">', '<link name="$(arg side)_frame"/><joint name="f" type="fixed"><parent link="'
+        urdf.read_text()
+        .replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ', 1)
+        .replace(
+            '<link name="palm">',
+            '<link name="$(arg side)_frame"/><joint name="f" type="fixed"><parent link="'
             '$(arg side)_frame"/><child link="palm"/></joint><link name="palm">',
         )
-    )  # fmt: skip
+    )
     (urdf.parent / "other.urdf").write_text("<robot/>")
     (folder / "my_model").mkdir()
     (folder / "my_model" / "hand.xml").write_text(FOUR_BAR)
@@ -67,7 +70,13 @@ def _on_a_wrist() -> bytes:
         joint("LFJ4", "palm", "lf", origin="0.03 0.03 0.03", axis="0 -1 0"),
     ]
     return robot(
-        link("world"), link("wrist"), link("palm"), link("ff"), link("th"), link("lf"),
+        link("world"),
+        link("wrist"),
+        link("palm"),
+        link("ff"),
+        link("th"),
+        link("lf"),
         joint("WRJ2", "world", "wrist", axis="1 0 0", limit=f"<limit {_WRIST}/>"),
-        joint("WRJ1", "wrist", "palm", limit=f"<limit {_WRIST}/>"), *fingers,
-    )  # fmt: skip
+        joint("WRJ1", "wrist", "palm", limit=f"<limit {_WRIST}/>"),
+        *fingers,
+    )

@@ -28,9 +28,15 @@ def three_fingers(outwards: float, **options: object) -> HandModel:
         axis = f"{-outwards * s} {outwards * c} 0"
         parts += [
             link(f"finger{number}", shape),
-            joint(f"bend{number}", "palm", f"finger{number}", origin=f"{0.05 * c} {0.05 * s} 0.01", axis=axis,
-                  limit='<limit lower="0" upper="1.2" effort="1" velocity="1"/>'),
-        ]  # fmt: skip
+            joint(
+                f"bend{number}",
+                "palm",
+                f"finger{number}",
+                origin=f"{0.05 * c} {0.05 * s} 0.01",
+                axis=axis,
+                limit='<limit lower="0" upper="1.2" effort="1" velocity="1"/>',
+            ),
+        ]
     urdf = robot(link("palm", _PALM), *parts)
     return load_hand({"r.urdf": urdf}, name="r", digest="0" * 32, options={"approach": [0, 0, 1], **options})
 

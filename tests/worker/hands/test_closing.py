@@ -24,11 +24,13 @@ def limit(lower: float, upper: float) -> str:
 def finger(name: str, x: float, bends: str = limit(-0.2, 1.5)) -> list[str]:
     """A finger along z that bends to +y, where the palm faces, about -x; it swings sideways about y."""
     return [
-        link(f"{name}0", _PHALANX), link(f"{name}1", _PHALANX), link(f"{name}2", _PHALANX),
+        link(f"{name}0", _PHALANX),
+        link(f"{name}1", _PHALANX),
+        link(f"{name}2", _PHALANX),
         joint(f"{name}_spread", "palm", f"{name}0", origin=f"{x} 0 0.045", axis="0 1 0", limit=limit(-0.1, 0.5)),
         joint(f"{name}_bend", f"{name}0", f"{name}1", origin="0 0 0.04", axis="-1 0 0", limit=bends),
         joint(f"{name}_tip", f"{name}1", f"{name}2", origin="0 0 0.04", axis="-1 0 0", limit=limit(-0.1, 1.5)),
-    ]  # fmt: skip
+    ]
 
 
 def urdf(*thumb: str, bends: str = limit(-0.2, 1.5)) -> bytes:
@@ -38,11 +40,13 @@ def urdf(*thumb: str, bends: str = limit(-0.2, 1.5)) -> bytes:
 def opposing_thumb(bends: str) -> list[str]:
     """Before the palm, along z: it bends back to the fingers, about +x, behind an axial joint along itself."""
     return [
-        link("thumb0", _PHALANX), link("thumb1", _PHALANX), link("thumb2", _PHALANX),
+        link("thumb0", _PHALANX),
+        link("thumb1", _PHALANX),
+        link("thumb2", _PHALANX),
         joint("thumb_axial", "palm", "thumb0", origin="0 0.09 0.02", axis="0 0 1", limit=limit(-0.2, 2.0)),
         joint("thumb_bend", "thumb0", "thumb1", origin="0 0 0.04", axis="1 0 0", limit=bends),
         joint("thumb_tip", "thumb1", "thumb2", origin="0 0 0.04", axis="1 0 0", limit=bends),
-    ]  # fmt: skip
+    ]
 
 
 def hand_of(text: bytes, **options: object) -> HandModel:

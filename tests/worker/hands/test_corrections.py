@@ -12,22 +12,27 @@ from typer.testing import CliRunner
 from graspd.cli import build
 from service.model.states import AssetKind
 from service.store.assets import builtin_names
-from service.store.hand_corrections import HandCorrections, corrected, facts_of
+from service.store.descriptions import HandCorrections, corrected, facts_of
 from tests.worker.hands.grippers import gripper
 from tests.worker.hands.urdfs import BOX, joint, link, robot
+from worker.hands.jaws import pads_of
 from worker.hands.load import files_from_path, hand_from_path, load_hand
 from worker.hands.model import HandModel
-from worker.hands.pads import pads_of
-from worker.stages.glb import hand_glb
+from worker.stages.models import hand_glb
 
 CLAW = robot(
-    link("palm", BOX), link("a", BOX), link("b", BOX), link("c", BOX), link("mount", ""), link("tip", ""),
+    link("palm", BOX),
+    link("a", BOX),
+    link("b", BOX),
+    link("c", BOX),
+    link("mount", ""),
+    link("tip", ""),
     joint("ja", "palm", "a", origin="0.02 0 0.02", axis="0 -1 0"),
     joint("jb", "palm", "b", origin="-0.02 0 0.02"),
     joint("jc", "palm", "c", origin="-0.02 0.03 0.02"),
     joint("jm", "palm", "mount", kind="fixed", origin="0.01 0.02 0.03"),
     joint("jt", "a", "tip", kind="fixed", origin="0 0 0.04"),
-)  # fmt: skip
+)
 
 
 def same(one: HandModel, other: HandModel, *, palm: bool) -> bool:
@@ -46,7 +51,7 @@ def same(one: HandModel, other: HandModel, *, palm: bool) -> bool:
         ({"fingertips": ["a"], "preshape": {"jb": 0.7}}, ["--fingertips", "a", "--pre-shape", "jb=0.7"], False),
         ({"palm": {"link": "mount"}}, ["--palm", "mount"], True),
     ],
-)  # fmt: skip
+)
 def test_corrections_and_options_make_the_same_hand(
     said: dict[str, object], options: list[str], palm: bool, tmp_path: Path
 ) -> None:

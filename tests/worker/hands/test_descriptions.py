@@ -19,8 +19,13 @@ from worker.commands.hands import report_hand
 from worker.hands.check import check_hand
 from worker.hands.load import hand_from_path
 
-NOTES = {"urdf": "leap.urdf", "palm_link": "palm_lower", "palm_normal_in_palm_link": [0, 0, -1],
-         "fingertips": {"one": "b"}, "physical": {"torque_limit_Nm_measured": 0.95}}  # fmt: skip
+NOTES = {
+    "urdf": "leap.urdf",
+    "palm_link": "palm_lower",
+    "palm_normal_in_palm_link": [0, 0, -1],
+    "fingertips": {"one": "b"},
+    "physical": {"torque_limit_Nm_measured": 0.95},
+}
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from tests.worker.hands.urdfs import joint, link, robot
-from worker.hands.hollows import MAX_ERROR_M, hull_error, parts_of
 from worker.hands.load import load_hand
+from worker.hands.shapes import MAX_ERROR_M, hull_error, parts_of
 
 
 @pytest.fixture(autouse=True)
@@ -68,7 +68,7 @@ def test_an_object_fits_between_the_prongs_of_a_loaded_hand() -> None:
 
 
 def test_a_failed_decomposition_leaves_the_hull_and_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("worker.hands.hollows.coacd_parts", lambda *_: ())
+    monkeypatch.setattr("worker.hands.shapes.coacd_parts", lambda *_: ())
     mesh = fork(0.05)
     assert measured(mesh)[0] == 1
     monkeypatch.undo()

@@ -17,7 +17,7 @@ from worker.hands.model import HandModel
 from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.model import MujocoOptions, build
 from worker.simulation.device import joint_units
-from worker.studies.stability.hands import ring_hand
+from worker.studies.stability.assets import ring_hand
 
 #: The pads are planes, so points on them tell their distance to rounding.
 PLANE_M = 1e-9

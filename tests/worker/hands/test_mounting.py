@@ -27,14 +27,19 @@ def limits(lower: float, upper: float) -> str:
 def with_wrist(forearm: str = FOREARM, yaw: str = limits(-0.5, 0.2)) -> bytes:
     """world - arm - forearm - wrist - palm, a camera on the forearm."""
     return robot(
-        link("world"), link("arm", BOX.format(0.1, 0.1, 0.1)), link("forearm", forearm),
-        link("wrist", BOX.format(0.02, 0.02, 0.02)), link("camera", BOX.format(0.01, 0.02, 0.01)),
-        joint("base", "world", "arm", kind="fixed"), joint("elbow", "arm", "forearm", origin="0.1 0 0.3"),
+        link("world"),
+        link("arm", BOX.format(0.1, 0.1, 0.1)),
+        link("forearm", forearm),
+        link("wrist", BOX.format(0.02, 0.02, 0.02)),
+        link("camera", BOX.format(0.01, 0.02, 0.01)),
+        joint("base", "world", "arm", kind="fixed"),
+        joint("elbow", "arm", "forearm", origin="0.1 0 0.3"),
         joint("lens", "forearm", "camera", kind="fixed", origin="0.05 0 0.1"),
         joint("yaw", "forearm", "wrist", origin="0.01 0.02 0.22", axis="1 0 0", limit=yaw),
         joint("pitch", "wrist", "hub", origin="0 0 0.03", axis="0 1 0", limit=limits(-0.7, 0.4)),
-        link("hub", ""), *gripper("palm", "hub", "0 0 0.02"),
-    )  # fmt: skip
+        link("hub", ""),
+        *gripper("palm", "hub", "0 0 0.02"),
+    )
 
 
 def loaded(urdf: bytes, **options: Any) -> HandModel:

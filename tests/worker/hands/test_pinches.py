@@ -28,8 +28,10 @@ def test_opposed_fingertips_end_on_one_plane_and_nothing_else_is_as_low(name: st
         np.einsum("nvi,ni->nv", apply(bodies[:, p.body, None], p.vertices) - found.middle[:, None], down).max(axis=1)
         for p in hand.pieces
     ]
-    tips = {tip: np.max([r for r, p in zip(reach, hand.pieces, strict=True) if p.body == tip], axis=0)
-            for tip in hand.fingertips}  # fmt: skip
+    tips = {
+        tip: np.max([r for r, p in zip(reach, hand.pieces, strict=True) if p.body == tip], axis=0)
+        for tip in hand.fingertips
+    }
     lowest = np.max(list(tips.values()), axis=0)
     assert lowest == pytest.approx(HEIGHT_M / 2, abs=2e-3)  # the surface is sampled
     low = np.sum([lowest - tip < HEIGHT_M for tip in tips.values()], axis=0)

@@ -13,10 +13,9 @@ from service.store.asset_summary import summary
 from service.store.assets import builtin_files
 from tests.worker.hands.urdfs import joint, link, robot
 from worker.hands.check import check_hand
-from worker.hands.jaws import sign_of
+from worker.hands.jaws import fingertip_pad, sign_of
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
-from worker.hands.pads import fingertip_pad
 
 RADIUS = 0.045
 _PLATE = '<geometry><box size="0.16 0.1 0.02"/></geometry>'
@@ -121,9 +120,11 @@ def test_two_fingers_that_oppose_one_take_hold_between_them_and_not_sideways(mir
         bend = {"axis": "0 -1 0", "limit": '<limit lower="0" upper="1.4" effort="10"/>'}
         base = joint(f"j{k}", "palm", f"f{k}", origin=f"{x} {y} 0", **bend)
         parts += [
-            link(f"f{k}", _bar(0.05)), base.replace("<origin xyz", f'<origin rpy="0 0 {about}" xyz'),
-            link(f"t{k}", _bar(0.04)), joint(f"k{k}", f"f{k}", f"t{k}", origin="0 0 0.05", **bend),
-        ]  # fmt: skip
+            link(f"f{k}", _bar(0.05)),
+            base.replace("<origin xyz", f'<origin rpy="0 0 {about}" xyz'),
+            link(f"t{k}", _bar(0.04)),
+            joint(f"k{k}", f"f{k}", f"t{k}", origin="0 0 0.05", **bend),
+        ]
     np.testing.assert_allclose(hand(robot(*parts)).palm.approach, [0, 0, 1], atol=1e-9)
 
 

@@ -20,16 +20,20 @@ MESH = '<collision><geometry><mesh filename="part.dae"/></geometry></collision>'
 BALL = '<collision><geometry><sphere radius="{}"/></geometry></collision>'
 #: Both balls turn about their own centres: nothing comes closer to anything.
 FORK = robot(
-    link("palm", BALL.format(0.01)), link("a", BALL.format(0.0005)), link("b", BALL.format(0.0005)),
+    link("palm", BALL.format(0.01)),
+    link("a", BALL.format(0.0005)),
+    link("b", BALL.format(0.0005)),
     joint("ja", "palm", "a", origin="0.03 0 0.05", axis="0 0 1"),
     joint("jb", "palm", "b", origin="-0.03 0 0.05", axis="0 0 1"),
-)  # fmt: skip
+)
 HANDS: dict[str, tuple[dict[str, bytes], str]] = {
     "runs.xacro": (
-        {"runs.xacro": XACRO.format("""<a b="${__import__('os').system('touch ran')}"/>""").encode()}, "__import__",
+        {"runs.xacro": XACRO.format("""<a b="${__import__('os').system('touch ran')}"/>""").encode()},
+        "__import__",
     ),
     "reads.xacro": (
-        {"reads.xacro": XACRO.format('<xacro:include filename="/etc/passwd"/>').encode()}, "outside the hand's folder",
+        {"reads.xacro": XACRO.format('<xacro:include filename="/etc/passwd"/>').encode()},
+        "outside the hand's folder",
     ),
     "includes.xml": (
         {"includes.xml": CLAW.replace('<light pos="0 0 1"/>', '<include file="/etc/passwd"/>').encode()},
@@ -47,7 +51,7 @@ HANDS: dict[str, tuple[dict[str, bytes], str]] = {
         "too deep",
     ),
     "fork.urdf": ({"fork.urdf": FORK}, "no two opposing digits"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", HANDS)

@@ -22,11 +22,22 @@ def jaws(follower: str = LIMIT, drive: str = LIMIT, *more: str) -> bytes:
     pad = '<collision><origin xyz="0 0 0.05"/><geometry><box size="0.01 0.02 0.06"/></geometry></collision>'
     base = '<collision><geometry><box size="0.12 0.04 0.04"/></geometry></collision>'
     return robot(
-        *more, link("base", base), link("left", pad), link("right", pad),
+        *more,
+        link("base", base),
+        link("left", pad),
+        link("right", pad),
         joint("jl", "base", "left", kind="prismatic", axis="1 0 0", origin="-0.045 0 0", limit=drive),
-        joint("jr", "base", "right", kind="prismatic", axis="1 0 0", origin="0.045 0 0", limit=follower,
-              extra='<mimic joint="jl" multiplier="-1"/>'),
-    )  # fmt: skip
+        joint(
+            "jr",
+            "base",
+            "right",
+            kind="prismatic",
+            axis="1 0 0",
+            origin="0.045 0 0",
+            limit=follower,
+            extra='<mimic joint="jl" multiplier="-1"/>',
+        ),
+    )
 
 
 def hand(data: bytes, **options: object) -> HandModel:
@@ -97,10 +108,14 @@ def test_a_free_joint_within_the_hand_is_refused_by_its_name() -> None:
 @pytest.mark.parametrize(
     "written",
     [
-        "meshes\\pad.stl", ".\\meshes\\pad.stl", "package://any/meshes/pad.stl", "model:\\\\any\\meshes\\pad.stl",
-        "file:///meshes/pad.stl", "model://meshes/pad.stl",
+        "meshes\\pad.stl",
+        ".\\meshes\\pad.stl",
+        "package://any/meshes/pad.stl",
+        "model:\\\\any\\meshes\\pad.stl",
+        "file:///meshes/pad.stl",
+        "model://meshes/pad.stl",
     ],
-)  # fmt: skip
+)
 def test_a_file_and_its_folder_are_read_by_one_rule(written: str, tmp_path: Path, box_stl: bytes) -> None:
     mesh = f'<collision><geometry><mesh filename="{written}"/></geometry></collision>'
     (tmp_path / "meshes").mkdir()

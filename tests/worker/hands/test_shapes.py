@@ -123,13 +123,16 @@ def test_a_mesh_in_millimetres_without_scale_is_refused_with_the_mend() -> None:
 
 
 def test_a_hand_may_touch_with_what_it_looks_like() -> None:
-    thin, fat = ('<geometry><cylinder radius="0.007" length="0.04"/></geometry>',
-                 '<geometry><cylinder radius="0.009" length="0.05"/></geometry>')  # fmt: skip
+    thin, fat = (
+        '<geometry><cylinder radius="0.007" length="0.04"/></geometry>',
+        '<geometry><cylinder radius="0.009" length="0.05"/></geometry>',
+    )
     seen = link("b", f"<visual>{fat}</visual><collision>{thin}</collision>")
     # A link that touches nothing does not begin to, and one that shows nothing keeps its shapes.
     bare = link("c", f"<visual>{fat}</visual>")
-    text = robot(link("palm"), link("a"), seen, bare, joint("j1", "palm", "a"), joint("j2", "a", "b"),
-                 joint("j3", "b", "c"))  # fmt: skip
+    text = robot(
+        link("palm"), link("a"), seen, bare, joint("j1", "palm", "a"), joint("j2", "a", "b"), joint("j3", "b", "c")
+    )
     sizes = {}
     for shapes in ("collision", "visual"):
         hand = load_hand({"hand.urdf": text}, name="hand", digest="0" * 32, options={"shapes": shapes})

@@ -30,10 +30,12 @@ def claw(mesh: str = "") -> str:
     more = f'<collision><geometry><mesh filename="{mesh}"/></geometry></collision>' if mesh else ""
     finger = '<collision><origin xyz="0 0 0.03"/><geometry><box size="0.02 0.02 0.06"/></geometry></collision>'
     return robot(
-        link("palm", box), link("left", finger + more), link("right", finger),
+        link("palm", box),
+        link("left", finger + more),
+        link("right", finger),
         joint("jl", "palm", "left", origin="0.03 0 0.01", axis="0 -1 0"),
         joint("jr", "palm", "right", origin="-0.03 0 0.01", axis="0 1 0"),
-    ).decode()  # fmt: skip
+    ).decode()
 
 
 def verdicts(files: Mapping[str, bytes], main: str, folder: Path) -> list[str]:
@@ -70,10 +72,20 @@ def verdicts(files: Mapping[str, bytes], main: str, folder: Path) -> list[str]:
         claw().encode() + b"\n\0\0",
     ],
     ids=[
-        "byte order mark", "CRLF", "UTF-16", "UTF-16 that is UTF-8", "UTF-32", "GB 2312", "no encoding", "Latin 1",
-        "a comment first", "a line first", "a namespace", "padded",
+        "byte order mark",
+        "CRLF",
+        "UTF-16",
+        "UTF-16 that is UTF-8",
+        "UTF-32",
+        "GB 2312",
+        "no encoding",
+        "Latin 1",
+        "a comment first",
+        "a line first",
+        "a namespace",
+        "padded",
     ],
-)  # fmt: skip
+)
 def test_a_urdf_is_read_as_programs_write_it(data: bytes) -> None:
     report = check_hand({"h.urdf": data}, "h")
     assert report["verdict"] == "accept", report["message"]

@@ -17,7 +17,7 @@ from worker.hands.check import check_hand
 from worker.hands.load import files_from_path, hand_from_path, load_hand
 from worker.hands.model import HandModel
 from worker.hands.tendons import Tendon, actuators
-from worker.objects.content import TOLD_IF_SET, content_of
+from worker.objects.disk_cache import TOLD_IF_SET, content_of
 
 FINGERS = ("FF", "MF", "RF", "LF")
 

@@ -20,7 +20,7 @@ from worker.commands.hands import report_hand
 from worker.hands.check import check_hand
 from worker.hands.load import hand_from_path
 from worker.hands.xacro import expand
-from worker.stages.hand_files import load_hand_files
+from worker.stages.assets import load_hand_files
 
 CLAW = """<?xml version="1.0"?>
 <robot name="claw" xmlns:xacro="http://www.ros.org/wiki/xacro">
@@ -210,5 +210,5 @@ def test_a_hand_in_the_store_is_expanded_once(monkeypatch: pytest.MonkeyPatch) -
     asset = publish_asset(store, AssetKind.HAND, "claw", {**FILES, "asset.json": b'{"file": "urdf/claw.urdf.xacro"}'})
     first = load_hand_files(store, asset.digest)
     assert first["urdf/claw.urdf.xacro"] == expand(FILES, "urdf/claw.urdf.xacro", {})
-    monkeypatch.setattr("worker.stages.hand_files.expand", lambda *_: pytest.fail("expanded again"))
+    monkeypatch.setattr("worker.stages.assets.expand", lambda *_: pytest.fail("expanded again"))
     assert load_hand_files(store, asset.digest) == first

@@ -7,7 +7,7 @@ from manifold3d import Manifold
 from numpy.typing import NDArray
 
 from worker.objects.builtin import stl_bytes
-from worker.objects.solid import from_manifold
+from worker.objects.mesh_geometry import from_manifold
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 

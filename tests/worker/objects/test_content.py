@@ -10,7 +10,7 @@ import trimesh
 
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.hands.surface import sample_surface
-from worker.objects.content import content_of
+from worker.objects.disk_cache import content_of
 from worker.quality.probe import probe_of
 from worker.rendering.scene_setup import CameraPlan, Setting
 from worker.scenes.simulate import rest_probability

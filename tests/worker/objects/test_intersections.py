@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from tests.worker.objects.shapes import Mesh, box, cylinder, join, sphere, stl
 from worker.objects.check import check_object
 from worker.objects.intersections import crossings, untangle
-from worker.objects.mass import signed_volume
-from worker.objects.solid import from_manifold
+from worker.objects.mesh_geometry import from_manifold, signed_volume
 
 RADIUS = 0.008
 #: Where two cylinders of one radius cross at right angles they share 16/3 r^3 (Steinmetz).

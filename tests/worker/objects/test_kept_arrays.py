@@ -14,8 +14,8 @@ from tests.worker.models import two_finger_hand
 from tests.worker.objects.shapes import sphere, stl
 from worker.hands import surface
 from worker.hands.load import hand_from_path
-from worker.objects import kept_arrays
-from worker.objects.kept_arrays import arrays_kept_or_made, recalled, recalling
+from worker.objects import disk_cache
+from worker.objects.disk_cache import arrays_kept_or_made, recalled, recalling
 from worker.objects.prepare import load_object
 from worker.simulation import sampling
 
@@ -35,23 +35,23 @@ def never() -> dict[str, np.ndarray]:
 
 
 def test_what_was_made_is_read_bit_for_bit(own_cache: Path) -> None:
-    first = arrays_kept_or_made("things", ("x", 1), (kept_arrays,), lambda: made(1 / 3))
-    again = arrays_kept_or_made("things", ("x", 1), (kept_arrays,), never)
+    first = arrays_kept_or_made("things", ("x", 1), (disk_cache,), lambda: made(1 / 3))
+    again = arrays_kept_or_made("things", ("x", 1), (disk_cache,), never)
     assert all(np.array_equal(first[name], again[name]) and first[name].dtype == again[name].dtype for name in first)
     assert [file.suffix for file in (own_cache / "things").iterdir()] == [".npz"]
 
 
 def test_other_terms_or_other_code_are_another_entry() -> None:
-    arrays_kept_or_made("things", ("x", 1), (kept_arrays,), lambda: made(1))
-    assert arrays_kept_or_made("things", ("x", 2), (kept_arrays,), lambda: made(2))["a"][0, 0] == 2
+    arrays_kept_or_made("things", ("x", 1), (disk_cache,), lambda: made(1))
+    assert arrays_kept_or_made("things", ("x", 2), (disk_cache,), lambda: made(2))["a"][0, 0] == 2
     assert arrays_kept_or_made("things", ("x", 1), (surface,), lambda: made(3))["a"][0, 0] == 3
 
 
 def test_a_damaged_entry_is_made_again(own_cache: Path) -> None:
-    arrays_kept_or_made("things", ("x",), (kept_arrays,), lambda: made(1))
+    arrays_kept_or_made("things", ("x",), (disk_cache,), lambda: made(1))
     (file,) = (own_cache / "things").iterdir()
     user_cache.keep(file, b"no arrays")
-    assert arrays_kept_or_made("things", ("x",), (kept_arrays,), lambda: made(2))["a"][0, 0] == 2
+    assert arrays_kept_or_made("things", ("x",), (disk_cache,), lambda: made(2))["a"][0, 0] == 2
 
 
 def test_samples_of_hand_and_object_are_those_of_a_process_without_a_cache() -> None:
@@ -69,11 +69,11 @@ def test_small_steps_are_kept_together_and_each_follows_from_what_it_was_given(o
         return recalled("half", [array], lambda: [array / 2])["0"]
 
     for _ in range(2):
-        with recalling("steps", ("one thing",), (kept_arrays,)):
+        with recalling("steps", ("one thing",), (disk_cache,)):
             assert halves(np.arange(3.0)).tolist() == [0, 0.5, 1]
             assert halves(np.arange(2.0)).tolist() == [0, 0.5]
     assert len(list((own_cache / "steps").iterdir())) == 1
-    with recalling("steps", ("one thing",), (kept_arrays,)):
+    with recalling("steps", ("one thing",), (disk_cache,)):
         step = recalled("half", [np.arange(3.0)], lambda: list(never().values()))["0"]
         step += 1
         assert halves(np.arange(3.0)).tolist() == [0, 0.5, 1], "nobody writes into what is kept"

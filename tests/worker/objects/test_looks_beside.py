@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from service.store.hand_files import files_of_hand
-from service.store.mesh_looks import MAX_NAMES, beside, looks_of
+from service.store.mesh_files import MAX_NAMES, beside, looks_of
 from tests.worker.hands.urdfs import BOX, joint, link, robot
 from tests.worker.objects.test_colours import large
 from tests.worker.objects.test_dae import dae

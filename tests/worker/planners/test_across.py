@@ -13,10 +13,10 @@ from service.model.transforms import apply, quat_from_matrix, quat_rotate
 from tests.worker.models import object_from_mesh
 from tests.worker.simulation.rigs import ball
 from worker.grasps import Posture
+from worker.hands.jaws import pads_of
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.oppositions import oppositions_of
-from worker.hands.pads import pads_of
 from worker.hands.pinches import pinches_of
 from worker.objects.prepare import object_from_path
 from worker.planners.fast_graspd.across import ACROSS, NEAR_M, Openings, across, crossings_of, promising
@@ -26,8 +26,8 @@ from worker.planners.fast_graspd.scene_starts import REACHING, clear_scene_start
 from worker.planners.fast_graspd.selection import posture_of
 from worker.planners.fast_graspd.starts import CLEAR, start_generator
 from worker.planners.fast_graspd.withdrawal import hindrance
+from worker.simulation.data import HandState
 from worker.simulation.obstacles import MARGIN_M, DeviceObstacles, body_room
-from worker.simulation.state import HandState
 from worker.simulation.surroundings import Obstacle, Scenes, Surroundings
 
 UP = np.array([0.0, 0, 1])

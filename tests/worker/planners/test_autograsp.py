@@ -10,7 +10,7 @@ from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.planners.autograsp import kernels
 from worker.planners.autograsp.closing import TOUCH_M, Closed, Closer
 from worker.planners.peers import ground_of
-from worker.simulation.state import HandState
+from worker.simulation.data import HandState
 
 #: Hand points are 9 mm apart on these fingers: a curved link may come this much nearer between two of them [m].
 SAMPLED = 1.5e-3

@@ -26,8 +26,7 @@ from worker.quality.referee.short import SLIPS, push_trial
 from worker.run import Run
 from worker.scenes.kinds import rest_poses, supports_of
 from worker.scenes.trial import lift_trial
-from worker.simulation.data import Data
-from worker.simulation.state import HandState
+from worker.simulation.data import Data, HandState
 from worker.simulation.surroundings import Obstacle, Placed
 
 QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2, "finalists": 2})

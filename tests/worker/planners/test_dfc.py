@@ -15,7 +15,7 @@ from worker.planners.dfc.search import Descent
 from worker.planners.peers import ground_of
 from worker.planners.threads import Steps
 from worker.run import ALONE
-from worker.simulation.state import HandState
+from worker.simulation.data import HandState
 
 BOX = object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05)))
 WEIGHTS = np.array([1.0, 100.0, 100.0, 10.0, 1.0])

@@ -14,9 +14,9 @@ from tests.worker.models import object_from_mesh
 from worker.certified import certified_grasps
 from worker.commands.synth import _said
 from worker.files.synthesis import synthesized
+from worker.hands.jaws import thinnest_fingertip
 from worker.hands.load import hand_from_path
 from worker.hands.oppositions import oppositions_of
-from worker.hands.pads import thinnest_fingertip
 from worker.planners.fast_graspd.across import Openings, crossings_of, room_beside
 from worker.planners.fast_graspd.gaps import why_narrow
 from worker.run import Run

@@ -24,7 +24,7 @@ from worker.planners.graspd2022.search import (
     physics_of,
 )
 from worker.planners.peers import ground_of
-from worker.simulation.state import HandState
+from worker.simulation.data import HandState
 
 RADIUS = 0.05
 SPHERE = object_from_mesh(trimesh.creation.icosphere(subdivisions=4, radius=RADIUS))

@@ -22,7 +22,7 @@ from worker.planners.fast_graspd.starts import (
 )
 from worker.run import Run
 from worker.simulation.model import Model
-from worker.studies.stability.hands import ring_hand
+from worker.studies.stability.assets import ring_hand
 
 DRAFT = FIDELITIES["draft"]
 

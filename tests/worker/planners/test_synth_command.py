@@ -20,7 +20,7 @@ from service.readers import Grasps, open_shards
 from service.store.shards import Shard, read_shard
 from worker import certified
 from worker.commands import synth as synth_command
-from worker.files.of_shard import object_of_shard
+from worker.files.provenance import object_of_shard
 
 
 def run(*words: str | Path) -> Any:

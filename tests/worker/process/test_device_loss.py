@@ -18,7 +18,7 @@ from service.store.manifests import shard_exists
 from service.store.records import task_attempts
 from service.store.store import Store, open_store
 from tests.fakes import engine_of, fake_synthesize, message_for
-from worker.engines.cuda_errors import DeviceLost
+from worker.engines.devices import DeviceLost
 from worker.pool.pool import ProcessLost
 from worker.process import engine, main
 from worker.process.runner import Runner

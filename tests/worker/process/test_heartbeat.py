@@ -9,7 +9,7 @@ import pytest
 
 from service.model.clock import timestamp
 from service.model.states import Stage
-from service.model.worker_beat import WorkerBeat
+from service.model.workers import WorkerBeat
 from service.queue.port import EventKind
 from service.queue.rq_queue import RqQueue
 from tests.waiting import until

@@ -6,12 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from service.model.transforms import quat_rotate
+from service.model.transforms import Floats, quat_rotate
 from worker.grasps import Posture
-from worker.hands.jacobian import generalized_forces
 from worker.hands.jaws import slides
-from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel
+from worker.hands.kinematics import body_poses, generalized_forces
+from worker.hands.model import HandModel
 from worker.quality.contact import choose_contacts, finger_of_body
 from worker.quality.opening import (
     CLEARANCE_M,

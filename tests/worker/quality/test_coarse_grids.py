@@ -10,7 +10,7 @@ import pytest
 
 from tests.worker.models import two_finger_hand
 from tests.worker.simulation.rigs import ball
-from worker.objects import kept_arrays
+from worker.objects import disk_cache
 from worker.quality import probe
 from worker.quality.probe import Probe
 
@@ -56,7 +56,7 @@ def test_an_entry_that_is_not_sound_is_made_again(own_cache: Path, harm: str) ->
     if harm == "cut":
         file.write_bytes(whole[:-1])
     else:
-        kept_arrays._write(file, harms[harm])
+        disk_cache._write(file, harms[harm])
     assert same(distances(Probe(HAND, BALL, hand_points=100, object_points=64)), first)
     assert file.read_bytes() == whole
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.diversity import CELLS, GraspType, entropy_bits, evenness
+from service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits, evenness
 from service.model.transforms import apply, quat_from_axis_angle
 from tests.worker.models import object_from_mesh
 from tests.worker.quality.helpers import grasp_set, pad_hand, plate_hand, posture
@@ -87,7 +87,9 @@ def test_least_distance_of_zero_keeps_twins_and_given_ones_are_kept() -> None:
 
 
 def test_entropy_of_even_kinds_is_the_logarithm_of_their_number() -> None:
-    assert entropy_bits([7] * 48) == pytest.approx(math.log2(48)) and evenness([7] * 48, CELLS) == pytest.approx(1)
+    assert entropy_bits([7] * 48) == pytest.approx(math.log2(48)) and evenness(
+        [7] * 48, DIRECTION_CELLS
+    ) == pytest.approx(1)
     assert entropy_bits([9, 0]) == 0 and entropy_bits([]) == 0 and evenness([], 3) == 0
     assert entropy_bits([1, 1, 2]) == pytest.approx(1.5)
 

@@ -18,7 +18,7 @@ from service.model.matter import ACCELERATION, FRICTION, MASS_KG
 from service.store.shards import read_shard
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.grasps import GraspSet, Posture
-from worker.objects.matter import as_asked
+from worker.objects.options import as_asked
 from worker.objects.prepare import object_from_path
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.key import verdict_key

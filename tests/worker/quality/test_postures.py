@@ -12,8 +12,7 @@ from service.model.transforms import apply
 from tests.worker.models import object_from_mesh, piece, two_finger_hand
 from tests.worker.quality.helpers import plate_hand, posture
 from worker.grasps import Posture
-from worker.hands.jacobian import generalized_forces
-from worker.hands.kinematics import body_poses
+from worker.hands.kinematics import body_poses, generalized_forces
 from worker.hands.model import HandModel
 from worker.quality.opening import CLEARANCE_M, JAM_M, PALM_CLEARANCE_M
 from worker.quality.postures import STANDS_OFF_M, hold_forces, normal_force, pregrasp, squeeze, standing_off

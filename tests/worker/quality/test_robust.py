@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from service.model.errors import TaskCancelled
-from service.model.robust import Axis
+from service.model.metrics import Axis
 from tests.worker.models import object_from_mesh
 from tests.worker.quality.helpers import pad_hand, posture
 from worker.grasps import GraspSet

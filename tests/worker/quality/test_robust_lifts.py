@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.model.errors import InputError
-from service.model.robust import Axis
+from service.model.metrics import Axis
 from service.model.transforms import quat_from_axis_angle, quat_rotate
 from tests.worker.quality.test_lift import BOX, HAND, PLACED, WHOLE, beside, grasp
 from worker.grasps import GraspSet, joined

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from service.model.matter import MASS_KG
-from service.model.robust import Axis
+from service.model.metrics import Axis
 from service.model.transforms import apply
 from tests.worker.models import object_from_mesh, piece, two_finger_hand
 from tests.worker.quality.helpers import pad_hand, plate_hand, posture

@@ -10,12 +10,10 @@ from PIL import Image, ImageSequence, features
 
 from service.model.errors import InputError
 from service.model.transforms import apply, compose, invert
-from worker.commands.grasp_animation import waypoints
+from worker.commands.grasp_sheet import waypoints
 from worker.grasps import Posture
-from worker.rendering.pages.animation import KINDS, animation
-from worker.robots.execution import POSTURES, Executions
-from worker.robots.frames import ToolFrame
-from worker.robots.timing import straight_paths, timed
+from worker.rendering.pages.way_pictures import KINDS, animation
+from worker.robots.execution import POSTURES, Executions, ToolFrame, straight_paths, timed
 
 SECONDS = [0.5, 0.05, 1.2]
 

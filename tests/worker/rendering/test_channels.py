@@ -16,9 +16,8 @@ from service.store.shards import check_columns
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.objects.model import ObjectModel
 from worker.rendering import Extras, render
-from worker.rendering.camera_file import GivenCameras, read_cameras
-from worker.rendering.cameras import intrinsics, look_at
-from worker.rendering.channels import parse_channels
+from worker.rendering.annotate import parse_channels
+from worker.rendering.cameras import GivenCameras, intrinsics, look_at, read_cameras
 from worker.rendering.hands import DrawnHand
 from worker.scenes import Neighbours
 

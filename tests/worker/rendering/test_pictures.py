@@ -12,8 +12,17 @@ from PIL import Image
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.rendering import render
 from worker.rendering.pages.pictures import THREE_SIDES, grasp_pictures
-from worker.rendering.pages.sheets import GAP, MARGIN, best, contact_sheet, figures, three_sides_sheet, views_page
-from worker.rendering.pages.typography import PAPER, depth_colours
+from worker.rendering.pages.sheets import (
+    GAP,
+    MARGIN,
+    PAPER,
+    best,
+    contact_sheet,
+    depth_colours,
+    figures,
+    three_sides_sheet,
+    views_page,
+)
 
 HAND = two_finger_hand()
 POSES = np.array([[0, 0, -0.06, 1.0, 0, 0, 0], [0, 0, 0.06, 0, 1.0, 0, 0]])

@@ -16,7 +16,7 @@ from tests.worker.hands.urdfs import joint, link, robot
 from worker.hands.load import hand_from_path, load_hand
 from worker.hands.model import HandModel
 from worker.rendering.hands import drawn_bodies, hand_parts, without_visuals
-from worker.stages.glb import hand_glb
+from worker.stages.models import hand_glb
 
 BOX = '<collision><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'
 RED = '<material name="red"><color rgba="1 0 0 1"/></material>'

@@ -17,7 +17,7 @@ from service.model.transforms import IDENTITY_POSE, compose, pose_from_matrix
 from tests.worker.robots.arms import JOINTS, write_arm
 from tests.worker.robots.shards import run
 from worker.robots.arm import read_arm
-from worker.robots.timing import ASSUMED_RAD_S
+from worker.robots.execution import ASSUMED_RAD_S
 
 pytest.importorskip("mink")
 

@@ -20,9 +20,19 @@ from worker.hands.kinematics import body_poses
 from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.model import MujocoOptions, build
 from worker.quality.referee.protocol import Test as Trial
-from worker.robots.execution import POSTURES, Executions, executions
-from worker.robots.frames import parse_pose, tool_frame
-from worker.robots.timing import ASSUMED_RAD_S, HAND_M_S, Limits, hand_limits, straight_paths, timed
+from worker.robots.execution import (
+    ASSUMED_RAD_S,
+    HAND_M_S,
+    POSTURES,
+    Executions,
+    Limits,
+    executions,
+    hand_limits,
+    parse_pose,
+    straight_paths,
+    timed,
+    tool_frame,
+)
 
 TOOL = tool_frame(None, "palm", {})
 

@@ -27,7 +27,7 @@ from worker.planners.port import Wanted
 from worker.run import ALONE
 from worker.scenes.clearance import MARGIN_M, transfer
 from worker.scenes.kinds import rest_poses, supports_of
-from worker.scenes.verdicts import scene_verdicts
+from worker.scenes.trial import scene_verdicts
 from worker.scenes.way import plan_way
 from worker.simulation.mounting import mounting_room
 from worker.simulation.obstacles import DeviceObstacles

@@ -105,9 +105,27 @@ def test_synth_in_a_scene_counts_grasps_that_lift(tmp_path: Path) -> None:
     out = tmp_path / "g.h5"
     result = CliRunner().invoke(
         build(),
-        ["synth", "--hand", "barrett", "--object", "block", "--scene", "table", "--scenes", "2", "-n", "3",
-         "--budget", "8", "--fidelity", "draft", "-o", str(out), "--json"],
-    )  # fmt: skip
+        [
+            "synth",
+            "--hand",
+            "barrett",
+            "--object",
+            "block",
+            "--scene",
+            "table",
+            "--scenes",
+            "2",
+            "-n",
+            "3",
+            "--budget",
+            "8",
+            "--fidelity",
+            "draft",
+            "-o",
+            str(out),
+            "--json",
+        ],
+    )
     assert result.exit_code == 0, result.output
     said = json.loads(result.stdout.splitlines()[-1])
     assert {"scene", "scenes", "clear_share", "lift_share", "lift_hard_share"} <= set(said)
@@ -133,8 +151,19 @@ def test_lifting_grasps_of_a_free_object_is_refused(tmp_path: Path) -> None:
 def test_a_method_for_free_objects_says_so(tmp_path: Path) -> None:
     result = CliRunner().invoke(
         build(),
-        ["synth", "--hand", "barrett", "--object", "block", "--scene", "table", "--method", "dfc", "-o",
-         str(tmp_path / "g.h5")],
-    )  # fmt: skip
+        [
+            "synth",
+            "--hand",
+            "barrett",
+            "--object",
+            "block",
+            "--scene",
+            "table",
+            "--method",
+            "dfc",
+            "-o",
+            str(tmp_path / "g.h5"),
+        ],
+    )
     assert result.exit_code == 2
     assert "free objects only" in result.output

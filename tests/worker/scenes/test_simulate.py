@@ -218,10 +218,17 @@ def test_a_flat_object_is_refused_by_name():
     flat = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], [[0, 1, 2], [0, 2, 1]], process=False)
     box = bracket()
     obj = ObjectModel(
-        name="sheet", digest="f" * 32, vertices=flat.vertices, faces=np.asarray(flat.faces, np.int32),
-        corner_normals=np.zeros((2, 3, 3)), volume=1e-9, centre_of_mass=np.array([0.03, 0.03, 0]),
-        inertia=box.inertia, radius=0.1, hull_vertices=np.asarray(flat.vertices),
+        name="sheet",
+        digest="f" * 32,
+        vertices=flat.vertices,
+        faces=np.asarray(flat.faces, np.int32),
+        corner_normals=np.zeros((2, 3, 3)),
+        volume=1e-9,
+        centre_of_mass=np.array([0.03, 0.03, 0]),
+        inertia=box.inertia,
+        radius=0.1,
+        hull_vertices=np.asarray(flat.vertices),
         hull_faces=np.asarray(flat.faces, np.int32),
-    )  # fmt: skip
+    )
     with pytest.raises(MeshError, match="sheet"):
         drop(obj, count=1, seed=0)

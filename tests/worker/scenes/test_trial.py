@@ -85,10 +85,13 @@ LIFTED, TOUCHED, FELL = 1, 3, 5
 
 def test_a_score_is_that_of_the_lift(monkeypatch: pytest.MonkeyPatch) -> None:
     found = trial_of(
-        monkeypatch, [0.2, 0.3, 0.4, 1.2, 1.3, 0.5, 4.0],
-        {True: [LIFTED, FELL, FELL, FELL, FELL, TOUCHED, FELL],
-         False: [LIFTED, LIFTED, FELL, LIFTED, FELL, TOUCHED, FELL]},
-    )  # fmt: skip
+        monkeypatch,
+        [0.2, 0.3, 0.4, 1.2, 1.3, 0.5, 4.0],
+        {
+            True: [LIFTED, FELL, FELL, FELL, FELL, TOUCHED, FELL],
+            False: [LIFTED, LIFTED, FELL, LIFTED, FELL, TOUCHED, FELL],
+        },
+    )
     falls = SLIPS + 1.0 + FALLS * np.array([0.4, 1.0])
     assert found == pytest.approx([0.2, SLIPS, falls[0], 1.2, falls[1], 0.5 + TOUCHES, 4.0])
     assert found[0] <= BEST

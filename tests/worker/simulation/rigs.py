@@ -11,11 +11,10 @@ from worker.objects.model import ObjectModel
 from worker.objects.prepare import build
 from worker.objects.repair import Repaired
 from worker.simulation import kernels
-from worker.simulation.data import Data
+from worker.simulation.data import Data, Schedule
 from worker.simulation.device import DeviceHand, DeviceObject
 from worker.simulation.model import LossOptions, Model
 from worker.simulation.sampling import object_samples
-from worker.simulation.state import Schedule
 
 
 def object_of(mesh: trimesh.Trimesh) -> ObjectModel:

@@ -10,7 +10,7 @@ import pytest
 
 from service import user_cache
 from tests.worker.simulation.rigs import ball
-from worker.objects import kept_arrays
+from worker.objects import disk_cache
 from worker.simulation import grids, kernels
 from worker.simulation.device import DeviceObject
 from worker.simulation.sampling import object_samples
@@ -100,13 +100,13 @@ def test_an_entry_that_would_lead_kernels_astray_is_made_again(
 ) -> None:
     first = grid()
     (file,) = own_cache.iterdir()
-    arrays = dict(kept_arrays._read(file) or {})
+    arrays = dict(disk_cache._read(file) or {})
     for name, change in harm.items():
         if change is None:
             del arrays[name]
         else:
             arrays[name] = change(arrays[name])
-    kept_arrays._write(file, arrays)
+    disk_cache._write(file, arrays)
     assert same(grid(), first) and len(computed) == 2
     assert same(grid(), first) and len(computed) == 2, "the entry is whole again"
 

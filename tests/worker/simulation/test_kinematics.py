@@ -15,9 +15,9 @@ from tests.worker.simulation.rigs import ball, rig
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
+from worker.simulation.data import HandState
 from worker.simulation.kernels import kinematics, wrenches
 from worker.simulation.record import record_placement
-from worker.simulation.state import HandState
 
 #: float32 positions of a hand 0.2 m large through at most 8 joints.
 FK_TOLERANCE = 3e-7

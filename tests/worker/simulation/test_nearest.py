@@ -10,8 +10,8 @@ from tests.worker.simulation.rigs import object_of
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.simulation import kernels
-from worker.simulation.cells import feature_normals
 from worker.simulation.device import DeviceObject, sorted_samples
+from worker.simulation.grids import feature_normals
 from worker.simulation.kernels import surface
 from worker.simulation.sampling import object_samples
 

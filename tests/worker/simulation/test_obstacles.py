@@ -13,13 +13,12 @@ from tests.worker.simulation.solids import nearest_edges
 from tests.worker.simulation.test_penalties import RELATIVE, bodies_of, differences
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
-from worker.simulation.data import Data
+from worker.scenes.beside import outer_solid
+from worker.simulation.data import Data, HandState
 from worker.simulation.model import LossOptions, Model
 from worker.simulation.obstacles import DeviceObstacles
-from worker.simulation.outer import outer_solid
 from worker.simulation.projection import Projection, ProjectionOptions
 from worker.simulation.record import record_evaluation, record_placement
-from worker.simulation.state import HandState
 from worker.simulation.surroundings import Obstacle, Surroundings
 
 MARGIN = 0.004

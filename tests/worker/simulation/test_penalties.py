@@ -16,10 +16,10 @@ from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.hands.surface import piece_distance, sample_surface
+from worker.simulation.data import HandState, Schedule
 from worker.simulation.model import REFERENCE_POINTS, REFERENCE_SAMPLES, REFERENCE_SELF_POINTS, LossOptions
 from worker.simulation.record import record_evaluation, record_iteration
 from worker.simulation.sampling import object_samples
-from worker.simulation.state import HandState, Schedule
 
 #: float32 depths of 1e-3 m from coordinates of 0.1 m are good to 1e-5 relative; points that enter or leave within the
 #: difference add the rest.

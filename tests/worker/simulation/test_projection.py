@@ -10,17 +10,15 @@ import warp as wp
 
 from service.model.transforms import quat_from_axis_angle, quat_multiply
 from tests.worker.models import object_from_mesh, two_finger_hand
-from worker.hands.jacobian import generalized_forces
-from worker.hands.kinematics import body_poses
+from worker.hands.kinematics import body_poses, generalized_forces
 from worker.hands.surface import sample_surface
 from worker.planners.fast_graspd.selection import posture_of
-from worker.simulation.data import Data
+from worker.simulation.data import Data, HandState, still_schedule
 from worker.simulation.device import DeviceHand, DeviceObject
 from worker.simulation.kernels import projection as kernels
 from worker.simulation.model import LossOptions, Model
 from worker.simulation.projection import Projection, ProjectionOptions
 from worker.simulation.sampling import object_samples
-from worker.simulation.state import HandState, still_schedule
 
 HAND = two_finger_hand()
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))

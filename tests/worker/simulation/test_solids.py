@@ -12,8 +12,8 @@ from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
+from worker.scenes.beside import MOST_PLANES, outer_solid
 from worker.simulation.obstacles import FAR_M, obstacle_distances
-from worker.simulation.outer import MOST_PLANES, outer_solid
 from worker.simulation.surroundings import Obstacle, Surroundings
 
 UP = np.array([0.0, 0.0, 1.0])

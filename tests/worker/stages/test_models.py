@@ -13,13 +13,12 @@ from service.model import names
 from service.model.states import AssetKind
 from service.model.transforms import IDENTITY_POSE, apply
 from service.store.assets import builtin_files, builtin_model, builtin_names
-from service.store.seals import sealed
+from service.store.integrity import sealed
 from service.store.store import open_store
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
-from worker.stages.glb import hand_glb, object_glb
-from worker.stages.models import model_of, publish_model
+from worker.stages.models import hand_glb, model_of, object_glb, publish_model
 
 #: Positions are single precision: half a micrometre at half a metre.
 TOLERANCE_M = 5e-7

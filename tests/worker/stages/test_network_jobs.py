@@ -17,14 +17,13 @@ from service.model.domain import Asset, JobOptions, JobRequest
 from service.model.messages import IngestMessage
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
-from service.model.scene_kinds import has_table
-from service.model.scene_options import scene_of
+from service.model.scene_spec import has_table, scene_of
 from service.model.states import AssetKind, Lane, Stage
 from service.queue.port import EventKind
 from service.store.assets import builtin_files, pack
 from service.store.library import load_check, publish_asset
 from service.store.manifests import load_shard
-from service.store.network_check import NETWORK_FILE, check_network
+from service.store.network_file import NETWORK_FILE, check_network
 from service.store.store import Store, open_store
 from tests.networks import LEARNED, network_files, random_network
 from worker.files.synthesis import synthesized

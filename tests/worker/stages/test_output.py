@@ -9,7 +9,7 @@ import pytest
 from service.model.messages import TaskMessage
 from service.model.states import Stage
 from tests.fakes import request
-from worker.stages.output import batch_seed
+from worker.stages.context import batch_seed
 
 
 def message(**changes: Any) -> TaskMessage:

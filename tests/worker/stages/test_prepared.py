@@ -13,8 +13,7 @@ from service.store.library import publish_asset
 from service.store.store import Store, open_store
 from tests.worker.objects.shapes import box, join, sphere, stl
 from worker.objects.model import ObjectModel
-from worker.objects.packed import from_bytes, to_bytes
-from worker.objects.prepare import load_object
+from worker.objects.prepare import from_bytes, load_object, to_bytes
 from worker.stages import assets
 from worker.stages.assets import prepared_object
 

@@ -18,7 +18,7 @@ from service.model.domain import JobRequest
 from service.model.errors import TaskRefused
 from service.model.planning import message_of, plan
 from service.model.records import AttemptRecord, JobRecord
-from service.model.scene_kinds import supports_in
+from service.model.scene_spec import supports_in
 from service.model.states import AssetKind, Lane, Stage
 from service.queue.port import EventKind
 from service.readers import Grasps, Pictures, open_shards
@@ -28,7 +28,7 @@ from service.store.manifests import load_manifest, load_shard
 from service.store.records import put_record, read_record
 from service.store.shards import Shard
 from service.store.store import Store, open_store
-from worker.files.of_shard import placed_of_shard
+from worker.files.provenance import placed_of_shard
 from worker.files.synthesis import synthesized
 from worker.process.runner import Runner
 from worker.rendering import Extras
@@ -36,8 +36,7 @@ from worker.rendering import render as pictures
 from worker.run import Run
 from worker.stages import render, scene, synthesize
 from worker.stages.assets import object_of
-from worker.stages.context import TaskContext
-from worker.stages.output import batch_seed
+from worker.stages.context import TaskContext, batch_seed
 
 TABLE = {
     "grasps": 6,

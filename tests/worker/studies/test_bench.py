@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from service.model.fidelity import FIDELITIES
-from worker.commands.bench import app
+from worker.commands.studies import app
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners.fast_graspd.pairs import pair_of
@@ -37,7 +37,9 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, object],
     out = tmp_path_factory.mktemp("bench")
     arguments = ["--hand", "barrett", "--object", "block", "--fidelity", "draft", "--batch", "1", "--batch", "4"]
     arguments += ["--join", "1", "--join", "2"]
-    done = CliRunner().invoke(app, [*arguments, "--threads", "1", "--repeats", "1", "--out", str(out), "--json"])
+    done = CliRunner().invoke(
+        app, ["bench", *arguments, "--threads", "1", "--repeats", "1", "--out", str(out), "--json"]
+    )
     assert done.exit_code == 0, done.output
     return json.loads(done.stdout.strip().splitlines()[-1]), out
 
@@ -90,5 +92,5 @@ def test_kernel_shares_add_up_and_the_distance_query_is_among_them() -> None:
 
 
 def test_an_unknown_fidelity_is_the_callers_mistake() -> None:
-    done = CliRunner().invoke(app, ["--fidelity", "superb"])
+    done = CliRunner().invoke(app, ["bench", "--fidelity", "superb"])
     assert done.exit_code == 2

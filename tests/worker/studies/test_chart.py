@@ -12,14 +12,14 @@ import pytest
 from typer.testing import CliRunner
 
 from service.model.fidelity import FIDELITIES
+from service.store.records import latest
 from service.store.store import open_store
-from service.store.study_records import latest
-from worker.commands.chart import app
+from worker.commands.studies import app
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.run import Run
+from worker.studies.chart.chart import settings_of
 from worker.studies.chart.report import markdown
-from worker.studies.chart.settings import settings_of
 from worker.studies.chart.statistics import first_valid, pareto, summed
 from worker.studies.chart.sweeps import Turn, _make, asking_each, turns
 
@@ -45,7 +45,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path
     folder = tmp_path_factory.mktemp("chart")
     arguments = ["--quick", "--methods", "fast_graspd,autograsp", "--hands", "barrett", "--objects", "block"]
     arguments += ["--publish", "--data-dir", str(folder / "data"), "--out", str(folder), "--json"]
-    done = CliRunner().invoke(app, arguments)
+    done = CliRunner().invoke(app, ["chart", *arguments])
     assert done.exit_code == 0, done.output
     return json.loads(done.stdout.strip().splitlines()[-1]), folder
 
@@ -113,7 +113,7 @@ def test_a_published_chart_is_the_latest_in_the_store(made: tuple[dict[str, Any]
     ],
 )
 def test_a_wrong_option_is_the_callers_mistake(arguments: list[str]) -> None:
-    done = CliRunner().invoke(app, ["--quick", *arguments])
+    done = CliRunner().invoke(app, ["chart", "--quick", *arguments])
     assert done.exit_code == 2
 
 

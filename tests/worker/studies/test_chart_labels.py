@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from matplotlib.figure import Figure
 
-from worker.studies.chart.labels import Label, place
+from worker.studies.chart.figure import Label, place
 
 CROWDS = {
     "beside each other": [(10.0, 0.98), (13.0, 0.95), (14.0, 0.93), (22.0, 0.94)],

@@ -10,7 +10,7 @@ import trimesh
 from typer.testing import CliRunner
 
 from tests.worker.models import object_from_mesh
-from worker.commands.gallery import app
+from worker.commands.admin import app
 from worker.rendering.scene_setup import CameraPlan, Setting
 from worker.run import Run
 from worker.studies.rendering_bench import COMPRESSIONS, bench_render, tables

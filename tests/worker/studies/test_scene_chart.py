@@ -12,21 +12,20 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from service.model.charts import FILTERED, IN_SCENE
 from service.model.scene_spec import SceneSpec
+from service.model.studies import FILTERED, IN_SCENE
 from service.pipeline.fidelity_choice import cheapest
+from service.store.records import latest
 from service.store.store import open_store
-from service.store.study_records import latest
-from worker.commands.chart import app
+from worker.commands.studies import app
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.quality.intervals import wilson
 from worker.run import Run
 from worker.studies.chart import scenes
-from worker.studies.chart.chart import Thing
+from worker.studies.chart.chart import Thing, settings_of
 from worker.studies.chart.scene_report import markdown
 from worker.studies.chart.scenes import figures, summed
-from worker.studies.chart.settings import settings_of
 
 TABLE = SceneSpec(kind="table", faces="all")
 ARGUMENTS = ("--scene", "table", "--quick", "--methods", "fast_graspd,autograsp", "--hands", "barrett")
@@ -36,7 +35,7 @@ ARGUMENTS = ("--scene", "table", "--quick", "--methods", "fast_graspd,autograsp"
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
     folder = tmp_path_factory.mktemp("chart")
     arguments = [*ARGUMENTS, "--objects", "block", "--work", str(folder / "work"), "--out", str(folder), "--json"]
-    done = CliRunner().invoke(app, arguments)
+    done = CliRunner().invoke(app, ["chart", *arguments])
     assert done.exit_code == 0, done.output
     return json.loads(done.stdout.strip().splitlines()[-1]), folder
 
@@ -86,13 +85,13 @@ def test_a_run_that_was_stopped_plans_only_what_is_missing(
     runs = {(run["method"], run["way"]): run for run in found["runs"]}
     monkeypatch.setattr("worker.studies.chart.scenes._tried", tried)
     arguments = [*ARGUMENTS, "--objects", "block", "--work", str(folder / "work"), "--json"]
-    again = json.loads(CliRunner().invoke(app, arguments).stdout.strip().splitlines()[-1])
+    again = json.loads(CliRunner().invoke(app, ["chart", *arguments]).stdout.strip().splitlines()[-1])
     assert len(planned) == 1
     assert again["runs"] == found["runs"]
 
 
 def test_a_sweep_is_refused_with_a_scene() -> None:
-    done = CliRunner().invoke(app, [*ARGUMENTS, "--objects", "block", "--sweep"])
+    done = CliRunner().invoke(app, ["chart", *ARGUMENTS, "--objects", "block", "--sweep"])
     assert done.exit_code == 2 and "leave out --scene" in done.output
 
 
@@ -101,7 +100,7 @@ def test_a_chart_measured_earlier_is_published_apart_from_free_ones_and_drawn(
 ) -> None:
     found, folder = made
     arguments = ["--from", str(folder / "chart.json"), "--publish", "--data-dir", str(tmp_path), "--out", str(tmp_path)]
-    done = CliRunner().invoke(app, arguments)
+    done = CliRunner().invoke(app, ["chart", *arguments])
     assert done.exit_code == 0, done.output
     store = open_store((tmp_path / "store").as_uri())
     stored = latest(store, "scene_charts/table")
@@ -122,7 +121,7 @@ def test_a_chart_measured_earlier_is_published_apart_from_free_ones_and_drawn(
 def test_a_file_that_is_no_chart_is_refused_in_a_line(tmp_path: Path, content: str, words: str) -> None:
     file = tmp_path / "chart.json"
     file.write_text(content)
-    done = CliRunner().invoke(app, ["--from", str(file)])
+    done = CliRunner().invoke(app, ["chart", "--from", str(file)])
     assert done.exit_code == 2 and words in " ".join(done.output.split())
 
 

@@ -16,20 +16,20 @@ from typer.testing import CliRunner
 from service.model.domain import JobRequest
 from service.model.errors import MeshError
 from service.model.fidelity import FIDELITIES
-from service.model.stability import MapCell, Stability, StabilityMap, from_json, graded
+from service.model.studies import MapCell, Stability, StabilityMap, from_json, graded
+from service.store.records import latest
 from service.store.store import open_store
-from service.store.study_records import latest
 from worker.certified import certified_grasps
-from worker.commands.stability import STUDIES, app
+from worker.commands.studies import STUDIES, app
 from worker.engines import backend
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.prepare import object_from_path
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.run import ALONE
+from worker.simulation.data import HandState
 from worker.simulation.model import LossOptions
-from worker.simulation.state import HandState
-from worker.studies.stability import descents, gradients, integrators, report, shapes, studies
+from worker.studies.stability import assets, descents, gradients, integrators, report, studies
 from worker.studies.stability.report import markdown, write
 
 
@@ -74,7 +74,7 @@ def test_gradients_agree_at_the_sizes_of_hands_and_their_objects() -> None:
 
 
 def test_a_shape_is_refused_or_its_grasps_are_sound(hand: HandModel) -> None:
-    found = shapes.shape_map(
+    found = assets.shape_map(
         hand, fidelities=("draft",), count=4, families=(), defects=("a side is missing", "inside out")
     )
     by_name = {cell.x: cell for cell in found.cells}
@@ -83,9 +83,9 @@ def test_a_shape_is_refused_or_its_grasps_are_sound(hand: HandModel) -> None:
 
 
 def test_a_mesh_without_an_inside_is_refused_with_the_mend() -> None:
-    mesh, options = shapes.DEFECTS["a side is missing"]
+    mesh, options = assets.DEFECTS["a side is missing"]
     with pytest.raises(MeshError, match="allow-open"):
-        shapes.prepared(mesh(), options, 1e-3)
+        assets.prepared(mesh(), options, 1e-3)
 
 
 def test_a_start_that_is_too_far_is_flagged(pair: Pair) -> None:
@@ -96,7 +96,7 @@ def test_a_start_that_is_too_far_is_flagged(pair: Pair) -> None:
 
 
 def test_a_job_whose_every_grasp_is_bad_ends_with_none(hand: HandModel) -> None:
-    crumb = shapes.prepared(shapes.cube(1), {"units": "m"}, 1e-5)
+    crumb = assets.prepared(assets.cube(1), {"units": "m"}, 1e-5)
     request = JobRequest(hand="hand", object="crumb", grasps=2, fidelity="draft", budget=2, audits=0)
     found = certified_grasps(hand, crumb, request, count=2)
     assert found.tried == len(found.grasps) + sum(found.rejected.values())
@@ -170,7 +170,7 @@ def test_numbers_on_a_picture_stay_within_their_cells(letters: str) -> None:
 
 
 def command(*arguments: str) -> tuple[int, str]:
-    done = CliRunner().invoke(app, list(arguments))
+    done = CliRunner().invoke(app, ["stability", *arguments])
     return done.exit_code, done.output
 
 

@@ -8,8 +8,8 @@ import pytest
 from worker.engines import backend
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
-from worker.studies.stability import hands
-from worker.studies.stability.hands import Coupling, ring_hand
+from worker.studies.stability import assets
+from worker.studies.stability.assets import Coupling, ring_hand
 
 
 def tips(hand: HandModel, joints: np.ndarray) -> np.ndarray:
@@ -51,7 +51,7 @@ def test_the_distal_joint_turns_by_the_ratio_of_the_one_before_it() -> None:
 
 def test_a_palm_without_fingers_is_refused_and_three_of_them_hold() -> None:
     backend.start()
-    found = hands.hand_map(
+    found = assets.hand_map(
         fingers=(0, 3), sizes=(), ratios=(), couplings=("distal follows",), fidelity="draft", count=4
     )
     by_fingers = {cell.x: cell for cell in found.cells}
@@ -61,5 +61,5 @@ def test_a_palm_without_fingers_is_refused_and_three_of_them_hold() -> None:
 
 def test_fingers_of_one_drive_hold_a_cube_between_them() -> None:
     backend.start()
-    found = hands.hand_map(fingers=(3, 5), sizes=(), ratios=(), couplings=("one drive",), fidelity="draft", count=4)
+    found = assets.hand_map(fingers=(3, 5), sizes=(), ratios=(), couplings=("one drive",), fidelity="draft", count=4)
     assert [cell.outcome for cell in found.cells] == ["good", "good"]

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.model.robust import Axis
-from service.model.stability import MapCell
+from service.model.metrics import Axis
+from service.model.studies import MapCell
 from worker.engines import backend
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path

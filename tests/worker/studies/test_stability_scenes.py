@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 from graspd.cli import build
 from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
-from service.model.stability import MapCell, Stability, StabilityMap, from_json
+from service.model.studies import MapCell, Stability, StabilityMap, from_json
 from tests.worker.simulation.test_surroundings import mujoco_room
 from worker.certified import Certified
-from worker.commands.stability import app
+from worker.commands.studies import app
 from worker.engines import backend
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
@@ -130,7 +130,7 @@ def test_maps_of_several_runs_are_drawn_and_published_as_one(tmp_path: Path) -> 
         run = Stability(f"2026-01-0{value:.0f}T00:00:00Z", f"graspd stability {name}", {"graspd": "0"}, [one, own])
         (tmp_path / f"{name}.json").write_text(json.dumps(run.as_json()))
     words = [part for name in ("first", "second") for part in ("--from", str(tmp_path / f"{name}.json"))]
-    result = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out"), "--json"])
+    result = CliRunner().invoke(app, ["stability", *words, "--out", str(tmp_path / "out"), "--json"])
     assert result.exit_code == 0, result.output
     found = from_json(json.loads((tmp_path / "out" / "stability.json").read_text()))
     assert {one.name: one.title for one in found.maps} == {"shared": "second", "first": "first", "second": "second"}

@@ -8,16 +8,13 @@ from typing import Any, Final
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE
+from service.model.transforms import IDENTITY_POSE, Floats
 from worker.files.exchange.bench_scene import TABLETOP
-from worker.files.exchange.objects import mesh_file, write_obj
+from worker.files.exchange.imported import mesh_file, write_obj
 from worker.hands.primitives import hull, volume
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import decompose
-
-Floats = NDArray[np.float64]
 
 #: Where a checkout of DexGraspBench keeps a set of objects.
 SET: Final = Path("assets") / "object" / "graspd"

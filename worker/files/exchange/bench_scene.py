@@ -12,19 +12,17 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
-from service.model.transforms import IDENTITY_POSE, compose, invert
-from worker.files.exchange.bench_mapping import HandMapping
-from worker.files.exchange.pickles import load_npy
+from service.model.transforms import IDENTITY_POSE, Floats, compose, invert
+from worker.files.exchange.bench_hand import HandMapping
+from worker.files.exchange.imported import load_npy
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.scenes.kinds import supports_of
 from worker.simulation.surroundings import Placed
 
-Floats = NDArray[np.float64]
 Row = dict[str, Any]
 
 #: Folder of scenes with a table, and part of the name of an experiment.

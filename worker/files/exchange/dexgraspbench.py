@@ -15,12 +15,18 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import IDENTITY_POSE, compose, invert
-from worker.files.exchange.bench_hand import joint_order, write_hand
-from worker.files.exchange.bench_mapping import GRASPS, HandMapping, link_names, mapping_of, of_the_benchmark
+from service.model.transforms import IDENTITY_POSE, Floats, compose, invert
+from worker.files.exchange.bench_hand import (
+    GRASPS,
+    HandMapping,
+    joint_order,
+    link_names,
+    mapping_of,
+    of_the_benchmark,
+    write_hand,
+)
 from worker.files.exchange.bench_object import SCALE, write_object, write_table
 from worker.files.exchange.bench_scene import (
     TABLETOP,
@@ -31,17 +37,14 @@ from worker.files.exchange.bench_scene import (
     tabletop_fields,
     with_way,
 )
-from worker.files.exchange.imported import Imported
-from worker.files.exchange.names import plain_name
-from worker.files.exchange.objects import scaled_object
-from worker.files.exchange.pickles import load_npy
+from worker.files.exchange.imported import Imported, load_npy, scaled_object
+from worker.files.exchange.lots import plain_name
 from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.simulation.surroundings import Placed
 
-Floats = NDArray[np.float64]
 Row = dict[str, Any]
 
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")

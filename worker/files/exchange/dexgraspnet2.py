@@ -31,24 +31,20 @@ import numpy as np
 import scipy.io
 from numpy.typing import NDArray
 
+from service.model.base import why
 from service.model.errors import InputError
-from service.model.refusals import why
-from service.model.transforms import apply, compose, invert, pose_from_matrix, pose_to_matrix
+from service.model.transforms import Floats, apply, compose, invert, pose_from_matrix, pose_to_matrix
 from service.readers import DepthNoise, Pictures
-from service.readers.cloud_views import CloudView
+from service.readers.clouds import CloudView
 from worker.files.exchange.dexgraspnet2_graspness import SceneGraspness, surface_samples
-from worker.files.exchange.imported import Imported, completed, joints_by_name, verdicts
-from worker.files.exchange.lots import Look, Lot, by_scene, looks
-from worker.files.exchange.names import plain_name
-from worker.files.exchange.objects import scaled_object
-from worker.files.exchange.written import Written
+from worker.files.exchange.imported import Imported, completed, joints_by_name, scaled_object, verdicts
+from worker.files.exchange.lots import Look, Lot, Written, by_scene, looks, plain_name
 from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.rendering.annotate import OBJECT
 from worker.rendering.export import export_png
 
-Floats = NDArray[np.float64]
 CAMERA: Final = "realsense"
 #: Views of a scene, among which its loader draws.
 VIEWS: Final = 256

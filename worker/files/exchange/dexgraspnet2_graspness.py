@@ -29,16 +29,14 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from service.model.transforms import IDENTITY_POSE, apply, invert, quat_rotate
+from service.model.transforms import IDENTITY_POSE, Floats, apply, invert, quat_rotate
 from worker.grasps import Posture
+from worker.hands.jaws import fingertip_pad
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
-from worker.hands.pads import fingertip_pad
 from worker.hands.surface import OVERSAMPLING, farthest_points
 from worker.objects.distance import sample_faces
 from worker.objects.model import ObjectModel
-
-Floats = NDArray[np.float64]
 
 SAMPLES: Final = 1000
 #: Half the opening of the cone that a grasp looks into [rad], and how far beyond its first point it sees [m].

@@ -22,17 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import IDENTITY_POSE, apply, invert
+from service.model.transforms import IDENTITY_POSE, Floats, apply, invert
 from service.readers import DepthNoise, Pictures
-from worker.files.exchange.bench_mapping import COLLECTED, HandMapping
+from worker.files.exchange.bench_hand import COLLECTED, HandMapping
 from worker.files.exchange.bench_object import SET, write_object, write_table
 from worker.files.exchange.bench_scene import TABLETOP, check_table
 from worker.files.exchange.dexgraspbench import POSTURES, experiment, models_of, postures
-from worker.files.exchange.lots import Look, Lot, looks, object_points
-from worker.files.exchange.written import Written
+from worker.files.exchange.lots import Look, Lot, Written, looks, object_points
 from worker.grasps import GraspSet
-
-Floats = NDArray[np.float64]
 
 #: Folder of each `quality/grasp_type`; the number before the line is what a network is told.
 TYPES: Final = ("0_any", "1_power", "2_precision", "3_lateral")

@@ -25,13 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import apply, pose_from_matrix, pose_to_matrix, quat_from_matrix
-from service.store import standing
-from worker.files.exchange.imported import Imported, completed, joints_by_name
-from worker.files.exchange.lots import Lot
-from worker.files.exchange.names import plain_name
-from worker.files.exchange.objects import mesh_file, scaled_object
-from worker.files.exchange.written import Written
+from service.model.transforms import Floats, apply, pose_from_matrix, pose_to_matrix, quat_from_matrix
+from service.store import validity
+from worker.files.exchange.imported import Imported, completed, joints_by_name, mesh_file, scaled_object
+from worker.files.exchange.lots import Lot, Written, plain_name
 from worker.grasps import GraspSet, Posture
 from worker.hands.jaws import jaws_of
 from worker.hands.kinematics import body_poses
@@ -42,9 +39,8 @@ from worker.planners.autograsp import kernels
 from worker.planners.autograsp.closing import Closer
 from worker.planners.fast_graspd.selection import posture_of
 from worker.planners.peers import ground_of
-from worker.simulation.state import HandState
+from worker.simulation.data import HandState
 
-Floats = NDArray[np.float64]
 MEMBER: Final = "grasps.json"
 INDEX: Final = "uuid_index.json"
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
@@ -140,7 +136,7 @@ def _record(hand: HandModel, lots: list[Lot]) -> dict[str, Any]:
         some: list[Posture] = [getattr(lot.grasps, name).take(lot.rows) for lot in lots]
         parts[f"{name}_pose"] = np.concatenate([part.hand_pose for part in some])
         parts[f"{name}_joints"] = np.concatenate([part.joint_positions for part in some])
-    held = np.concatenate([standing.valid(lot.shard.arrays)[lot.rows] for lot in lots])
+    held = np.concatenate([validity.valid(lot.shard.arrays)[lot.rows] for lot in lots])
     grasps = {"transforms": pose_to_matrix(parts["grasp_pose"]).tolist(), "object_in_gripper": held.tolist()}
     return {
         "object": {"file": f"{uuid_of(lots[0])}.obj", "scale": 1.0},

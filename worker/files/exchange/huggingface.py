@@ -21,21 +21,17 @@ from PIL import Image
 
 from service import parquet
 from service.model.errors import InputError
-from service.model.transforms import IDENTITY_POSE
+from service.model.transforms import IDENTITY_POSE, Floats
 from service.readers import DepthNoise, Pictures
-from service.readers.cloud_views import CloudView
+from service.readers.clouds import CloudView
 from service.readers.ways import scene_spec_of
 from service.store.manifests import INDEX_THRESHOLD_M
 from worker.files.exchange.bench_scene import placed_of
-from worker.files.exchange.imported import Imported, joints_by_name, verdicts
-from worker.files.exchange.lots import Lot
-from worker.files.exchange.objects import scaled_object
-from worker.files.exchange.written import Written
+from worker.files.exchange.imported import Imported, joints_by_name, scaled_object, verdicts
+from worker.files.exchange.lots import Lot, Written
 from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
 from worker.rendering.export import PNG_STEP_M
-
-Floats = NDArray[np.float64]
 
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 #: Kinds of scenes that a grasp may be planned in, as a row tells them.

@@ -1,25 +1,26 @@
-"""What goes into an export for training: grasps of many shards, the pictures of their scenes, and who is held out."""
+"""The plan of an export for training: grasps of many shards, pictures of their scenes, splits, names, and the
+summary."""
 
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import compose, invert, pose_from_matrix
+from service.model.names import fitted
+from service.model.transforms import Floats, compose, invert, pose_from_matrix
 from service.readers import DepthNoise, Pictures
-from service.readers.cloud_views import CloudView
+from service.readers.clouds import CloudView
 from service.store.shards import Shard
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.simulation.surroundings import Placed
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ def held_out(kinds: Mapping[str, str], share: float) -> frozenset[str]:
     """Objects that a network is tested on: `share` of them, at least one and not all, by the order of a hash.
 
     Args:
-        kinds: of each object by name what kind it is, see `worker.objects.families`. One kind comes to one side.
+        kinds: of each object by name what kind it is, see `worker.files.training_export`. One kind comes to one side.
 
     Returns:
         names; of a single kind none, for there is nothing to hold out.
@@ -108,3 +109,34 @@ def by_scene(found: Sequence[Look]) -> dict[tuple[str, int], list[Look]]:
     for look in found:
         scenes.setdefault((look.shard, look.scene), []).append(look)
     return scenes
+
+
+@dataclass
+class Written:
+    """What came of an export."""
+
+    counts: dict[str, Any]
+    notes: list[str] = field(default_factory=list)
+    """Lines for the user: what was assumed, what was left out and why."""
+
+
+def plain_name(name: str) -> str:
+    """A name fit for files and addresses; a long one is cut, which the log tells."""
+    return fitted(re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "unnamed")
+
+
+def prim_name(name: str) -> str:
+    """A name that USD allows for a prim: ASCII letters, digits and underscores, no digit first."""
+    plain = re.sub(r"[^A-Za-z0-9_]+", "_", name) or "_"
+    return f"_{plain}" if plain[0].isdigit() else plain
+
+
+def prim_names(names: Sequence[str]) -> list[str]:
+    """Names of prims with one parent: no two are the same, later ones are numbered."""
+    found: list[str] = []
+    for name in map(prim_name, names):
+        number = 1
+        while (one := name if number == 1 else f"{name}_{number}") in found:
+            number += 1
+        found.append(one)
+    return found

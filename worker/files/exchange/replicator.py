@@ -15,12 +15,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from service.store.shards import Shard
-from worker.files.exchange.names import prim_name
+from worker.files.exchange.lots import prim_name
 from worker.rendering.annotate import BACKGROUND, OBJECT, TABLE
 from worker.rendering.export import export_images
-
-Floats = NDArray[np.float64]
 
 _BOX_2D: Final = np.dtype(
     [

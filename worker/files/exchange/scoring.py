@@ -11,14 +11,13 @@ from service.model.domain import JobRequest
 from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
 from service.model.states import AssetKind
-from service.store.attributes import Attribute
+from service.store.columns import Attribute
 from service.store.shards import json_attribute, write_shard
 from worker.certified import scored
-from worker.files.base_attributes import base_attributes
-from worker.files.exchange.imported import Imported, Origin
-from worker.files.exchange.names import plain_name
-from worker.files.exchange.objects import mesh_file
-from worker.objects.matter import as_asked
+from worker.files.exchange.imported import Imported, Origin, mesh_file
+from worker.files.exchange.lots import plain_name
+from worker.files.provenance import base_attributes
+from worker.objects.options import as_asked
 from worker.objects.prepare import files_from_path
 from worker.run import ALONE, Run
 

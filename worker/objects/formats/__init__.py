@@ -12,18 +12,18 @@ from typing import Final
 import numpy as np
 
 from service.model.errors import GraspdError, MeshError
-from worker.objects.formats import dae, glb, obj, off, ply, stl
-from worker.objects.formats.mtl import Nearby, nothing_nearby
+from worker.objects.formats import bare, dae, glb, obj
+from worker.objects.formats.looks import Nearby, nothing_nearby
 from worker.objects.formats.soup import MAX_FACES, Soup, check_soup
 from worker.objects.stand_ins import other_format, refuse_stand_in
 
 __all__ = ["MAX_FACES", "READERS", "Nearby", "Soup", "read_mesh"]
 
 READERS: Final[dict[str, Callable[[bytes], Soup]]] = {
-    ".stl": stl.read,
+    ".stl": bare.read_stl,
     ".obj": obj.read,
-    ".ply": ply.read,
-    ".off": off.read,
+    ".ply": bare.read_ply,
+    ".off": bare.read_off,
     ".glb": glb.read,
     ".dae": dae.read,
 }

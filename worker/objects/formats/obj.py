@@ -7,11 +7,10 @@ from collections.abc import Iterable
 import numpy as np
 
 from service.model.errors import MeshError
-from service.store.mesh_looks import MAX_NAMES
-from worker.objects.formats import mtl
-from worker.objects.formats.mtl import Nearby, nothing_nearby
-from worker.objects.formats.polygons import triangulate
-from worker.objects.formats.soup import Soup, check_face_count
+from service.store.mesh_files import MAX_NAMES
+from worker.objects.formats import looks
+from worker.objects.formats.looks import Nearby, nothing_nearby
+from worker.objects.formats.soup import Soup, check_face_count, triangulate
 
 _SHADES = 8
 _NO_COLOUR = [b"nan", b"nan", b"nan"]
@@ -63,7 +62,7 @@ def _material_colours(
     known: dict[bytes, np.ndarray] = {}
     for name in libraries:
         data = nearby(name.decode(errors="replace"))
-        known |= mtl.read(data, nearby) if data is not None else {}
+        known |= looks.read(data, nearby) if data is not None else {}
     if not known:
         return shown
     unknown = np.full(3, np.nan)

@@ -1,16 +1,19 @@
-"""Triangles as a file gives them, checked for what no later step could survive."""
+"""Triangles of a file, checked for what no later step could survive; polygons are cut into triangles."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Final
 
+import manifold3d
 import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import LimitError, MeshError
+from service.model.transforms import Floats
 
 MAX_FACES: Final = 1_000_000
+
 #: Coordinates beyond this are no length in any unit.
 MAX_COORDINATE: Final = 1e11
 
@@ -58,3 +61,55 @@ def check_face_count(count: int) -> None:
     """LimitError for more faces than are taken."""
     if count > MAX_FACES:
         raise LimitError(f"{count} faces; at most {MAX_FACES} are taken: decimate the mesh first")
+
+
+Ints = NDArray[np.int64]
+
+#: The triangulator takes up to 2 ns times the square of the corners: the squares of a file's re-entrant polygons.
+MAX_SQUARES: Final = 10**9
+
+#: A triangle against the polygon's winding counts from this share of the polygon's area on.
+_AGAINST: Final = 1e-9
+
+
+def triangulate(vertices: Floats, counts: Ints, corners: Ints) -> Ints:
+    """Triangles (F, 3) of polygons with `counts` corners each, laid out one after another in `corners`.
+
+    A polygon is cut as a fan from its first corner, or by manifold3d's ear clipping where the fan would leave it. Faces
+    with fewer than three corners are dropped.
+
+    Raises:
+        LimitError: too many faces, or re-entrant polygons of too many corners.
+    """
+    number = np.maximum(counts - 2, 0)
+    check_face_count(int(number.sum()))
+    starts, ends = np.cumsum(counts) - counts, np.cumsum(number)
+    start = np.repeat(starts, number)
+    step = np.arange(len(start)) - np.repeat(ends - number, number)
+    triangles = np.stack([corners[start], corners[start + step + 1], corners[start + step + 2]], axis=1)
+    if not (number > 1).any() or (triangles < 0).any() or (triangles >= len(vertices)).any():
+        return triangles
+    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+    normals = np.cross(b - a, c - a)
+    owner = np.repeat(np.arange(len(counts)), number)
+    # The sum over a fan is the polygon's vector area, whatever its corners do.
+    whole = np.stack([np.bincount(owner, normals[:, k], len(counts)) for k in range(3)], axis=1)
+    against = np.einsum("ij,ij->i", normals, whole[owner]) < -_AGAINST * np.einsum("ij,ij->i", whole, whole)[owner]
+    wrong = np.unique(owner[against])
+    if (counts[wrong].astype(float) ** 2).sum() > MAX_SQUARES:
+        raise LimitError("its re-entrant polygons have too many corners; triangulate the mesh where it was made")
+    for one in wrong:
+        ring = corners[starts[one] : starts[one] + counts[one]]
+        inside = manifold3d.triangulate([_flat(vertices[ring], whole[one])])
+        # A polygon that crosses itself may come back with fewer: it stays a fan.
+        if len(inside) == number[one]:
+            triangles[ends[one] - number[one] : ends[one]] = ring[inside]
+    return triangles
+
+
+def _flat(points: Floats, normal: Floats) -> Floats:
+    """(n, 2) points as seen against `normal`, counter-clockwise."""
+    axis = normal / np.linalg.norm(normal)
+    across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    across /= np.linalg.norm(across)
+    return np.stack([points @ across, points @ np.cross(axis, across)], axis=1)

@@ -13,18 +13,15 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.model.transforms import quat_rotate
-from worker.hands.jacobian import ancestors
+from service.model.transforms import Floats, quat_rotate
+from worker.hands.kinematics import ancestors
 from worker.hands.model import HandModel, JointType, SurfacePoints
 from worker.planners.autograsp import kernels
 from worker.planners.fast_graspd.pairs import Pair
-from worker.simulation.data import Data
+from worker.simulation.data import Data, HandState
 from worker.simulation.launches import Launches
 from worker.simulation.model import Model
 from worker.simulation.record import add_poses
-from worker.simulation.state import HandState
-
-Floats = NDArray[np.float64]
 
 #: Contact: GraspIt!'s threshold layer [m].
 TOUCH_M: Final = 2e-4

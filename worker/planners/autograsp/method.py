@@ -16,7 +16,7 @@ from worker.planners.peers import free_starts, grasp_set, ground_of, joined
 from worker.planners.port import Method, Options, Planner, Wanted
 from worker.planners.threads import Steps, cut, run_parts
 from worker.run import Run
-from worker.simulation.state import HandState
+from worker.simulation.data import HandState
 
 
 class AutograspOptions(Options):

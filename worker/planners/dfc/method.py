@@ -9,19 +9,19 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from service.model.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
+from service.model.transforms import Floats, quat_from_axis_angle, quat_from_matrix, quat_multiply
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.distance import sample_faces
 from worker.objects.model import ObjectModel
 from worker.planners.dfc import kernels
 from worker.planners.dfc.schedule import STEPS
-from worker.planners.dfc.search import Descent, Floats
+from worker.planners.dfc.search import Descent
 from worker.planners.peers import grasp_set, ground_of, joined
 from worker.planners.port import Method, Options, Planner, Wanted
 from worker.planners.threads import Steps, cut, run_parts
 from worker.run import Run
-from worker.simulation.state import HandState
+from worker.simulation.data import HandState
 
 #: Force closure, distance and penetration that the source lets pass.
 PASSES: Final = (0.3, 0.005, 0.001)

@@ -10,9 +10,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from service.model.transforms import Floats
 
 STEPS: Final = 6000
 CONTACTS: Final = 4

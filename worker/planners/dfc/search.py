@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, apply
+from service.model.transforms import IDENTITY_POSE, Floats, apply
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.planners.dfc import kernels
@@ -17,14 +17,12 @@ from worker.planners.dfc.schedule import CONTACTS, SELF_GAP_M
 from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.inner_surface import inside_points
 from worker.planners.threads import Steps
-from worker.simulation.data import Data
+from worker.simulation.data import Data, HandState
 from worker.simulation.kernels import optimizers
 from worker.simulation.launches import Launches
 from worker.simulation.model import Model
 from worker.simulation.record import add_poses, add_root_gradient
-from worker.simulation.state import HandState
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 #: Places that may become contacts, on each link and on the palm.

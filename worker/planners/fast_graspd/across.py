@@ -14,16 +14,15 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
+from service.model.transforms import Floats
+from worker.hands.jaws import thinnest_fingertip
 from worker.hands.model import HandModel
 from worker.hands.oppositions import Oppositions, oppositions_of
-from worker.hands.pads import thinnest_fingertip
 from worker.hands.pinches import pinches_of
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.outlines import outlines_of
 from worker.simulation.obstacles import MARGIN_M
 from worker.simulation.surroundings import Surroundings
-
-Floats = NDArray[np.float64]
 
 #: Points of the surface that pairs are made of, and how far their line may turn from their normals (cosine).
 SAMPLES: Final = 500

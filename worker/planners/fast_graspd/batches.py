@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from service.model.errors import InputError, TaskCancelled
 from service.model.fidelity import Fidelity
 from service.model.integers import distinct_values
+from service.model.transforms import Floats
 from worker.grasps import GraspSet
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.scene_starts import free_ways
@@ -23,7 +24,6 @@ from worker.planners.port import Asked
 from worker.planners.threads import Steps
 from worker.simulation.surroundings import Placed, placed_together
 
-Floats = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 

@@ -9,15 +9,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.grasps import GraspSet, joined
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.selection import posture_of, ranked
 from worker.quality.postures import normal_force, pregrasp, squeeze
-from worker.simulation.state import HandState
+from worker.simulation.data import HandState
 from worker.simulation.surroundings import Placed
-
-Floats = NDArray[np.float64]
 
 #: Hands of each grasp that are seated and tried before the next are: seating costs half of a trial.
 TOGETHER: Final = 2

@@ -12,15 +12,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from worker.hands.jaws import thinnest_fingertip
 from worker.hands.model import HandModel
 from worker.hands.oppositions import oppositions_of
-from worker.hands.pads import thinnest_fingertip
 from worker.hands.pinches import HEIGHTS_M, pinches_of
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.across import STEEP, Crossings, crossings_of, room_beside
 from worker.simulation.surroundings import CLEAR_M, Surroundings
-
-Floats = NDArray[np.float64]
 
 #: A gap that is wider is as good as this, and how exactly others are told [m].
 WIDEST_M: Final = 0.064

@@ -10,17 +10,14 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from service.model.transforms import quat_from_matrix, quat_rotate
+from service.model.transforms import Floats, quat_from_matrix, quat_rotate
 from worker.hands.jaws import Jaws, jaws_of
 from worker.hands.model import HandModel
 from worker.objects.antipodal import Pairs
 from worker.objects.model import ObjectModel
 from worker.planners.fitting import fitting_pairs
-from worker.simulation.state import HandState
-
-Floats = NDArray[np.float64]
+from worker.simulation.data import HandState
 
 #: Room between each pad and the object [m]: least and most.
 ROOM_M: Final = (0.002, 0.005)

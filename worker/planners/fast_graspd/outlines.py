@@ -11,15 +11,13 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, apply, spread_directions
+from service.model.transforms import IDENTITY_POSE, Floats, apply, spread_directions
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.hands.oppositions import Oppositions
 from worker.simulation.mounting import OUTERMOST, points_of
 from worker.simulation.obstacles import MARGIN_M
 from worker.simulation.surroundings import Surroundings
-
-Floats = NDArray[np.float64]
 
 #: Directions in which a hand's outermost points are taken, of its fingertips and of the rest of it.
 DIRECTIONS: Final = 20

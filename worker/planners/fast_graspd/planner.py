@@ -16,6 +16,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from service.model.integers import distinct_values
+from service.model.transforms import Floats
 from worker.grasps import GraspSet, joined
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -42,15 +43,13 @@ from worker.planners.threads import cut, run_parts
 from worker.quality.gate import MAX_PENETRATION_MM, MIN_CONTACT_LINKS
 from worker.quality.postures import standing_off, touching_links
 from worker.run import Run
-from worker.simulation.data import Data
+from worker.simulation.data import Data, HandState
 from worker.simulation.launches import Launches
 from worker.simulation.model import Model
 from worker.simulation.obstacles import DeviceObstacles
 from worker.simulation.projection import Projection, ProjectionOptions
-from worker.simulation.state import HandState
 from worker.simulation.surroundings import Placed
 
-Floats = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 #: Iterations between two looks at cancellation.

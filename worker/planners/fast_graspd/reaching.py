@@ -16,7 +16,7 @@ import warp as wp
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, quat_from_matrix, quat_rotate
+from service.model.transforms import IDENTITY_POSE, Floats, quat_from_matrix, quat_rotate
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.hands.oppositions import Oppositions, oppositions_of
@@ -24,13 +24,11 @@ from worker.hands.spans import Size, spans_of, widest_span
 from worker.hands.surface import sample_surface
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.across import ALIKE_M, BESIDE_M, NOISE, ROOM_M, crossings_of, frames
+from worker.simulation.data import HandState
 from worker.simulation.device import to_wxyz, to_xyzw
 from worker.simulation.kernels import reaching as kernels
 from worker.simulation.launches import launch
 from worker.simulation.model import Model
-from worker.simulation.state import HandState
-
-Floats = NDArray[np.float64]
 
 #: Draws of one start, and how often the simulation looks at one that is clear by its balls.
 DRAWS: Final = 512

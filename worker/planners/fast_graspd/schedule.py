@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.model.fidelity import Fidelity
+from service.model.transforms import Floats
+from worker.simulation.data import Schedule
 from worker.simulation.model import LossOptions
 from worker.simulation.projection import ProjectionOptions
-from worker.simulation.state import Schedule
-
-Floats = NDArray[np.float64]
 
 #: Rates of Adam: translation [m], rotation [rad], joints [rad].
 COARSE_RATES: Final = (2e-3, 2e-2, 4e-2)

@@ -7,14 +7,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import quat_rotate
+from service.model.transforms import Floats, quat_rotate
 from worker.grasps import Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.postures import hold_forces
-from worker.simulation.state import HandState
-
-Floats = NDArray[np.float64]
+from worker.simulation.data import HandState
 
 #: Coulomb coefficient with which contacts must balance: less than any test uses, so that what balances has a reserve.
 FRICTION: Final = 0.3

@@ -16,18 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import cross, quat_from_axis_angle, quat_from_matrix, quat_multiply
+from service.model.transforms import Floats, cross, quat_from_axis_angle, quat_from_matrix, quat_multiply
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd import jaw_starts
 from worker.planners.fast_graspd.jaw_starts import JawStarts
 from worker.planners.fast_graspd.reaching import LOOKS, Reaching
-from worker.simulation.data import Data
+from worker.simulation.data import Data, HandState
 from worker.simulation.model import Model
 from worker.simulation.record import record_placement
-from worker.simulation.state import HandState
-
-Floats = NDArray[np.float64]
 
 #: Distance of the palm from the surface [m]: nearest, farthest, then the steps of retreat while something touches.
 GAP: Final = (0.002, 0.012)

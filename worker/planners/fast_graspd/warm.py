@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.model.fidelity import Fidelity
+from service.model.transforms import Floats
+from worker.simulation.data import HandState
 from worker.simulation.model import Model
-from worker.simulation.state import HandState
 from worker.simulation.surroundings import Placed
-
-Floats = NDArray[np.float64]
 
 
 class WarmStart(Protocol):

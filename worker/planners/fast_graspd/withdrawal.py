@@ -11,16 +11,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import quat_rotate
+from service.model.transforms import Floats, quat_rotate
 from worker.planners.fast_graspd.selection import posture_of
 from worker.planners.fast_graspd.starts import Probe
 from worker.quality.contact import finger_of_body
+from worker.simulation.data import HandState
 from worker.simulation.model import Model
 from worker.simulation.mounting import mounting_lack
-from worker.simulation.state import HandState
 from worker.simulation.surroundings import RISE_M, Placed, Surroundings
-
-Floats = NDArray[np.float64]
 
 #: Shares of their range by which fingers have opened, and how far the hand has moved back [m].
 OUT: Final = ((0.2, 0.0), (0.3, 0.015), (0.4, 0.04))

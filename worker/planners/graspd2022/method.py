@@ -8,17 +8,18 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
+from service.model.transforms import Floats
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.graspd2022 import kernels
-from worker.planners.graspd2022.search import Floats, Search
+from worker.planners.graspd2022.search import Search
 from worker.planners.peers import Kept, free_starts, grasp_set, ground_of, joined
 from worker.planners.port import Method, Options, Planner, Wanted
 from worker.planners.threads import Steps, cut, run_parts
 from worker.run import Run
-from worker.simulation.state import HandState
+from worker.simulation.data import HandState
 
 
 class Graspd2022Options(Options):

@@ -14,20 +14,18 @@ import warp as wp
 from numpy.typing import NDArray
 
 from service.model.cores import available_cores
-from service.model.transforms import quat_rotate
+from service.model.transforms import Floats, quat_rotate
 from worker.hands.surface import sample_surface
 from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.graspd2022 import kernels
 from worker.planners.threads import Steps
-from worker.simulation.data import Data
+from worker.simulation.data import Data, HandState, Schedule
 from worker.simulation.device import DeviceObject
 from worker.simulation.kernels import surface
 from worker.simulation.launches import Launches
 from worker.simulation.model import MAX_DILATION, Model
 from worker.simulation.record import add_poses, add_root_gradient, add_self_penalty, add_step
-from worker.simulation.state import HandState, Schedule
 
-Floats = NDArray[np.float64]
 #: Hand points: the source's hand has 778 vertices.
 POINTS: Final = 778
 #: The source's constants, SI units: stiffness, viscous friction, friction, time step, speed, mass.

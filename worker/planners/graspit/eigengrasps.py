@@ -13,10 +13,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.hands.jacobian import ancestors
+from service.model.transforms import Floats
+from worker.hands.kinematics import ancestors
 from worker.hands.model import HandModel
-
-Floats = NDArray[np.float64]
 
 #: Weights of a finger's first, second and later closing joints in the human hand's eigengrasps.
 FLEXION: Final = (1.0, 0.3, 0.15)

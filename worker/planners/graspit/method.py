@@ -19,7 +19,7 @@ from worker.planners.peers import Kept, grasp_set, ground_of, joined
 from worker.planners.port import Method, Options, Planner, Wanted
 from worker.planners.threads import Steps, cut, run_parts
 from worker.run import Run
-from worker.simulation.state import HandState
+from worker.simulation.data import HandState
 
 _searches: Final = Kept(Search)
 

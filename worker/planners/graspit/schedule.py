@@ -12,9 +12,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from service.model.transforms import Floats
 
 START_TEMPERATURE: Final = 1e6
 COOLING: Final = 7.0

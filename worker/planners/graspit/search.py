@@ -13,7 +13,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import quat_from_matrix
+from service.model.transforms import Floats, quat_from_matrix
 from worker.hands.model import HandModel, SurfacePoints
 from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.graspit import kernels
@@ -21,13 +21,11 @@ from worker.planners.graspit.eigengrasps import Eigengrasps, eigengrasps
 from worker.planners.graspit.schedule import FIRST_STEP
 from worker.planners.inner_surface import inside_points
 from worker.planners.threads import Steps
-from worker.simulation.data import Data
+from worker.simulation.data import Data, HandState
 from worker.simulation.device import to_wxyz, to_xyzw
 from worker.simulation.model import body_points
 from worker.simulation.record import record_placement
-from worker.simulation.state import HandState
 
-Floats = NDArray[np.float64]
 #: Bounds of the palm's place about the object's centre of mass [m] and its largest jump (GraspIt!'s, in mm there).
 PLACE: Final = ((-0.25, 0.25), (-0.25, 0.25), (-0.25, 0.35))
 PLACE_JUMP: Final = 0.15

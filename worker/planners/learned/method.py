@@ -7,9 +7,9 @@ from typing import Final
 
 from pydantic import Field
 
+from service.model.base import Digest
 from service.model.errors import InputError
 from service.model.fidelity import Fidelity
-from service.model.labels import Digest
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

@@ -24,10 +24,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from service.model.errors import InputError
-from service.model.transforms import cross, quat_from_matrix, quat_to_matrix
+from service.model.transforms import Floats, cross, quat_from_matrix, quat_to_matrix
 from service.store.network_file import (
     BLOCKS,
     CONDITION,
@@ -56,7 +56,6 @@ __all__ = [
     "weight_shapes",
 ]
 
-Floats = NDArray[np.float64]
 #: Lengths of the encoder's input and of the condition are in units of this [m].
 LENGTH_M: Final = 0.1
 #: Products of matrices are cut into ones of 32 rows and so few multiplications that OpenBLAS, which shares larger ones

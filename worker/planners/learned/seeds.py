@@ -12,18 +12,15 @@ from numpy.typing import NDArray
 
 from service.model.errors import SceneError
 from service.model.fidelity import Fidelity
-from service.model.scene_kinds import UPRIGHT
-from service.model.transforms import compose, invert, quat_conjugate, quat_rotate
+from service.model.scene_spec import UPRIGHT
+from service.model.transforms import Floats, compose, invert, quat_conjugate, quat_rotate
 from worker.planners.fast_graspd.scene_starts import ROOM, clear_scene_starts
 from worker.planners.fast_graspd.starts import CLEAR, Probe
 from worker.planners.learned.network import ProposalNetwork, cloud_inputs, conditions, decode, flow
 from worker.planners.learned.sight import Seen
+from worker.simulation.data import HandState
 from worker.simulation.model import Model
-from worker.simulation.state import HandState
 from worker.simulation.surroundings import UP, Obstacle, Placed
-
-Floats = NDArray[np.float64]
-
 
 #: Steps back along the way in while something touches [m].
 RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08)

@@ -6,12 +6,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from service.model.transforms import cross, quat_rotate
+from service.model.transforms import Floats, cross, quat_rotate
 from worker.objects.model import ObjectModel
-
-Floats = NDArray[np.float64]
 
 #: Elevation of a camera above the table [rad]; share of its field of view (half of it [rad]) that the object's bounding
 #: ball fills; nearest distance of the ball [m]: as pictures of a job have them.

@@ -10,7 +10,7 @@ from typing import Any, Final
 from cachetools import LRUCache
 
 from worker.hands.model import HandModel
-from worker.objects.content import content_of
+from worker.objects.disk_cache import content_of
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.model import MujocoOptions, Scene, build

@@ -15,16 +15,14 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.model.digests import digest_json
 from service.model.errors import MeshError
 from service.model.libraries import version_of
+from service.model.transforms import Floats
 from worker.hands.primitives import triangle_areas
 from worker.objects.convex import TooMuchWork, coacd_parts, default_cache, keep_parts, load_parts, union_volume
 from worker.objects.model import ObjectModel
-
-Floats = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 

@@ -12,8 +12,8 @@ from typing import Any, Final
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.engines.mujoco_warnings import ARENA, void
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
@@ -23,8 +23,6 @@ from worker.quality.referee.compiled import slipping_model
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.model import add_object, add_shape
 from worker.run import ALONE, Run
-
-Floats = NDArray[np.float64]
 
 MASS: Final = 1.0
 FRICTION: Final = 3.0

@@ -8,10 +8,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.hands.model import HandModel
 from worker.hands.tendons import Tendon
-
-Floats = NDArray[np.float64]
 
 
 def leading_joints(hand: HandModel) -> tuple[Floats, Floats]:

@@ -13,10 +13,10 @@ from typing import Any, cast
 
 import numpy as np
 
-from service.model.transforms import apply, compose, invert
+from service.model.transforms import Floats, apply, compose, invert
 from worker.grasps import GraspSet, Posture
 from worker.hands.collisions import resting_neighbours
-from worker.hands.model import ConvexPiece, Floats, HandModel
+from worker.hands.model import ConvexPiece, HandModel
 from worker.hands.same_hand import SameHand
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces

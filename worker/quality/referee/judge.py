@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
+from service.model.transforms import Floats
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
-from worker.objects.content import content_of
+from worker.objects.disk_cache import content_of
 from worker.objects.model import ObjectModel
 from worker.quality.referee.compiled import scene_of
 from worker.quality.referee.decomposition import ConvexPieces, decompose
@@ -26,8 +27,6 @@ from worker.quality.referee.key import Level, postures_key, verdict_key
 from worker.quality.referee.model import COARSE, MujocoOptions, Scene
 from worker.quality.referee.protocol import DIRECTIONS, SCREEN_BAND, Outcome, Test, Trial
 from worker.run import ALONE, Count, Run
-
-Floats = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 #: Grasps that a process of a pool judges at a time: few, so that those of one batch are shared by many processes.

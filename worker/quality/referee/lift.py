@@ -17,10 +17,9 @@ from typing import Any, Final
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from service.model.matter import ACCELERATION
-from service.model.transforms import invert, quat_conjugate, quat_multiply, quat_rotate, slerp
+from service.model.transforms import Floats, invert, quat_conjugate, quat_multiply, quat_rotate, slerp
 from worker.engines.mujoco_warnings import void
 from worker.grasps import GraspSet, Posture
 from worker.quality.referee.model import Scene, blend
@@ -34,8 +33,6 @@ from worker.quality.referee.protocol import (
     Trial,
 )
 from worker.simulation.surroundings import RISE_M, Placed
-
-Floats = NDArray[np.float64]
 
 #: A neighbour may be moved by this [m], and tilted by this [rad]: more is toppled. It may turn about the vertical.
 NEIGHBOUR_MOVED_M: Final = 0.02

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from service.model.matter import MASS_KG
-from service.model.outcomes import limit_told
+from service.model.planning import limit_told
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

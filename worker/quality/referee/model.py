@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from service.model.matter import ACCELERATION
 from service.model.matter import FRICTION as SLIDING
-from service.model.transforms import slerp
+from service.model.transforms import Floats, slerp
 from worker.engines.mujoco_warnings import ARENA
 from worker.grasps import Posture
 from worker.hands.jaws import jaws_of
@@ -22,8 +22,6 @@ from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.drives import add_tendon, equality_data, leading_bodies, leading_joints
 from worker.simulation.surroundings import CLEAR_M, Neighbour, Obstacle
-
-Floats = NDArray[np.float64]
 
 #: Sliding and torsional friction; `hard` scales them by `HARD`.
 FRICTION: Final = (SLIDING, 0.02)

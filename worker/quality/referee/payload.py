@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.matter import ACCELERATION, MOST_KG
+from service.model.transforms import Floats
 from worker.engines.mujoco_warnings import void
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
@@ -31,8 +32,6 @@ from worker.quality.referee.short import LIFTING
 from worker.quality.referee.threads import measured
 from worker.run import ALONE, Run
 from worker.simulation.surroundings import Placed
-
-Floats = NDArray[np.float64]
 
 #: The payload is told downwards, to this ratio.
 TOLD: Final = 1.03

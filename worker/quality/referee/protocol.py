@@ -15,13 +15,11 @@ from typing import Any, Final
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.engines.mujoco_warnings import void
 from worker.grasps import GraspSet, Posture
 from worker.quality.referee.model import Scene, blend
-
-Floats = NDArray[np.float64]
 
 DIRECTIONS: Final = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 MAX_DISPLACEMENT_M: Final = 0.05

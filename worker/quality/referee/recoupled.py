@@ -7,7 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from worker.hands.model import Floats, HandModel
+from service.model.transforms import Floats
+from worker.hands.model import HandModel
 
 Coupling = Literal["own", "compliant", "separate", "ratio"]
 

@@ -13,9 +13,9 @@ from typing import Final, Literal
 
 import numpy as np
 
-from service.model.transforms import IDENTITY_POSE, apply, invert, quat_from_matrix
+from service.model.transforms import IDENTITY_POSE, Floats, apply, invert, quat_from_matrix
 from worker.hands.collisions import resting_neighbours
-from worker.hands.model import ConvexPiece, Floats, HandModel
+from worker.hands.model import ConvexPiece, HandModel
 from worker.hands.primitives import hull, sample, signed_distance, tessellate, volume
 
 Fit = Literal["own", "hull", "primitive", "capsule"]

@@ -19,7 +19,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.robust import MODELS, Axis
+from service.model.metrics import ROBUST_MODELS, Axis
+from service.model.transforms import Floats
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -30,8 +31,6 @@ from worker.quality.referee.variant import Variant, dealt, draw
 from worker.quality.referee.varied import Models
 from worker.run import ALONE, Run
 from worker.simulation.surroundings import Placed
-
-Floats = NDArray[np.float64]
 
 NOT_JUDGED: Final = -1
 #: Shares are wanted to this: 0.9 of 10 models is 9 of them.
@@ -99,7 +98,7 @@ def robust(
     held: NDArray[np.generic] | None = None,
     placed: Placed | None = None,
     level: LiftLevel = "lift",
-    models: int = MODELS,
+    models: int = ROBUST_MODELS,
     wanted: float = 0.0,
     seed: int = 0,
     hard: bool = False,

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import compose, invert, quat_from_axis_angle
+from service.model.transforms import Floats, compose, invert, quat_from_axis_angle
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -16,8 +16,6 @@ from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.judge import judge
 from worker.quality.referee.key import Level
 from worker.run import ALONE, Run
-
-Floats = NDArray[np.float64]
 
 NOISE_M: Final = 1e-3
 NOISE_RAD: Final = float(np.radians(1.0))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.matter import ACCELERATION
-from service.model.transforms import quat_rotate
+from service.model.transforms import Floats, quat_rotate
 from worker.engines.mujoco_warnings import void
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
@@ -26,8 +26,6 @@ from worker.quality.referee.short import LIFTING
 from worker.quality.referee.threads import measured
 from worker.run import ALONE, Run
 from worker.simulation.surroundings import Placed
-
-Floats = NDArray[np.float64]
 
 #: Amplitude [m], frequency [Hz] and periods along each axis: at most 7.1 m/s2.
 AMPLITUDE_M: Final = 0.02

@@ -19,6 +19,7 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.engines.mujoco_warnings import void
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
@@ -30,7 +31,6 @@ from worker.quality.referee.model import MujocoOptions, Scene
 from worker.quality.referee.protocol import LOST, STAGE_S, Outcome, Test
 from worker.simulation.surroundings import Placed
 
-Floats = NDArray[np.float64]
 _T = TypeVar("_T")
 
 #: The root is fixed: a hand that hangs on a spring, as the protocol has it, costs twice as much. In so short a time

@@ -10,14 +10,12 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from service.model.robust import Axis
+from service.model.metrics import Axis
 from worker.hands.model import HandModel
 from worker.quality.referee.recoupled import Coupling
 from worker.quality.referee.refit import Fit, fits_of
 
-Floats = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 #: How far each axis goes. Shapes stand out or back by this [m].

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import compose, invert, quat_from_axis_angle
+from service.model.transforms import Floats, compose, invert, quat_from_axis_angle
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -25,8 +25,6 @@ from worker.quality.referee.recoupled import Coupling, nearest, recoupled
 from worker.quality.referee.refit import Fit, refitted
 from worker.quality.referee.variant import Variant
 from worker.simulation.surroundings import Neighbour, Obstacle, Placed
-
-Floats = NDArray[np.float64]
 
 #: What couples joints where it gives way: MuJoCo's default constraint, 2.5 times as slow as the protocol's and softer.
 COMPLIANT_SOLREF: Final = (0.02, 1.0)

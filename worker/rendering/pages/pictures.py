@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.colours import hexadecimal
-from service.model.transforms import IDENTITY_POSE, apply, quat_rotate
+from service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
 from worker.grasps import moved
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
-from worker.objects.model import Floats, ObjectModel
+from worker.objects.model import ObjectModel
 from worker.rendering.cameras import Cameras, intrinsics, look_at
 from worker.rendering.hands import drawn_bodies, hand_looks, hand_solids
 from worker.rendering.kernels.shading import CATCHER

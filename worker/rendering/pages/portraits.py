@@ -13,17 +13,16 @@ from PIL import Image, ImageDraw
 
 from service.model.colours import hexadecimal
 from service.model.errors import InputError
-from service.model.transforms import IDENTITY_POSE, apply, compose, quat_from_matrix
+from service.model.transforms import IDENTITY_POSE, Floats, apply, compose, quat_from_matrix
 from worker.hands.closing import posture
+from worker.hands.jaws import pads_of
 from worker.hands.kinematics import body_poses
-from worker.hands.model import Floats, HandModel
-from worker.hands.pads import pads_of
+from worker.hands.model import HandModel
+from worker.objects.mesh_geometry import corner_normals, from_manifold
 from worker.objects.model import ObjectModel
-from worker.objects.normals import corner_normals
-from worker.objects.solid import from_manifold
 from worker.rendering.cameras import intrinsics
 from worker.rendering.hands import drawn_bodies, hand_looks, hand_solids, without_visuals
-from worker.rendering.pages import typography
+from worker.rendering.pages import sheets
 from worker.rendering.pages.pictures import (
     FIELD_OF_VIEW,
     FLOOR,
@@ -131,7 +130,7 @@ def hand_sides(hand: HandModel, *, device: str = "cpu") -> Image.Image:
 
 def above(first: Image.Image, second: Image.Image) -> Image.Image:
     """Two pictures, one over the other."""
-    page = Image.new("RGB", (max(first.width, second.width), first.height + second.height), typography.PAPER)
+    page = Image.new("RGB", (max(first.width, second.width), first.height + second.height), sheets.PAPER)
     page.paste(first.convert("RGB"), (0, 0))
     page.paste(second.convert("RGB"), (0, first.height))
     return page
@@ -150,7 +149,7 @@ def object_portrait(obj: ObjectModel, *, device: str = "cpu") -> Image.Image:
 def write_png(image: Image.Image, path: Path) -> None:
     """InputError if the file cannot be written."""
     try:
-        path.write_bytes(typography.png(image))
+        path.write_bytes(sheets.png(image))
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror}") from None
 
@@ -186,11 +185,11 @@ def _row(pictures: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:
 
 def _page(pictures: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:
     width, height = SIZE
-    page = Image.new("RGB", (width * len(pictures), height + _CAPTION), typography.PAPER)
+    page = Image.new("RGB", (width * len(pictures), height + _CAPTION), sheets.PAPER)
     draw = ImageDraw.Draw(page)
     for number, (picture, caption) in enumerate(zip(pictures, captions, strict=True)):
         page.paste(Image.fromarray(picture), (number * width, 0))
-        typography.text(draw, (number * width + 12, height + 21), caption, 15, typography.INK)
+        sheets.text(draw, (number * width + 12, height + 21), caption, 15, sheets.INK)
     return page
 
 

@@ -1,31 +1,45 @@
-"""Pages of pictures: the best grasps with their figures, grasps from three sides, the views of a shard."""
+"""Pages of pictures: the best grasps with their figures, grasps from three sides, the views of a shard.
+
+Text and colour for pictures that people read.
+"""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
+from service.model.transforms import Floats
 from worker.rendering.annotate import OBJECT, TABLE
-from worker.rendering.cameras import Floats
-from worker.rendering.pages import typography as type_
 
 MARGIN: Final = 40
+
 GAP: Final = 18
+
 _HEAD: Final = 74
+
 _CAPTION: Final = 44
+
 _NAME: Final = 22
+
 #: Contact threshold at which a sheet quotes epsilon and contact area [m].
 _QUOTED_THRESHOLD_M: Final = 0.005
+
 _SEGMENT: Final = np.array(
     [[214, 216, 219], [150, 168, 178], [224, 129, 63], [96, 122, 158], [122, 158, 112], [168, 118, 150]], np.uint8
 )
+
 _TIGHT: Final = (0, 214, 190)
+
 _LOOSE: Final = (255, 255, 255)
+
 _BOX_3D: Final = (255, 205, 60)
+
 _EDGES: Final = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
 
 Arrays = Mapping[str, NDArray[np.generic]]
@@ -94,7 +108,7 @@ def contact_sheet(
         y = top + (k // columns) * (height + _CAPTION + GAP)
         page.paste(Image.fromarray(picture), (x, y))
         _caption(draw, (x, y + height), width, k + 1, captions[k] if k < len(captions) else ())
-    return type_.png(page)
+    return png(page)
 
 
 def three_sides_sheet(
@@ -106,7 +120,7 @@ def three_sides_sheet(
     columns: int = 2,
 ) -> bytes:
     """PNG of N grasps from three sides (N, 3, H, W, 3): a strip of three per grasp, `columns` strips in a row."""
-    seam = np.full((*pictures.shape[:1], pictures.shape[2], 4, 3), type_.PAPER, np.uint8)
+    seam = np.full((*pictures.shape[:1], pictures.shape[2], 4, 3), PAPER, np.uint8)
     strips = np.concatenate([part for side in np.moveaxis(pictures, 1, 0) for part in (seam, side)][1:], axis=2)
     return contact_sheet(strips, captions, title=title, subtitle=subtitle, columns=columns)
 
@@ -128,10 +142,10 @@ def views_page(views: Arrays, *, title: str, subtitle: str = "") -> bytes:
     page, draw, top = _page(len(heads), len(first), width, height, title, subtitle, head=_HEAD + 24)
     for column, head in enumerate(heads):
         x = MARGIN + column * (width + GAP)
-        type_.text(draw, (x, top - 10), head, 15, type_.QUIET)
+        text(draw, (x, top - 10), head, 15, QUIET)
         for row, view in enumerate(first.tolist()):
             page.paste(columns[head](view), (x, top + row * (height + GAP)))
-    return type_.png(page)
+    return png(page)
 
 
 def scene_cells(views: Arrays) -> list[Image.Image]:
@@ -155,14 +169,14 @@ def label_page(
     width, height = rows[0][0].size
     page, draw, top = _page(len(heads), len(rows), width, height + _NAME, title, subtitle, head=_HEAD + 24)
     for column, head in enumerate(heads):
-        type_.text(draw, (MARGIN + column * (width + GAP), top - 10), head, 15, type_.QUIET)
+        text(draw, (MARGIN + column * (width + GAP), top - 10), head, 15, QUIET)
     for row, (cells, below) in enumerate(zip(rows, names, strict=True)):
         y = top + row * (height + _NAME + GAP)
         for column, cell in enumerate(cells):
             page.paste(cell, (MARGIN + column * (width + GAP), y))
         for column, name in enumerate(below):
-            type_.text(draw, (MARGIN + column * (width + GAP), y + height + _NAME - 4), name, 14, type_.INK)
-    return type_.png(page)
+            text(draw, (MARGIN + column * (width + GAP), y + height + _NAME - 4), name, 14, INK)
+    return png(page)
 
 
 def _page(
@@ -170,10 +184,10 @@ def _page(
 ) -> tuple[Image.Image, ImageDraw.ImageDraw, int]:
     """Empty page with its title, and the y at which the cells begin."""
     size = (2 * MARGIN + columns * (width + GAP) - GAP, MARGIN + head + rows * (height + GAP) - GAP + MARGIN)
-    page = Image.new("RGB", size, type_.PAPER)
+    page = Image.new("RGB", size, PAPER)
     draw = ImageDraw.Draw(page)
-    type_.text(draw, (MARGIN, MARGIN + 20), title, 26, type_.INK)
-    type_.text(draw, (MARGIN, MARGIN + 46), subtitle, 15, type_.QUIET)
+    text(draw, (MARGIN, MARGIN + 20), title, 26, INK)
+    text(draw, (MARGIN, MARGIN + 46), subtitle, 15, QUIET)
     return page, draw, MARGIN + head
 
 
@@ -181,13 +195,13 @@ def _caption(
     draw: ImageDraw.ImageDraw, at: tuple[int, int], width: int, rank: int, pairs: Sequence[tuple[str, str]]
 ) -> None:
     x, y = at
-    draw.line([(x, y + 1), (x + width - 1, y + 1)], fill=type_.RULE)
-    type_.text(draw, (x, y + 26), str(rank), 17, type_.ACCENT)
+    draw.line([(x, y + 1), (x + width - 1, y + 1)], fill=RULE)
+    text(draw, (x, y + 26), str(rank), 17, ACCENT)
     # Ranks of up to three digits, then equal columns.
     left, step = x + 34, (width - 34) / max(1, len(pairs))
     for k, (label, value) in enumerate(pairs):
-        type_.text(draw, (left + k * step, y + 18), label, 11, type_.QUIET)
-        type_.text(draw, (left + k * step, y + 35), value, 14, type_.INK)
+        text(draw, (left + k * step, y + 18), label, 11, QUIET)
+        text(draw, (left + k * step, y + 35), value, 14, INK)
 
 
 def _colours(views: Arrays, path: str, view: int) -> Image.Image:
@@ -199,12 +213,12 @@ def _depth(views: Arrays, view: int) -> Image.Image:
     solid = np.asarray(views["image/segmentation"][view]) == OBJECT
     finite = depth[np.isfinite(depth)]
     if finite.size == 0:
-        return Image.fromarray(type_.depth_colours(depth, 0.0, 1.0))
+        return Image.fromarray(depth_colours(depth, 0.0, 1.0))
     # The far table would eat the range; what matters is around the object.
     near, far = float(finite.min()), float(np.percentile(finite, 90))
     if solid.any():
         far = max(float(depth[solid].max()), min(far, float(depth[solid].max()) * 1.4))
-    image = Image.fromarray(type_.depth_colours(depth, near, far))
+    image = Image.fromarray(depth_colours(depth, near, far))
     _scale_bar(image, near, far)
     return image
 
@@ -215,11 +229,11 @@ def _scale_bar(image: Image.Image, near: float, far: float) -> None:
         return
     x, y = image.width - ramp - after, image.height - 13
     draw = ImageDraw.Draw(image)
-    draw.rectangle([x - before, y - 7, image.width, image.height], fill=type_.PAPER)
-    colours = type_.depth_colours(np.linspace(near, far, ramp, dtype=np.float32)[None].repeat(thick, 0), near, far)
+    draw.rectangle([x - before, y - 7, image.width, image.height], fill=PAPER)
+    colours = depth_colours(np.linspace(near, far, ramp, dtype=np.float32)[None].repeat(thick, 0), near, far)
     image.paste(Image.fromarray(colours), (x, y))
-    type_.text(draw, (x - before + 6, y + thick + 1), f"{near:.2f}", 11, type_.INK)
-    type_.text(draw, (x + ramp + 6, y + thick + 1), f"{far:.2f} m", 11, type_.INK)
+    text(draw, (x - before + 6, y + thick + 1), f"{near:.2f}", 11, INK)
+    text(draw, (x + ramp + 6, y + thick + 1), f"{far:.2f} m", 11, INK)
 
 
 def _segments(views: Arrays, view: int) -> Image.Image:
@@ -251,3 +265,71 @@ def _boxes(views: Arrays, view: int) -> Image.Image:
     small = overlay.resize(image.size, Image.Resampling.LANCZOS)
     image.paste(small, (0, 0), small)
     return image
+
+
+PAPER: Final = (250, 250, 249)
+
+INK: Final = (28, 32, 36)
+
+QUIET: Final = (122, 128, 134)
+
+RULE: Final = (222, 224, 226)
+
+ACCENT: Final = (31, 132, 126)
+
+#: Anchors of the depth colours, near to far: even steps of lightness from light to dark, hue from sand to indigo.
+_DEPTH: Final = np.array(
+    [
+        [252, 243, 207],
+        [250, 206, 130],
+        [243, 158, 93],
+        [220, 103, 92],
+        [173, 63, 107],
+        [113, 43, 109],
+        [54, 32, 84],
+        [16, 16, 40],
+    ],
+    float,
+)
+
+
+@lru_cache(maxsize=16)
+def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """Pillow's own scalable font."""
+    return ImageFont.load_default(size)
+
+
+def text(
+    draw: ImageDraw.ImageDraw, at: tuple[float, float], words: str, size: int, fill: tuple[int, int, int]
+) -> float:
+    """Writes words with the baseline at `at`; `^2` is set as an exponent. Returns the x where they end."""
+    x, y = at
+    for k, part in enumerate(words.split("^")):
+        if k and part:
+            exponent, part = part[0], part[1:]
+            small = font(round(0.62 * size))
+            draw.text((x + 1, y - 0.38 * size), exponent, font=small, fill=fill, anchor="ls")
+            x += 1 + small.getlength(exponent)
+        draw.text((x, y), part, font=font(size), fill=fill, anchor="ls")
+        x += font(size).getlength(part)
+    return x
+
+
+def depth_colours(depth: NDArray[np.float32], near: float, far: float) -> NDArray[np.uint8]:
+    """(..., 3) colours of depths: light is near, dark is far, grey is nothing."""
+    t = np.clip((np.where(np.isfinite(depth), depth, near) - near) / max(far - near, 1e-9), 0, 1) * (len(_DEPTH) - 1)
+    low = np.minimum(t.astype(int), len(_DEPTH) - 2)
+    mixed = _DEPTH[low] + (t - low)[..., None] * (_DEPTH[low + 1] - _DEPTH[low])
+    return np.where(np.isfinite(depth)[..., None], mixed, 214.0).round().astype(np.uint8)
+
+
+def png(image: Image.Image) -> bytes:
+    """PNG bytes."""
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()
+
+
+def with_palette(page: bytes) -> bytes:
+    """The same PNG in 256 colours: a third of the bytes, for pages of documents."""
+    return png(Image.open(io.BytesIO(page)).convert("RGB").quantize(256, method=Image.Quantize.MEDIANCUT))

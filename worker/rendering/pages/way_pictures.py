@@ -1,23 +1,26 @@
-"""Pictures of grasps in their scenes and on their way, for people: one camera a grasp, from a side that shows it."""
+"""Pictures and films of grasps along their trajectories, for people: one camera a grasp, from a side that shows it."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from service.model.colours import hexadecimal
+from service.model.errors import InputError
 from service.model.scene_spec import HalfSpace
-from service.model.transforms import IDENTITY_POSE, apply, compose
+from service.model.transforms import IDENTITY_POSE, Floats, apply, compose
 from service.readers.ways import Waypoint
 from worker.grasps import moved
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
-from worker.objects.frames import to_centre
-from worker.objects.model import Floats, ObjectModel
+from worker.objects.mesh_geometry import to_centre
+from worker.objects.model import ObjectModel
 from worker.rendering.cameras import intrinsics, look_at
 from worker.rendering.hands import drawn_bodies, drawn_parts, drawn_poses
 from worker.rendering.pages.pictures import (
@@ -32,29 +35,39 @@ from worker.rendering.pages.pictures import (
     hand_points,
     side_of,
 )
-from worker.rendering.scenery import Box, Look, Shot, Solid
-from worker.rendering.standing import Supports, seen_share, slab_poses, slabs
+from worker.rendering.scenery import Box, Look, Shot, Solid, Supports, seen_share, slab_poses, slabs
 from worker.rendering.tracer import Tracer
 from worker.run import ALONE, Run
 from worker.scenes.neighbours import Neighbours
 
 #: Postures that a strip shows; those that a grasp has.
 STRIP: Final = ("standoff", "pregrasp", "grasp", "lift")
+
 FREE_STRIP: Final = ("pregrasp", "grasp", "squeeze")
+
 #: Sides that are tried: so many around, at these heights above the horizon [rad].
 _AROUND: Final = 16
+
 _HEIGHTS: Final = tuple(np.radians([20.0, 35.0, 52.0]).tolist())
+
 #: Two sides of one grasp are this far apart at least [rad], if they can be.
 _APART: Final = np.radians(50.0)
+
 #: Edge of the pictures that sides are judged by [px].
 _GLANCE: Final = 48
+
 #: Towards the lamp where a board is above the object: from before it, as high as a room's window.
 _UNDER_A_BOARD: Final = np.array([0.85, -0.42, 0.32]) / np.linalg.norm([0.85, -0.42, 0.32])
+
 #: Hand parts farther than this from the object do not draw the camera back [m].
 _NEAR_M: Final = 0.14
+
 _HIGH_M: Final = 3.0
+
 _TABLE: Final = Look(hexadecimal("#b9bfc2"), roughness=0.85)
+
 _WALL: Final = Look(hexadecimal("#7f97a5"), roughness=0.8)
+
 _BESIDE: Final = Look(hexadecimal("#8d86a3"), roughness=0.6)
 
 
@@ -222,3 +235,53 @@ class _Stage:
                 if len(chosen) < count and one not in chosen and min(turns, default=np.pi) >= apart:
                     chosen.append(one)
         return [sides[one] for one in chosen]
+
+
+#: How a file is written, by how its name ends. A GIF has 256 colours, and is many times as large as a WebP.
+KINDS: Final[dict[str, dict[str, Any]]] = {
+    ".gif": {"format": "GIF", "optimize": False, "disposal": 1},
+    ".webp": {"format": "WEBP", "quality": 82, "method": 4},
+    ".png": {"format": "PNG", "default_image": False},
+}
+
+#: Pictures whose colours make the palette of a GIF.
+_PALETTE_OF: Final = 9
+
+
+def animation_kind(suffix: str) -> str:
+    """The suffix in small letters.
+
+    Raises:
+        InputError: no animation is written under it.
+    """
+    if (small := suffix.lower()) not in KINDS:
+        raise InputError(f"an animation is written as {', '.join(KINDS)}, not as {suffix or 'a file without suffix'}")
+    return small
+
+
+def animation(pictures: NDArray[np.uint8], seconds: Sequence[float], suffix: str) -> bytes:
+    """A film that begins anew when it ends.
+
+    Args:
+        pictures: (F, H, W, 3) sRGB.
+        seconds: (F,) how long each is shown; files keep milliseconds, a GIF hundredths of a second.
+        suffix: one of `KINDS`.
+
+    Raises:
+        InputError: no animation is written under this suffix.
+    """
+    kind = animation_kind(suffix)
+    images = [Image.fromarray(picture) for picture in pictures]
+    if kind == ".gif":
+        images = _in_one_palette(pictures)
+    buffer = io.BytesIO()
+    durations = [round(1000 * shown) for shown in seconds]
+    images[0].save(buffer, save_all=True, append_images=images[1:], duration=durations, loop=0, **KINDS[kind])
+    return buffer.getvalue()
+
+
+def _in_one_palette(pictures: NDArray[np.uint8]) -> list[Image.Image]:
+    """Without dither, so what stands still stays the same from picture to picture."""
+    some = np.unique(np.linspace(0, len(pictures) - 1, _PALETTE_OF).round().astype(int))
+    palette = Image.fromarray(np.concatenate(pictures[some])).quantize(256, method=Image.Quantize.MEDIANCUT)
+    return [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]

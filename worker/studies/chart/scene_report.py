@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from service.model.charts import FILTERED, IN_SCENE
+from service.model.studies import FILTERED, IN_SCENE
 from worker.studies.chart.figure import SPEED, draw_hands, draw_scenes, one_of_several
 from worker.studies.chart.report import first, share
 from worker.studies.chart.scenes import ACCURACIES

@@ -19,11 +19,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.charts import FILTERED, IN_SCENE
 from service.model.clock import timestamp
 from service.model.digests import digest_json
 from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
+from service.model.studies import FILTERED, IN_SCENE
 from service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel

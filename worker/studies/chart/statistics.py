@@ -6,12 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.quality.intervals import wilson, wilson_of_mean
 from worker.studies.chart.trials import Trial
-
-Floats = NDArray[np.float64]
 
 #: Bootstrap draws; error bars are their 2.5 and 97.5 percentiles.
 DRAWS: Final = 400

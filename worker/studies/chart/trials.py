@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.fidelity import Fidelity
+from service.model.transforms import Floats
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -25,8 +26,6 @@ from worker.quality.table import measure
 from worker.run import ALONE, Run
 from worker.scenes.trial import trial_on
 from worker.studies.clock import clock_of
-
-Floats = NDArray[np.float64]
 
 #: Contact threshold and Coulomb coefficient of area, epsilon and wrench volume: the paper's.
 THRESHOLD_M: Final = 0.005

@@ -7,23 +7,20 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.model.fidelity import FIDELITIES, Fidelity
-from service.model.stability import MapCell, StabilityMap, graded, reachable, short
-from service.model.transforms import quat_rotate
+from service.model.studies import MapCell, StabilityMap, graded, reachable, short
+from service.model.transforms import Floats, quat_rotate
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.schedule import AROUND, coarse_schedule, fine_schedule
 from worker.planners.fast_graspd.selection import merits
 from worker.planners.fast_graspd.starts import sample_starts
-from worker.simulation.data import Data
+from worker.simulation.data import Data, HandState, Schedule
 from worker.simulation.projection import Projection
 from worker.simulation.record import record_iteration
-from worker.simulation.state import HandState, Schedule
 
-Floats = NDArray[np.float64]
 Say = Callable[[str], None]
 
 #: How far the start is moved along the approach [m]: towards the object where negative is away from it.

@@ -8,15 +8,13 @@ from typing import Any, Final
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
-from service.model.stability import MapCell, StabilityMap, graded, reachable
+from service.model.studies import MapCell, StabilityMap, graded, reachable
+from service.model.transforms import Floats
 from worker.simulation import reference
 from worker.simulation.kernels import contact
 from worker.simulation.model import initial_motions
 from worker.simulation.reference import Contacts, World
-
-Floats = NDArray[np.float64]
 
 PASSES: Final = 12
 #: Sizes of the ball that is held [m], and how deep or far its contacts are at most, over the step of 1 mm.

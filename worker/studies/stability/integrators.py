@@ -12,14 +12,13 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from service.model.stability import MapCell, StabilityMap, graded, reachable, short
+from service.model.studies import MapCell, StabilityMap, graded, reachable, short
+from service.model.transforms import Floats
 from worker.simulation import reference
 from worker.simulation.model import LossOptions
 from worker.simulation.reference import Contacts, World
 
-Floats = NDArray[np.float64]
 #: From contacts (of which the distances are the present ones), free motion and world to the motion that is allowed.
 Solver = Callable[[Contacts, Floats, World], Floats]
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.domain import JobRequest
-from service.model.stability import MapCell, Outcome, StabilityMap
+from service.model.studies import MapCell, Outcome, StabilityMap
 from worker.certified import certified_grasps
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

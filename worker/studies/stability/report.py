@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from service.model.stability import OUTCOMES, MapCell, Stability, StabilityMap, between, counts, tick
+from service.model.studies import OUTCOMES, MapCell, Stability, StabilityMap, between, counts, tick
 
 #: Told apart by lightness alone too, from calm to alarming: (fill, text).
 COLOURS: Final = {

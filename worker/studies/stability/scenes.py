@@ -12,7 +12,7 @@ from service.model.domain import JobRequest
 from service.model.errors import GraspdError
 from service.model.fidelity import FIDELITIES
 from service.model.scene_spec import Box, HalfSpace, SceneSpec
-from service.model.stability import MapCell, Outcome, StabilityMap, reachable
+from service.model.studies import MapCell, Outcome, StabilityMap, reachable
 from service.model.transforms import quat_rotate
 from worker.certified import Certified, certified_grasps
 from worker.hands.kinematics import body_poses
@@ -20,7 +20,7 @@ from worker.hands.model import HandModel
 from worker.run import ALONE, Run
 from worker.scenes.kinds import rest_poses, supports_of
 from worker.simulation.surroundings import Scenes
-from worker.studies.stability.shapes import prepared, refused
+from worker.studies.stability.assets import prepared, refused
 
 Say = Callable[[str], None]
 Support = HalfSpace | Box

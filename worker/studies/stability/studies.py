@@ -1,21 +1,23 @@
-"""The studies by name, whole or quick."""
+"""The stability studies by name, whole or quick; and the baselines on shapes that are hard."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
-from service.model.stability import StabilityMap
+from service.model.studies import StabilityMap, reachable
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.prepare import object_from_path
-from worker.run import Run
-from worker.studies.stability import descents, gradients, hands, integrators, model_errors, peers, scenes, shapes
+from worker.run import ALONE, Run
+from worker.studies.stability import assets, descents, gradients, integrators, model_errors, scenes
+from worker.studies.stability.assets import BOUNDS, FAMILIES, MEASURE, SHOWS, shape_cell
 
 Say = Callable[[str], None]
 
 #: Hands beside the one that is named, for what depends on a hand's size and build.
 OTHER_HANDS: Final = ("barrett",)
+
 #: And for what depends on its drives.
 ALL_HANDS: Final = ("allegro", "barrett", "shadow")
 
@@ -45,13 +47,13 @@ def run(
         "gradient": lambda: gradients.gradient_map(
             few(gradients.SIZES_M), few(gradients.GAPS), repeats=1 if quick else 3
         ),
-        "shapes": lambda: shapes.shape_map(
+        "shapes": lambda: assets.shape_map(
             model,
             fidelities=("draft",) if quick else ("draft", "standard", "fine"),
             count=4 if quick else 8,
-            families=("plate", "cube") if quick else tuple(shapes.FAMILIES),
+            families=("plate", "cube") if quick else tuple(assets.FAMILIES),
             # Grasps on an open mesh cost more than all else of a quick run.
-            defects=shapes.CLOSED if quick else tuple(shapes.DEFECTS),
+            defects=assets.CLOSED if quick else tuple(assets.DEFECTS),
             run=work,
             say=say,
         ),
@@ -60,11 +62,11 @@ def run(
             model, thing, rates=few(descents.RATES), weights=few(descents.WEIGHTS), count=4 if quick else 8, say=say
         ),
         "length": lambda: descents.length_map(model, thing, lengths=lengths, say=say),
-        "hands": lambda: hands.hand_map(
-            fingers=(1, 3) if quick else hands.FINGERS,
-            sizes=() if quick else hands.SIZES,
-            ratios=() if quick else hands.RATIOS,
-            couplings=("each joint",) if quick else hands.COUPLINGS,
+        "hands": lambda: assets.hand_map(
+            fingers=(1, 3) if quick else assets.FINGERS,
+            sizes=() if quick else assets.SIZES,
+            ratios=() if quick else assets.RATIOS,
+            couplings=("each joint",) if quick else assets.COUPLINGS,
             fidelity="draft" if quick else "standard",
             count=4 if quick else 8,
             run=work,
@@ -79,10 +81,10 @@ def run(
             run=work,
             say=say,
         ),
-        "peers": lambda: peers.peer_map(
+        "peers": lambda: peer_map(
             model,
-            methods=peers.METHODS[:2] if quick else peers.METHODS,
-            shapes={"cube": (60,)} if quick else peers.SHAPES,
+            methods=METHODS[:2] if quick else METHODS,
+            shapes={"cube": (60,)} if quick else SHAPES,
             count=4 if quick else 8,
             run=work,
             say=say,
@@ -105,3 +107,50 @@ def run(
         say(f"study {name}")
         found.append(studies[name]())
     return found
+
+
+#: Methods around a free object; the first is graspd's own.
+METHODS: Final = ("fast_graspd", "autograsp", "dfc", "graspit", "graspd2022")
+
+#: Parameters of each family: an easy one and hard ones.
+SHAPES: Final[dict[str, tuple[float, ...]]] = {
+    "plate": (1, 10),
+    "wedge": (10, 80),
+    "ring": (8, 64),
+    "cross": (20,),
+    "cube": (10, 30, 60, 100, 200),
+}
+
+
+def peer_map(
+    hand: HandModel,
+    *,
+    methods: Sequence[str] = METHODS,
+    shapes: dict[str, tuple[float, ...]] = SHAPES,
+    count: int = 8,
+    run: Run = ALONE,
+    say: Callable[[str], None] = lambda line: None,
+) -> StabilityMap:
+    """Valid grasps of each method on each shape, at the settings that it was published with."""
+    cells = []
+    for family, values in shapes.items():
+        unit, make, _ = FAMILIES[family]
+        for value in values:
+            for method in methods:
+                place = (f"{family}: {unit}", value, method)
+                cell = shape_cell(hand, place, make(value), {"units": "m"}, {"method": method}, count, run)
+                say(f"{family} {value:g} {method}: {cell.outcome} {cell.value:.2f} {cell.note}")
+                cells.append(cell)
+    return StabilityMap(
+        "peers",
+        f"{count} grasps of {hand.name} by each method on shapes that are hard",
+        "the shape's parameter",
+        "method",
+        MEASURE,
+        BOUNDS,
+        reachable(cells, lambda cell: True),
+        SHOWS,
+        "what a method leaves in the object or the referee drops is never valid; a job that finds too few says so",
+        "tests/worker/studies/test_stability.py::test_a_job_whose_every_grasp_is_bad_ends_with_none",
+        reach="all: any job may name another method",
+    )

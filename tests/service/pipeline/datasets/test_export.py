@@ -10,8 +10,8 @@ from pathlib import Path
 import h5py
 import pytest
 
-from service.model.dataset_records import Snapshot, SnapshotShard
 from service.model.errors import DamagedShard, InputError, StoreUnavailable
+from service.model.records import Snapshot, SnapshotShard
 from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.export import export_shards, path_of

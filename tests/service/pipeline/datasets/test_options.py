@@ -9,20 +9,17 @@ import pytest
 
 from service.index.rebuild import rebuild
 from service.model import digests, names
-from service.model.charts import IN_SCENE
-from service.model.dataset_records import DatasetRecord, request_of
 from service.model.domain import JobRequest
 from service.model.errors import ConflictError, InputError
-from service.model.records import JobRecord
+from service.model.records import DatasetRecord, JobRecord, request_of
 from service.model.scene_spec import SceneSpec
+from service.model.studies import IN_SCENE
 from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.cost import estimate
 from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.fidelity_choice import Resolver
-from service.store.datasets import load_dataset
-from service.store.records import read_record
-from service.store.study_records import charts_of, publish
+from service.store.records import charts_of, load_dataset, publish, read_record
 from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import finish, jobs_of, wanted
 

@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from service.index.damage import Damage
 from service.index.database import REVISION
 from service.index.index import Index
+from service.index.notes import Damage
 from service.index.rebuild import rebuild
 from service.model import names
 from service.model.finding import Condition, Finding
 from service.model.states import Stage
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
-from service.run.doctor import database
+from service.run.doctor import backends
 from service.settings import Settings
 from service.store.store import open_store
 from tests.fakes import add_assets, request
@@ -47,8 +47,8 @@ def kept(tmp_path: Path) -> Iterator[Services]:
 def look(request: pytest.FixtureRequest, kept: Services, monkeypatch: pytest.MonkeyPatch) -> Look:
     """The comparison of all rows, and that of a sample."""
     if request.param == "sample":
-        monkeypatch.setattr(database, "_ALL_SHARDS", 0)
-    return lambda: database.index_is_store(kept.settings, settles_s=0.0)
+        monkeypatch.setattr(backends, "_ALL_SHARDS", 0)
+    return lambda: backends.index_is_store(kept.settings, settles_s=0.0)
 
 
 def shard_of(services: Services) -> Path:
@@ -58,7 +58,7 @@ def shard_of(services: Services) -> Path:
 def test_an_index_that_is_what_the_store_says_is_good(kept: Services, look: Look) -> None:
     found = look()
     assert found.condition is Condition.GOOD, found
-    assert database.index(kept.settings).condition is Condition.GOOD
+    assert backends.index(kept.settings).condition is Condition.GOOD
 
 
 def test_a_manifest_that_is_gone_is_bad(kept: Services, look: Look) -> None:
@@ -95,9 +95,9 @@ def test_what_is_on_its_way_in_is_no_difference(kept: Services, look: Look, monk
 
 
 def test_known_damage_is_told_with_its_mend(kept: Services) -> None:
-    assert database.damage(kept.settings).condition is Condition.GOOD
+    assert backends.store_damage(kept.settings).condition is Condition.GOOD
     kept.index.damage.mark([Damage("shards/base/x.h5", "has another checksum", "x")])
-    found = database.damage(kept.settings)
+    found = backends.store_damage(kept.settings)
     assert not found.ok
     assert "shards/base/x.h5" in found.message
     assert found.mend == "graspd admin store verify --repair"
@@ -105,7 +105,7 @@ def test_known_damage_is_told_with_its_mend(kept: Services) -> None:
 
 def test_where_there_is_no_index_none_is_made(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path)
-    found = [database.index(settings), database.index_is_store(settings), database.damage(settings)]
+    found = [backends.index(settings), backends.index_is_store(settings), backends.store_damage(settings)]
     assert {one.condition for one in found} == {Condition.SKIPPED}
     assert list(tmp_path.iterdir()) == []
 
@@ -116,10 +116,10 @@ def test_a_damaged_file_is_bad_and_left_where_it_is(kept: Services) -> None:
     for beside in kept.settings.data_dir.glob("index.sqlite-*"):
         beside.unlink()
     file.write_bytes(b"no database" * 1000)
-    found = database.index(kept.settings)
+    found = backends.index(kept.settings)
     assert not found.ok
     assert "graspd admin index rebuild" in found.mend
-    assert database.index_is_store(kept.settings).condition is Condition.SKIPPED
+    assert backends.index_is_store(kept.settings).condition is Condition.SKIPPED
     assert file.read_bytes() == b"no database" * 1000
 
 
@@ -128,10 +128,10 @@ def test_tables_of_another_version_are_bad_and_left_as_they_are(kept: Services, 
     with kept.index.database.writing() as connection:
         connection.exec_driver_sql(f"UPDATE alembic_version SET version_num = '{revision}'")
     kept.index.close()
-    found = database.index(kept.settings)
+    found = backends.index(kept.settings)
     assert not found.ok
     assert "graspd admin index rebuild" in found.mend
-    assert database.index_is_store(kept.settings).condition is Condition.SKIPPED
+    assert backends.index_is_store(kept.settings).condition is Condition.SKIPPED
     with sqlite3.connect(kept.settings.data_dir / "index.sqlite") as connection:
         assert connection.execute("SELECT version_num FROM alembic_version").fetchone() == (revision,)
 
@@ -139,11 +139,11 @@ def test_tables_of_another_version_are_bad_and_left_as_they_are(kept: Services, 
 @pytest.mark.postgres
 def test_a_postgresql_without_tables_and_with_them(tmp_path: Path, postgres_server: PostgresServer) -> None:
     settings = Settings(data_dir=tmp_path, index_url=postgres_server.database())
-    found = database.index(settings)
+    found = backends.index(settings)
     assert found.condition is Condition.WARNING, found
     assert "revision none" in found.message
     Index(settings.resolved_index_url).close()
-    found = database.index(settings)
+    found = backends.index(settings)
     assert found.condition is Condition.GOOD, found
     assert postgres_server._password not in str(found)
 
@@ -153,7 +153,7 @@ def test_a_postgresql_that_is_away_or_refuses_is_bad(tmp_path: Path, postgres_se
     away = f"postgresql+psycopg://graspd:hidden@127.0.0.1:{free_ports(1)[0]}/graspd"
     stranger = f"postgresql+psycopg://graspd:hidden@127.0.0.1:{postgres_server.port}/postgres"
     for url in (away, stranger):
-        found = database.index(Settings(data_dir=tmp_path, index_url=url))
+        found = backends.index(Settings(data_dir=tmp_path, index_url=url))
         assert not found.ok
         assert "GRASPD_INDEX_URL" in found.mend
         assert "hidden" not in str(found)
@@ -164,11 +164,11 @@ def test_an_index_in_postgresql_is_compared_too(kept: Services, postgres_server:
     settings = Settings(data_dir=kept.settings.data_dir, index_url=postgres_server.database())
     index = Index(settings.resolved_index_url)
     rebuild(index, kept.store)
-    assert database.index_is_store(settings, settles_s=0.0).condition is Condition.GOOD
+    assert backends.index_is_store(settings, settles_s=0.0).condition is Condition.GOOD
     job = index.jobs.page(limit=1).items[0].id
     fail(Services(settings, open_store("memory://"), index, MemoryQueue()), job, 0, 1, last=False)
     index.close()
-    found = database.index_is_store(settings, settles_s=0.0)
+    found = backends.index_is_store(settings, settles_s=0.0)
     assert not found.ok
     assert "attempts" in found.message
 

@@ -11,7 +11,7 @@ import pytest
 from obstore.store import MemoryStore
 
 from service.model.finding import Condition
-from service.run.doctor.object_store import judge, store
+from service.run.doctor.backends import judge_store, store
 from service.settings import Settings
 from service.store.store import Entry, Store, open_store
 
@@ -46,7 +46,7 @@ def test_a_wrong_secret_is_bad_and_the_mend_names_the_variables(
 
 
 def test_a_store_in_memory_is_gone_with_its_process() -> None:
-    assert judge("store", open_store("memory://")).condition is Condition.WARNING
+    assert judge_store("store", open_store("memory://")).condition is Condition.WARNING
 
 
 class Overwriting(Store):
@@ -76,6 +76,6 @@ class Keeping(Store):
     ("kind", "word"), [(Overwriting, "overwritten"), (Deaf, "not in the list"), (Keeping, "still there")]
 )
 def test_a_store_that_breaks_a_promise_is_bad(kind: type[Store], word: str) -> None:
-    found = judge("store", kind(MemoryStore(), "fake://"))
+    found = judge_store("store", kind(MemoryStore(), "fake://"))
     assert not found.ok
     assert word in found.message

@@ -12,7 +12,7 @@ from redis import Redis
 from service.model.finding import Condition
 from service.queue.connection import connect, redis_url
 from service.queue.rq_queue import RqQueue
-from service.run.doctor.redis_server import persistence, redis
+from service.run.doctor.backends import persistence, redis
 from service.run.embedded import find_server, server_command
 from service.settings import Settings
 from tests.servers import free_ports
@@ -34,7 +34,7 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Settings]:
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is slow is the machine that the tests run on."""
-    monkeypatch.setattr("service.run.doctor.redis_server._SLOW_S", 60.0)
+    monkeypatch.setattr("service.run.doctor.backends._SLOW_REDIS_S", 60.0)
 
 
 @pytest.fixture

@@ -22,9 +22,9 @@ from worker.files.exchange import dexgraspnet2
 from worker.files.exchange.dexgraspnet2 import load_npz
 from worker.files.exchange.dexgraspnet2_graspness import surface_samples
 from worker.files.exchange.lots import Look
+from worker.hands.jaws import fingertip_pad
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
-from worker.hands.pads import fingertip_pad
 from worker.objects.model import ObjectModel
 from worker.rendering.annotate import TABLE
 

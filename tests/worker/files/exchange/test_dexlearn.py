@@ -13,7 +13,7 @@ import trimesh
 from service.model.errors import InputError
 from service.model.transforms import apply, compose, invert, pose_to_matrix
 from service.readers import Pictures, open_shards
-from service.readers.cloud_views import COLUMNS
+from service.readers.clouds import COLUMNS
 from service.readers.depth_noise import noise_of
 from service.store.shards import Shard
 from tests.worker.files.exchange.conftest import run

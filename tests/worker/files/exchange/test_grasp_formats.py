@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from service.model.errors import InputError
 from service.model.transforms import compose, quat_to_matrix
 from service.store.shards import read_shard
-from worker.files.exchange import ddgc, dexgraspbench, dexgraspnet, multidex
-from worker.files.exchange.imported import Origin, verdicts
-from worker.files.exchange.pickles import load_npy
+from worker.files.exchange import dexgraspbench, published
+from worker.files.exchange.imported import Origin, load_npy, verdicts
 from worker.files.exchange.scoring import write_scored
 from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
@@ -112,7 +111,7 @@ def test_dexgraspnets_angles_turn_about_the_fixed_axes(tmp_path: Path) -> None:
     angles = np.array([0.4, -1.2, 2.2])
     qpos = dict(zip(("WRJRx", "WRJRy", "WRJRz"), angles, strict=True)) | {"WRJTx": 0.1, "WRJTy": 0.2, "WRJTz": -0.3}
     path = _dexgraspnet(tmp_path, qpos | {"robot0:FFJ2": 0.5}, scale=1.0)
-    (found,) = dexgraspnet.read(path, hand="shadow", obj="block")
+    (found,) = published.read_dexgraspnet(path, hand="shadow", obj="block")
     expected = Rotation.from_euler("xyz", angles).as_matrix()  # SciPy's lower-case letters are fixed axes too
     np.testing.assert_allclose(quat_to_matrix(found.grasps.grasp.hand_pose[0, 3:]), expected, atol=TINY)
     np.testing.assert_allclose(found.grasps.grasp.hand_pose[0, :3], [0.1, 0.2, -0.3])
@@ -120,14 +119,16 @@ def test_dexgraspnets_angles_turn_about_the_fixed_axes(tmp_path: Path) -> None:
 
 def test_dexgraspnets_joints_are_the_urdfs_of_one_number_more(tmp_path: Path) -> None:
     qpos = dict.fromkeys(("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz"), 0.0)
-    (found,) = dexgraspnet.read(_dexgraspnet(tmp_path, qpos | {"robot0:THJ4": 0.37}, 1.0), hand="shadow", obj="block")
+    (found,) = published.read_dexgraspnet(
+        _dexgraspnet(tmp_path, qpos | {"robot0:THJ4": 0.37}, 1.0), hand="shadow", obj="block"
+    )
     at = next(k for k, name in enumerate(found.hand.joint_names) if name.endswith("THJ5"))
     assert found.grasps.grasp.joint_positions[0, at] == 0.37
 
 
 def test_dexgraspnets_scale_is_put_on_the_mesh(block: ObjectModel, tmp_path: Path) -> None:
     qpos = dict.fromkeys(("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz"), 0.0)
-    (found,) = dexgraspnet.read(_dexgraspnet(tmp_path, qpos, 1.5), hand="shadow", obj="block")
+    (found,) = published.read_dexgraspnet(_dexgraspnet(tmp_path, qpos, 1.5), hand="shadow", obj="block")
     assert np.ptp(found.obj.vertices, axis=0) == pytest.approx(1.5 * np.ptp(block.vertices, axis=0), rel=1e-6)
 
 
@@ -140,13 +141,13 @@ def _dexgraspnet(folder: Path, qpos: dict[str, float], scale: float) -> Path:
 def test_two_columns_of_a_rotation_give_it_back() -> None:
     matrices = Rotation.random(20, rng=np.random.default_rng(1)).as_matrix()
     columns = np.concatenate([matrices[:, :, 0], matrices[:, :, 1]], axis=1)
-    np.testing.assert_allclose(quat_to_matrix(multidex.rotation_of_columns(columns)), matrices, atol=1e-12)
+    np.testing.assert_allclose(quat_to_matrix(published.rotation_of_columns(columns)), matrices, atol=1e-12)
 
 
 def test_rotating_axes_are_scipys_capital_letters() -> None:
     angles = np.random.default_rng(2).uniform(-3, 3, (20, 3))
     expected = Rotation.from_euler("XYZ", angles).as_matrix()
-    np.testing.assert_allclose(quat_to_matrix(multidex.rotation_of_angles(angles)), expected, atol=1e-12)
+    np.testing.assert_allclose(quat_to_matrix(published.rotation_of_angles(angles)), expected, atol=1e-12)
 
 
 def test_multidex_gives_the_grasps_of_one_robot_on_one_object(hand: HandModel, tmp_path: Path) -> None:
@@ -155,7 +156,7 @@ def test_multidex_gives_the_grasps_of_one_robot_on_one_object(hand: HandModel, t
     q = torch.cat([torch.tensor([0.1, 0.2, 0.3, 1.0, 0, 0, 0, 1, 0]), torch.full((joints,), 0.4)])
     rows = [(q, "ycb+block", "barrett"), (q + 1, "ycb+cup", "barrett"), (q, "ycb+block", "allegro")]
     torch.save({"info": {}, "metadata": rows}, tmp_path / "cmap_dataset.pt")
-    (found,) = multidex.read(
+    (found,) = published.read_multidex(
         tmp_path / "cmap_dataset.pt", hand="barrett", obj="block", robot="barrett", object_name="ycb+block"
     )
     np.testing.assert_allclose(found.grasps.grasp.hand_pose, [[0.1, 0.2, 0.3, 1, 0, 0, 0]], atol=1e-6)  # float32
@@ -169,7 +170,7 @@ def test_ddgcs_quaternion_and_joints_are_put_in_our_order(hand: HandModel, tmp_p
         rows = np.empty(2, dtype=object)
         rows[:] = [[], values.tolist()]
         np.save(tmp_path / f"barrett_{name}_3.npy", rows, allow_pickle=True)
-    (found,) = ddgc.read(tmp_path / "barrett_translation_3.npy", hand="barrett", obj="block", number=1)
+    (found,) = published.read_ddgc(tmp_path / "barrett_translation_3.npy", hand="barrett", obj="block", number=1)
     np.testing.assert_allclose(found.grasps.grasp.hand_pose[0, 3:], [np.cos(0.5), 0, 0, np.sin(0.5)], atol=TINY)
     joints = dict(zip(hand.joint_names, found.grasps.grasp.joint_positions[0], strict=True))
     assert abs(joints["finger_3_medial"]) == pytest.approx(0.7)
@@ -191,10 +192,10 @@ def test_imported_grasps_are_scored_and_say_where_they_come_from(
 
 
 def test_published_reference_grasps_come_in_by_name(shared_data: Path) -> None:
-    from worker.files.exchange import reference
+    from worker.files.exchange import published
 
     path = shared_data / "reference_grasps" / "frogger_allegro" / "061_foam_brick.json"
-    (found,) = reference.read(path)
+    (found,) = published.read_reference(path)
     assert (len(found.grasps), found.name) == (28, "061_foam_brick")
     assert found.published is not None
     assert found.published.mean() == pytest.approx(0.64, abs=0.005)  # the rate that DATA.md states
@@ -208,7 +209,7 @@ def test_a_hand_that_lacks_a_joint_is_told() -> None:
 
 
 def test_an_object_at_two_scales_is_two_objects() -> None:
-    from worker.files.exchange.objects import scaled_object
+    from worker.files.exchange.imported import scaled_object
 
     # What is kept of a pair between calls is found by digest.
     assert len({scaled_object("block", scale).digest for scale in (1.0, 0.5, 2.0)}) == 3

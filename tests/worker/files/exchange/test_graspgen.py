@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from service.model.errors import InputError
 from service.model.transforms import IDENTITY_POSE
-from service.store import standing
+from service.store import validity
 from service.store.shards import Shard
 from tests.worker.files.exchange.conftest import run
 from tests.worker.hands.grippers import OPENING, gripper
@@ -75,7 +75,7 @@ def test_its_grasps_are_ours_with_their_verdicts(
     record = record_of(data, "block")
     poses, mask = np.array(record["grasps"]["transforms"]), np.array(record["grasps"]["object_in_gripper"])
     assert poses.shape == (8, 4, 4) and mask.dtype == bool
-    np.testing.assert_array_equal(mask, standing.valid(stored.arrays))
+    np.testing.assert_array_equal(mask, validity.valid(stored.arrays))
     assert len(poses[mask]) + len(poses[~mask]) == 8
     joints = np.array(record["grasps"]["grasp_joints"])
     tip = hand.fingertips[0]
@@ -111,7 +111,7 @@ def test_grasps_come_back_as_they_were(data: Path, stored: Shard) -> None:
         np.testing.assert_array_equal(found.joint_positions, stored[f"{name}/joint_positions"])
         np.testing.assert_allclose(found.hand_pose[:, :3], stored[f"{name}/hand_pose"][:, :3], atol=ROUNDING_M)
     assert back.published is not None
-    np.testing.assert_array_equal(back.published == 1, standing.valid(stored.arrays))
+    np.testing.assert_array_equal(back.published == 1, validity.valid(stored.arrays))
 
 
 def test_of_grasps_without_joints_the_fingers_close_until_they_touch(

@@ -23,7 +23,7 @@ from service.model.transforms import compose
 from service.readers import Pictures, open_shards
 from service.store.shards import Shard
 from tests.worker.files.exchange.conftest import run
-from worker.files.exchange import lerobot_import
+from worker.files.exchange import lerobot
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 
@@ -136,7 +136,7 @@ def test_an_episode_is_the_way_of_its_grasp(root: Path, on_tables: Path, hand: H
 
 
 def test_grasps_come_back_with_their_ways_and_verdicts(root: Path, stored: Shard) -> None:
-    (back,) = lerobot_import.read(root, hand="barrett", obj="block", object_name="block")
+    (back,) = lerobot.read(root, hand="barrett", obj="block", object_name="block")
     assert back.placed is not None and back.published is not None and back.grasps.lift is not None
     assert back.grasps.approach is not None
     np.testing.assert_array_equal(back.published, stored["quality/success"])
@@ -155,9 +155,9 @@ def test_a_data_set_of_somebody_else_is_told(root: Path, tmp_path: Path) -> None
     info["features"]["observation.state"]["names"] = ["shoulder", "elbow"]
     (other / "meta" / "info.json").write_text(json.dumps(info))
     with pytest.raises(InputError, match="no data set of ours"):
-        lerobot_import.read(other, hand="barrett", obj="block", object_name="block")
+        lerobot.read(other, hand="barrett", obj="block", object_name="block")
     with pytest.raises(InputError, match="lift the block, lift the mug"):
-        lerobot_import.read(root, hand="barrett", obj="block", object_name="cup")
+        lerobot.read(root, hand="barrett", obj="block", object_name="cup")
 
 
 def test_grasps_without_pictures_are_no_episodes(on_tables: Path, tmp_path: Path) -> None:

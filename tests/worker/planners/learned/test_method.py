@@ -31,8 +31,8 @@ from worker.planners.learned.seeds import RETREATS, Seeds
 from worker.planners.registry import of_this_machine
 from worker.run import Run
 from worker.scenes.kinds import rest_poses, supports_of
+from worker.simulation.data import HandState
 from worker.simulation.obstacles import DeviceObstacles
-from worker.simulation.state import HandState
 from worker.simulation.surroundings import Obstacle, Placed
 
 QUICK = resolve_fidelity("draft").model_copy(

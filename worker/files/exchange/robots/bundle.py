@@ -9,14 +9,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from service.model.transforms import compose, invert
-from worker.files.exchange.names import plain_name, prim_names
-from worker.hands.description import Description
-from worker.hands.model import Floats
-from worker.robots.arm import Arm
-from worker.robots.execution import Executions
-from worker.robots.timing import Path, Trajectory
-from worker.robots.world import World
+from service.model.transforms import Floats, compose, invert
+from worker.files.exchange.lots import plain_name, prim_names
+from worker.robots.arm import Arm, Description
+from worker.robots.execution import Executions, Path, Trajectory
+from worker.robots.reach import World
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from typing import Any, Final
 import numpy as np
 
 from service.model.errors import InputError
-from worker.files.exchange.names import plain_name
-from worker.files.exchange.objects import mesh_file
+from service.model.transforms import Floats
+from worker.files.exchange.imported import mesh_file
+from worker.files.exchange.lots import plain_name
 from worker.files.exchange.robots.bundle import Bundle, dump_yaml, numbers
-from worker.hands.model import Floats
-from worker.robots.timing import Trajectory
+from worker.robots.execution import Trajectory
 
 #: Share of a straight motion that must be possible for the grasp to be tried.
 LEAST_SHARE: Final = 0.5

@@ -1,4 +1,5 @@
-"""Grasps as a MuJoCo scene: hand, object and supports with the referee's physics, and a key frame for each posture.
+"""Grasps as MuJoCo scenes with a key frame for each posture: the hand alone with the validator's physics, or on its
+arm.
 
 The world is the frame of the grasps, z up in a scene. A mocap body leads the hand's root; position actuators bear the
 names of the degrees of freedom. In a scene gravity pulls the object alone; a free object floats.
@@ -17,8 +18,8 @@ import numpy as np
 
 from service.model.matter import ACCELERATION
 from service.model.transforms import compose
-from worker.files.exchange.names import plain_name
-from worker.files.exchange.robots.bundle import Bundle
+from worker.files.exchange.lots import plain_name
+from worker.files.exchange.robots.bundle import Bundle, Carrier
 from worker.hands.model import HandModel
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.model import MujocoOptions, Scene, build, scene_spec
@@ -26,11 +27,12 @@ from worker.robots.execution import POSTURES, Executions
 
 #: Of the hand, the object, and all else.
 _COLOURS: Final = ("0.36 0.45 0.58 1", "0.87 0.45 0.2 1", "0.75 0.75 0.72 1")
+
 #: Attributes of MJCF that the specification knows by another name.
 _SPEC_NAMES: Final = {"vertex": "uservert"}
 
 
-def write(bundle: Bundle, folder: Path, pieces: ConvexPieces) -> list[Path]:
+def write_scene(bundle: Bundle, folder: Path, pieces: ConvexPieces) -> list[Path]:
     """Write `scene.xml`, which needs no other file, and `replay.py`, which plays and judges its grasps.
 
     Args:
@@ -172,3 +174,53 @@ def one(tree: Element, path: str) -> Element:
 def element_text(values: Any) -> str:
     """Numbers as MJCF has them."""
     return " ".join(f"{float(value):.17g}" for value in np.ravel(values))
+
+
+def write_arm(bundle: Bundle, folder: Path) -> list[Path]:
+    """Write `arm.xml`; nothing where there is no arm."""
+    if (carrier := bundle.carrier) is None:
+        return []
+    tree = ElementTree.fromstring(carrier.world.spec.to_xml())
+    tree.set("model", f"{carrier.arm.model.name} with {bundle.found.hand.name}")
+    dress(tree, bundle.found, ("hand0", "object"))
+    for geom in tree.iterfind("./worldbody/geom"):
+        geom.set("rgba", "0.75 0.75 0.72 1")
+    for geom in one(tree, ".//body[@name='arm0']").iter("geom"):
+        if "rgba" not in geom.attrib:
+            geom.set("rgba", "0.85 0.85 0.87 1")
+    _add_arm_keys(tree, bundle, carrier)
+    rename(tree, _arm_names(bundle, carrier))
+    ElementTree.indent(tree)
+    file = folder / "arm.xml"
+    file.write_text(ElementTree.tostring(tree, encoding="unicode") + "\n")
+    return [file]
+
+
+def _add_arm_keys(tree: Element, bundle: Bundle, carrier: Carrier) -> None:
+    keys, world, found = SubElement(tree, "keyframe"), carrier.world, bundle.found
+    arms = len(carrier.arm.model.joint_names)
+    for row, paths in enumerate(carrier.paths):
+        ends = [paths[0].joints[0], *(path.joints[-1] for path in paths)]
+        for posture, joints in zip(POSTURES, ends, strict=True):
+            thing = found.lifted_object_pose[row] if posture == "lift" else found.object_pose[row]
+            qpos = np.zeros(world.model.nq)
+            qpos[world.arm_qpos], qpos[world.hand_qpos] = joints[:arms], joints[arms:]
+            SubElement(
+                keys,
+                "key",
+                name=f"{bundle.name(row)}/{posture}",
+                qpos=element_text(qpos),
+                mpos=element_text(thing[:3]),
+                mquat=element_text(thing[3:]),
+            )
+
+
+def _arm_names(bundle: Bundle, carrier: Carrier) -> dict[str, str]:
+    """The arm's and the hand's own names; those of the hand that the arm has as well begin with `hand_`."""
+    found: dict[str, str] = {}
+    taken = {"object", "world", "flange"}
+    for prefix, model in (("arm", carrier.arm.model), ("hand", bundle.found.hand)):
+        names = [name if name not in taken else f"{prefix}_{name}" for name in model.body_names]
+        found |= {f"{prefix}{k}": name for k, name in enumerate(names)}
+        taken |= set(names)
+    return found

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.engines.cuda_errors import check_device, is_out_of_memory
+from worker.engines.devices import check_device, is_out_of_memory
 from worker.engines.mujoco_warp import has_mujoco_warp, mujoco_warp_version
 from worker.grasps import GraspSet, joined
 from worker.hands.jaws import jaws_of

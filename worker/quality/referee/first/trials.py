@@ -10,9 +10,8 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.quality.referee.protocol import Outcome
-
-Floats = NDArray[np.float64]
 
 #: A verdict is clear where the worst motion that was seen is below the first share of its limit, or above the second.
 #: Both engines' margins of a grasp that holds differ by 0.11 at the 99th percentile (benchmarks.first_judge).

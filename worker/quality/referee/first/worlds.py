@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from service.model.transforms import Floats
 from worker.engines.mujoco_warp import mujoco_warp
 from worker.grasps import GraspSet, Posture
 from worker.quality.referee import protocol
@@ -23,7 +24,6 @@ from worker.quality.referee.model import Scene
 from worker.run import ALONE, Run
 
 log = logging.getLogger(__name__)
-Floats = NDArray[np.float64]
 
 #: Contacts and constraint rows that a world has room for at first: twice what grasps of three hands were seen to need.
 CONTACTS: Final = 96

@@ -1,0 +1,360 @@
+"""Figures of the pages: charts as SVG without scripts, the hand x object matrix, and maps of failure as coloured
+cells."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+from urllib.parse import urlencode
+
+from api.models import Histogram
+from service.index.queries.statistics import Distribution
+from service.index.views import CellView, DatasetView, MatrixCell
+from service.model.errors import DamagedError
+from service.model.states import State
+from service.model.studies import OUTCOMES, MapCell, Outcome, Stability, StabilityMap, between, counts, from_json, tick
+from service.store.records import STABILITY, latest
+from service.store.store import Store
+
+#: Coordinates of a chart's inside; the SVG stretches it to the page.
+WIDTH: Final = 600.0
+
+HEIGHT: Final = 160.0
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A line or bars: SVG points for readers without a script, the numbers for the script."""
+
+    label: str
+    points: str
+    data: str
+    height: int = 180
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One bar of a histogram and the address of the grasps in it."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+    count: int
+    low: float
+    high: float
+    href: str
+
+
+def line(xs: Sequence[float], ys: Sequence[float], *, x: str, y: str, unit: str = "", log: bool = False) -> Plot:
+    """A line through points; on a logarithmic axis values at or below zero are left out.
+
+    Args:
+        x: name of the horizontal axis with its unit.
+        y: name of the values.
+        unit: of the values.
+    """
+    kept = [(a, b) for a, b in zip(xs, ys, strict=True) if math.isfinite(b) and (b > 0 or not log)]
+    scaled = [(a, math.log10(b) if log else b) for a, b in kept]
+    low, high = (min(b for _, b in scaled), max(b for _, b in scaled)) if scaled else (0.0, 1.0)
+    low = low if log else min(0.0, low)
+    first, last = (scaled[0][0], scaled[-1][0]) if scaled else (0.0, 1.0)
+    points = " ".join(
+        f"{_share(a, first, last) * WIDTH:.1f},{HEIGHT - _share(b, low, high) * HEIGHT:.1f}" for a, b in scaled
+    )
+    data = {"kind": "line", "xs": [a for a, _ in kept], "ys": [b for _, b in kept], "x": x, "y": y, "unit": unit}
+    label = f"{y} over {x}"
+    if kept:
+        label += f", from {kept[0][1]:.3g} to {kept[-1][1]:.3g} {unit}".rstrip()
+    return Plot(label, points, json.dumps(data | {"log": log}))
+
+
+def minutes(values: Sequence[int], start: float, *, step_s: int = 60) -> Plot:
+    """Bars of what was made in each interval from `start` [s since 1970] on."""
+    top = max([*values, 1])
+    width = WIDTH / max(len(values), 1)
+    points = " ".join(
+        f"{i * width:.1f},{HEIGHT:.0f} {i * width:.1f},{HEIGHT * (1 - v / top):.1f} "
+        f"{(i + 0.85) * width:.1f},{HEIGHT * (1 - v / top):.1f} {(i + 0.85) * width:.1f},{HEIGHT:.0f}"
+        for i, v in enumerate(values)
+    )
+    data = {
+        "kind": "bars",
+        "xs": [start + i * step_s for i in range(len(values))],
+        "ys": list(values),
+        "x": "Time",
+        "y": "Valid grasps",
+        "unit": "/min",
+        "log": False,
+    }
+    return Plot(
+        f"Valid grasps in each minute of the last hour; at most {max(values, default=0)}", points, json.dumps(data)
+    )
+
+
+def bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:
+    """The bars of a histogram; each leads to the grasps whose metric lies in it.
+
+    Args:
+        path: the page of the list.
+        where: its other filters.
+    """
+    count = len(histogram.counts)
+    width = (histogram.high - histogram.low) / count
+    made = []
+    for index, (share, number) in enumerate(zip(histogram.bars, histogram.counts, strict=True)):
+        low, high = histogram.low + index * width, histogram.low + (index + 1) * width
+        tall = max(60 * share, 1.5 if number else 0)
+        query = where | {f"min_{histogram.metric}": f"{low:.6g}", f"max_{histogram.metric}": f"{high:.6g}"}
+        made.append(Bar(10.0 * index + 1, 63 - tall, 8.0, tall, number, low, high, f"{path}?{urlencode(query)}"))
+    return made
+
+
+@dataclass(frozen=True)
+class TwinBar:
+    """Shares of two sets of grasps in one bin, side by side."""
+
+    x: float
+    one: float
+    other: float
+    """Heights."""
+    low: float
+    high: float
+    shares: tuple[float, float]
+
+
+def twins(both: Sequence[Distribution | None]) -> list[TwinBar]:
+    """The bins of two distributions over the same range, each a share of its own grasps."""
+    first = next(each for each in both if each is not None)
+    bins = len(first.counts)
+    shares = [[n / each.count for n in each.counts] if each is not None else [0.0] * bins for each in both]
+    most, width = max(map(max, shares)) or 1.0, (first.high - first.low) / bins
+    return [
+        TwinBar(10.0 * at, 60 * a / most, 60 * b / most, first.low + at * width, first.low + (at + 1) * width, (a, b))
+        for at, (a, b) in enumerate(zip(*shares, strict=True))
+    ]
+
+
+def _share(value: float, low: float, high: float) -> float:
+    return (value - low) / (high - low) if high > low else 0.5
+
+
+#: Steps of the colour scale; the style sheet has a class for each.
+STEPS: Final = 10
+
+#: More objects than this are too long a page; those with work come first.
+_ROWS: Final = 60
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One hand on one object. `made` counts grasps of its `standing`; `share` is the valid part of the judged; `value`
+    is what its checkbox sends, `href` where it leads."""
+
+    hand: str
+    object: str
+    value: str
+    href: str
+    state: str
+    made: int
+    tried: int
+    share: float | None
+    standing: str = "valid"
+    jobs: int = 0
+    progress: float | None = None
+    note: str = ""
+    scene: str = "free"
+    """Kind of the scene in which its grasps are valid."""
+
+    @property
+    def shade(self) -> str:
+        """Class of the cell's colour: by yield, or none while there is nothing to judge."""
+        return "none" if self.share is None else f"y{min(STEPS, int(STEPS * self.share + 0.5))}"
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Rows are objects, columns are hands."""
+
+    hands: list[str]
+    rows: list[tuple[str, list[Tile | None]]]
+    hidden: int = 0
+
+
+def of_dataset(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
+    """The matrix of a dataset."""
+    found = {
+        (cell.hand, cell.object): Tile(
+            hand=cell.hand,
+            object=cell.object,
+            value=cell.job_id,
+            href=f"/jobs/{cell.job_id}" if cell.planned else "",
+            state=cell.state.value,
+            made=cell.counted(dataset.options),
+            tried=cell.tried,
+            share=cell.valid_yield,
+            standing=dataset.options.standing,
+            progress=cell.progress if cell.state is State.RUNNING else None,
+            note=cell.reason or "",
+            scene=dataset.options.place.kind,
+        )
+        for cell in cells
+    }
+    return _grid(dataset.hands, dataset.objects, found)
+
+
+def of_service(cells: Iterable[MatrixCell], hands: Sequence[str], objects: Sequence[str]) -> Grid:
+    """The matrix of everything: all known hands and objects, with what their jobs came to."""
+    found = {
+        (cell.hand, cell.object): Tile(
+            hand=cell.hand,
+            object=cell.object,
+            value=f"{cell.hand}|{cell.object}",
+            href=f"/grasps?hand={cell.hand}&object={cell.object}",
+            state=_state(cell),
+            made=cell.valid if cell.judged else cell.grasps,
+            tried=cell.tried,
+            share=cell.valid_yield,
+            standing="valid" if cell.judged else "kept",
+            jobs=cell.jobs,
+        )
+        for cell in cells
+    }
+    columns = list(dict.fromkeys([*hands, *(hand for hand, _ in found)]))
+    names = list(dict.fromkeys([*objects, *(obj for _, obj in found)]))
+    worked = {obj for _, obj in found}
+    ordered = sorted(names, key=lambda name: (name not in worked, name))
+    for hand in columns:
+        for obj in ordered[:_ROWS]:
+            found.setdefault((hand, obj), Tile(hand, obj, f"{hand}|{obj}", "", "blank", 0, 0, None))
+    return _grid(columns, ordered[:_ROWS], found, hidden=max(0, len(ordered) - _ROWS))
+
+
+def _grid(hands: Sequence[str], objects: Sequence[str], found: dict[tuple[str, str], Tile], hidden: int = 0) -> Grid:
+    return Grid(list(hands), [(obj, [found.get((hand, obj)) for hand in hands]) for obj in objects], hidden)
+
+
+def _state(cell: MatrixCell) -> str:
+    if cell.running:
+        return State.RUNNING.value
+    if cell.queued:
+        return State.QUEUED.value
+    return State.FAILED.value if cell.failed else State.SUCCEEDED.value
+
+
+#: Width and height of a cell with its gap, as the style sheet has them [px]: lines are drawn over the cells.
+PITCH: Final = (40, 30)
+
+
+@dataclass(frozen=True)
+class Square:
+    """A cell as it is drawn."""
+
+    outcome: Outcome
+    text: str
+    said: str
+    """All about it in one line, for whoever points at it."""
+    ringed: bool
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One method or family: rows from the top down, columns from the left."""
+
+    name: str
+    x: str
+    y: str
+    columns: list[str]
+    rows: list[tuple[str, list[Square | None]]]
+    line: str
+    """Points of the boundary that theory gives, over the cells."""
+
+    @property
+    def width(self) -> int:
+        return PITCH[0] * len(self.columns)
+
+    @property
+    def height(self) -> int:
+        return PITCH[1] * len(self.rows)
+
+
+@dataclass(frozen=True)
+class Share:
+    """A part of a bar that is 100 wide."""
+
+    outcome: Outcome
+    count: int
+    x: float
+    width: float
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """One map with what is said beneath it."""
+
+    map: StabilityMap
+    panels: list[Panel]
+    counts: dict[Outcome, int]
+    reached: list[Share]
+    still_breaks: list[str]
+
+
+def load(store: Store) -> Stability | None:
+    """The maps that were published last; None where there are none that can be read."""
+    try:
+        found = latest(store, STABILITY)
+        return None if found is None else from_json(found)
+    except (ValueError, DamagedError):
+        return None
+
+
+def draw(one: StabilityMap) -> Drawn:
+    """A map as panels and numbers."""
+    return Drawn(
+        map=one,
+        panels=[_panel(one, name) for name in one.panels],
+        counts={outcome: number for outcome, number in counts(one.cells).items() if number},
+        reached=_shares(one.reached()),
+        still_breaks=one.still_breaks(),
+    )
+
+
+def _panel(one: StabilityMap, name: str) -> Panel:
+    cells = one.of(name)
+    xs, ys = ([*dict.fromkeys(getattr(cell, axis) for cell in cells)] for axis in ("x", "y"))
+    squares = {(cell.x, cell.y): _square(one, cell, ringed=one.is_divided and cell.reached) for cell in cells}
+    line = one.lines.get(name, [])
+    if any(isinstance(x, str) for x in xs):
+        # Words stand better before a row than under a narrow column.
+        rows = [(tick(x), [squares.get((x, y)) for y in ys]) for x in xs]
+        return Panel(name, one.y, one.x, [tick(y) for y in ys], rows, "")
+    upward = ys if all(isinstance(y, str) for y in ys) else ys[::-1]
+    rows = [(tick(y), [squares.get((x, y)) for x in xs]) for y in upward]
+    points = " ".join(
+        f"{PITCH[0] * (between(xs, x) + 0.5):.1f},{PITCH[1] * (len(ys) - 0.5 - between(ys, y)):.1f}" for x, y in line
+    )
+    return Panel(name, one.x, one.y, [tick(x) for x in xs], rows, points)
+
+
+def _square(one: StabilityMap, cell: MapCell, *, ringed: bool) -> Square:
+    value = cell.note or (f"{cell.value:.3g}" if cell.value == cell.value else "no value")
+    return Square(
+        outcome=cell.outcome,
+        text=cell.text,
+        said=f"{one.x} {tick(cell.x)}, {one.y} {tick(cell.y)}: {cell.outcome}; {value}",
+        ringed=ringed,
+    )
+
+
+def _shares(cells: Sequence[MapCell]) -> list[Share]:
+    found = counts(cells)
+    shares, x = [], 0.0
+    for outcome in OUTCOMES:
+        if found[outcome]:
+            width = 100.0 * found[outcome] / len(cells)
+            shares.append(Share(outcome, found[outcome], x, width))
+            x += width
+    return shares

@@ -1,1 +1,0 @@
-"""What pages draw: charts, matrices and maps, as SVG and tables."""

@@ -1,0 +1,313 @@
+"""The charts of speed against accuracy that `graspd chart` leaves in the store: read, summed up, drawn as SVG.
+
+One of free objects, and one for each kind of scene: they ask different questions, so none has points of another.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+from pydantic import BaseModel, ConfigDict
+
+from service.model.errors import DamagedError
+from service.model.scene_spec import SceneSpec
+from service.model.studies import FILTERED
+from service.store.records import CHARTS, latest, scene_kinds
+from service.store.store import Store
+
+WIDTH: Final = 860
+
+HEIGHT: Final = 420
+
+_LEFT, _RIGHT, _TOP, _BOTTOM = 64, 24, 16, 46
+
+#: A letter of a label, and a line of it; from a point to its label, and the point itself [px].
+_LETTER, _LINE, _AWAY, _DOT = 6.9, 15.0, 12.0, 7.0
+
+#: How far a label may move up or down from its point, the wanted places first [px].
+_MOVES: Final = (0.0, 15.0, -15.0, 30.0, -30.0, 45.0, -45.0, 60.0, -60.0)
+
+#: Of methods that know no fidelities; their label is their name.
+_NO_FIDELITY: Final = "as published"
+
+
+@dataclass(frozen=True)
+class Axis:
+    """An accuracy to choose."""
+
+    label: str
+    unit: str = "%"
+    more_is_better: bool = True
+    factor: float = 100.0
+    """From the stored number."""
+
+
+#: Accuracies of grasps around free objects, and of grasps in scenes; the first one is drawn where none is chosen.
+FREE: Final[dict[str, Axis]] = {
+    "gsr": Axis("Success in MuJoCo"),
+    "letter": Axis("Success by the letter"),
+    "hard": Axis("Success at half the friction"),
+    "robust": Axis("Robust share of those that hold"),
+    "epsilon": Axis("ε", "", factor=1.0),
+    "pd_mm": Axis("Penetration", "mm", more_is_better=False, factor=1.0),
+}
+
+IN_SCENES: Final[dict[str, Axis]] = {
+    "lift": Axis("Lifted, of all tries"),
+    "lift_letter": Axis("Lifted by the letter"),
+    "lift_hard": Axis("Lifted at half the friction"),
+    "robust": Axis("Robust share of those lifted"),
+}
+
+
+class Run(BaseModel):
+    """One method at one fidelity on one hand and object; in scenes planned there, or filtered."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    method: str
+    fidelity: str
+    hand: str
+    object: str
+    way: str = ""
+    valid_per_second: float | None = None
+    end_seconds: list[float] | float | None = None
+    kept: int | None = None
+    lift_count: int | None = None
+    seconds_to_first_valid: float | None = None
+    seconds_to_first: float | None = None
+    gsr: float | None = None
+    letter: float | None = None
+    hard: float | None = None
+    robust: float | None = None
+    epsilon: float | None = None
+    pd_mm: float | None = None
+    lift: float | None = None
+    lift_letter: float | None = None
+    lift_hard: float | None = None
+
+    @property
+    def name(self) -> str:
+        """The method, and whether its grasps were put into the scene afterwards."""
+        return f"{self.method}, filtered" if self.way == FILTERED else self.method
+
+    @property
+    def label(self) -> str:
+        """That, with the fidelity where the method knows any."""
+        return self.name if self.fidelity == _NO_FIDELITY else f"{self.name} {self.fidelity}"
+
+    @property
+    def found(self) -> int | None:
+        """Grasps that are valid, in a scene lifted; None in charts of graspd 0.1."""
+        return self.kept if self.lift_count is None else self.lift_count
+
+    @property
+    def seconds(self) -> float:
+        """What they took end to end."""
+        return sum(self.end_seconds) if isinstance(self.end_seconds, list) else self.end_seconds or 0.0
+
+    @property
+    def first_s(self) -> float | None:
+        """Seconds to the first of them."""
+        return self.seconds_to_first_valid if self.seconds_to_first is None else self.seconds_to_first
+
+
+class Measured(BaseModel):
+    """What the command left."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    runs: list[Run]
+    created: str | None = None
+    device: str | None = None
+    scene: SceneSpec | None = None
+
+    @property
+    def axes(self) -> dict[str, Axis]:
+        """The accuracies that it may hold."""
+        return IN_SCENES if self.scene else FREE
+
+    @property
+    def counted(self) -> str:
+        """What its speeds count."""
+        return "lifted" if self.scene else "valid"
+
+
+@dataclass(frozen=True)
+class Point:
+    """A method and fidelity, over the hands and objects chosen."""
+
+    method: str
+    fidelity: str
+    pairs: int
+    speed: float
+    first_valid_s: float | None
+    accuracy: float
+    on_front: bool = False
+    x: float = 0.0
+    y: float = 0.0
+    label_y: float = 0.0
+    is_left: bool = False
+    """Whether its label stands on its left."""
+    series: int = 0
+
+    @property
+    def label(self) -> tuple[str, str]:
+        """Method and fidelity as they are written beside it."""
+        return self.method, "" if self.fidelity == _NO_FIDELITY else self.fidelity
+
+    def label_box(self, move: float, *, is_left: bool) -> tuple[float, float, float, float]:
+        """Left, top, right, bottom of its label."""
+        width = _LETTER * len(" ".join(self.label))
+        start = self.x - _AWAY - width if is_left else self.x + _AWAY
+        return start, self.y + move - _LINE / 2, start + width, self.y + move + _LINE / 2
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """The chart: points, front, ticks in SVG coordinates."""
+
+    points: list[Point]
+    front: str
+    x_ticks: list[tuple[float, str]]
+    y_ticks: list[tuple[float, str]]
+    axis: Axis
+    nothing: list[str]
+    """Methods and fidelities that found nothing: they have no place on an axis of speeds."""
+
+
+def load(store: Store) -> list[Measured]:
+    """The charts that were published last, that of free objects first; those that cannot be read are left out."""
+    found = []
+    for kind in (CHARTS, *scene_kinds(store)):
+        try:
+            content = latest(store, kind)
+            found += [] if content is None else [Measured.model_validate(content)]
+        except (ValueError, DamagedError):
+            continue
+    return found
+
+
+def draw(measured: Measured, *, axis: str, hand: str = "", object: str = "") -> Drawing:
+    """Points of every method and fidelity over the runs of a hand and an object (empty: all of them)."""
+    shown = measured.axes[axis]
+    chosen = [run for run in measured.runs if hand in ("", run.hand) and object in ("", run.object)]
+    names = sorted({run.name for run in measured.runs})
+    groups = [group for group in _groups(chosen) if any(getattr(run, axis) is not None for run in group)]
+    points = [point for group in groups if (point := _point(group, axis, shown.factor, names)) is not None]
+    points.sort(key=lambda point: point.speed)
+    front = pareto([(p.speed, p.accuracy if shown.more_is_better else -p.accuracy) for p in points])
+    across, x_ticks = _logarithmic([point.speed for point in points])
+    up, y_ticks = _linear([point.accuracy for point in points], top=100.0 if shown.unit == "%" else None)
+    placed = _labelled(
+        [
+            replace(point, on_front=index in front, x=across(point.speed), y=up(point.accuracy))
+            for index, point in enumerate(points)
+        ]
+    )
+    line = " ".join(f"{point.x:.1f},{point.y:.1f}" for point in placed if point.on_front)
+    nothing = [group[0].label for group in _groups(chosen) if not _speed(group)]
+    return Drawing(placed, line, x_ticks, y_ticks, shown, nothing)
+
+
+def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
+    """Indices of points (more, more) that no other point beats in both."""
+    return {
+        index
+        for index, (x, y) in enumerate(points)
+        if not any((a >= x and b >= y) and (a > x or b > y) for a, b in points)
+    }
+
+
+def _groups(runs: Sequence[Run]) -> list[list[Run]]:
+    groups: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        groups.setdefault((run.name, run.fidelity), []).append(run)
+    return list(groups.values())
+
+
+def _point(runs: list[Run], axis: str, scale: float, names: list[str]) -> Point | None:
+    speed = _speed(runs)
+    values = [value for run in runs if (value := getattr(run, axis)) is not None]
+    firsts = [run.first_s for run in runs if run.first_s is not None]
+    if not speed or not values:
+        return None
+    return Point(
+        method=runs[0].name,
+        fidelity=runs[0].fidelity,
+        pairs=len(runs),
+        speed=speed,
+        # Of pairs on which nothing was found nobody knows how long it takes: a mean without them would flatter.
+        first_valid_s=sum(firsts) / len(firsts) if len(firsts) == len(runs) else None,
+        accuracy=scale * sum(values) / len(values),
+        series=names.index(runs[0].name) % 6,
+    )
+
+
+def _speed(runs: Sequence[Run]) -> float:
+    """All that was found over all seconds that it took, end to end; 0 where nothing was found.
+
+    Charts of graspd 0.1 have speeds alone. Those of easy and hard objects differ by a factor: their mean is geometric.
+    """
+    if all(run.found is not None for run in runs) and (seconds := sum(run.seconds for run in runs)):
+        return sum(run.found or 0 for run in runs) / seconds
+    speeds = [run.valid_per_second for run in runs if run.valid_per_second]
+    return math.exp(sum(map(math.log, speeds)) / len(speeds)) if speeds else 0.0
+
+
+def _labelled(points: list[Point]) -> list[Point]:
+    """Labels beside their points: on the left or the right, up or down, where they cover the least."""
+    taken = [(p.x - _DOT, p.y - _DOT, p.x + _DOT, p.y + _DOT) for p in points]
+    placed: list[Point] = []
+    for point in sorted(points, key=lambda point: point.y):
+        offers = [(move, is_left) for move in _MOVES for is_left in (False, True)]
+        boxes = [point.label_box(move, is_left=is_left) for move, is_left in offers]
+        costs = [sum(_covered(box, other) for other in taken) + _outside(box) for box in boxes]
+        # Of places that cover as little the first one, which is the nearest.
+        best = costs.index(min(costs))
+        move, is_left = offers[best]
+        taken.append(boxes[best])
+        placed.append(replace(point, label_y=point.y + move + 4, is_left=is_left))
+    return sorted(placed, key=lambda point: point.speed)
+
+
+def _covered(one: tuple[float, ...], other: tuple[float, ...]) -> float:
+    across, up = (max(0.0, min(one[i + 2], other[i + 2]) - max(one[i], other[i])) for i in (0, 1))
+    return across * up
+
+
+def _outside(box: tuple[float, float, float, float]) -> float:
+    """How far a label would leave the chart, or stand on its ticks: worse than any cover."""
+    left, top, right, bottom = box
+    over = (_LEFT - left, right - (WIDTH - 4), -top, bottom - (HEIGHT - _BOTTOM))
+    return 1e4 * sum(max(0.0, part) for part in over)
+
+
+def _logarithmic(values: Sequence[float]) -> tuple[Callable[[float], float], list[tuple[float, str]]]:
+    low, high = (min(values), max(values)) if values else (0.1, 10.0)
+    start, end = math.log10(low / 1.6), math.log10(high * 2.4)
+
+    def place(value: float) -> float:
+        return _LEFT + (math.log10(value) - start) / (end - start) * (WIDTH - _LEFT - _RIGHT)
+
+    ticks = [m * 10.0**e for e in range(math.floor(start), math.ceil(end) + 1) for m in (1, 2, 5)]
+    return place, [(place(tick), f"{tick:g}") for tick in ticks if start <= math.log10(tick) <= end]
+
+
+def _linear(values: Sequence[float], *, top: float | None) -> tuple[Callable[[float], float], list[tuple[float, str]]]:
+    highest = max(values, default=1.0)
+    end = top if top is not None else highest * 1.15 or 1.0
+    step = _round_step(end / 5)
+
+    def place(value: float) -> float:
+        return HEIGHT - _BOTTOM - value / end * (HEIGHT - _TOP - _BOTTOM)
+
+    return place, [(place(step * i), f"{step * i:g}") for i in range(int(end / step + 1e-9) + 1)]
+
+
+def _round_step(value: float) -> float:
+    size: Any = 10.0 ** math.floor(math.log10(value))
+    return next(float(size * m) for m in (1, 2, 2.5, 5, 10) if size * m >= value * 0.999)

@@ -1,0 +1,439 @@
+"""Redis, the index and the store: whether each answers, may be written and keeps what it is given."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import unquote, urlsplit
+
+from redis import Redis
+from redis.exceptions import RedisError
+from sqlalchemy import func, make_url, select
+
+from service.index.index import Index
+from service.index.rebuild import differences
+from service.index.sample import IndexCondition, compare, draw, look
+from service.index.tables import shards
+from service.model.errors import (
+    GraspdError,
+    IndexDamaged,
+    InputError,
+    NotFoundError,
+    QueueUnavailable,
+    UnavailableError,
+)
+from service.model.finding import Finding, bad, good, skipped, warning
+from service.pipeline.identity import Identity, recorded, service_ids
+from service.queue.connection import connect, redis_url, socket_path
+from service.queue.rq_queue import open_queue
+from service.run.doctor.machine import existing, local_store
+from service.run.embedded import find_server
+from service.settings import Settings
+from service.store.store import Store, open_store
+
+#: The oldest that graspd was tried on.
+_OLDEST: Final = (6, 2)
+
+_SLOW_REDIS_S: Final = 0.02
+
+_FULL: Final = 0.9
+
+_TIMEOUT_S: Final = 5.0
+
+_LOCAL: Final = ("127.0.0.1", "localhost", "::1")
+
+_START: Final = "start it, or set GRASPD_REDIS_URL=redis://:PASSWORD@HOST:6379/0"
+
+
+def is_there(settings: Settings) -> bool:
+    """Whether a Redis is named, or the one of `graspd up` may run: False on a machine where nothing was started."""
+    return settings.redis_url is not None or socket_path(settings.data_dir).exists()
+
+
+@contextmanager
+def redis_connection(settings: Settings) -> Iterator[Redis]:
+    """A client that gives up soon."""
+    client = connect(redis_url(settings), patience=0, timeout_s=_TIMEOUT_S)
+    try:
+        yield client
+    finally:
+        client.close()
+
+
+def redis(settings: Settings) -> Finding:
+    """The server that `GRASPD_REDIS_URL` or the data folder names."""
+    name = "redis"
+    if not is_there(settings):
+        try:
+            _, rung = find_server()
+        except QueueUnavailable as error:
+            return bad(name, "no service runs on this data folder, and there is no Redis to start", str(error))
+        return skipped(name, f"no service runs on this data folder; `graspd up` starts the Redis of {rung}")
+    try:
+        with redis_connection(settings) as client:
+            return _judge_redis(name, settings, client, _info(client))
+    except (RedisError, OSError) as error:
+        return bad(name, f"{_shown(settings)} does not answer: {_line(error)}", _mend(error, settings))
+
+
+def _judge_redis(name: str, settings: Settings, client: Redis, info: Mapping[str, Any]) -> Finding:
+    version = str(info.get("redis_version", "0"))
+    if int(info.get("cluster_enabled", 0)):
+        return bad(name, "it is a Redis Cluster: tasks move between keys of several nodes", "name a plain Redis")
+    if info.get("role") != "master":
+        return bad(name, f"it is a {info.get('role')}: it cannot be written", "name the primary in GRASPD_REDIS_URL")
+    most, policy = int(info.get("maxmemory", 0)), str(info.get("maxmemory_policy", "noeviction"))
+    if most and policy != "noeviction":
+        mend = "redis-cli config set maxmemory-policy noeviction, and the same line in its configuration"
+        return bad(
+            name, f"maxmemory-policy is {policy}: when memory is full, it throws tasks away without a word", mend
+        )
+    used = int(info.get("used_memory", 0))
+    if most and used > _FULL * most:
+        return bad(
+            name,
+            f"{used >> 20} of {most >> 20} MiB are used",
+            "redis-cli config set maxmemory to more; see who else uses it",
+        )
+    seconds = _write(client)
+    line = f"Redis {version} at {_shown(settings)}, {1000 * seconds:.1f} ms, {used >> 20} MiB"
+    if tuple(int(part) for part in version.split(".")[:2]) < _OLDEST:
+        return warning(
+            name, f"{line}: older than 6.2, on which graspd was tried", "install Redis 6.2 or newer, or Valkey"
+        )
+    if _is_open(settings):
+        mend = "requirepass in its configuration, or an ACL, and the password in GRASPD_REDIS_URL"
+        return warning(name, f"{line}: it asks for no password, and who writes to it can start tasks", mend)
+    if seconds > _SLOW_REDIS_S:
+        return warning(
+            name,
+            f"{line}: a task takes some 109 operations",
+            "put Redis nearer to the workers, or look after the network",
+        )
+    return good(name, line)
+
+
+def _write(client: Redis) -> float:
+    """Seconds of a write and its reading. Raises RedisError where writes are refused."""
+    key, value = f"graspd:doctor:{secrets.token_hex(8)}", secrets.token_bytes(8)
+    start = time.perf_counter()
+    client.set(key, value, ex=60)
+    found = client.get(key)
+    seconds = (time.perf_counter() - start) / 2
+    client.delete(key)
+    if found != value:
+        raise RedisError("what was written is not what is read")
+    return seconds
+
+
+def persistence(settings: Settings) -> Finding:
+    """Whether a Redis that crashes comes back with its tasks."""
+    name = "redis-persistence"
+    if not is_there(settings):
+        return skipped(name, "no service runs on this data folder; the Redis of `graspd up` keeps a log of writes")
+    try:
+        with redis_connection(settings) as client:
+            info = _info(client)
+    except (RedisError, OSError):
+        return skipped(name, "Redis does not answer")
+    mend = "make room on the disk of Redis and see its log; then redis-cli bgrewriteaof"
+    if int(info.get("aof_enabled", 0)):
+        for what in ("aof_last_write_status", "aof_last_bgrewrite_status"):
+            if info.get(what, "ok") != "ok":
+                return bad(name, f"the log of writes fails ({what}: {info[what]})", mend)
+        return good(name, "the log of writes is on: a killed Redis comes back with its tasks")
+    if info.get("rdb_last_bgsave_status", "ok") != "ok":
+        return bad(
+            name, "its snapshots fail, and it may refuse writes", "make room on the disk of Redis and see its log"
+        )
+    return warning(
+        name,
+        "the log of writes is off: after a crash nothing runs until the controller has queued everything again",
+        "redis-cli config set appendonly yes, and `appendonly yes` in its configuration",
+    )
+
+
+def _info(client: Redis) -> dict[str, Any]:
+    return dict(client.info())
+
+
+def _shown(settings: Settings) -> str:
+    parts = urlsplit(redis_url(settings))
+    if parts.scheme == "unix":
+        return unquote(parts.path)
+    return f"{parts.scheme}://{parts.hostname}{f':{parts.port}' if parts.port else ''}{parts.path}"
+
+
+def _is_open(settings: Settings) -> bool:
+    """Whether it was reached over a network without a secret."""
+    parts = urlsplit(redis_url(settings))
+    return parts.scheme != "unix" and parts.hostname not in _LOCAL and not parts.password
+
+
+def _mend(error: Exception, settings: Settings) -> str:
+    said = str(error).upper()
+    if "NOAUTH" in said or "WRONGPASS" in said or "AUTHENTICATION" in said:
+        return "put the password into GRASPD_REDIS_URL: redis://:PASSWORD@HOST:6379/0"
+    if "MISCONF" in said or "OOM" in said:
+        return "it cannot write: make room on its disk or in its memory, and see its log"
+    if settings.redis_url is None:
+        return "the service of this data folder ended without a word: start `graspd up` again"
+    return _START
+
+
+def _line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+_NONE_HERE: Final = (
+    "no index is here: GRASPD_INDEX_URL is unset and there is no index.sqlite; only api and controller need one"
+)
+
+_REBUILD: Final = (
+    "graspd admin index rebuild --check shows all of it; graspd admin index rebuild mends it while the service runs"
+)
+
+_CROWDED: Final = 0.8
+
+#: With more shards than this only a sample is compared.
+_ALL_SHARDS: Final = 2000
+
+#: What a controller has to take up between two looks [s].
+_SETTLES_S: Final = 3.0
+
+
+def index(settings: Settings) -> Finding:
+    """Connection, integrity and schema; changes nothing."""
+    name = "index"
+    try:
+        found = look(settings.resolved_index_url)
+    except IndexDamaged as error:
+        return bad(name, str(error), "graspd admin index rebuild: it is moved aside and made again from the store")
+    except InputError as error:
+        return bad(name, str(error), "see the message, and GRASPD_INDEX_URL")
+    except UnavailableError as error:
+        mend = "start the database; see host, user, password and database in GRASPD_INDEX_URL"
+        return bad(name, str(error), mend if settings.index_url is not None else "see who may read the file")
+    if found is None:
+        return _absent(name, settings)
+    return _judge_index(name, settings, found)
+
+
+def _absent(name: str, settings: Settings) -> Finding:
+    if settings.index_url is None:
+        return skipped(name, _NONE_HERE)
+    where = existing(Path(str(make_url(settings.resolved_index_url).database)).resolve())
+    return good(name, f"the index is made at the first start, in {where}")
+
+
+def _judge_index(name: str, settings: Settings, found: IndexCondition) -> Finding:
+    parsed = make_url(settings.resolved_index_url)
+    url = parsed.set(query={}).render_as_string(hide_password=True)
+    line = f"{found.kind} at {url}, revision {found.revision or 'none'}"
+    if not found.may_write:
+        return bad(name, f"{line}: it cannot be written", "name the primary, and grant CREATE and USAGE on the schema")
+    if found.revision and not found.is_ready and found.revision > found.newest:
+        return bad(
+            name,
+            f"{line}: a newer graspd made it; this one knows {found.newest}",
+            "install the newer version here, or graspd admin index rebuild: it is made again from the store",
+        )
+    if found.revision and not found.is_ready:
+        return bad(
+            name,
+            f"{line}: this graspd has {found.newest}",
+            "graspd admin index rebuild: it is made again from the store",
+        )
+    if not found.is_ready:
+        return warning(name, line, "the next start makes its tables")
+    used, most = found.connections
+    if most and used > _CROWDED * most:
+        return warning(
+            name, f"{line}: {used} of {most} connections are used", "raise max_connections, or run fewer api processes"
+        )
+    return good(name, line)
+
+
+def _openable(settings: Settings) -> str:
+    """Why the index should not be opened; "" if opening it changes nothing."""
+    try:
+        found = look(settings.resolved_index_url)
+    except (InputError, UnavailableError):
+        return "the index does not answer, or is damaged"
+    if found is None:
+        return "there is no index here"
+    if not found.is_ready:
+        return "the tables of the index are of another version"
+    folder = local_store(settings)
+    return "" if folder is None or folder.exists() else "there is no store yet"
+
+
+def index_identity(settings: Settings) -> Finding:
+    """Whether store, index and Redis belong to one service; changes nothing."""
+    name, folder = "identity", local_store(settings)
+    if folder is not None and not folder.exists():
+        return skipped(name, "there is no store yet")
+    store = open_store(settings.resolved_store_url)
+    said, redis = None, None
+    if not _openable(settings):
+        with closing(Index(settings.resolved_index_url)) as opened:
+            said = opened.notes.service()
+    if is_there(settings):
+        try:
+            with closing(open_queue(settings, patience=0)) as queue:
+                redis = queue.service()
+        except QueueUnavailable:
+            if said is None:
+                return skipped(name, "there is no index here, and Redis does not answer")
+    found = Identity(service_ids(store), said, redis, recorded(settings.data_dir.resolve()), settings.store_url is None)
+    if why := found.refusal(store.url):
+        return bad(name, why, "see the message, and GRASPD_STORE_URL, GRASPD_INDEX_URL, GRASPD_REDIS_URL")
+    if not found.chain:
+        return skipped(name, "no service has worked on this store yet")
+    return good(
+        name, "store, index and Redis belong to one service" if said else "store and Redis belong to one service"
+    )
+
+
+def index_is_store(settings: Settings, *, full: bool = False, settles_s: float = _SETTLES_S) -> Finding:
+    """Whether the rows are those that follow from the store. What only one of two looks finds is on its way in.
+
+    Args:
+        full: compare all rows, however many there are.
+        settles_s: pause before the second look [s].
+    """
+    name = "index-is-store"
+    if why := _openable(settings):
+        return skipped(name, why)
+    store = open_store(settings.resolved_store_url)
+    with closing(Index(settings.resolved_index_url)) as opened:
+        made = opened.notes.completeness()
+        if made is None:
+            return warning(
+                name, "the index is new, and lacks what the store has", "start graspd controller: it fills the index"
+            )
+        with opened.database.reading() as connection:
+            count = int(connection.scalar(select(func.count()).select_from(shards)) or 0)
+        whole = full or count <= _ALL_SHARDS
+        chosen = None if whole else draw(opened, store)
+        found = differences(opened, store) if chosen is None else compare(opened, store, chosen)
+        if found:
+            time.sleep(settles_s)
+            again = set(differences(opened, store) if chosen is None else compare(opened, store, chosen))
+            found = [line for line in found if line in again]
+    if found:
+        # A shard that is missing changes rows of tasks and jobs: the cause goes first.
+        found.sort(key=lambda line: not line.startswith("shards "))
+        more = f", and {len(found) - 3} more" if len(found) > 3 else ""
+        return bad(name, f"{'; '.join(found[:3])}{more}", _REBUILD)
+    what = f"all rows of {count} shards" if whole else f"a sample of {count} shards (--full compares all)"
+    return good(name, f"{what} are what the store says")
+
+
+def store_damage(settings: Settings) -> Finding:
+    """Findings of the controller's integrity scan, or of `graspd admin store verify`."""
+    name = "damage"
+    if why := _openable(settings):
+        return skipped(name, why)
+    with closing(Index(settings.resolved_index_url)) as opened:
+        count, known = opened.damage.known(limit=1)
+        note, made = opened.notes.scan_note(), opened.notes.completeness()
+    if count:
+        return bad(
+            name,
+            f"{count} objects of the store are damaged or missing, {known[0].key}: {known[0].what}",
+            "graspd admin store verify --repair",
+        )
+    if made is not None and made.left_out:
+        mend = "put copies in their place, then graspd admin index rebuild"
+        return bad(name, f"{made.left_out} damaged records are left out of the index, {made.names[0]}", mend)
+    if not settings.integrity_scan_mb_per_s:
+        return warning(
+            name,
+            "no damage is known, and the integrity scan is off",
+            "GRASPD_INTEGRITY_SCAN_MB_PER_S=1, or graspd admin store verify at times",
+        )
+    when = (
+        f"last read through by {note.ended}"
+        if note.ended
+        else "not read through yet; graspd admin store verify does at once"
+    )
+    return good(name, f"nothing is known to be damaged; {when}")
+
+
+_FOLDER: Final = "health"
+
+#: For a dozen requests.
+_SLOW_STORE_S: Final = 5.0
+
+#: Who put the same name at once; one may win.
+_RIVALS: Final = 4
+
+_CREDENTIALS: Final = (
+    "see bucket, region and credentials (AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION, AWS_ENDPOINT_URL; "
+    "GOOGLE_APPLICATION_CREDENTIALS; AZURE_STORAGE_ACCOUNT_NAME, ..._KEY): they must allow get, put, list and delete"
+)
+
+
+def store(settings: Settings) -> Finding:
+    """Every operation that graspd uses, on an object of a name of its own."""
+    name, folder = "store", local_store(settings)
+    if folder is not None and not folder.exists():
+        return good(name, f"{folder} is made at the first start, below {existing(folder)}")
+    try:
+        opened = open_store(settings.resolved_store_url, public_endpoint=settings.store_public_endpoint)
+        return judge_store(name, opened)
+    except GraspdError as error:
+        mend = f"make room below {folder}, and let user and group write there" if folder else _CREDENTIALS
+        return bad(name, str(error), mend)
+
+
+def judge_store(name: str, opened: Store) -> Finding:
+    """The finding on an open store. Raises GraspdError where an operation fails."""
+    key = f"{_FOLDER}/doctor-{secrets.token_hex(8)}"
+    start = time.perf_counter()
+    try:
+        wrong = _try(opened, key)
+    finally:
+        opened.delete(key)
+    seconds = time.perf_counter() - start
+    if not wrong and opened.exists(key):
+        wrong = "an object that was removed is still there"
+    if wrong:
+        mend = "name a store that keeps this: a local disk, Amazon, Google, Azure, SeaweedFS, Ceph, or a recent MinIO"
+        return bad(name, f"{opened.url}: {wrong}", mend)
+    line = (
+        f"{opened.url} gives what it takes, lists, removes, and refuses a name that is taken ({1000 * seconds:.0f} ms)"
+    )
+    if opened.url.startswith("memory:"):
+        return warning(name, f"{opened.url} is gone with its process", "GRASPD_STORE_URL=file:///FOLDER or s3://BUCKET")
+    if seconds > _SLOW_STORE_S:
+        return warning(name, f"{line}: that is slow", "put the store nearer, or look after the network")
+    return good(name, line)
+
+
+def _try(opened: Store, key: str) -> str:
+    """What the store does not keep to, "" if nothing."""
+    contents = [secrets.token_bytes(1000) for _ in range(_RIVALS)]
+    with ThreadPoolExecutor(_RIVALS) as pool:
+        won = list(pool.map(lambda content: opened.put(key, content), contents))
+    if sum(won) != 1:
+        return f"of {_RIVALS} puts of one name at once, {sum(won)} were taken: results could be overwritten"
+    kept = contents[won.index(True)]
+    try:
+        if opened.get(key) != kept:
+            return "what is read is not what was written"
+        if opened.get_range(key, 100, 50) != kept[100:150]:
+            return "a part of an object is not what was written there"
+    except NotFoundError:
+        return "what was written is not there when it is read"
+    if opened.put(key, b"another") or opened.get(key) != kept:
+        return "an object can be overwritten: create-only puts (If-None-Match: *) are not honoured"
+    if (key, len(kept)) not in [(entry.key, entry.size) for entry in opened.list(_FOLDER)]:
+        return "what was written is not in the list of its folder"
+    return ""

@@ -1,0 +1,230 @@
+"""Log lines of every process: JSON for machines, text on a terminal, each with the request, job and task it is about.
+
+`bind` says what a piece of work is about; every line written within carries that, whichever module writes it.
+
+OpenTelemetry spans, where the operator asks for them: OTEL_EXPORTER_OTLP_ENDPOINT set and `graspd[otel]` installed.
+
+Off, nothing of OpenTelemetry is imported and a span costs a comparison.
+
+A file that a process touches while it lives: a health check is then a look at its age, and no process of ours.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import logging
+import os
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from datetime import UTC, datetime
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final
+
+from service.model.errors import without_secrets
+
+if TYPE_CHECKING:
+    from service.settings import Settings
+
+#: What a line can be about, in the order in which it is shown.
+SUBJECTS: Final = ("request", "key", "job", "task", "attempt", "worker")
+
+_bound: ContextVar[Mapping[str, Any]] = ContextVar("bound", default=MappingProxyType({}))
+
+_ORDINARY: Final = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "about", "taskName"}
+
+#: RQ tells of every idle poll, httpx of every request.
+_TALKATIVE: Final = ("rq.worker", "rq.job", "rq.queue", "httpx")
+
+
+@contextmanager
+def bind(**subjects: Any) -> Iterator[None]:
+    """Lines written within are about these; empty values are left out. Threads begun within do not inherit it."""
+    token = _bound.set({**_bound.get(), **{name: value for name, value in subjects.items() if value}})
+    try:
+        yield
+    finally:
+        _bound.reset(token)
+
+
+def bound(subject: str) -> str:
+    """What the present work is about, e.g. `bound("request")`; empty if it was not said."""
+    return str(_bound.get().get(subject, ""))
+
+
+def set_up_logs(settings: Settings, process: str = "graspd") -> None:
+    """Send the lines of this process to stderr.
+
+    Args:
+        process: its name in every JSON line, e.g. api, controller, worker.
+    """
+    is_text = settings.log_format == "text" or (settings.log_format == "auto" and sys.stderr.isatty())
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_TextLines() if is_text else JsonLines(process))
+    logging.basicConfig(level=settings.log_level.upper(), handlers=[handler], force=True)
+    logging.captureWarnings(True)
+    for name in _TALKATIVE:
+        logging.getLogger(name).setLevel(logging.WARNING)
+
+
+class JsonLines(logging.Formatter):
+    """One JSON object a line: time, level, process, pid, logger, message, subjects, what was given as `extra`."""
+
+    def __init__(self, process: str) -> None:
+        super().__init__()
+        self._process = process
+
+    def format(self, record: logging.LogRecord) -> str:
+        line: dict[str, Any] = {
+            "time": _time(record),
+            "level": record.levelname,
+            "process": self._process,
+            "pid": os.getpid(),
+            "logger": record.name,
+            "message": record.getMessage(),
+            **_subjects(record),
+            **{name: value for name, value in vars(record).items() if name not in _ORDINARY and name not in SUBJECTS},
+        }
+        if record.exc_info:
+            line["trace"] = self.formatException(record.exc_info)
+        return without_secrets(json.dumps(line, default=str, ensure_ascii=False))
+
+
+class _TextLines(logging.Formatter):
+    """Time, level, module, message, and in brackets what it is about."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        record = _plain(record)
+        about = " ".join(f"{name}={value}" for name, value in _subjects(record).items())
+        trace = f"\n{self.formatException(record.exc_info)}" if record.exc_info else ""
+        text = f"{_time(record)[11:23]} {record.levelname} {record.name} {record.getMessage()}"
+        return without_secrets(f"{text} [{about}]{trace}" if about else f"{text}{trace}")
+
+
+#: What ends a line, or what a terminal obeys.
+_OBEYED: Final = {
+    code: repr(chr(code))[1:-1]
+    for code in (*range(0x20), *range(0x7F, 0xA0), 0x2028, 0x2029, *range(0x202A, 0x202F), *range(0x2066, 0x206A))
+}
+
+
+def _plain(record: logging.LogRecord) -> logging.LogRecord:
+    """The same record with a message of one line: a path or a name of a stranger writes no line of its own."""
+    made = copy.copy(record)
+    made.msg, made.args = record.getMessage().translate(_OBEYED), ()
+    return made
+
+
+def _subjects(record: logging.LogRecord) -> dict[str, Any]:
+    """Those bound where the line was written, and those given with the line itself."""
+    found = dict(_bound.get())
+    found.update((name, vars(record)[name]) for name in SUBJECTS if name in vars(record))
+    return {name: found[name] for name in SUBJECTS if found.get(name)}
+
+
+def _time(record: logging.LogRecord) -> str:
+    when = datetime.fromtimestamp(record.created, UTC)
+    return when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+log = logging.getLogger(__name__)
+
+_ASKED_BY: Final = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
+
+_tracer: Any = None
+
+
+def set_up_tracing(process: str, *, exporter: Any = None) -> None:
+    """Send the spans of this process where the environment says; do nothing if it says nothing.
+
+    Args:
+        process: its name: api or worker; the spans' service is `graspd-{process}`.
+        exporter: where to send them instead.
+    """
+    global _tracer
+    if exporter is None and not any(os.environ.get(name) for name in _ASKED_BY):
+        return
+    try:
+        from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
+        from opentelemetry.sdk.resources import Resource
+        from opentelemetry.sdk.trace import TracerProvider
+        from opentelemetry.sdk.trace.export import BatchSpanProcessor, SimpleSpanProcessor
+    except ImportError:
+        log.warning("no traces are sent: run `pip install 'graspd[otel]'`, or unset %s", _ASKED_BY[0])
+        return
+    resource = Resource.create({"service.name": os.environ.get("OTEL_SERVICE_NAME", f"graspd-{process}")})
+    provider = TracerProvider(resource=resource)
+    provider.add_span_processor(
+        SimpleSpanProcessor(exporter) if exporter is not None else BatchSpanProcessor(OTLPSpanExporter())
+    )
+    _tracer = provider.get_tracer("graspd")
+
+
+def stop() -> None:
+    """Make no more spans."""
+    global _tracer
+    _tracer = None
+
+
+@contextmanager
+def span(name: str, *, parent: str = "", **attributes: Any) -> Iterator[dict[str, Any]]:
+    """A span around what is done within; an exception marks it as failed.
+
+    Args:
+        parent: `traceparent` of the span that caused this one (W3C trace context), in whatever process.
+        attributes: what it is about, as `graspd.{name}`.
+
+    Yields:
+        a dictionary; what is put there becomes attributes at the end.
+    """
+    later: dict[str, Any] = {}
+    if _tracer is None:
+        yield later
+        return
+    from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
+
+    context = TraceContextTextMapPropagator().extract({"traceparent": parent}) if parent else None
+    known = {f"graspd.{key}": value for key, value in attributes.items()}
+    with _tracer.start_as_current_span(name, context=context, attributes=known) as current:
+        yield later
+        current.set_attributes(later)
+
+
+def traceparent() -> str:
+    """W3C trace context of the present span; empty without one."""
+    if _tracer is None:
+        return ""
+    from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
+
+    carrier: dict[str, str] = {}
+    TraceContextTextMapPropagator().inject(carrier)
+    return carrier.get("traceparent", "")
+
+
+#: Far below the minute after which a check calls the process dead.
+_EVERY_S: Final = 5.0
+
+
+class HeartbeatFile:
+    """Touched at most every few seconds, however often it is asked to."""
+
+    def __init__(self, path: Path | None) -> None:
+        """`path` is None where nobody looks."""
+        self._path = path
+        self._again = 0.0
+
+    def touch(self) -> None:
+        """Say that this process lives. A disk without room is said once, and ends nothing."""
+        now = time.monotonic()
+        if self._path is None or now < self._again:
+            return
+        self._again = now + _EVERY_S
+        try:
+            self._path.touch()
+        except OSError as error:
+            log.warning("health checks will miss this process: %s cannot be touched (%s)", self._path, error.strerror)
+            self._path = None

@@ -1,0 +1,93 @@
+"""Point clouds as files, one npz for each shard of pictures, and the hand of each grasp as points."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from itertools import groupby
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from cachetools import LRUCache, cached
+from numpy.typing import NDArray
+
+from service.model.errors import ConflictError
+from service.model.transforms import Floats, apply
+from service.readers import Clouds
+from service.readers.clouds import OF_GRASPS
+from service.store.shards import Shard
+from worker.files.provenance import hand_of_shard
+from worker.hands.kinematics import body_poses
+from worker.hands.model import HandModel
+from worker.hands.surface import sample_surface
+
+#: What of a sample says where it comes from.
+_WORDS = ("hand", "object", "shard_id", "base_id")
+
+
+def write_clouds(clouds: Clouds, folder: Path, said: Mapping[str, Any]) -> dict[str, int]:
+    """Write all clouds: `clouds-NNNNN.npz`, and `clouds.json`, which says how they were made.
+
+    An npz has the keys of a sample (docs/how-to/clouds.md) stacked over its C clouds. What has a row for each grasp
+    stands in one array for all of them, cloud by cloud; `grasp/count` (C,) says how many rows each cloud has.
+
+    Args:
+        said: what `clouds.json` says besides the numbers.
+
+    Returns:
+        numbers of files, clouds and of clouds that are empty.
+
+    Raises:
+        ConflictError: the folder is there and not empty.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ConflictError(f"{folder} is there already; name another folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    done = {"files": 0, "clouds": 0, "empty": 0}
+    for _, samples in groupby(clouds, key=lambda sample: sample["shard_id"]):
+        together = list(samples)
+        np.savez_compressed(folder / f"clouds-{done['files']:05}.npz", **stacked(together))
+        done["files"] += 1
+        done["clouds"] += len(together)
+        done["empty"] += sum(sample["cloud/seen"] == 0 for sample in together)
+    (folder / "clouds.json").write_text(json.dumps({**said, **done}, indent=1) + "\n")
+    return done
+
+
+def stacked(samples: list[dict[str, Any]]) -> dict[str, Any]:
+    """Samples of one shard as arrays."""
+    found: dict[str, NDArray[Any]] = {name: np.array(str(samples[0][name])) for name in _WORDS}
+    found["grasp/count"] = np.array([len(sample["grasp/base_row"]) for sample in samples], np.int32)
+    for name in samples[0]:
+        if name not in _WORDS:
+            values = [sample[name] for sample in samples]
+            found[name] = np.concatenate(values) if name.startswith(OF_GRASPS) else np.stack(values)
+    return found
+
+
+#: Points on a hand: some 5 mm apart on one as large as a man's.
+POINTS: Final = 2048
+
+_hands: LRUCache[Any, HandModel] = LRUCache(8)
+
+
+def hand_surface(shard: Shard, rows: NDArray[np.intp]) -> Floats:
+    """(K, H, 3) points on the hand's surface at contact in the object's frame [m].
+
+    Args:
+        shard: a base shard.
+        rows: (K,) its grasps.
+
+    Raises:
+        NotFoundError: the hand that the shard was made with is not here.
+    """
+    hand = _hand(shard)
+    points = sample_surface(hand, POINTS)
+    pose, joints = (np.asarray(shard[f"grasp/{part}"], float)[rows] for part in ("hand_pose", "joint_positions"))
+    return apply(body_poses(hand, pose, joints)[:, points.body], points.position)
+
+
+@cached(_hands, key=lambda shard: shard.attributes["hand_digest"])
+def _hand(shard: Shard) -> HandModel:
+    return hand_of_shard(shard, None)

@@ -1,0 +1,208 @@
+"""Curation of datasets: balanced parts (types, approaches, resting faces), and the differences of two datasets."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic_core import from_json
+
+from service.model.errors import InputError, one_of
+from service.model.transforms import quat_conjugate, quat_rotate
+from service.readers import Shards
+from service.store import validity
+from service.store.shards import Shard
+from worker.files.provenance import hand_of_shard
+from worker.files.subsets import base_shards
+from worker.grasps import Posture
+from worker.quality.diversity import distinct, hand_points
+
+#: What grasps can be shared out by.
+KINDS: Final = ("type", "direction", "face")
+
+_COLUMNS: Final = {"type": "quality/grasp_type", "direction": "quality/approach_cell"}
+
+#: Two scenes have the object on one face where their down, in its frame, differ by less than this [cosine of 20 deg].
+_SAME_FACE: Final = float(np.cos(np.radians(20)))
+
+
+@dataclass(frozen=True)
+class Balance:
+    """How to choose; a chooser of `worker.files.subsets`, called with the shards of one hand on one object."""
+
+    by: Sequence[str]
+    at_most: int = 0
+    """Of each kind; 0: as many as the median kind has."""
+    min_distance: float = 0.0
+    """No two of those chosen are nearer [m], see `worker.quality.diversity`; 0: any."""
+    seed: int = 0
+    hand: str | None = None
+    """The hand's file, where the shards do not lead to it; only distances need it."""
+
+    def __post_init__(self) -> None:
+        if unknown := [one for one in self.by if one not in KINDS]:
+            raise InputError(f"grasps cannot be balanced by {unknown[0]!r}; choose of {one_of(unknown[0], KINDS)}")
+        if not self.by:
+            raise InputError(f"say what to balance by: {', '.join(KINDS)}")
+
+    def __call__(self, shards: list[Shard]) -> list[NDArray[np.bool_]]:
+        """Masks of the chosen grasps: valid ones, drawn at random by the seed, none of a kind more often than allowed.
+
+        Raises:
+            InputError: a shard does not tell the kind.
+        """
+        kinds = self._kinds(shards)
+        wanted = np.concatenate([validity.valid(shard.arrays) for shard in shards])
+        if self.min_distance > 0 and wanted.any():
+            wanted[np.flatnonzero(wanted)[~self._apart(shards, wanted)]] = False
+        _, kind = np.unique(kinds, axis=0, return_inverse=True)
+        counts = np.bincount(kind.ravel()[wanted])
+        limit = self.at_most or int(np.median(counts[counts > 0])) if wanted.any() else 0
+        order = np.random.default_rng(self.seed).permutation(len(kinds))
+        chosen = np.zeros(len(kinds), bool)
+        for number in range(len(counts)):
+            mine = order[(kind.ravel()[order] == number) & wanted[order]]
+            chosen[mine[:limit]] = True
+        return np.split(chosen, np.cumsum([len(shard["quality/valid"]) for shard in shards])[:-1])
+
+    def _kinds(self, shards: list[Shard]) -> NDArray[np.int64]:
+        """(N, len(by)) what kind each grasp is of."""
+        columns = []
+        for name in self.by:
+            if name == "face":
+                columns.append(faces(np.concatenate([_down(shard) for shard in shards])))
+                continue
+            if old := [shard for shard in shards if _COLUMNS[name] not in shard.arrays]:
+                raise InputError(f"{old[0].path} does not tell the {name} of its grasps: an older graspd made it")
+            columns.append(np.concatenate([np.asarray(shard[_COLUMNS[name]], np.int64) for shard in shards]))
+        return np.stack(columns, axis=1)
+
+    def _apart(self, shards: list[Shard], wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        hand = hand_of_shard(shards[0], self.hand)
+        parts = [Posture.from_columns(shard.arrays) for shard in shards]
+        pose = np.concatenate([part.hand_pose for part in parts])[wanted]
+        joints = np.concatenate([part.joint_positions for part in parts])[wanted]
+        return distinct(hand_points(hand, Posture(pose, joints)), self.min_distance)
+
+
+def _down(shard: Shard) -> NDArray[np.float64]:
+    """(N, 3) what is down in the scene of each grasp, in the object's frame; zero: it floats."""
+    if "grasp/scene_index" not in shard.arrays:
+        return np.zeros((len(shard["quality/valid"]), 3))
+    poses = np.asarray(shard["scene/object_pose"], float)
+    down = quat_rotate(quat_conjugate(poses[:, 3:]), np.array([0.0, 0, -1.0]))
+    return np.asarray(down[np.asarray(shard["grasp/scene_index"], np.intp)])
+
+
+def faces(down: NDArray[np.float64]) -> NDArray[np.int64]:
+    """(N,) number of the face that lies below, for what is down (N, 3): the first seen within 20 degrees."""
+    seen = np.zeros((0, 3))
+    found = np.full(len(down), -1, np.int64)
+    for row in np.flatnonzero(np.linalg.norm(down, axis=1) > 0):
+        near = np.flatnonzero(seen @ down[row] > _SAME_FACE)
+        if not len(near):
+            seen, near = np.concatenate([seen, down[row][None]]), np.array([len(seen)])
+        found[row] = near[0]
+    return found
+
+
+Row = dict[str, Any]
+
+#: Root attributes of base shards that are compared.
+_SETTINGS: Final = (
+    "method",
+    "fidelity",
+    "seed",
+    "want",
+    "mu",
+    "verdict_level",
+    "verdict_key",
+    "scene",
+    "code_version",
+    "hand_digest",
+    "object_digest",
+)
+
+#: Grasps that agree in pose and joints to so many digits (metres, radians) are one.
+_DIGITS: Final = 6
+
+
+@dataclass
+class _Side:
+    """One of the two."""
+
+    grasps: dict[tuple[str, str], Counter[bytes]] = field(default_factory=dict)
+    valid: Counter[tuple[str, str]] = field(default_factory=Counter)
+    settings: dict[str, set[str]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, shards: Shards) -> _Side:
+        side = cls()
+        for together in base_shards(shards):
+            for shard in together:
+                side._add(shard)
+        return side
+
+    def _add(self, shard: Shard) -> None:
+        said = shard.attributes
+        pair = (str(said.get("hand", "")), str(said.get("object", "")))
+        rows = np.hstack([shard["grasp/hand_pose"], shard["grasp/joint_positions"]]).astype(float)
+        rounded = np.round(rows, _DIGITS) + 0.0  # no minus zero
+        self.grasps.setdefault(pair, Counter()).update(row.tobytes() for row in rounded)
+        self.valid[pair] += int(validity.valid(shard.arrays).sum())
+        for name in _SETTINGS:
+            if (value := said.get(name)) not in (None, ""):
+                self.settings.setdefault(name, set()).add(_short(name, value))
+
+
+def _short(name: str, value: object) -> str:
+    if name == "fidelity":
+        try:
+            return str(from_json(str(value))["name"])
+        except (ValueError, KeyError, TypeError):
+            return str(value)
+    return str(value)
+
+
+def difference(first: Shards, second: Shards) -> Row:
+    """What differs, as JSON values.
+
+    Keys: shards {first, second, common}; cells[] {hand, object, first, second: grasps, valid_first, valid_second,
+    common: grasps that both have}, of those that differ; same_cells, how many do not; settings {name: {first, second}}
+    of those that differ.
+    """
+    a, b = _Side.of(first), _Side.of(second)
+    ids = [{file.id for file in shards} for shards in (first, second)]
+    rows = []
+    same = 0
+    for pair in sorted({*a.grasps, *b.grasps}):
+        mine, theirs = a.grasps.get(pair, Counter()), b.grasps.get(pair, Counter())
+        if mine == theirs and a.valid[pair] == b.valid[pair]:
+            same += 1
+            continue
+        rows.append(
+            {
+                "hand": pair[0],
+                "object": pair[1],
+                "first": mine.total(),
+                "second": theirs.total(),
+                "valid_first": a.valid[pair],
+                "valid_second": b.valid[pair],
+                "common": (mine & theirs).total(),
+            }
+        )
+    settings = {
+        name: {"first": sorted(a.settings.get(name, ())), "second": sorted(b.settings.get(name, ()))}
+        for name in _SETTINGS
+        if a.settings.get(name) != b.settings.get(name)
+    }
+    return {
+        "shards": {"first": len(first), "second": len(second), "common": len(ids[0] & ids[1])},
+        "same_cells": same,
+        "cells": rows,
+        "settings": settings,
+    }

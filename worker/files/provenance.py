@@ -1,0 +1,379 @@
+"""The hand and the object of a shard: what it notes of them, and how their files are found again.
+
+They are known by their digests, so a file that was changed or is another one is never taken for them.
+
+What a base shard says at its root of the grasps in it; `service.store.columns` has the schema.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import zip_longest
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+from pydantic_core import from_json
+
+from service.model.digests import digest_files, digest_variant
+from service.model.domain import JobOptions
+from service.model.errors import ConflictError, GraspdError, InputError, NotFoundError
+from service.model.matter import FRICTION, MASS_KG
+from service.model.states import AssetKind
+from service.readers.ways import scene_spec_of
+from service.store.assets import builtin_files, builtin_names
+from service.store.columns import Attribute
+from service.store.library import load_asset_files
+from service.store.shards import Shard, json_attribute
+from service.store.store import open_store
+from worker.grasps import Columns
+from worker.hands.load import files_from_path, hand_from_path, load_hand
+from worker.hands.load import files_from_path as hand_files
+from worker.hands.model import HandModel
+from worker.objects.formats import READERS
+from worker.objects.model import ObjectModel
+from worker.objects.prepare import files_from_path as object_files
+from worker.objects.prepare import load_object, object_from_path
+from worker.scenes.beside import neighbour_of
+from worker.scenes.kinds import supports_of
+from worker.scenes.neighbours import Neighbours
+from worker.simulation.surroundings import Placed, Scenes
+
+#: What a file may be called that describes a hand or an object.
+SUFFIXES: Final = {AssetKind.HAND: (".urdf", ".xml", ".zip"), AssetKind.OBJECT: (*READERS, ".zip")}
+
+#: Files of the shard's folder, and of the folders in it, that are looked at.
+LOOKED_AT: Final = 200
+
+_FILES: Final[dict[AssetKind, Callable[[Path], tuple[str, dict[str, bytes], dict[str, Any]]]]] = {
+    AssetKind.HAND: hand_files,
+    AssetKind.OBJECT: object_files,
+}
+
+
+@dataclass(frozen=True)
+class Sought:
+    """A hand or an object as a shard knows it."""
+
+    kind: AssetKind
+    name: str
+    digest: str
+    source: str = ""
+    """The path it was read from."""
+    options: Mapping[str, Any] | None = None
+    """What was said of it besides, such as `keep_largest`."""
+    folder: Path | None = None
+    """The shard's."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """Its files, and the options to read them with."""
+
+    files: dict[str, bytes]
+    options: dict[str, Any]
+
+
+def remembered(hand: str, obj: str, options: Mapping[str, Any]) -> dict[str, Attribute]:
+    """Root attributes that tell where hand and object were read; built-in ones need none."""
+    found: dict[str, Attribute] = {}
+    for kind, path in (("hand", Path(hand)), ("object", Path(obj))):
+        if path.is_file():
+            found[f"{kind}_source"] = str(path.resolve())
+    return found | ({"object_options": json_attribute(dict(options))} if options else {})
+
+
+def find(sought: Sought) -> Found:
+    """The files of a hand or object: built in, at the path the shard notes, in the store, or in the shard's folder.
+
+    Raises:
+        NotFoundError: in none of these; says where it looked.
+    """
+    if sought.name in builtin_names(sought.kind):
+        files = builtin_files(sought.kind, sought.name)
+        if digest_files(sought.kind, files) == sought.digest:
+            return Found(files, {})
+    looked: list[str] = []
+    for path in _paths(sought, looked):
+        if (found := at(sought, path)) is not None:
+            return found
+    if (found := _stored(sought, looked)) is not None:
+        return found
+    for path in _beside(sought, looked):
+        if (found := at(sought, path)) is not None:
+            return found
+    raise NotFoundError(
+        f"the {sought.kind} {sought.name!r} of digest {sought.digest[:12]} is not {', not '.join(looked)}; "
+        f"name its file: --{sought.kind}"
+    )
+
+
+def _paths(sought: Sought, looked: list[str]) -> Iterator[Path]:
+    if sought.source:
+        looked.append(f"at {sought.source}, where the shard was made")
+        yield Path(sought.source)
+
+
+def _stored(sought: Sought, looked: list[str]) -> Found | None:
+    from service.settings import Settings
+
+    url = Settings().resolved_store_url
+    looked.append(f"in the store {url}")
+    try:
+        return Found(load_asset_files(open_store(url, make=False), sought.kind, sought.digest), {})
+    except GraspdError:
+        return None
+
+
+def _beside(sought: Sought, looked: list[str]) -> Iterator[Path]:
+    if sought.folder is None:
+        return
+    looked.append(f"in {sought.folder}")
+    near = (path for pattern in ("*", "*/*") for path in sorted(sought.folder.glob(pattern)))
+    fitting = (path for path in near if path.suffix.lower() in SUFFIXES[sought.kind])
+    yield from (path for _, path in zip(range(LOOKED_AT), fitting, strict=False))
+
+
+def at(sought: Sought, path: Path) -> Found | None:
+    """The files at a path, if they are what is sought."""
+    try:
+        if not path.is_file():
+            return None
+        _, files, stated = _FILES[sought.kind](path)
+        digest = digest_files(sought.kind, files)
+    except (GraspdError, OSError):
+        return None
+    for options in ({}, dict(sought.options or {})):
+        if digest_variant(digest, options) == sought.digest:
+            return Found(files, {**stated, **options})
+    return None
+
+
+def options_of(attribute: object) -> dict[str, Any]:
+    """Options from a shard's attribute; none where it has none."""
+    try:
+        said = from_json(str(attribute or "{}"))
+    except ValueError:
+        return {}
+    return said if isinstance(said, dict) else {}
+
+
+#: Neighbours are looked at and kept clear of, not grasped.
+NEIGHBOUR_FACE_ERROR_M: Final = 3e-4
+
+_MATTER: Final = {"object_mass_kg": MASS_KG, "object_friction": FRICTION}
+
+
+def hand_of_shard(shard: Shard, given: str | None) -> HandModel:
+    """The hand named by `given` (a file or a built-in); by default the one the shard was made with, see `origin.find`.
+
+    Raises:
+        NotFoundError: there is no such file or built-in, or it is in none of the places where it may be.
+        ConflictError: it is not the hand the shard was made with.
+    """
+    if given:
+        hand = hand_from_path(given)
+        _check(shard, "hand", hand.digest, given)
+        return hand
+    wanted = _wanted(shard, AssetKind.HAND)
+    found = find(wanted)
+    return load_hand(found.files, name=wanted.name, digest=wanted.digest, options=found.options)
+
+
+def hand_files_of_shard(shard: Shard, given: str | None) -> Found:
+    """The files of `hand_of_shard`, with the options to read them with."""
+    if given:
+        _, files, stated = files_from_path(given)
+        return Found(files, stated)
+    return find(_wanted(shard, AssetKind.HAND))
+
+
+def object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
+    """The object named by `given`, simplified and as heavy as in the shard; see `hand_of_shard`."""
+    said = shard.attributes
+    # What older shards do not say was the same for all objects.
+    mass, friction = (float(said.get(key, default)) for key, default in _MATTER.items())  # type: ignore[arg-type]
+    return _object_of_shard(shard, given).weighing(mass=mass, friction=friction)
+
+
+def _object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
+    knobs = options_of(shard.attributes.get("fidelity"))
+    stated = knobs.get("face_error_m")
+    error = float(stated) if isinstance(stated, int | float) else 3e-4
+    wanted = _wanted(shard, AssetKind.OBJECT)
+    if not given:
+        return _loaded(wanted, find(wanted), error)
+    if (found := at(wanted, Path(given))) is not None:
+        return _loaded(wanted, found, error)
+    obj = object_from_path(given, face_error_m=error)
+    _check(shard, "object", obj.digest, given)
+    return obj
+
+
+def _loaded(wanted: Sought, found: Found, face_error_m: float) -> ObjectModel:
+    return load_object(
+        found.files, name=wanted.name, digest=wanted.digest, face_error_m=face_error_m, options=found.options
+    )
+
+
+def _wanted(shard: Shard, kind: AssetKind) -> Sought:
+    said = shard.attributes
+    return Sought(
+        kind,
+        str(said.get(kind.value, "")),
+        str(said.get(f"{kind.value}_digest", "")),
+        str(said.get(f"{kind.value}_source", "")),
+        options_of(said.get(f"{kind.value}_options")),
+        None if shard.path is None else shard.path.resolve().parent,
+    )
+
+
+def neighbours_of_shard(shard: Shard, given: Sequence[str]) -> Neighbours | None:
+    """The other objects of a scene shard with their poses; None if the object is alone.
+
+    Raises:
+        NotFoundError: one is in none of the places where it may be.
+        ConflictError: they are not the objects the shard was made with.
+    """
+    names, digests = (shard.attributes.get(key, []) for key in ("neighbours", "neighbour_digests"))
+    if "scene/neighbour_pose" not in shard.arrays or not isinstance(names, list) or not isinstance(digests, list):
+        return None
+    if given and len(given) != len(names):
+        raise ConflictError(f"the scene shard has {len(names)} neighbours; give each of them as --with, in their order")
+    said = shard.attributes.get("neighbour_sources", [])
+    sources = said if isinstance(said, list) else []
+    objects = (
+        [object_from_path(name, face_error_m=NEIGHBOUR_FACE_ERROR_M) for name in given]
+        if given
+        else [_neighbour(shard, *one) for one in zip_longest(names, digests, sources, fillvalue="")]
+    )
+    for obj, name, digest in zip(objects, names, digests, strict=True):
+        if obj.digest != digest:
+            raise ConflictError(
+                f"the scene shard's neighbour {name!r} has digest {digest[:12]}, but {obj.name!r} has "
+                f"{obj.digest[:12]}; give the files it was made with as --with"
+            )
+    return Neighbours(objects, np.asarray(shard["scene/neighbour_pose"], float))
+
+
+def beside_attributes(others: Sequence[ObjectModel], given: Sequence[str]) -> dict[str, Attribute]:
+    """What a shard says of the objects beside its own, given as files or names; nothing if there are none."""
+    if not others:
+        return {}
+    return {
+        "neighbours": [other.name for other in others],
+        "neighbour_digests": [other.digest for other in others],
+        "neighbour_sources": [str(Path(name).resolve()) if Path(name).is_file() else "" for name in given],
+    }
+
+
+def _neighbour(shard: Shard, name: str, digest: str, source: str) -> ObjectModel:
+    folder = None if shard.path is None else shard.path.resolve().parent
+    wanted = Sought(AssetKind.OBJECT, name, digest, source, folder=folder)
+    return _loaded(wanted, find(wanted), NEIGHBOUR_FACE_ERROR_M)
+
+
+def placed_of_shard(shard: Shard) -> Placed | None:
+    """The scenes that the grasps of a base shard were planned in; None: they were planned around a free object.
+
+    Raises:
+        InputError: what the shard says of its scene is no scene.
+    """
+    if "scene/object_pose" not in shard.arrays or "grasp/scene_index" not in shard.arrays:
+        return None
+    if (spec := scene_spec_of(shard)) is None:
+        raise InputError("the shard has grasps in scenes, but its attribute scene does not say which")
+    scenes = Scenes(supports_of(spec), np.asarray(shard["scene/object_pose"], float))
+    if (beside := neighbours_of_shard(shard, [])) is not None:
+        neighbours = tuple(neighbour_of(other) for other in beside.objects)
+        scenes = replace(scenes, neighbours=neighbours, neighbour_pose=beside.poses)
+    return scenes.placed(np.asarray(shard["grasp/scene_index"], np.intp))
+
+
+def _check(shard: Shard, kind: str, digest: str, given: str | None) -> None:
+    expected = str(shard.attributes.get(f"{kind}_digest", ""))
+    if expected != digest:
+        name = given or str(shard.attributes.get(kind, ""))
+        raise ConflictError(
+            f"the {shard.kind} shard was made with the {kind} of digest {expected[:12]}, but {name!r} has "
+            f"{digest[:12]}; give the file it was made with as --{kind}"
+        )
+
+
+def id_of_columns(columns: Columns) -> str:
+    """Id of a shard that no job made: a digest of its columns, so that later shards can name it."""
+    found = hashlib.sha256()
+    for name in sorted(columns):
+        array = np.ascontiguousarray(columns[name])
+        found.update(f"{name} {array.dtype.str} {array.shape} ".encode())
+        found.update(array.tobytes())
+    return found.hexdigest()
+
+
+def made_of(source: Shard) -> dict[str, Attribute]:
+    """What a later shard says of the shard whose scenes or grasps it is made of."""
+    return {f"{source.kind}_shard": str(source.attributes.get("shard_id") or id_of_columns(source.arrays))}
+
+
+#: What every later shard says about the job it comes from.
+INHERITED: Final = (
+    "hand",
+    "hand_digest",
+    "hand_source",
+    "object",
+    "object_digest",
+    "object_source",
+    "object_options",
+    "method",
+    "fidelity",
+    "batch",
+    "root_link",
+)
+
+
+def base_attributes(
+    hand: HandModel,
+    obj: ObjectModel,
+    request: JobOptions,
+    *,
+    tried: int,
+    verdict_key: str | None,
+    outcomes: Mapping[str, int] = MappingProxyType({}),
+) -> dict[str, Attribute]:
+    """The hand's joints, what was asked for, in which scene, how many grasps were tried, and who judged them.
+
+    Args:
+        hand: the hand.
+        obj: the object as it was judged.
+        request: friction, want, referee and scene.
+        tried: grasps tried until the last one kept.
+        verdict_key: digest of the terms of the verdicts; None: nobody judged.
+        outcomes: tries that were not kept, by what became of them.
+    """
+    said: dict[str, Attribute] = {
+        "joint_names": list(hand.joint_names),
+        "mu": request.friction,
+        "root_link": hand.root_link,
+        "object_mass_kg": obj.mass,
+        "object_friction": obj.friction,
+        "want": request.want,
+        "tried": tried,
+    }
+    if outcomes:
+        said["outcomes"] = json_attribute(dict(outcomes))
+    if request.in_scene:
+        said |= {"scene": json_attribute(request.place.told())} | wrist_attributes(hand)
+    if request.models:
+        said["robust"] = json_attribute({"models": request.models, "wanted": request.robust})
+    if verdict_key is None:
+        return said | {"verdict_level": "none"}
+    return said | {"verdict_level": request.referee, "verdict_key": verdict_key}
+
+
+def wrist_attributes(hand: HandModel) -> dict[str, Attribute]:
+    """What names the columns of `grasp/wrist_positions`, which grasps in scenes have."""
+    wrist = () if hand.mounting is None else hand.mounting.joint_names
+    return {"wrist_joint_names": list(wrist)} if wrist else {}

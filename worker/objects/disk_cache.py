@@ -1,0 +1,181 @@
+"""Arrays on this machine that take long to compute and follow from little: read in a millisecond by later processes.
+
+What a model holds, as a key for caches: of one file there are as many models as there are ways to prepare it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import platform
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import fields, is_dataclass
+from functools import lru_cache
+from pathlib import Path
+from types import MappingProxyType, ModuleType
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service import user_cache
+from service.model.digests import digest_json
+from service.model.libraries import version_of
+
+#: Libraries that go into the arrays.
+_LIBRARIES: Final = ("numpy", "scipy")
+
+#: All entries of a kind together; one has some 100 kB.
+_LIMIT_BYTES: Final = 256 << 20
+
+Arrays = Mapping[str, NDArray[Any]]
+
+_recalled: ContextVar[dict[str, NDArray[Any]] | None] = ContextVar("recalled", default=None)
+
+
+def arrays_kept_or_made(
+    kind: str,
+    terms: tuple[str | int, ...],
+    code: tuple[ModuleType, ...],
+    make: Callable[[], Arrays],
+    *,
+    fits: Callable[[Arrays], bool] = lambda _: True,
+) -> Arrays:
+    """Arrays from the user's cache, else made and kept there; the same bit for bit.
+
+    Args:
+        kind: folder of the cache.
+        terms: all that they follow from, besides the code.
+        code: modules whose change would change them.
+        make: computes them; what it raises is not kept.
+        fits: whether arrays that were read can be what is wanted; those that cannot are made again.
+    """
+    file = _file(kind, terms, code)
+    if (held := _read(file)) is not None and fits(held):
+        return held
+    made = make()
+    _write(file, made)
+    return made
+
+
+@contextmanager
+def recalling(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Iterator[None]:
+    """What `recalled` gives inside is kept in one entry, and read from there the next time.
+
+    For small steps of something large, the dearest of which is to load the library that they need.
+
+    Args:
+        kind, terms, code: see `arrays_kept_or_made`; the terms only tell entries apart.
+    """
+    file = _file(kind, terms, code)
+    known = _read(file) or {}
+    now = dict(known)
+    token = _recalled.set(now)
+    try:
+        yield
+    finally:
+        _recalled.reset(token)
+    if len(now) > len(known):
+        _write(file, now)
+
+
+def recalled(what: str, given: Sequence[NDArray[Any]], make: Callable[[], Sequence[NDArray[Any]]]) -> Arrays:
+    """Arrays that follow from others alone, by their numbers "0", "1", ...: from the present `recalling`, or made."""
+    known = _recalled.get()
+    if known is None:
+        return {str(number): array for number, array in enumerate(make())}
+    whole = hashlib.sha256(what.encode())
+    for array in given:
+        whole.update(f"{array.dtype.str}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
+    key = f"{whole.hexdigest()[:32]}-"
+    if key + "0" not in known:
+        known |= {f"{key}{number}": array for number, array in enumerate(make())}
+    found: dict[str, NDArray[Any]] = {}
+    while (name := f"{key}{len(found)}") in known:
+        found[str(len(found))] = known[name].copy()
+    return found
+
+
+def _file(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Path:
+    address = digest_json([*terms, _revision(tuple(str(module.__file__) for module in code))])
+    return user_cache.folder(kind) / f"{address}.npz"
+
+
+def _read(file: Path) -> dict[str, NDArray[Any]] | None:
+    if (held := user_cache.load(file)) is None:
+        return None
+    try:
+        with np.load(io.BytesIO(held), allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _write(file: Path, arrays: Arrays) -> None:
+    whole = io.BytesIO()
+    np.savez(whole, **dict[str, Any](arrays))
+    user_cache.keep(file, whole.getvalue(), limit_bytes=_LIMIT_BYTES)
+
+
+@lru_cache(maxsize=16)
+def _revision(files: tuple[str, ...]) -> str:
+    """Digest of source files, of libraries, and of the kind of processor, whose last bits may differ."""
+    whole = hashlib.sha256()
+    for file in files:
+        whole.update(Path(file).read_bytes())
+    return digest_json([whole.hexdigest(), *map(version_of, _LIBRARIES), platform.machine()])
+
+
+#: How a model is called says nothing of what it is.
+_NAMES: Final = frozenset({"name", "digest"})
+
+#: Metadata of a field that says nothing while it has its default.
+TOLD_IF_SET: Final = MappingProxyType({"told_if_set": True})
+
+
+def content_of(model: Any) -> str:
+    """Digest of all fields of a dataclass but its name and the digest of its files: arrays bit for bit.
+
+    Raises:
+        TypeError: a field that holds neither numbers, texts, arrays, tuples and sets of these, nor a dataclass.
+    """
+    whole = hashlib.sha256()
+    for part in _parts({name: value for name, value in _told(model).items() if name not in _NAMES}):
+        whole.update(len(part).to_bytes(8, "little"))
+        whole.update(part)
+    return whole.hexdigest()[:32]
+
+
+def _told(model: Any) -> dict[str, Any]:
+    """Fields of a dataclass that say something."""
+    values = {f: getattr(model, f.name) for f in fields(model)}
+    return {
+        f.name: value
+        for f, value in values.items()
+        if not (f.metadata.get("told_if_set") and type(value) is type(f.default) and value == f.default)
+    }
+
+
+def _parts(value: Any) -> Iterator[bytes]:
+    if isinstance(value, np.ndarray):
+        yield f"{value.dtype.str}{value.shape}".encode()
+        yield np.ascontiguousarray(value).tobytes()
+    elif isinstance(value, dict):
+        for key, held in value.items():
+            yield str(key).encode()
+            yield from _parts(held)
+    elif isinstance(value, (tuple, frozenset)):
+        yield f"{type(value).__name__}{len(value)}".encode()
+        for held in sorted(value) if isinstance(value, frozenset) else value:
+            yield from _parts(held)
+    elif is_dataclass(value) and isinstance(told := getattr(value, "content", None), str):
+        yield told.encode()
+    elif is_dataclass(value) and not isinstance(value, type):
+        yield from _parts(_told(value))
+    elif isinstance(value, (str, int, float, np.generic)) or value is None:
+        yield f"{type(value).__name__}{value!r}".encode()
+    else:
+        raise TypeError(f"a model cannot be told by a {type(value).__name__}")

@@ -1,0 +1,278 @@
+"""Formats of bare geometry: PLY (ASCII, binary of both byte orders), STL (binary, ASCII), OFF. Colours and normals are
+passed over."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from service.model.errors import MeshError
+from worker.objects.formats.soup import Soup, check_face_count, triangulate
+
+_TYPES = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
+
+_MAX_ELEMENTS = 16
+
+
+@dataclass
+class _Property:
+    name: str
+    type: str
+    count_type: str | None = None
+
+
+@dataclass
+class _Element:
+    name: str
+    count: int
+    properties: list[_Property] = field(default_factory=list)
+
+
+def read_ply(data: bytes) -> Soup:
+    """Vertices x y z and the polygons of `vertex_indices`."""
+    found = re.search(rb"[\r\n]end_header", data[:65536])
+    if not data.startswith(b"ply") or found is None:
+        raise MeshError("a PLY file begins with the word ply and a header of at most 64 KiB")
+    end, line_end = found.end(), _line_end(data[: found.end()])
+    start = data.index(line_end, end) + len(line_end)
+    order, elements = _header(data[:end].decode("ascii", "replace").splitlines()[1:])
+    body = _Ascii(data[start:]) if order is None else _Binary(data[start:], order)
+    vertices = np.zeros((0, 3))
+    polygons = (np.zeros(0, np.int64), np.zeros(0, np.int64))
+    for element in elements:
+        scalars, lists = body.read(element)
+        if element.name == "vertex":
+            vertices = np.stack([scalars[axis].astype(float) for axis in "xyz"], axis=1)
+        elif element.name == "face":
+            name = next((p.name for p in element.properties if p.count_type and p.name.startswith("vertex_ind")), None)
+            if name is None:
+                raise MeshError("the faces have no list vertex_indices")
+            polygons = lists[name]
+    return Soup(vertices, triangulate(vertices, *polygons))
+
+
+def _line_end(header: bytes) -> bytes:
+    """How lines of the header end: what follows it may be binary and begin with any byte."""
+    return next(end for end in (b"\r\n", b"\n", b"\r") if end in header)
+
+
+def _header(lines: list[str]) -> tuple[str | None, list[_Element]]:
+    """Byte order ("<", ">", None for ASCII) and the elements in the file's order."""
+    order: str | None = ""
+    elements: list[_Element] = []
+    for line in lines:
+        match line.split():
+            case ["format", "ascii", *_]:
+                order = None
+            case ["format", "binary_little_endian", *_]:
+                order = "<"
+            case ["format", "binary_big_endian", *_]:
+                order = ">"
+            case ["element", name, count]:
+                elements.append(_Element(name, int(count)))
+                # Of a closed mesh there are about half as many vertices as faces.
+                check_face_count(int(count) if name == "face" else int(count) // 4)
+            case ["property", "list", count_type, type_, name]:
+                elements[-1].properties.append(_Property(name, _TYPES[type_], _TYPES[count_type]))
+            case ["property", type_, name]:
+                elements[-1].properties.append(_Property(name, _TYPES[type_]))
+    if order == "" or len(elements) > _MAX_ELEMENTS or any(e.count < 0 or not e.properties for e in elements):
+        raise MeshError("the PLY header has no format, or elements without a count or properties")
+    return order, elements
+
+
+_Lists = dict[str, tuple[np.ndarray, np.ndarray]]
+
+
+class _Ascii:
+    """Reads one line per row."""
+
+    def __init__(self, body: bytes) -> None:
+        self._lines = [line for line in body.splitlines() if line.strip()]
+        self._at = 0
+
+    def read(self, element: _Element) -> tuple[dict[str, np.ndarray], _Lists]:
+        rows = self._lines[self._at : self._at + element.count]
+        if len(rows) < element.count:
+            raise MeshError(f"truncated: {element.count} rows of {element.name} are promised, {len(rows)} are there")
+        self._at += element.count
+        if not any(p.count_type for p in element.properties):
+            width = len(element.properties)
+            table = np.array([row.split()[:width] for row in rows], dtype="S40").astype(float).reshape(-1, width)
+            return {p.name: table[:, i] for i, p in enumerate(element.properties)}, {}
+        counts: dict[str, list[int]] = {p.name: [] for p in element.properties if p.count_type}
+        items: dict[str, list[int]] = {name: [] for name in counts}
+        for row in rows:
+            words = iter(row.split())
+            for item in element.properties:
+                if not item.count_type:
+                    next(words, None)
+                    continue
+                values = [float(w) for _, w in zip(range(int(next(words, b""))), words, strict=False)]
+                counts[item.name].append(len(values))
+                items[item.name] += map(int, values)
+        return {}, {n: (np.array(counts[n], dtype=np.int64), np.array(items[n], dtype=np.int64)) for n in counts}
+
+
+class _Binary:
+    """Reads rows of fixed width at once, rows with lists one by one."""
+
+    def __init__(self, body: bytes, order: str) -> None:
+        self._body = body
+        self._order = order
+        self._at = 0
+
+    def read(self, element: _Element) -> tuple[dict[str, np.ndarray], _Lists]:
+        lists = [p for p in element.properties if p.count_type]
+        if not lists:
+            table = self._take(np.dtype([(p.name, self._order + p.type) for p in element.properties]), element.count)
+            return {p.name: table[p.name] for p in element.properties}, {}
+        uniform = self._uniform(element) if len(lists) == 1 else None
+        return {}, uniform if uniform is not None else self._row_by_row(element)
+
+    def _uniform(self, element: _Element) -> _Lists | None:
+        """All rows at once, if every list is as long as the first: the usual case of triangles only."""
+        first = self._at
+        (name,) = self._row_by_row(_Element(element.name, min(element.count, 1), element.properties)).items()
+        self._at = first
+        width = int(name[1][0][0]) if element.count else 0
+        fields: list[tuple[str, str, tuple[int, ...]]] = []
+        for p in element.properties:
+            if p.count_type:
+                fields.append((p.name + " count", self._order + p.count_type, ()))
+            fields.append((p.name, self._order + p.type, (width,) if p.count_type else ()))
+        dtype = np.dtype(fields)
+        if dtype.itemsize * element.count > len(self._body) - self._at:
+            return None
+        table = np.frombuffer(self._body, dtype, count=element.count, offset=self._at)
+        if not (table[name[0] + " count"] == width).all():
+            return None
+        self._at += dtype.itemsize * element.count
+        return {name[0]: (np.full(element.count, width, np.int64), table[name[0]].reshape(-1).astype(np.int64))}
+
+    def _row_by_row(self, element: _Element) -> _Lists:
+        counts: dict[str, list[int]] = {p.name: [] for p in element.properties if p.count_type}
+        items: dict[str, list[np.ndarray]] = {name: [] for name in counts}
+        for _ in range(element.count):
+            for p in element.properties:
+                if p.count_type:
+                    count = int(self._take(np.dtype(self._order + p.count_type), 1)[0])
+                    counts[p.name].append(count)
+                    items[p.name].append(self._take(np.dtype(self._order + p.type), count))
+                else:
+                    self._take(np.dtype(self._order + p.type), 1)
+        empty = [np.zeros(0, np.int64)]
+        return {
+            n: (np.array(counts[n], dtype=np.int64), np.concatenate(empty + items[n]).astype(np.int64)) for n in counts
+        }
+
+    def _take(self, dtype: np.dtype, count: int) -> np.ndarray:
+        if count < 0 or dtype.itemsize * count > len(self._body) - self._at:
+            raise MeshError("truncated: the header promises more than the file holds")
+        values = np.frombuffer(self._body, dtype, count=count, offset=self._at)
+        self._at += dtype.itemsize * count
+        return values
+
+
+_HEADER = 84
+
+_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+_FACET = re.compile(rb"\bfacet\s", re.IGNORECASE)
+
+_LOOP = re.compile(rb"\bouter\s+loop\b", re.IGNORECASE)
+
+_VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
+
+
+def read_stl(data: bytes) -> Soup:
+    """Triangles of an STL file; each has its own three vertices."""
+    if len(data) >= _HEADER and len(data) == _HEADER + _RECORD.itemsize * _promised(data):
+        return _binary(data, _promised(data))
+    if b"\0" not in data[:1024] and (_FACET.search(data) or b"endsolid" in data[-1024:].lower()):
+        return _ascii(data)
+    if len(data) < _HEADER:
+        raise MeshError(f"{len(data)} bytes are too few for an STL file; it is truncated")
+    if b"\0" not in data[:1024]:
+        raise MeshError("neither binary STL nor text with facets; export the mesh again")
+    held = (len(data) - _HEADER) / _RECORD.itemsize
+    if _promised(data) > held:
+        raise MeshError(f"truncated: the header promises {_promised(data)} faces, the file holds {int(held)}")
+    # Some exporters append their own data: what the header promises is all there.
+    return _binary(data, _promised(data))
+
+
+def _promised(data: bytes) -> int:
+    return int.from_bytes(data[80:84], "little")
+
+
+def _binary(data: bytes, count: int) -> Soup:
+    check_face_count(count)
+    records = np.frombuffer(data, _RECORD, count=count, offset=_HEADER)
+    return _soup(records["corners"].reshape(-1, 3).astype(float))
+
+
+def _ascii(data: bytes) -> Soup:
+    rows = _VERTEX.findall(data)
+    check_face_count(len(rows) // 3)
+    if len(rows) % 3:
+        raise MeshError("truncated: the last facet has fewer than three vertices")
+    if (loops := len(_LOOP.findall(data))) and 3 * loops != len(rows):
+        raise MeshError("facets of more than three vertices; triangulate the mesh and export it again")
+    return _soup(np.array(rows, dtype="S32").astype(float).reshape(-1, 3))
+
+
+def _soup(corners: np.ndarray) -> Soup:
+    return Soup(corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3))
+
+
+#: The word may have the counts glued to it (ModelNet40), and letters before it for what vertices have besides.
+_HEAD: Final = re.compile(rb"(?:ST)?C?N?(4?n?)OFF(?![A-Z])(\s*BINARY)?", re.IGNORECASE)
+
+
+def read_off(data: bytes) -> Soup:
+    """Triangles of the polygons of an OFF file."""
+    lines = [line for raw in data.splitlines() if (line := raw.partition(b"#")[0].strip())]
+    head = _HEAD.match(lines[0]) if lines else None
+    if head is None:
+        raise MeshError("an OFF file begins with the word OFF")
+    if head[1] or head[2]:
+        raise MeshError(f"OFF of the kind {head[0].decode()} is not read; export plain OFF in text")
+    lines[0] = lines[0][head.end() :].strip()
+    rows = [line.split() for line in lines if line]
+    if not rows or len(rows[0]) < 2:
+        raise MeshError("truncated: the counts of vertices and faces are missing")
+    vertex_count, face_count = int(rows[0][0]), int(rows[0][1])
+    check_face_count(face_count)
+    if min(vertex_count, face_count) < 0 or vertex_count + face_count > len(rows) - 1:
+        raise MeshError(f"truncated: {vertex_count} vertices and {face_count} faces are promised, not all are there")
+    vertices = np.array([row[:3] for row in rows[1 : 1 + vertex_count]], dtype="S40").astype(float).reshape(-1, 3)
+    counts: list[int] = []
+    corners: list[int] = []
+    for row in rows[1 + vertex_count : 1 + vertex_count + face_count]:
+        count = int(row[0])
+        if count < 0 or count > len(row) - 1:
+            raise MeshError(f"face {len(counts)} promises {count} corners and has {len(row) - 1}")
+        counts.append(count)
+        corners += map(int, row[1 : 1 + count])
+    return Soup(vertices, triangulate(vertices, np.array(counts, dtype=np.int64), np.array(corners, dtype=np.int64)))
