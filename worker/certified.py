@@ -37,7 +37,7 @@ from worker.quality.referee.judge import judge
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lift import LiftOutcome
 from worker.quality.referee.lifting import judge_lifts, lift_key
-from worker.quality.referee.limit import Limit, limit_of
+from worker.quality.referee.limit import ENOUGH, Limit, limit_of
 from worker.quality.referee.payload import payloads
 from worker.quality.referee.protocol import DIRECTIONS, Outcome
 from worker.quality.referee.robust import reaches, robust
@@ -227,15 +227,18 @@ class _Work:
                 run = self._run.part(begun, begun + (1 - begun) * min(1.0, share / (count - valid)) * 0.9)
                 parts.append(self._round(number, range(first, first + share), run))
                 first, valid = first + share, valid + len(parts[-1].grasps)
-            if not valid and self._hopeless(parts[-1]):
+            if not valid and self._hopeless(parts):
                 return
             number += 1
 
-    def _hopeless(self, made: Round) -> bool:
-        """Whether grasps of a round, none of which is kept, show that the hand lifts far less than is wanted."""
-        if self.limit is not None or self.pieces is None:
+    def _hopeless(self, made: Sequence[Round]) -> bool:
+        """Whether the latest grasps of these rounds, none of which is kept, show that the hand lifts far less than is
+        wanted."""
+        if self.pieces is None or (self.limit is not None and self.limit.grasps >= ENOUGH):
             return False
-        planned = joined(made.planned)
+        planned = joined([grasps for one in made for grasps in one.planned])
+        latest = max(ENOUGH, sum(map(len, made[-1].planned)))
+        planned = planned.take(slice(max(0, len(planned) - latest), None))
         self.limit = limit_of(
             self.hand, self.obj, planned, wanted=max(self.obj.mass, self.request.min_payload),
             pieces=self.pieces.result(), placed=self._placed(planned), run=self._run.quiet(),

@@ -26,4 +26,4 @@ SCHEMA_OF_RANGES: Final = 6
 SCHEMA_OF_NETWORKS: Final = 4
 
 #: Revision of each stage's algorithm. Part of the digest of a result, so results of two revisions never collide.
-STAGE_REVISIONS: Final = {"synthesize": 29, "scene": 5, "render": 6}
+STAGE_REVISIONS: Final = {"synthesize": 30, "scene": 5, "render": 6}

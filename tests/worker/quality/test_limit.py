@@ -16,7 +16,7 @@ from service.model.matter import ACCELERATION, FRICTION
 from tests.worker.quality.test_mass import BOX, HAND, LEVER_M, PIECES, TABLE, TORQUE, pinch
 from worker.grasps import Posture
 from worker.quality.capacity import AT_STOP, capacities
-from worker.quality.referee.limit import HOPELESS, LEAST, Limit, limit_of
+from worker.quality.referee.limit import ENOUGH, HOPELESS, LEAST, Limit, limit_of
 from worker.quality.wrench_space import EDGES
 
 UP = np.array([[[0.0, 1.0, 0.0]]])
@@ -49,10 +49,10 @@ def test_what_touches_nothing_bears_nothing() -> None:
 
 
 def test_what_is_wanted_is_told_with_what_the_best_grasp_lifts() -> None:
-    grasps = pinch().take(np.zeros(LEAST, int))
-    placed = TABLE.take(np.zeros(LEAST, int))
+    grasps = pinch().take(np.zeros(ENOUGH, int))
+    placed = TABLE.take(np.zeros(ENOUGH, int))
 
-    def limit(wanted: float, count: int = LEAST) -> Limit | None:
+    def limit(wanted: float, count: int = ENOUGH) -> Limit | None:
         rows = np.arange(count)
         return limit_of(HAND, BOX, grasps.take(rows), pieces=PIECES, placed=placed.take(rows), wanted=wanted)
 
@@ -67,19 +67,22 @@ def test_what_is_wanted_is_told_with_what_the_best_grasp_lifts() -> None:
     near = limit(0.9 * HOPELESS * lifts)
     assert near is not None and not near.hopeless
     assert limit(0.9 * lifts) is None, "they lift it"
+    few = limit(3 * lifts, ENOUGH - 1)
+    assert few is not None and not few.hopeless, "it may be their shape"
     assert limit(3 * lifts, LEAST - 1) is None, "too few to tell"
 
 
-def test_a_weight_out_of_reach_ends_the_work_with_what_the_hand_lifts(tmp_path: Path) -> None:
+@pytest.mark.parametrize("wanted", [ENOUGH // 2, ENOUGH])
+def test_a_weight_out_of_reach_ends_the_work_with_what_the_hand_lifts(tmp_path: Path, wanted: int) -> None:
     words = [
-        "synth", "--hand", "allegro", "--object", "block", "--mass", "20", "--scene", "table", "-n", "8", "--fidelity",
-        "draft", "--seed", "3", "--json", "-o", str(tmp_path / "g.h5"),
+        "synth", "--hand", "allegro", "--object", "block", "--mass", "20", "--scene", "table", "-n", str(wanted),
+        "--fidelity", "draft", "--seed", "3", "--json", "-o", str(tmp_path / "g.h5"),
     ]  # fmt: skip
     result = CliRunner().invoke(build(), words)
     told = json.loads(result.stdout.splitlines()[-1])
     assert result.exit_code == 3
-    assert (told["grasps"], told["tried"]) == (0, 8), "the budget would be 32"
+    assert (told["grasps"], told["tried"]) == (0, wanted), "the budget would be four times as many"
     assert 0.3 < told["limit"]["lifts_kg"] <= told["limit"]["bound_kg"] < 10
-    tries = 8 + told["outcomes"]["repeated"]
-    assert told["reason"].startswith(f"found 0 of 8 valid grasps in {tries} tries: ")
+    tries = wanted + told["outcomes"]["repeated"]
+    assert told["reason"].startswith(f"found 0 of {wanted} valid grasps in {tries} tries: ")
     assert told["reason"].endswith(told["limit"]["says"]) and "20 kg are wanted" in told["reason"]

@@ -22,8 +22,10 @@ from worker.simulation.surroundings import Placed
 
 #: Grasps that must lift what weighs little, before what they lift is told as the hand's limit: else their shape may be
 #: why. It weighs as much as an object of which nothing is said, or this share of what is wanted.
-LEAST: Final = 8
+LEAST: Final = 2
 LIGHT: Final = 1 / 8
+#: So many grasps show that no further ones need be tried.
+ENOUGH: Final = 8
 #: What is wanted over what the best of them lifts, from which on no further ones are tried.
 HOPELESS: Final = 2.0
 
@@ -45,7 +47,7 @@ class Limit:
     @property
     def hopeless(self) -> bool:
         """Whether what is wanted is so much more that further grasps need not be tried."""
-        return self.wanted_kg is not None and self.wanted_kg > HOPELESS * self.lifts_kg
+        return self.grasps >= ENOUGH and self.wanted_kg is not None and self.wanted_kg > HOPELESS * self.lifts_kg
 
     @property
     def line(self) -> str:
