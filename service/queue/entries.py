@@ -13,7 +13,6 @@ from collections.abc import Iterable
 from typing import Any, Final, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
-from redis.exceptions import ResponseError
 
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Stage
@@ -38,16 +37,6 @@ def task_of(job: str) -> tuple[str, int]:
     """Task id and attempt of an RQ job id; a forged one is a task of its own."""
     match = _ATTEMPT.fullmatch(job)
     return (match[1], int(match[2])) if match else (job, 0)
-
-
-def fields(connection: Any, key: str, *names: str) -> list[bytes | None]:
-    """Fields of a hash; none of them where something else stands under its name."""
-    try:
-        return list(connection.hmget(key, *names))
-    except ResponseError as error:
-        if not is_wrong_type(error):
-            raise
-        return [None] * len(names)
 
 
 def is_wrong_type(error: Exception) -> bool:

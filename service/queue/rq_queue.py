@@ -161,22 +161,27 @@ class RqQueue:
             for key in keys:
                 pipe.zrange(key, 0, -1, withscores=True)
             found = pipe.execute()
-        return [_lease(key, entry, score) for key, held in zip(keys, found, strict=True) for entry, score in held]
+        # Every sign of life moves the score, and an entry is of one execution only.
+        return [
+            Lease(*entries.task_of(entries.text(entry.partition(b":")[0])), key=(key, entry), beat=str(score))
+            for key, held in zip(keys, found, strict=True)
+            for entry, score in held
+        ]
 
     def holder(self, lease: Lease) -> tuple[str, Message | None]:
         """Which worker holds a lease, and what was asked of it; None if Redis no longer knows.
 
         Only of one that is lost is this asked: reading all leases stays one round trip.
         """
-        job = entries.text(bytes.fromhex(lease.key.partition(" ")[2]).partition(b":")[0])
-        with _mapped():
-            worker, data = entries.fields(self.connection, job_key(job), "worker_name", "data")
+        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+            pipe.hmget(job_key(entries.text(lease.key[1].partition(b":")[0])), "worker_name", "data")
+            (found,) = pipe.execute(raise_on_error=False)  # something else may stand under its name
+        worker, data = (None, None) if isinstance(found, Exception) else found
         return entries.text(worker), entries.message(data)
 
     def release(self, lease: Lease) -> None:
         """Forget a lease whose worker is lost; if it lives after all, it notices and stops."""
-        key, _, digits = lease.key.partition(" ")
-        entry = bytes.fromhex(digits)
+        key, entry = lease.key
         name = entries.text(entry)
         with _mapped(), self.connection.pipeline(transaction=True) as pipe:
             pipe.zrem(key, entry)
@@ -412,12 +417,6 @@ def unlist_worker(connection: Any, left: Event) -> None:
         pipe.srem(WORKERS, left.worker)
         put_event(pipe, left)
         pipe.execute()
-
-
-def _lease(key: str, entry: bytes, score: float) -> Lease:
-    task, attempt = entries.task_of(entries.text(entry.partition(b":")[0]))
-    # Every sign of life moves the score, and an entry is of one execution only.
-    return Lease(task_id=task, attempt=attempt, key=f"{key} {entry.hex()}", beat=str(score))
 
 
 def worker_key(name: str) -> str:
