@@ -64,6 +64,17 @@ def read(kind: type[Entry], data: bytes | None) -> Entry | None:
         return None
 
 
+def events(reply: Any) -> list[tuple[str, Event | None]]:
+    """Id and event of each entry of a reply; an entry that was trimmed has no fields."""
+    streams = reply.items() if isinstance(reply, dict) else reply or []
+    return [
+        (event_id.decode(), read(Event, fields.get(b"e")) if fields else None)
+        for _, found in streams
+        for entry in found
+        for event_id, fields in ([entry] if isinstance(entry, tuple) else entry)
+    ]
+
+
 def sweep(connection: Any, kinds: Iterable[tuple[str, str]], streams: Iterable[str] = ()) -> None:
     """Remove what is not of the kind that its name says, and streams that take no more entries.
 
