@@ -37,8 +37,7 @@ from service.pipeline import job_actions
 from service.pipeline.backends import Services
 from service.pipeline.leading import PART
 from service.queue.lists import held_key, queue_name
-from service.queue.rq_queue import RqQueue
-from service.queue.streams import EVENTS
+from service.queue.rq_queue import EVENTS, RqQueue
 from service.run.embedded import server_command
 from service.settings import Settings
 from tests.fakes import add_assets, request

@@ -33,8 +33,7 @@ from service.model.version import PACKAGE_VERSION
 from service.model.workers import own_ability
 from service.queue.lists import execution_keys, held_key, job_key, list_key, queue_name, rq_worker_key
 from service.queue.port import Event, EventKind, Report
-from service.queue.rq_queue import REPORTS, WORKERS, RqQueue, cancel_key, open_queue, worker_key
-from service.queue.streams import put_event
+from service.queue.rq_queue import REPORTS, WORKERS, RqQueue, cancel_key, open_queue, put_event, worker_key
 from service.settings import Settings
 from service.store.store import Store, open_store
 from tests.fakes import make_shard

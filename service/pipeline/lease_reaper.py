@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Collection
-from typing import Final
+from typing import Any, Final
 
 from service.model import names
 from service.model.clock import timestamp
@@ -34,7 +34,7 @@ class LeaseReaper:
         self._services = services
         self._indexer = indexer
         self._clock = clock
-        self._beats: dict[str, tuple[str, float]] = {}
+        self._beats: dict[Any, tuple[str, float]] = {}
         self._looked = clock()
         self._missing: dict[str, float] = {}
 
@@ -44,7 +44,7 @@ class LeaseReaper:
         lease_s = self._services.settings.lease_s
         # Time in which nobody looked, because Redis was away or this process was stopped, is no worker's silence.
         looked, self._looked = min(now - self._looked, lease_s / 3), now
-        beats: dict[str, tuple[str, float]] = {}
+        beats: dict[Any, tuple[str, float]] = {}
         lost = []
         for lease in leases:
             beat, silence = self._beats.get(lease.key, (None, 0.0))

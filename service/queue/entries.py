@@ -13,7 +13,6 @@ from collections.abc import Iterable
 from typing import Any, Final, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
-from redis.exceptions import ResponseError
 
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Stage
@@ -40,16 +39,6 @@ def task_of(job: str) -> tuple[str, int]:
     return (match[1], int(match[2])) if match else (job, 0)
 
 
-def fields(connection: Any, key: str, *names: str) -> list[bytes | None]:
-    """Fields of a hash; none of them where something else stands under its name."""
-    try:
-        return list(connection.hmget(key, *names))
-    except ResponseError as error:
-        if not is_wrong_type(error):
-            raise
-        return [None] * len(names)
-
-
 def is_wrong_type(error: Exception) -> bool:
     """Whether Redis refused because another kind of value lies there."""
     return str(error).startswith("WRONGTYPE")
@@ -73,6 +62,17 @@ def read(kind: type[Entry], data: bytes | None) -> Entry | None:
         return found
     except ValidationError:
         return None
+
+
+def events(reply: Any) -> list[tuple[str, Event | None]]:
+    """Id and event of each entry of a reply; an entry that was trimmed has no fields."""
+    streams = reply.items() if isinstance(reply, dict) else reply or []
+    return [
+        (event_id.decode(), read(Event, fields.get(b"e")) if fields else None)
+        for _, found in streams
+        for entry in found
+        for event_id, fields in ([entry] if isinstance(entry, tuple) else entry)
+    ]
 
 
 def sweep(connection: Any, kinds: Iterable[tuple[str, str]], streams: Iterable[str] = ()) -> None:

@@ -49,11 +49,11 @@ def queue_names(stages: Collection[Stage], taken: int = 0, *, ability: Ability |
     What waits apart comes first: others cannot do it.
     """
     return [
-        name
+        queue_name(lane, stage, need)
         for lane in lane_order(taken)
         for stage in _STAGE_ORDER
         if stage in stages
-        for name in (*_apart(lane, stage, ability), queue_name(lane, stage))
+        for need in (*_needs(stage, ability), None)
     ]
 
 
@@ -81,12 +81,7 @@ def is_apart(name: str) -> bool:
 
 def without_takers(names: Iterable[str], abilities: Collection[tuple[Stage, Ability]]) -> list[str]:
     """Lists apart that no worker looks into: none with such an ability serves their stage."""
-    served = {
-        queue_name(lane, stage, need)
-        for stage, ability in abilities
-        for lane in Lane
-        for need in _needs(stage, ability)
-    }
+    served = {name for stage, ability in abilities for name in queue_names([stage], ability=ability)}
     return [name for name in names if is_apart(name) and name not in served]
 
 
@@ -95,12 +90,10 @@ def _common(name: str) -> str:
     return found[1] if found else name
 
 
-def _apart(lane: Lane, stage: Stage, ability: Ability | None) -> list[str]:
-    return [queue_name(lane, stage, need) for need in _needs(stage, ability)] if ability is not None else []
-
-
-def _needs(stage: Stage, ability: Ability) -> list[Need]:
+def _needs(stage: Stage, ability: Ability | None) -> list[Need]:
     """What a worker can do of what may wait apart."""
+    if ability is None:
+        return []
     revision = ability.revisions.get(stage.value, 0)
     return [Need(stage, schema, schema, revision) for schema in range(FIRST_SCHEMA, ability.schemas[1] + 1)]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 from pydantic import BeforeValidator, ConfigDict, Field
 
@@ -93,12 +93,14 @@ class Report(Model):
 
 @dataclass(frozen=True)
 class Lease:
-    """A worker's hold on a task. `beat` changes with every sign of life; only its change has a meaning."""
+    """A worker's hold on a task."""
 
     task_id: str
     attempt: int
-    key: str
+    key: Any
+    """Where the queue keeps it."""
     beat: str
+    """Another one with every sign of life; only its change has a meaning."""
 
 
 Place = tuple[Lane, Stage]

@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from typing import Any, Final
 
 from redis import Redis
@@ -45,9 +46,14 @@ from service.queue.lists import (
     workers_key,
 )
 from service.queue.port import Event, Lease, Message, Place, QueueNow, Report
-from service.queue.streams import EVENTS, EventReader, put_event, readable
 from service.settings import Settings
 
+EVENTS: Final = "graspd:events"
+#: Events kept, 20 MB at most: a minute of a controller that is away and four hundred tasks a second. Lost ones are
+#: made good from the store.
+EVENTS_KEPT: Final = 50_000
+#: Group of readers, by the name that graspd 0.2 gave it: a controller goes on where one of 0.2 ended.
+_GROUP: Final = "keeper"
 WORKERS: Final = "graspd:workers"
 #: Lease of the controller that leads. A graspd of 0.2 takes and keeps the same one: so the two give way to each other.
 LEAD: Final = "graspd:lead:keeper"
@@ -70,7 +76,8 @@ class RqQueue:
     def __init__(self, connection: Redis) -> None:
         self.connection: Any = connection
         self._queues: dict[str, Queue] = {}
-        self._reader = EventReader(connection)
+        self._unread = "0"
+        """Up to where what an earlier controller took was read; ">": all of it."""
         self._leases: dict[str, Any] = {}
         """Locks of those who lead, or want to, through this connection."""
 
@@ -161,22 +168,27 @@ class RqQueue:
             for key in keys:
                 pipe.zrange(key, 0, -1, withscores=True)
             found = pipe.execute()
-        return [_lease(key, entry, score) for key, held in zip(keys, found, strict=True) for entry, score in held]
+        # Every sign of life moves the score, and an entry is of one execution only.
+        return [
+            Lease(*entries.task_of(entries.text(entry.partition(b":")[0])), key=(key, entry), beat=str(score))
+            for key, held in zip(keys, found, strict=True)
+            for entry, score in held
+        ]
 
     def holder(self, lease: Lease) -> tuple[str, Message | None]:
         """Which worker holds a lease, and what was asked of it; None if Redis no longer knows.
 
         Only of one that is lost is this asked: reading all leases stays one round trip.
         """
-        job = entries.text(bytes.fromhex(lease.key.partition(" ")[2]).partition(b":")[0])
-        with _mapped():
-            worker, data = entries.fields(self.connection, job_key(job), "worker_name", "data")
+        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+            pipe.hmget(job_key(entries.text(lease.key[1].partition(b":")[0])), "worker_name", "data")
+            (found,) = pipe.execute(raise_on_error=False)  # something else may stand under its name
+        worker, data = (None, None) if isinstance(found, Exception) else found
         return entries.text(worker), entries.message(data)
 
     def release(self, lease: Lease) -> None:
         """Forget a lease whose worker is lost; if it lives after all, it notices and stops."""
-        key, _, digits = lease.key.partition(" ")
-        entry = bytes.fromhex(digits)
+        key, entry = lease.key
         name = entries.text(entry)
         with _mapped(), self.connection.pipeline(transaction=True) as pipe:
             pipe.zrem(key, entry)
@@ -220,20 +232,24 @@ class RqQueue:
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         """Next events for the controller, the oldest first; those never acknowledged come again to the next one."""
         with _mapped():
-            return self._reader.read(limit=limit, wait_s=wait_s)
+            while self._unread != ">":
+                pending = self._of_group(self._unread, limit, 0.0)
+                self._unread = pending[-1][0] if pending else ">"
+                if known := self._known(pending):
+                    return known
+            return self._known(self._of_group(">", limit, wait_s))
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
         """Say that the events are in the index."""
         if event_ids:
             with _mapped():
-                self._reader.acknowledge(event_ids)
+                self.connection.xack(EVENTS, _GROUP, *event_ids)
 
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
-        """Events after an id, for any number of readers. `"$"`: only what comes from now on; `"0"`:
-        all kept."""
+        """Events after an id, for any number of readers. `"$"`: only what comes from now on; `"0"`: all kept."""
         with _mapped():
-            block = max(1, int(wait_s * 1000)) if wait_s > 0 else None
-            return readable(self.connection.xread({EVENTS: after}, count=limit, block=block))
+            found = entries.events(self.connection.xread({EVENTS: after}, count=limit, block=_block_ms(wait_s)))
+        return [(event_id, event) for event_id, event in found if event is not None]
 
     def announce(self, part: str, seconds: float) -> None:
         """Say that a part of the service (the controller) lives, for that long."""
@@ -353,6 +369,25 @@ class RqQueue:
         """Give the connections back."""
         self.connection.close()
 
+    def _of_group(self, after: str, limit: int, wait_s: float) -> list[tuple[str, Event | None]]:
+        """Events of the group of controllers, which is made where there is none."""
+        read = partial(
+            self.connection.xreadgroup, _GROUP, _GROUP, {EVENTS: after}, count=limit, block=_block_ms(wait_s)
+        )
+        try:
+            return entries.events(read())
+        except ResponseError as error:
+            if not str(error).startswith("NOGROUP"):
+                raise
+        with suppress(ResponseError):  # another one made it
+            self.connection.xgroup_create(EVENTS, _GROUP, id="0", mkstream=True)
+        return entries.events(read())
+
+    def _known(self, found: Sequence[tuple[str, Event | None]]) -> list[tuple[str, Event]]:
+        """Events that can be read. What cannot be is acknowledged: it is nobody's."""
+        self.acknowledge([event_id for event_id, event in found if event is None])
+        return [(event_id, event) for event_id, event in found if event is not None]
+
     def _job(self, message: Message) -> Job:
         return new_job(
             TASK_FUNCTION,
@@ -369,6 +404,15 @@ class RqQueue:
 def open_queue(settings: Settings, *, patience: int = 3) -> RqQueue:
     """The queue that the settings name; it need not answer yet."""
     return RqQueue(connect(redis_url(settings), patience=patience))
+
+
+def put_event(pipe: Any, event: Event) -> None:
+    """Append an event to the bounded stream."""
+    pipe.xadd(EVENTS, {"e": event.model_dump_json(exclude_defaults=True)}, maxlen=EVENTS_KEPT, approximate=True)
+
+
+def _block_ms(wait_s: float) -> int | None:
+    return max(1, int(wait_s * 1000)) if wait_s > 0 else None
 
 
 def rq_id(task_id: str, attempt: int) -> str:
@@ -412,12 +456,6 @@ def unlist_worker(connection: Any, left: Event) -> None:
         pipe.srem(WORKERS, left.worker)
         put_event(pipe, left)
         pipe.execute()
-
-
-def _lease(key: str, entry: bytes, score: float) -> Lease:
-    task, attempt = entries.task_of(entries.text(entry.partition(b":")[0]))
-    # Every sign of life moves the score, and an entry is of one execution only.
-    return Lease(task_id=task, attempt=attempt, key=f"{key} {entry.hex()}", beat=str(score))
 
 
 def worker_key(name: str) -> str:

@@ -8,8 +8,7 @@ from benchmarks.large_index import fill
 from service.model.clock import timestamp
 from service.model.states import Lane
 from service.queue.port import Event, EventKind, Report
-from service.queue.rq_queue import RqQueue, cancel_key
-from service.queue.streams import EVENTS, EVENTS_KEPT
+from service.queue.rq_queue import EVENTS, EVENTS_KEPT, RqQueue, cancel_key
 from service.store.store import open_store
 from tests.fakes import message_for
 from tests.indexes import empty_index

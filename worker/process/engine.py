@@ -120,7 +120,7 @@ class Engine:
         return fit
 
     def _sit_out(self, stages: Collection[Stage]) -> bool:
-        return self._fitness.sit_out(stages, self, lambda: self._reason is not None)
+        return self._fitness.sit_out(stages, self.update, lambda: self._reason is not None)
 
     def _do(self, raw: dict[str, Any]) -> None:
         context = self._surroundings.context(raw, lambda *report: self._say("report", report))

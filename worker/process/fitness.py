@@ -16,7 +16,7 @@ import hashlib
 import logging
 import time
 from collections.abc import Callable, Collection
-from typing import Final, Protocol
+from typing import Final
 
 from service import user_cache
 from service.model.errors import DamagedError, InputError, TaskRefused, UnavailableError
@@ -50,12 +50,6 @@ def first_loss(task: str) -> bool:
         return False
     user_cache.keep(file, b"", limit_bytes=_LOSSES_BYTES)
     return True
-
-
-class Listing(Protocol):
-    """Where a worker says how it is."""
-
-    def update(self, **facts: str) -> None: ...
 
 
 class Fitness:
@@ -100,11 +94,15 @@ class Fitness:
                 self._failed = dict(list(self._failed.items())[-_REMEMBERED:])
         return self.reason
 
-    def sit_out(self, stages: Collection[Stage], listing: Listing, told_to_stop: Callable[[], bool]) -> bool:
-        """Quarantine; returns whether the worker is fit again. It ends early when the worker is told to stop."""
+    def sit_out(self, stages: Collection[Stage], update: Callable[..., None], told_to_stop: Callable[[], bool]) -> bool:
+        """Quarantine; returns whether the worker is fit again. It ends early when the worker is told to stop.
+
+        Args:
+            update: takes facts for the list of workers.
+        """
         log.warning("this worker takes no tasks: %s", self.reason)
         for pause in PAUSES_S:
-            listing.update(state="quarantined", reason=self.reason)
+            update(state="quarantined", reason=self.reason)
             end = time.monotonic() + pause
             while time.monotonic() < end:
                 if told_to_stop():
@@ -112,7 +110,7 @@ class Fitness:
                 time.sleep(_LOOK_S)
             if self._can_pass and self.try_engine(stages):
                 log.info("this worker is fit again")
-                listing.update(state="idle", reason="")
+                update(state="idle", reason="")
                 return True
         return False
 

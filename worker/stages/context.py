@@ -29,8 +29,8 @@ from worker.run import ALONE, Run
 if TYPE_CHECKING:
     from service.store.store import Store
 
-#: Least time between two reports [s]: as often as the controller passes them on.
-REPORT_EVERY_S: Final = 0.5
+#: Least time between two reports [s]: enough for a bar that moves.
+REPORT_EVERY_S: Final = 1.0
 
 
 class StopReason(StrEnum):

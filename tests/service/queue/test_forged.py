@@ -20,8 +20,7 @@ from service.pipeline.backends import Services
 from service.pipeline.controller import Controller
 from service.pipeline.leading import PART
 from service.queue.port import Event, EventKind
-from service.queue.rq_queue import METRICS, WORKERS, RqQueue, worker_key
-from service.queue.streams import EVENTS
+from service.queue.rq_queue import EVENTS, METRICS, WORKERS, RqQueue, worker_key
 from service.settings import Settings
 from service.store.store import open_store
 from tests.fakes import add_assets, request

@@ -360,7 +360,7 @@ def test_a_worker_is_listed_while_it_gives_signs_of_life(rq_queue: RqQueue, redi
 
 
 def test_the_stream_of_events_is_bounded(rq_queue: RqQueue, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.queue.streams.EVENTS_KEPT", 200)
+    monkeypatch.setattr("service.queue.rq_queue.EVENTS_KEPT", 200)
     for _ in range(1000):
         rq_queue.publish(Event(kind=EventKind.STARTED, at=timestamp()))
     # Redis trims whole nodes of the stream, of 100 entries each.

@@ -122,7 +122,7 @@ def test_a_worker_comes_back_once_its_engine_works(bench: Bench) -> None:
     bench.engine_works = False
     assert not bench.fitness.try_engine((Stage.SYNTHESIZE,))
     bench.engine_works = True
-    assert bench.fitness.sit_out((Stage.SYNTHESIZE,), listing, lambda: False)
+    assert bench.fitness.sit_out((Stage.SYNTHESIZE,), listing.update, lambda: False)
     assert listing.told == [
         {"state": "quarantined", "reason": "synthesize: ImportError: libcuda.so.1"},
         {"state": "idle", "reason": ""},
@@ -132,17 +132,17 @@ def test_a_worker_comes_back_once_its_engine_works(bench: Bench) -> None:
 def test_a_worker_whose_engine_stays_broken_gives_up_after_some_tries(bench: Bench) -> None:
     bench.engine_works = False
     assert not bench.fitness.try_engine((Stage.SYNTHESIZE,))
-    assert not bench.fitness.sit_out((Stage.SYNTHESIZE,), Listing(), lambda: False)
+    assert not bench.fitness.sit_out((Stage.SYNTHESIZE,), Listing().update, lambda: False)
     assert len(bench.checked) == 1 + len(module.PAUSES_S)
 
 
 def test_a_fault_that_the_check_cannot_see_is_not_cured_by_passing_it(bench: Bench) -> None:
     test_failures_in_a_row_that_others_do_not_have_are_the_workers(bench)
-    assert not bench.fitness.sit_out((Stage.SYNTHESIZE,), Listing(), lambda: False), "a fresh process must start"
+    assert not bench.fitness.sit_out((Stage.SYNTHESIZE,), Listing().update, lambda: False), "a fresh process must start"
 
 
 def test_a_worker_in_quarantine_stops_when_told(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "PAUSES_S", (600.0,))
     bench.engine_works = False
     assert not bench.fitness.try_engine((Stage.SYNTHESIZE,))
-    assert not bench.fitness.sit_out((Stage.SYNTHESIZE,), Listing(), lambda: True)
+    assert not bench.fitness.sit_out((Stage.SYNTHESIZE,), Listing().update, lambda: True)
