@@ -27,7 +27,7 @@ from worker.hands.model import HandModel
 from worker.hands.oppositions import require_opposing
 from worker.objects.model import ObjectModel
 from worker.planners import NoPlace, Trial, Wanted, fitting_pairs, method, synthesize
-from worker.planners.fast_graspd.gaps import why_narrow
+from worker.planners.fast_graspd.across import why_narrow
 from worker.quality.diversity import POINTS, distinct, hand_points
 from worker.quality.gate import GATES, failed_gate, passes
 from worker.quality.referee.decomposition import ConvexPieces, decompose
@@ -37,12 +37,9 @@ from worker.quality.referee.judge import judge
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lift import LiftOutcome
 from worker.quality.referee.lifting import judge_lifts, lift_key
-from worker.quality.referee.limit import ENOUGH, Limit, limit_of
-from worker.quality.referee.payload import payloads
+from worker.quality.referee.payload import ENOUGH, Limit, limit_of, payloads, shake_margins
 from worker.quality.referee.protocol import DIRECTIONS, Outcome
-from worker.quality.referee.robust import reaches, robust
-from worker.quality.referee.robustness import robustness
-from worker.quality.referee.shake import shake_margins
+from worker.quality.referee.robust import reaches, robust, robustness
 from worker.quality.table import measure
 from worker.rounds import ROUND_STRIDE, Arrays, Round, enough, lanes_of, next_round, taken
 from worker.run import ALONE, Run

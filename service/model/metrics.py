@@ -323,7 +323,7 @@ def axis_word(number: int) -> str | None:
 
 
 class GraspType(IntEnum):
-    """What a hand does in a grasp, by the opposition in it; `worker.quality.taxonomy` has the rule."""
+    """What a hand does in a grasp, by the opposition in it; `worker.quality.table` has the rule."""
 
     NONE = 0
     """Not told: one digit alone touches, or nothing does."""

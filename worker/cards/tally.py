@@ -17,7 +17,7 @@ from service.store import validity
 from service.store.manifests import INDEX_THRESHOLD_M
 from worker.cards.contents import AssetFacts, Contents, Pair, Piece
 from worker.grasps import Posture
-from worker.quality.approach import cells_of
+from worker.quality.diversity import cells_of
 
 #: Bins between a joint's limits.
 BINS: Final = 200

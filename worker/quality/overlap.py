@@ -1,4 +1,7 @@
-"""Which pieces of a hand share volume with the object: the others need no boolean of solids."""
+"""Which pieces of a hand share volume with the object: the others need no boolean of solids.
+
+Depth of penetration between hand and object.
+"""
 
 from __future__ import annotations
 
@@ -85,3 +88,14 @@ def _planes(piece: ConvexPiece) -> Floats:
     # One of planes that are the same but for rounding, itself unrounded.
     _, first = np.unique(np.round(np.column_stack([normal, offset]), _DIGITS), axis=0, return_index=True)
     return np.column_stack([normal, offset])[first]
+
+
+def penetration_depth(found: Distances) -> Floats:
+    """(B,) deepest penetration, asked from both sides: hand points in the object, object points in the hand [m].
+
+    One side alone is blind: a thin wall passes between hand points, a small fingertip between object points.
+    """
+    hand_in_object = np.maximum(0.0, -found.distance).max(axis=1)
+    object_in_hand = np.maximum(0.0, -found.piece_distance).max(axis=1)
+    deepest: Floats = np.maximum(hand_in_object, object_in_hand)
+    return deepest

@@ -1,6 +1,10 @@
 """The postures around a grasp: before contact, fingers open and clear; and the commanded one that presses.
 
 They decide more of a grasp's success than the optimiser does (Dexonomy, table VI).
+
+Pregrasps raised where fingers that open sideways would dip into what the object stands on.
+
+A finger that stands on the table swings through it when it opens: its hand comes from a little higher.
 """
 
 from __future__ import annotations
@@ -19,30 +23,37 @@ from worker.objects.model import ObjectModel
 from worker.quality.jaw_squeeze import jaw_squeeze
 from worker.quality.opening import Blocked, Openings, count_fingers, fingers_of_bodies, fingers_of_dofs
 from worker.quality.posed import posing_of
-from worker.quality.raising import raised
 from worker.quality.squeeze import Holds, balanced
-from worker.simulation.obstacles import body_room
-from worker.simulation.surroundings import Placed
+from worker.simulation.obstacles import body_room, obstacle_room
+from worker.simulation.surroundings import CLEAR_M, Placed
 
 #: Distance that opening fingers keep from obstacles [m].
 ROOM_M: Final = 0.0025
+
 #: Share of its range by which a joint opens beyond the pregrasp for the way in: fingers that reach around the object
 #: would sweep it away.
 WIDE: Final = 0.4
 
 #: Hand points that postures are judged by; those within so much of the object press on it [m], as many at most.
 _POINTS: Final = 600
+
 PRESSING_M: Final = 0.003
+
 MAX_PRESSING: Final = 16
+
 #: A finger that stands off presses with its points within so much [m]: commanded to close, or the others push a free
 #: object past it.
 CLOSING_M: Final = 0.009
+
 #: A finger between the two stands off: it could touch and does not. One that is farther away is not of the grasp [m].
 STANDS_OFF_M: Final = (0.005, 0.02)
+
 #: Sum of the contact forces' normal components [N], and the Coulomb coefficient they are balanced with: less than that
 #: of what is held, for forces at the edge of their cones slip as soon as a contact is not quite where it was thought.
 TOTAL_NORMAL_FORCE: Final = 50.0
+
 FRICTION: Final = 0.3
+
 #: The same over the object's weight, at least and at most: 50 N push what is light and flat from between fingertips,
 #: which bear against its upper edges. At 0.1 kg the most is 50 N.
 OF_WEIGHT: Final = (10.0, 50.0)
@@ -173,3 +184,45 @@ def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: Plac
     for f in np.unique(finger[finger >= 0]):
         out[:, f] = found[:, finger == f].min(axis=1)
     return out
+
+
+#: Room that the open hand has, and that it has while it closes [m]: a little more than is asked for, since ways are
+#: looked at in steps.
+OPEN_M: Final = CLEAR_M + 0.0025
+
+LIFTED_CLOSING_M: Final = CLEAR_M + 0.0003
+
+#: Shares of the way to the grasp that are looked at: those of the sweep, but for the grasp itself.
+LOOKS: Final = tuple(np.arange(8) / 8)
+
+#: A hand is raised by no more than this [m]: from higher it would come down on the object.
+HIGHEST_M: Final = 0.008
+
+
+def raised(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: Placed) -> Posture:
+    """Pregrasps (N) whose root went against gravity by what the hand lacks of its room on the straight way from there
+    to the grasp; those that lack nothing, or too much, are as they were."""
+    poses = np.array(pregrasp.hand_pose, float)
+    near = np.array([any(one.tips_m is not None for one in scene.obstacles) for scene in placed.scenes], bool)
+    rows = np.flatnonzero(near[placed.index])
+    if not len(rows):
+        return pregrasp
+    lack = _lack(hand, grasp.take(rows), pregrasp.take(rows), placed.take(rows))
+    # What the root is raised by at first is less and less on the way.
+    height = (lack / (1 - np.array(LOOKS))).max(axis=1)
+    height = np.where(height <= HIGHEST_M, height, 0.0)
+    up = np.array([scene.up for scene in placed.scenes])[placed.index[rows]]
+    poses[rows, :3] += height[:, None] * up
+    return Posture(poses, pregrasp.joint_positions)
+
+
+def _lack(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: Placed) -> Floats:
+    """(n, looks) what hands lack of their room at the shares `LOOKS` of their way."""
+    share = np.array(LOOKS)[None, :, None]
+    pose = (1 - share) * pregrasp.hand_pose[:, None] + share * grasp.hand_pose[:, None]
+    pose[..., 3:] = pregrasp.hand_pose[:, None, 3:]  # a pregrasp is never turned against its grasp
+    joints = (1 - share) * pregrasp.joint_positions[:, None] + share * grasp.joint_positions[:, None]
+    postures = Posture(pose.reshape(-1, 7), joints.reshape(-1, joints.shape[-1]))
+    room = obstacle_room(hand, postures, placed.scenes, np.repeat(placed.index, len(LOOKS)))
+    wanted = np.where(np.array(LOOKS) > 0, LIFTED_CLOSING_M, OPEN_M)
+    return np.maximum(0.0, wanted - room.reshape(len(grasp), -1))

@@ -21,8 +21,7 @@ from worker.objects.mesh_geometry import to_centre, to_file
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import decompose
 from worker.scenes.kinds import SUNK, check_free, inside, rest_poses, room_in, supports_of
-from worker.scenes.laid import lay_beside
-from worker.scenes.neighbours import drop_together
+from worker.scenes.neighbours import drop_together, lay_beside
 from worker.simulation.surroundings import Neighbour, Obstacle, Scenes
 
 #: Convex pieces of a neighbour at most: no hand is put into a neighbour's hollow, so hollows may be filled.

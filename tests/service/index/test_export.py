@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 
+from service.index.export import TABLES, export
 from service.model.errors import InputError
 from service.pipeline.backends import Services
-from service.run.store_commands import TABLES, export
 from tests.service.index.test_projects import enter, make
 
 pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed; pip install 'graspd[parquet]'")

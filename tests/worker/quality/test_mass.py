@@ -23,8 +23,7 @@ from worker.objects.prepare import object_from_path
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lifting import judge_lifts
-from worker.quality.referee.payload import payloads
-from worker.quality.referee.shake import AMPLITUDE_M, FREQUENCY_HZ, shake_margins
+from worker.quality.referee.payload import AMPLITUDE_M, FREQUENCY_HZ, payloads, shake_margins
 from worker.simulation.surroundings import Obstacle, Placed
 
 #: A box between the fingertips of the two-finger hand, whose pads are 58 mm apart and 68 mm above its joints.

@@ -31,7 +31,7 @@ from worker.quality.referee.judge import judge
 from worker.quality.referee.key import LEVEL_MOVES, MOVES, Level, verdict_key
 from worker.quality.referee.model import MujocoOptions, blend, build
 from worker.quality.referee.protocol import Outcome, Test
-from worker.quality.referee.robustness import robustness
+from worker.quality.referee.robust import robustness
 from worker.run import Run
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))

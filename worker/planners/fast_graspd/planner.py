@@ -1,6 +1,8 @@
 """The planner: starts, coarse phase, fine phase, projection, of one batch or of several in one launch.
 
 A launch is cut into one part per CPU thread. Which grasps it holds besides does not matter to a grasp.
+
+How `fast_graspd` is offered.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from service.model.fidelity import Fidelity
 from service.model.integers import distinct_values
 from service.model.transforms import Floats
 from worker.grasps import GraspSet, joined
@@ -22,23 +25,25 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd import scene_starts, starts
 from worker.planners.fast_graspd.batches import Batches, finalists
-from worker.planners.fast_graspd.candidates import TOGETHER, Seated, tried, with_postures
-from worker.planners.fast_graspd.pairs import Pair, pair_of
-from worker.planners.fast_graspd.schedule import AROUND, DILATION, coarse_schedule, fine_schedule
-from worker.planners.fast_graspd.selection import (
+from worker.planners.fast_graspd.candidates import (
     FRICTION,
     NEAR_M,
     NEARNESS,
     SCENE_FRICTION,
+    TOGETHER,
+    Seated,
     best_of_each,
     merits,
     posture_of,
     ranked,
+    tried,
+    with_postures,
 )
+from worker.planners.fast_graspd.pairs import Pair, pair_of
+from worker.planners.fast_graspd.schedule import AROUND, DILATION, WarmStart, coarse_schedule, fine_schedule
 from worker.planners.fast_graspd.starts import NO_PLACE, Probe
-from worker.planners.fast_graspd.warm import WarmStart
 from worker.planners.fast_graspd.withdrawal import hindrance
-from worker.planners.port import Asked, Wanted
+from worker.planners.port import Asked, Method, Wanted
 from worker.planners.threads import cut, run_parts
 from worker.quality.gate import MAX_PENETRATION_MM, MIN_CONTACT_LINKS
 from worker.quality.postures import standing_off, touching_links
@@ -54,22 +59,30 @@ Rows = NDArray[np.intp]
 
 #: Iterations between two looks at cancellation.
 CHUNK: Final = 10
+
 #: Fewest grasps worth a thread of their own.
 PART: Final = 4
+
 #: A grasp whose merit is above this sets out once more: of such grasps a fifth (Shadow) to a half hold, of others most.
 SET_OUT_AGAIN: Final = 0.05
+
 #: The same of scores in a trial, see `worker.planners.port.Trial`: a tenth to a quarter of such grasps hold.
 FAILED: Final = 2.0
+
 #: How often grasps whose hands are tried may set out again. One more attempt finds what the first ones found, so valid
 #: grasps a second hardly depend on it, and fewer grasps of a hard pair are left that hold nothing.
 ATTEMPTS: Final = 20
+
 #: Score of a free grasp that holds while a finger stands off: it sets out again up to `CLOSER` times, then the best
 #: stays.
 STANDS: Final = 1.99
+
 CLOSER: Final = 2
+
 #: Scores beyond which grasps in scenes set out again, at each attempt: at the first also those that lift at the whole
 #: friction only. An attempt costs half of another grasp of the batch, and one in ten of these then lifts at half.
 IN_SCENES: Final = (1.0, FAILED, FAILED, FAILED, FAILED)
+
 #: Attempts of one grasp that are made at once, at the most.
 AHEAD: Final = 4
 
@@ -474,3 +487,14 @@ def grasps_of(
     attempts = int(sum(part.attempts.sum() for part in parts))
     info = {"loss_curve": np.round(curve, 5).tolist(), "chunk": CHUNK}
     return replace(grasps, seconds=seconds, info=info, attempts=attempts)
+
+
+METHOD: Final = Method(
+    summary="gradient descent through a differentiable contact simulation",
+    source="D. Turpin et al., Fast-Grasp'D, ICRA 2023",
+    planner=lambda options: plan,
+    joined=lambda options: plan_joined,
+    in_scenes=True,
+    in_parts=True,
+    uses=tuple(name for name in Fidelity.model_fields if name != "name"),
+)

@@ -1,29 +1,40 @@
-"""What each iteration weighs: the coarse phase shrinks the dilation, the fine phase seats the hand."""
+"""What each iteration weighs: the coarse phase shrinks the dilation, the fine phase seats the hand.
+
+Where hands set out in scenes when another method proposes it; descent, trials and verdicts are the same.
+"""
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Sequence
+from typing import Final, Protocol
 
 import numpy as np
 
 from service.model.fidelity import Fidelity
 from service.model.transforms import Floats
-from worker.simulation.data import Schedule
-from worker.simulation.model import LossOptions
+from worker.simulation.data import HandState, Schedule
+from worker.simulation.model import LossOptions, Model
 from worker.simulation.projection import ProjectionOptions
+from worker.simulation.surroundings import Placed
 
 #: Rates of Adam: translation [m], rotation [rad], joints [rad].
 COARSE_RATES: Final = (2e-3, 2e-2, 4e-2)
+
 FINE_RATES: Final = (5e-4, 5e-3, 1e-2)
+
 #: The paper's rate of plain gradient descent, the same for all variables in SI units.
 PAPER_RATES: Final = (1e-3, 1e-3, 1e-3)
+
 #: Largest dilation of the object [m].
 DILATION: Final = 0.01
+
 SELF_WEIGHT: Final = 2e4
+
 #: Pull on points that touch nothing, see `LossOptions` [m]: fingers lie around a free object instead of at it, and more
 #: of them hold at half the friction. With half as much a Barrett hand gains little, with twice as much the slender
 #: fingers of a Shadow hand are drawn into thin walls.
 PULL: Final = 3e-4
+
 #: The projection of hands around a free object: it draws in what is farther off than among obstacles, so more of the
 #: hand comes to lie at the object. It costs about half of the depth that the samples of `pairs.DENSER` save.
 AROUND: Final = ProjectionOptions(hold=5e-3)
@@ -93,3 +104,16 @@ def fine_schedule(fidelity: Fidelity) -> Schedule:
     return Schedule(
         np.zeros(n), penetration, 0.3 * penetration, np.full(n, 3 * SELF_WEIGHT), _decayed(FINE_RATES, n, 0.1)
     )
+
+
+class WarmStart(Protocol):
+    """Starts of grasps in scenes."""
+
+    def adapted(self, fidelity: Fidelity) -> Fidelity:
+        """The fidelity of grasps in scenes, as `schedule.in_scene` gives it, with as many starts and finalists as these
+        starts need."""
+
+    def __call__(
+        self, model: Model, generators: list[np.random.Generator], *, each: int, placed: Placed, ways: Sequence[Floats]
+    ) -> tuple[HandState, Floats]:
+        """See `scene_starts.clear_scene_starts`."""

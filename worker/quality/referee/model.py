@@ -1,4 +1,7 @@
-"""A hand and an object in MuJoCo, as DexGraspBench has them. The object's body frame stands in its centre of mass."""
+"""A hand and an object in MuJoCo, as DexGraspBench has them. The object's body frame stands in its centre of mass.
+
+Drives of a hand in MuJoCo: which joint carries a dof's actuator, and actuators on tendons.
+"""
 
 from __future__ import annotations
 
@@ -17,31 +20,41 @@ from worker.engines.mujoco_warnings import ARENA
 from worker.grasps import Posture
 from worker.hands.jaws import jaws_of
 from worker.hands.model import ConvexPiece, HandModel, JointType
-from worker.hands.tendons import actuators
+from worker.hands.tendons import Tendon, actuators
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
-from worker.quality.referee.drives import add_tendon, equality_data, leading_bodies, leading_joints
 from worker.simulation.surroundings import CLEAR_M, Neighbour, Obstacle
 
 #: Sliding and torsional friction; `hard` scales them by `HARD`.
 FRICTION: Final = (SLIDING, 0.02)
+
 HARD: Final = (0.5, 0.1)
+
 #: Joint damping over position gain [s]: 0.1 N m s/rad at the protocol's gain of 5.
 DAMPING_TIME: Final = 0.02
+
 HAND_SOLIMP: Final = (0.5, 0.99, 1e-4, 0.5, 2.0)
+
 HAND_SOLREF: Final = (0.005, 1.0)
+
 #: Couplings are stiffer than contacts, or a pressed finger would stretch them; 2 steps is MuJoCo's floor.
 COUPLING_SOLREF: Final = (0.008, 1.0)
+
 COUPLING_SOLIMP: Final = (0.98, 0.999, 1e-4, 0.5, 2.0)
+
 #: What the engine does by default today and did not in 3.3.2, the version that DexGraspBench pins: several contacts for
 #: a pair of convex pieces, and a solver for each island of contacts.
 NOT_IN_3_3_2: Final = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+
 #: Degrees of freedom from which on sparse Jacobians cost less, though the engine's own rule has 60: lifts .77 of the
 #: time with 28 (Allegro), .73 with 34 (Shadow); 1.09 with 20 (Barrett). Verdicts are the same but for rounding.
 SPARSE: Final = 24
+
 #: Inertia of a body without geometry: that of a ball of this radius [m].
 _BARE_RADIUS: Final = 0.01
+
 _MIN_MASS: Final = 1e-3
+
 #: Fingertips that are told to touch a support are in it by as much at most, for the way is looked at in steps [m].
 TOUCH_ROUNDING_M: Final = 1e-4
 
@@ -407,3 +420,33 @@ def blend(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Float
     start, end = a.hand_pose[row], b.hand_pose[row]
     pose = np.concatenate([(1 - share) * start[:3] + share * end[:3], slerp(start[3:], end[3:], share)])
     return pose, (1 - share) * a.joint_positions[row] + share * b.joint_positions[row]
+
+
+def leading_joints(hand: HandModel) -> tuple[Floats, Floats]:
+    """Multiplier and offset of the first body that each dof drives."""
+    first = leading_bodies(hand)
+    return hand.multiplier[first], hand.offset[first]
+
+
+def leading_bodies(hand: HandModel) -> NDArray[np.intp]:
+    """(D,) the body whose joint carries each dof's actuator: of the first joint it drives, as `HandModel.reduce`."""
+    drives = hand.dof[hand.joint_body]
+    return np.array([hand.joint_body[int(np.flatnonzero(drives == d)[0])] for d in range(hand.dofs)], np.intp)
+
+
+def add_tendon(spec: Any, hand: HandModel, tendon: Tendon, name: str, leading: NDArray[np.intp]) -> None:
+    """One actuator on the sum of joints; nothing else holds them to each other."""
+    cord = spec.add_tendon(name=name)
+    for d, pull in zip(tendon.dofs, tendon.coefficients, strict=True):
+        cord.wrap_joint(f"joint{leading[d]}", pull)
+    actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_TENDON)
+    actuator.set_to_position(kp=tendon.gain(hand.stiffness))
+    limit = tendon.limit(hand.effort)
+    actuator.forcerange = [-limit, limit]
+    actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+
+
+def equality_data(*values: float) -> Floats:
+    data = np.zeros(mujoco.mjNEQDATA)
+    data[: len(values)] = values
+    return data

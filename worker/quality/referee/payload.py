@@ -3,6 +3,13 @@
 The hand closes once around the object with its own mass. Then the object hangs, or is pushed, with other masses until
 its motion tells how that ends: first what the forces of the closed hand and friction bear, then nearer and nearer, each
 from where the heaviest one so far hangs.
+
+What a hand lifts at best, where none of its grasps lifts what it should: measured, and bounded by its actuators.
+
+The shake: what was lifted is moved to and fro, first along x of the scene, then along y.
+
+The hand stands still and the object feels the inertial force of the motion. Accelerations begin at zero: the velocity
+that this leaves the hand with is the same as none (Galilei).
 """
 
 from __future__ import annotations
@@ -10,35 +17,38 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.matter import ACCELERATION, MOST_KG
-from service.model.transforms import Floats
+from service.model.matter import ACCELERATION, MASS_KG, MOST_KG
+from service.model.planning import limit_told
+from service.model.transforms import Floats, quat_rotate
 from worker.engines.mujoco_warnings import void
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.quality.referee.compiled import scene_of
+from worker.quality.capacity import capacities
+from worker.quality.referee.compiled import measured, scene_of
 from worker.quality.referee.decomposition import ConvexPieces
-from worker.quality.referee.hanging import CLOSING, Hanging
 from worker.quality.referee.model import Scene
-from worker.quality.referee.protocol import DIRECTIONS, Outcome, Test
-from worker.quality.referee.short import LIFTING
-from worker.quality.referee.threads import measured
+from worker.quality.referee.protocol import DIRECTIONS, LOST, Outcome, Test
+from worker.quality.referee.short import HANGING_CLOSING, LIFTING, Hanging
 from worker.run import ALONE, Run
 from worker.simulation.surroundings import Placed
 
 #: The payload is told downwards, to this ratio.
 TOLD: Final = 1.03
+
 #: Share of the friction bound that is tried first, its median over the grasps of `benchmarks.payload`; and the first
 #: step from there.
 FIRST: Final = 0.75
+
 STEP: Final = math.sqrt(2)
+
 #: Stages that a load is watched at most.
 WATCHED: Final = 10
 
@@ -129,7 +139,7 @@ class PushPayload(_Weighed):
         self._weigh(self._own)
         if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return math.nan
-        if not self._close(grasps, row, give_up=True, stages=CLOSING) or void(self.data):
+        if not self._close(grasps, row, give_up=True, stages=HANGING_CLOSING) or void(self.data):
             return math.nan
         self._save()
         bounds = [self._bound(-np.array(direction, float)) for direction in DIRECTIONS]
@@ -181,3 +191,153 @@ def payloads(
         return PushPayload(scene) if placed is None else LiftPayload(scene, placed)
 
     return measured(len(grasps), held, make, lambda test, row: test.payload(grasps, row), run=run, name="payload")
+
+
+#: Grasps that must lift what weighs little, before what they lift is told as the hand's limit: else their shape may be
+#: why. It weighs as much as an object of which nothing is said, or this share of what is wanted.
+LEAST: Final = 2
+
+LIGHT: Final = 1 / 8
+#: So many grasps show that no further ones need be tried.
+ENOUGH: Final = 8
+
+#: What is wanted over what the best of them lifts, from which on no further ones are tried.
+HOPELESS: Final = 2.0
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What some grasps of a hand lift."""
+
+    hand: str
+    friction: float
+    grasps: int
+    lifts_kg: float
+    """Payload of the best, by simulated lifts."""
+    bound_kg: float
+    """Largest load capacity of one (`worker.quality.capacity`)."""
+    wanted_kg: float | None = None
+    """What they should lift; None: nobody asked."""
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether what is wanted is so much more that further grasps need not be tried."""
+        return self.grasps >= ENOUGH and self.wanted_kg is not None and self.wanted_kg > HOPELESS * self.lifts_kg
+
+    @property
+    def line(self) -> str:
+        """A sentence for people."""
+        return limit_told(self.hand, self.friction, self.grasps, self.lifts_kg, self.bound_kg, self.wanted_kg)
+
+    def facts(self) -> dict[str, Any]:
+        """For JSON; no bound: None."""
+        bound = round(self.bound_kg, 3) if math.isfinite(self.bound_kg) else None
+        return {"lifts_kg": round(self.lifts_kg, 3), "bound_kg": bound, "grasps": self.grasps, "says": self.line}
+
+
+def limit_of(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    *,
+    pieces: ConvexPieces,
+    placed: Placed | None = None,
+    wanted: float | None = None,
+    least: int = LEAST,
+    run: Run = ALONE,
+) -> Limit | None:
+    """What the best of N grasps lifts; None: it lifts as much as is wanted, or fewer than `least` lift anything.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        grasps: N grasps.
+        pieces: the object's convex pieces.
+        placed: their scenes; None: the object is free.
+        wanted: mass that should be lifted [kg]; None: nobody asked.
+        least: grasps that must lift what weighs little.
+        run: asked between grasps whether to stop.
+
+    Raises:
+        TaskCancelled: when `run.cancelled()` answers True.
+    """
+    if len(grasps) < least:
+        return None
+    light = obj.weighing(mass=MASS_KG if wanted is None else min(MASS_KG, LIGHT * wanted))
+    found = payloads(hand, light, grasps, pieces=pieces, placed=placed, run=run)
+    if np.isfinite(found).sum() < least:
+        return None
+    lifts = float(np.nanmax(found))
+    if wanted is not None and lifts >= wanted:
+        return None
+    against = np.broadcast_to(-np.array(DIRECTIONS, float), (len(grasps), len(DIRECTIONS), 3))
+    if placed is not None:
+        against = np.array([[placed.scenes[number].up] for number in placed.index])
+    bound = float(capacities(hand, obj, grasps.grasp, against).max())
+    return Limit(hand.name, obj.friction, len(grasps), lifts, max(bound, lifts), wanted)
+
+
+#: Amplitude [m], frequency [Hz] and periods along each axis: at most 7.1 m/s2.
+AMPLITUDE_M: Final = 0.02
+
+FREQUENCY_HZ: Final = 3.0
+
+PERIODS: Final = 3
+
+#: The force changes in steps of this length [s].
+STEP_S: Final = 0.008
+
+
+class Shake(Hanging):
+    """Shakes grasps in one scene. Not for several threads at once."""
+
+    def margin(self, grasps: GraspSet, row: int) -> float:
+        """Worst displacement or rotation of the object in the hand over its limit, until it is lost: 1 or more."""
+        if not self._closed(grasps, row):
+            return LOST
+        self._hang(0.0, self.scene.mass)
+        turn = 2 * math.pi * FREQUENCY_HZ
+        worst = 0.0
+        for axis in np.eye(3)[:2]:
+            along = quat_rotate(self._scene_pose[3:], axis)
+            for step in range(round(PERIODS / FREQUENCY_HZ / STEP_S)):
+                jerked = AMPLITUDE_M * turn**2 * math.sin(turn * step * STEP_S) * along
+                force = -self.scene.mass * (ACCELERATION * self._up + jerked)
+                self.data.xfrc_applied[self.scene.object_body, :3] = force
+                self._run(STEP_S)
+                worst = max(worst, LOST if void(self.data) else self._excess())
+                if worst >= 1.0:
+                    return worst
+        return worst
+
+
+def shake_margins(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    placed: Placed,
+    *,
+    pieces: ConvexPieces,
+    held: NDArray[np.bool_] | None = None,
+    run: Run = ALONE,
+) -> Floats:
+    """(N,) worst displacement or rotation over its limit of each grasp that is shaken: below 1 it survives; nan: not
+    tried.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        grasps: N grasps.
+        placed: their scenes.
+        pieces: the object's convex pieces.
+        held: (N,) which grasps are tried; None: all.
+        run: asked between grasps whether to stop.
+
+    Raises:
+        TaskCancelled: when `run.cancelled()` answers True.
+    """
+
+    def make() -> Shake:
+        return Shake(scene_of(hand, obj, pieces, LIFTING, placed.supports, placed.neighbours), placed)
+
+    return measured(len(grasps), held, make, lambda test, row: test.margin(grasps, row), run=run, name="shake")

@@ -5,6 +5,8 @@ then gone, and for a moment most of the object's weight pulls; a free object is 
 tetrahedron, nearly twice as hard as it weighs. All this at half the friction: what slips is pulled once more, from the
 same closed hand, at the whole friction, and by a third more than the weight in a scene. Not a verdict: it ranks
 candidates for a fifth of a verdict's cost, and what it chooses the whole test judges all the same.
+
+Lifts as the hand sees them: its root is fixed, the support goes, and the object hangs. Half the price of a rise.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.matter import ACCELERATION
 from service.model.transforms import Floats
 from worker.engines.mujoco_warnings import void
 from worker.grasps import GraspSet
@@ -36,30 +39,43 @@ _T = TypeVar("_T")
 #: The root is fixed: a hand that hangs on a spring, as the protocol has it, costs twice as much. In so short a time
 #: nothing slips that would not slip without it: no iterations against slip.
 PHYSICS: Final = MujocoOptions(timestep=0.006, root="fixed", noslip_iterations=0)
+
 #: The same of a lift: under the weight of a real object coarser contacts creep.
 LIFTING: Final = MujocoOptions(root="fixed")
+
 #: Stages of closing and of squeezing, then of hanging.
 CLOSING: Final = 2
+
 HANGING: Final = 6
+
 #: The same of a free object, and of a push.
 FREE_CLOSING: Final = 3
+
 PUSHED: Final = 2
+
 #: Pull while the object hangs at half the friction, at the whole of it, and of a push, in its weights. A hand that is
 #: turned away costs more than one that the whole test then drops. Of 32 hands of Allegro that lift at half the friction
 #: 1.3 weights turn away 19, these 9; of 63 that hold a free object at half of it 14 were turned away with 2 weights and
 #: two stages of closing, now 9. What nothing holds must be gone when a push ends. At the whole friction the pull is
 #: more than the weight: of 25 hands that lift .8 of it another lift test drops 10, of 21 that lift 1.3 of it 3.
 HANGS: Final = 0.8
+
 HANGS_WHOLE: Final = 1.3
+
 PULL: Final = 1.8
+
 #: What has passed a limit by so much is lost.
 GONE: Final = 1.5
+
 #: Where a free object is pushed: no direction is farther from all of them than 71 degrees.
 CORNERS: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
+
 #: How far supports go away [m]: farther than any scene is high.
 AWAY_M: Final = 10.0
+
 #: Added to the score of what holds at the whole friction only.
 SLIPS: Final = 1.0
+
 #: Score of what starts too deep.
 DEEP: Final = 20.0
 
@@ -217,3 +233,32 @@ def push_trial(
         return pushes.scores(grasps)
 
     return trial
+
+
+#: Stages of closing and of squeezing.
+HANGING_CLOSING: Final = 4
+
+#: Pull of an object that hangs, in its weights: the mean of a smooth rise while it speeds up (`lift.SMOOTHLY`).
+RISING: Final = 1.06
+
+#: A change of the load comes over this time, in steps [s]: at once it would weigh up to twice.
+LOADING_S: Final = 0.04
+
+LOADS: Final = 5
+
+
+class Hanging(Lift):
+    """A scene whose root is fixed. Not for several threads at once."""
+
+    def _closed(self, grasps: GraspSet, row: int) -> bool:
+        """Whether the hand closes around the object and holds on to it."""
+        if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
+            return False
+        return self._close(grasps, row, give_up=True, stages=HANGING_CLOSING) and not void(self.data)
+
+    def _hang(self, before: float, mass: float) -> None:
+        """Let the object hang, and its weight change from that of `before` to that of `mass` [kg]."""
+        self.data.mocap_pos[1] = self._scene_pose[:3] - AWAY_M * self._up
+        for load in np.linspace(before, mass, LOADS + 1)[1:]:
+            self.data.xfrc_applied[self.scene.object_body, :3] = -RISING * ACCELERATION * load * self._up
+            self._run(LOADING_S / LOADS)

@@ -21,9 +21,8 @@ from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.lift import Lift, LiftTrial
 from worker.quality.referee.model import MujocoOptions, Scene, blend, build
 from worker.quality.referee.protocol import STAGES, Test, Trial
-from worker.quality.referee.recoupled import Coupling, nearest, recoupled
 from worker.quality.referee.refit import Fit, refitted
-from worker.quality.referee.variant import Variant
+from worker.quality.referee.variant import Coupling, Variant, nearest, recoupled
 from worker.simulation.surroundings import Neighbour, Obstacle, Placed
 
 #: What couples joints where it gives way: MuJoCo's default constraint, 2.5 times as slow as the protocol's and softer.
