@@ -22,7 +22,6 @@ from service.run.doctor.patience import THREADS, Check, run_checks
 from service.settings import Settings
 
 app = typer.Typer(no_args_is_help=False)
-
 _COLOURS: Final = {
     Condition.GOOD: typer.colors.GREEN,
     Condition.WARNING: typer.colors.YELLOW,

@@ -32,11 +32,8 @@ if TYPE_CHECKING:
 
 #: What a line can be about, in the order in which it is shown.
 SUBJECTS: Final = ("request", "key", "job", "task", "attempt", "worker")
-
 _bound: ContextVar[Mapping[str, Any]] = ContextVar("bound", default=MappingProxyType({}))
-
 _ORDINARY: Final = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "about", "taskName"}
-
 #: RQ tells of every idle poll, httpx of every request.
 _TALKATIVE: Final = ("rq.worker", "rq.job", "rq.queue", "httpx")
 
@@ -132,9 +129,7 @@ def _time(record: logging.LogRecord) -> str:
 
 
 log = logging.getLogger(__name__)
-
 _ASKED_BY: Final = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
-
 _tracer: Any = None
 
 

@@ -16,7 +16,6 @@ from worker.meeting import Meeting
 from worker.pool.pool import Pool
 
 FirstJudge = Literal["auto", "on", "off"]
-
 Progress = Callable[[float, float, str], None]
 
 """Told what is done, of how much, and a word on it; from any thread, often."""

@@ -73,7 +73,6 @@ def jobs_of(scope: ProjectScope) -> Select[tuple[str]]:
 
 
 MAX_LIMIT: Final = 200
-
 #: Every database holds whole numbers up to here.
 _MOST: Final = 2**63
 

@@ -334,7 +334,6 @@ class GraspType(IntEnum):
 
 #: Directions fall into cells of equal area: bands of equal height z (Archimedes), each cut into equal azimuths.
 BANDS: Final = 4
-
 SECTORS: Final = 12
 
 DIRECTION_CELLS: Final = BANDS * SECTORS

@@ -212,10 +212,8 @@ def _own_state(facts: TaskFacts, *, job_cancelled: bool) -> State:
 
 
 T = TypeVar("T")
-
 #: Jobs fed in one round; the others have their turn in the next ones.
 JOBS_A_ROUND: Final = 64
-
 #: Turns remembered: more than there are jobs with waiting tasks, or a forgotten one would come first again.
 _REMEMBERED: Final = 100_000
 

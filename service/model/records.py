@@ -285,12 +285,9 @@ def object_set_of(
 
 #: Tags of one project (of one key, where it belongs to none), and grasps of one tag.
 MOST_TAGS: Final = 100
-
 MOST_TAGGED: Final = 20_000
-
 #: A grasp: its shard, and its row there.
 Grasp = tuple[str, int]
-
 Row = Annotated[int, Field(ge=0, lt=2**31)]
 
 

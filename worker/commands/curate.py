@@ -18,15 +18,12 @@ from worker.files.curation import KINDS, Balance, difference
 from worker.files.subsets import Subset, shards_of, write_subset
 
 app = typer.Typer(no_args_is_help=True, add_completion=False)
-
 group = typer.Typer(no_args_is_help=True, help="Grasps of files and datasets, chosen by their numbers.")
-
 app.add_typer(group, name="grasps")
 
 SourceArgument = Annotated[
     str, typer.Argument(help="A file, a folder of shards, or a dataset of the store by its name.")
 ]
-
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="The folder to write; it must not be there.")]
 
 

@@ -23,15 +23,11 @@ app = typer.Typer(no_args_is_help=True)
 
 #: Formats of robots and their simulators; the first of them goes by two names.
 ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "usd", "glb", "isaac", "csv")
-
 #: Formats that a network is trained on: they take a folder of shards.
 TRAINING: Final = ("dexlearn", "dexgraspnet2", "graspgen", "huggingface", "lerobot")
-
 EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *TRAINING, *ROBOTS)
-
 #: Imports of one object, which `--name` names in the file.
 NAMED: Final = ("graspgen", "huggingface", "lerobot")
-
 IMPORTS: Final = ("dexgraspbench", "dexlearn", *NAMED, "dexgraspnet", "dexgraspnet2", "multidex", "ddgc", "reference")
 
 

@@ -34,7 +34,6 @@ from worker.robots.execution import (
 from worker.run import Run
 
 Kind = Literal["one side", "three sides", "way"]
-
 #: Edge of a grasp's picture [px] and rays a pixel. Tracing costs what goes with both: three sides half of one alone.
 LOOKS: Final[dict[Kind, tuple[int, int]]] = {"one side": (300, SAMPLES), "three sides": (160, 8), "way": (300, SAMPLES)}
 
@@ -137,18 +136,14 @@ def _named(way: list[Waypoint], name: str) -> Waypoint:
 
 #: Width of the film [px], and its height as a share of that.
 WIDTH: Final = 480
-
 HIGH: Final = 0.75
 
 #: Rays a pixel: shadows that move show what is coarse in them.
 FILM_SAMPLES: Final = 24
-
 #: Share of the velocity limits of joints and hand that is used.
 SPEED: Final = 0.5
-
 #: The open hand is shown for so long before it sets out, and the lifted object before all begins anew [s].
 BEFORE_S: Final = 0.4
-
 AFTER_S: Final = 1.4
 
 

@@ -48,7 +48,6 @@ from worker.run import Run
 app = typer.Typer(add_completion=False)
 
 _Device = Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")]
-
 _Object = Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")]
 
 

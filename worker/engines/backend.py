@@ -29,11 +29,8 @@ import warp as wp
 from service import user_cache
 
 _HARMLESS = b"Could not find or load the NVIDIA CUDA driver"
-
 _lock = threading.Lock()
-
 _started = False
-
 log = logging.getLogger(__name__)
 
 
@@ -106,7 +103,6 @@ def kernel_cache() -> Path | None:
 
 #: Names the folder of kernels that were compiled ahead.
 VARIABLE: Final = "GRASPD_KERNELS"
-
 #: A100, H100 and H200, B200.
 ARCHITECTURES: Final = (80, 90, 100)
 

@@ -44,10 +44,8 @@ from worker.simulation.surroundings import Placed, Scenes
 
 #: What a file may be called that describes a hand or an object.
 SUFFIXES: Final = {AssetKind.HAND: (".urdf", ".xml", ".zip"), AssetKind.OBJECT: (*READERS, ".zip")}
-
 #: Files of the shard's folder, and of the folders in it, that are looked at.
 LOOKED_AT: Final = 200
-
 _FILES: Final[dict[AssetKind, Callable[[Path], tuple[str, dict[str, bytes], dict[str, Any]]]]] = {
     AssetKind.HAND: hand_files,
     AssetKind.OBJECT: object_files,
@@ -163,7 +161,6 @@ def options_of(attribute: object) -> dict[str, Any]:
 
 #: Neighbours are looked at and kept clear of, not grasped.
 NEIGHBOUR_FACE_ERROR_M: Final = 3e-4
-
 _MATTER: Final = {"object_mass_kg": MASS_KG, "object_friction": FRICTION}
 
 

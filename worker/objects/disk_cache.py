@@ -27,12 +27,10 @@ from service.model.libraries import version_of
 
 #: Libraries that go into the arrays.
 _LIBRARIES: Final = ("numpy", "scipy")
-
 #: All entries of a kind together; one has some 100 kB.
 _LIMIT_BYTES: Final = 256 << 20
 
 Arrays = Mapping[str, NDArray[Any]]
-
 _recalled: ContextVar[dict[str, NDArray[Any]] | None] = ContextVar("recalled", default=None)
 
 
@@ -131,7 +129,6 @@ def _revision(files: tuple[str, ...]) -> str:
 
 #: How a model is called says nothing of what it is.
 _NAMES: Final = frozenset({"name", "digest"})
-
 #: Metadata of a field that says nothing while it has its default.
 TOLD_IF_SET: Final = MappingProxyType({"told_if_set": True})
 

@@ -38,7 +38,6 @@ T = TypeVar("T")
 GROUND: Final = Fidelity(
     name="peers", coarse_points=400, fine_points=1000, object_points=4000, polish_iterations=0, phong_alpha=0.0
 )
-
 _lock = threading.Lock()
 
 
@@ -98,9 +97,7 @@ def grasp_set(
 
 #: Inside: the surface moves along its normal to within 45 degrees when the fingers close; the palm looks ahead.
 INSIDE_COS: Final = 0.7
-
 SAMPLES: Final = 1200
-
 STEP: Final = 1e-4
 
 

@@ -19,10 +19,8 @@ from worker.hands.surface import sample_surface
 
 #: Points of the hand's surface by which two postures are compared, spread evenly over it.
 POINTS: Final = 64
-
 #: Pairs of grasps that are compared at a time.
 _PAIRS: Final = 4096
-
 #: Grasps of which all pairs are looked at: SciPy, whose tree finds the near ones of many, is slow to load.
 FEW: Final = 256
 

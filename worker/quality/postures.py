@@ -29,31 +29,23 @@ from worker.simulation.surroundings import CLEAR_M, Placed
 
 #: Distance that opening fingers keep from obstacles [m].
 ROOM_M: Final = 0.0025
-
 #: Share of its range by which a joint opens beyond the pregrasp for the way in: fingers that reach around the object
 #: would sweep it away.
 WIDE: Final = 0.4
 
 #: Hand points that postures are judged by; those within so much of the object press on it [m], as many at most.
 _POINTS: Final = 600
-
 PRESSING_M: Final = 0.003
-
 MAX_PRESSING: Final = 16
-
 #: A finger that stands off presses with its points within so much [m]: commanded to close, or the others push a free
 #: object past it.
 CLOSING_M: Final = 0.009
-
 #: A finger between the two stands off: it could touch and does not. One that is farther away is not of the grasp [m].
 STANDS_OFF_M: Final = (0.005, 0.02)
-
 #: Sum of the contact forces' normal components [N], and the Coulomb coefficient they are balanced with: less than that
 #: of what is held, for forces at the edge of their cones slip as soon as a contact is not quite where it was thought.
 TOTAL_NORMAL_FORCE: Final = 50.0
-
 FRICTION: Final = 0.3
-
 #: The same over the object's weight, at least and at most: 50 N push what is light and flat from between fingertips,
 #: which bear against its upper edges. At 0.1 kg the most is 50 N.
 OF_WEIGHT: Final = (10.0, 50.0)
@@ -191,10 +183,8 @@ def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: Plac
 OPEN_M: Final = CLEAR_M + 0.0025
 
 LIFTED_CLOSING_M: Final = CLEAR_M + 0.0003
-
 #: Shares of the way to the grasp that are looked at: those of the sweep, but for the grasp itself.
 LOOKS: Final = tuple(np.arange(8) / 8)
-
 #: A hand is raised by no more than this [m]: from higher it would come down on the object.
 HIGHEST_M: Final = 0.008
 

@@ -25,10 +25,8 @@ from worker.simulation.launches import launch
 
 #: Weight of each edge's own size: spreads the load over contacts that would do equally well.
 SPREAD: Final = 0.1
-
 #: Weight of joint torques, the hardest one to exert being 1: prefers forces the hand is strong in.
 TORQUE: Final = 0.05
-
 #: Weight of the sum of normal forces: it is met closely, then exactly by scaling, balance or not.
 SUM: Final = 10.0
 

@@ -58,9 +58,7 @@ Columns = dict[str, NDArray[np.generic]]
 
 #: Contact thresholds [m]: the literature's tight one, the paper's (Table 2), and DDGC's.
 DEFAULT_THRESHOLDS_M: Final = (0.002, 0.005, 0.009)
-
 DEFAULT_FRICTION: Final = 1.0
-
 #: Grasps a thread works on at a time: small enough to cancel soon, large enough to fill a kernel launch.
 CHUNK: Final = 16
 
@@ -103,9 +101,7 @@ class _Pair:
 
 
 _pairs: LRUCache[str, _Pair] = LRUCache(4)
-
 _lock = threading.Lock()
-
 # Solids that outlive the interpreter are told as leaks by their library.
 atexit.register(_pairs.clear)
 
@@ -241,7 +237,6 @@ MEASURES: Final[dict[str, Callable[[_Chunk], NDArray[np.generic]]]] = {
 
 #: Cosine between a digit's surface and its axis of flexion above which the surface is a side: 45 degrees.
 SIDE_COS: Final = float(np.sqrt(0.5))
-
 #: Digits that must touch with more than their last links where the palm is free.
 ENVELOPING: Final = 2
 

@@ -28,13 +28,10 @@ from worker.simulation.launches import launch
 Norm = Literal["l1", "linf"]
 
 EDGES: Final = 8
-
 #: Least over largest singular value below which a set of wrenches is flat.
 FLATNESS: Final = 1e-7
-
 #: Most contacts of an L-infinity space: its points grow ninefold with each.
 MAX_LINF_CONTACTS: Final = 4
-
 #: From this number of points on our own hull is the faster one.
 MANY: Final = 24
 
@@ -184,24 +181,17 @@ def _minkowski(edge_wrenches: Floats) -> Floats:
 #: Points are moved at random by this share of the largest coordinate, so that no 7 of them lie in one hyperplane. Less
 #: leaves slivers whose planes are rounding errors, more is an error itself; on cubes this one is off by 4e-8 in volume.
 JOGGLE: Final = 1e-8
-
 #: Facets that may live at once: 160 random points have some 13,000.
 CAPACITY: Final = 40_000
-
 #: Entries of the hash table of ridges; one inserted point makes some thousands at most.
 _TABLE: Final = 1 << 16
-
 MAX_POINTS: Final = 512
-
 _DIMENSION: Final = 6
-
 #: A point that is above a plane by less than this share of the largest coordinate is on it: products of coordinates
 #: round by some 1e-15, and ε is off by no more than this.
 _ROUNDING: Final = 1e-13
-
 #: Least over greatest distance in a first simplex below which points count as flat.
 _FLAT: Final = 1e-6
-
 _LAST_STAMP: Final = 2**31 - 2 * MAX_POINTS
 
 

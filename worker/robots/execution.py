@@ -30,7 +30,6 @@ from worker.simulation.surroundings import STANDOFF_M, Placed
 #: Postures of a grasp in their order. The hand comes from `standoff` to `arrival` with open fingers, takes the shape of
 #: `pregrasp`, closes to `grasp`, is commanded to `squeeze`, and rises to `lift`.
 POSTURES: Final = ("standoff", "arrival", "pregrasp", "grasp", "squeeze", "lift")
-
 #: Motions from one posture to the next.
 PHASES: Final = ("approach", "shape", "close", "squeeze", "lift")
 
@@ -233,19 +232,13 @@ def _is_pose(text: str) -> bool:
 
 #: Velocity of a joint whose description states none [rad/s, m/s].
 ASSUMED_RAD_S: Final = 1.0
-
 ASSUMED_M_S: Final = 0.05
-
 #: The hand as a whole moves and turns no faster [m/s, rad/s].
 HAND_M_S: Final = 0.25
-
 HAND_RAD_S: Final = 1.0
-
 #: Shortest motion, and time between points [s].
 SHORTEST_S: Final = 0.4
-
 STEP_S: Final = 0.05
-
 _STEEPEST: Final = 15 / 8
 
 

@@ -223,9 +223,7 @@ def gaps_between(things: Sequence[Neighbour], poses: Floats, farthest: float = 0
 
 #: Faces of a solid at most, and what it may stand out from its piece before it needs more [m].
 MOST_PLANES: Final = 48
-
 ENOUGH_M: Final = 1e-3
-
 #: Corners nearer than this are one [m].
 _SAME_M: Final = 1e-7
 

@@ -44,21 +44,15 @@ from worker.scenes.simulate import (
 from worker.simulation.surroundings import Obstacle
 
 TIMEOUT_S: Final = 6.0
-
 #: Neighbours fall at this distance from the object, as a multiple of the sum of both bounding radii.
 RING: Final = (1.0, 1.25)
-
 #: Neighbours may come to rest this far from the middle of the table [m].
 NEIGHBOUR_REACH: Final = 0.4
-
 #: Laying an object flat lifts it by what MuJoCo's soft contacts let it sink; more means that it lay on something [m].
 MAX_LIFT: Final = 0.003
-
 #: Clearances beyond this are not told apart [m].
 FARTHEST_M: Final = 0.1
-
 MOST_NEIGHBOURS: Final = 8
-
 _SHAPES: Final = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -284,16 +278,12 @@ def _add_piece(spec: Any, body: Any, name: str, piece: ConvexPiece) -> None:
 
 #: Least gap between two objects [m]; from walls it is that of the object, `GAP`.
 BETWEEN: Final = 0.005
-
 #: Draws of all neighbours of a scene, and of each of them.
 _DRAWS: Final = 32
-
 _PLACES: Final = 100
-
 #: A neighbour's middle is at most this far from the object's, as a multiple of the sum of both bounding radii, and that
 #: much farther with each draw that found no room.
 _REACH: Final = 1.25
-
 _FARTHER: Final = 0.1
 
 

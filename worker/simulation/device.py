@@ -25,10 +25,8 @@ from worker.simulation.kernels import kinematics, nearest, pieces, surface
 
 #: Kernels' numbers for `ConvexPiece.kind`.
 _KINDS: Final = {"box": 0, "sphere": 1, "cylinder": 2, "capsule": 3, "hull": 4}
-
 #: Cells that samples of the object are sorted by [m].
 SAMPLE_CELL_M: Final = 0.008
-
 #: Way of a sliding joint that moves a fingertip as a revolute joint of a finger does by one radian [m].
 SLIDE_M: Final = 0.05
 
@@ -244,7 +242,6 @@ def room_for_bodies(hand: HandModel, count: int) -> Any:
 
 
 _chains: LRUCache[tuple[str, str], Any] = LRUCache(8)
-
 _lock = threading.Lock()
 
 

@@ -51,7 +51,6 @@ _IDENTITY: Final = np.array([0.0, 0, 0, 1, 0, 0, 0])
 
 #: Servos that go from nothing to their limit within less of a fingertip's way press by chance [m].
 SOFT_M: Final = 0.0015
-
 log = logging.getLogger(__name__)
 
 

@@ -141,12 +141,9 @@ class Overview:
 
 
 _CELL: Final = ("jobs", "queued", "running", "failed", "grasps", "valid", "tried", "judged")
-
 #: Seconds of an interval, and how many characters of a time tell such intervals apart.
 _UNITS: Final = ((3600, 13), (60, 16), (1, 19))
-
 _REST_OF_TIME: Final = "0000-00-00T00:00:00Z"
-
 _MADE = (func.sum(shards.c.count), func.sum(shards.c.valid), func.sum(shards.c.tried), func.sum(shards.c.judged))
 
 
@@ -169,9 +166,7 @@ def _bucket(created: str, bucket_s: int) -> str:
 
 #: Unfinished jobs are counted up to here.
 MOST_JOBS: Final = 10_000
-
 RATE_WINDOW_S: Final = 60
-
 UNFINISHED: Final = (State.QUEUED, State.RUNNING)
 
 

@@ -36,9 +36,7 @@ from service.settings import Settings
 from service.store.store import open_store
 
 _HTTP_S: Final = 5.0
-
 _IDLE: Final = "no service runs on this data folder"
-
 _AWAY: Final = "Redis does not answer"
 
 
@@ -179,9 +177,7 @@ def _bind(name: str, settings: Settings, where: str) -> Finding:
 
 
 _OFF_S: Final = 2.0
-
 _WRONG_S: Final = 300.0
-
 _MEND: Final = "timedatectl set-ntp true, or chronyd, on the machine that is wrong: it differs from all others"
 
 

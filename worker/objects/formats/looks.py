@@ -14,7 +14,6 @@ from service.store.mesh_files import MAX_NAMES, reference_of
 
 #: Materials that a library may have.
 MAX_MATERIALS: Final = 1024
-
 Nearby = Callable[[str], bytes | None]
 
 """Bytes of a file by the name that a mesh gives it; None: it is not among the hand's files."""
@@ -65,7 +64,6 @@ def _numbers(text: bytes) -> Floats | None:
 
 #: Larger textures are not looked at [pixels].
 MAX_PIXELS: Final = 2**24
-
 #: What an unreadable picture may raise.
 UNREADABLE: Final = (ValueError, OSError, SyntaxError)
 

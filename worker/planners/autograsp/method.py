@@ -80,21 +80,15 @@ METHOD: Final = Method(
 
 #: Contact: GraspIt!'s threshold layer [m].
 TOUCH_M: Final = 2e-4
-
 #: Distances beyond this are not asked for [m].
 REACH_M: Final = 0.03
-
 #: Gap between fingers beyond which they do not slow each other [m].
 MARGIN_M: Final = 0.005
-
 #: Share of a gap crossed in one step: far distances come from a grid that may be off by a third.
 SHARE: Final = 0.6
-
 #: Longest closing step [rad], and most steps.
 LARGEST: Final = 0.1
-
 STEPS: Final = 400
-
 #: Most advances of the root: each crosses more than half of what is left.
 ADVANCES: Final = 40
 

@@ -36,13 +36,10 @@ from worker.simulation.record import add_poses, add_root_gradient
 
 #: Force closure, distance and penetration that the source lets pass.
 PASSES: Final = (0.3, 0.005, 0.001)
-
 #: Distance of the palm from the hull [m]: the source puts the root, which is a palm's length behind, at 0.2 to 0.3.
 DISTANCE: Final = (0.1, 0.2)
-
 #: Tilt of the approach away from the hull's normal [rad], at most.
 TILT: Final = np.pi / 6
-
 #: Standard deviation of joints about the pre-shape, as a share of their range.
 POSTURE: Final = 0.1
 
@@ -123,17 +120,12 @@ Ints = NDArray[np.int32]
 
 #: Places that may become contacts, on each link and on the palm.
 EACH: Final = 12
-
 ON_PALM: Final = 24
-
 #: Object samples asked for penetration.
 SAMPLES: Final = 2000
-
 #: Energies: force closure, distance, penetration, self-penetration, joint limits.
 TERMS: Final = 5
-
 CHUNK: Final = 50
-
 INFINITE: Final = 1e30
 
 

@@ -41,36 +41,25 @@ SAMPLES: Final = 500
 ACROSS: Final = 0.96
 #: Least distance of the two points [m].
 THINNEST_M: Final = 0.002
-
 #: Room between pad and object, each side [m].
 ROOM_M: Final = (0.003, 0.015)
-
 #: Pairs this far beside the centre of mass, as gravity sees it, are drawn e times less often [m]; any pair is drawn at
 #: `FAR` of the best one's chance, and what is steep or hard to get at still less. With 30 mm and 0.02 Allegro holds
 #: 0.28 of six objects at half the friction, with these 0.38.
 BESIDE_M: Final = 0.02
-
 FAR: Final = 0.005
-
 STEEP: Final = 0.5
-
 SELDOM: Final = 0.1
-
 #: A hand whose pads are so near to either side of its pair reaches across it well enough [m].
 NEAR_M: Final = 0.008
-
 #: Hands whose draws are compared at once: more only take memory.
 AT_ONCE: Final = 256
-
 #: How upright hands come to what lies flat (cosine).
 UPRIGHT: Final = 0.9
-
 #: Noise of the posture as a share of each joint's range, ways that are compared, and differences of width that postures
 #: are taken from [m].
 NOISE: Final = 0.03
-
 WAYS: Final = 4
-
 ALIKE_M: Final = (0.002, 0.006)
 
 
@@ -95,7 +84,6 @@ class Crossings:
 
 
 _known: LRUCache[str, Crossings] = LRUCache(16)
-
 _lock = threading.Lock()
 
 
@@ -382,7 +370,6 @@ def _outlines(hand: HandModel, q: Floats) -> Outlines:
 
 #: A gap that is wider is as good as this, and how exactly others are told [m].
 WIDEST_M: Final = 0.064
-
 EXACT_M: Final = 0.0005
 
 

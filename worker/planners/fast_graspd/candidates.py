@@ -22,20 +22,15 @@ from worker.simulation.surroundings import Placed
 
 #: Hands of each grasp that are seated and tried before the next are: seating costs half of a trial.
 TOGETHER: Final = 2
-
 #: Merit beyond which a seated hand is not tried but where its grasp has nothing else: of 176 such hands of Allegro and
 #: Shadow 3 lifted at half the friction.
 HOPEFUL: Final = 0.3
-
 #: Score beyond which that of a grasp is as good as nothing: lost, or its way is blocked.
 POOR: Final = 7.0
-
 #: A hand that does not hold at half the friction, but nearly, is tried once more with so much of the force.
 #: 144 hands of Shadow lift .80 with all of it, .83 with half, .92 with the best of six forces.
 GENTLER: Final = 0.5
-
 NEARLY: Final = 2.5
-
 #: Score of what has none.
 HOPELESS: Final = 1e9
 
@@ -186,23 +181,17 @@ def _take(
 
 #: Coulomb coefficient with which contacts must balance: less than any test uses, so that what balances has a reserve.
 FRICTION: Final = 0.3
-
 #: The same in scenes: what balances with so little most often lifts at half the friction (AUC .80 of seated hands of
 #: Allegro and Shadow whose merit is below .1; .74 with the other).
 SCENE_FRICTION: Final = 0.15
-
 #: Weight of L_stable against the residual of the balance.
 STABILITY: Final = 0.05
-
 #: Weight of penetration [1/m] above the tolerated [m]: a millimetre too deep outweighs most of an unbalanced grasp.
 DEPTH: Final = 200.0
-
 TOLERATED_M: Final = 5e-4
-
 #: Weight of the share of the hand's surface that is at a free object after the coarse phase, and how near that is [m]:
 #: of hands that balance alike the one that lies around more of the object goes on, or is tried first.
 NEARNESS: Final = 2.0
-
 NEAR_M: Final = 0.005
 
 

@@ -59,30 +59,22 @@ Rows = NDArray[np.intp]
 
 #: Iterations between two looks at cancellation.
 CHUNK: Final = 10
-
 #: Fewest grasps worth a thread of their own.
 PART: Final = 4
-
 #: A grasp whose merit is above this sets out once more: of such grasps a fifth (Shadow) to a half hold, of others most.
 SET_OUT_AGAIN: Final = 0.05
-
 #: The same of scores in a trial, see `worker.planners.port.Trial`: a tenth to a quarter of such grasps hold.
 FAILED: Final = 2.0
-
 #: How often grasps whose hands are tried may set out again. One more attempt finds what the first ones found, so valid
 #: grasps a second hardly depend on it, and fewer grasps of a hard pair are left that hold nothing.
 ATTEMPTS: Final = 20
-
 #: Score of a free grasp that holds while a finger stands off: it sets out again up to `CLOSER` times, then the best
 #: stays.
 STANDS: Final = 1.99
-
 CLOSER: Final = 2
-
 #: Scores beyond which grasps in scenes set out again, at each attempt: at the first also those that lift at the whole
 #: friction only. An attempt costs half of another grasp of the batch, and one in ten of these then lifts at half.
 IN_SCENES: Final = (1.0, FAILED, FAILED, FAILED, FAILED)
-
 #: Attempts of one grasp that are made at once, at the most.
 AHEAD: Final = 4
 

@@ -19,22 +19,16 @@ from worker.simulation.surroundings import Placed
 
 #: Rates of Adam: translation [m], rotation [rad], joints [rad].
 COARSE_RATES: Final = (2e-3, 2e-2, 4e-2)
-
 FINE_RATES: Final = (5e-4, 5e-3, 1e-2)
-
 #: The paper's rate of plain gradient descent, the same for all variables in SI units.
 PAPER_RATES: Final = (1e-3, 1e-3, 1e-3)
-
 #: Largest dilation of the object [m].
 DILATION: Final = 0.01
-
 SELF_WEIGHT: Final = 2e4
-
 #: Pull on points that touch nothing, see `LossOptions` [m]: fingers lie around a free object instead of at it, and more
 #: of them hold at half the friction. With half as much a Barrett hand gains little, with twice as much the slender
 #: fingers of a Shadow hand are drawn into thin walls.
 PULL: Final = 3e-4
-
 #: The projection of hands around a free object: it draws in what is farther off than among obstacles, so more of the
 #: hand comes to lie at the object. It costs about half of the depth that the samples of `pairs.DENSER` save.
 AROUND: Final = ProjectionOptions(hold=5e-3)

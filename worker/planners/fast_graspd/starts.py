@@ -34,29 +34,20 @@ from worker.simulation.record import record_placement
 
 #: Distance of the palm from the surface [m]: nearest, farthest, then the steps of retreat while something touches.
 GAP: Final = (0.002, 0.012)
-
 RETREATS: Final = (0.0, 0.01, 0.02, 0.03)
-
 #: Distance of the palms of hands that open further to have a place: their fingers stand about the object already.
 OPENED_GAP: Final = (0.004, 0.02)
-
 #: Tilt of the approach away from the surface normal, standard deviation [rad].
 TILT: Final = 0.25
-
 #: Noise of the pre-shape, standard deviation as a share of the joint's range.
 POSTURE_NOISE: Final = 0.08
-
 #: Deepest penetration of a start [m].
 CLEAR: Final = 0.001
-
 #: Draws per grasp before the least penetrating one is taken.
 DRAWS: Final = 48
-
 #: How far hands that have no place in their pre-shape open, as shares of the way to their ends, and draws at each.
 OPENED: Final = (0.5, 1.0)
-
 OPENED_DRAWS: Final = 24
-
 #: A start that is deeper than this is none [m].
 NO_PLACE: Final = 0.01
 
@@ -328,19 +319,15 @@ def _put(states: HandState, rows: NDArray[np.intp], others: HandState) -> None:
 
 #: Room between each pad and the object [m]: least and most.
 ROOM_M: Final = (0.002, 0.005)
-
 #: How far ahead of the middle of the pads the object's place may lie, as a share of their length; then how much farther
 #: the hand stays back while something touches.
 AHEAD: Final = (-0.25, 0.25)
 
 JAW_RETREATS: Final = (0.0, 0.25, 0.5, 0.75)
-
 #: Shortest and longest length of pads that this is a share of [m].
 LENGTH_M: Final = (0.01, 0.05)
-
 #: Uniform numbers of one draw: pair, side, angle, room, place.
 UNIFORM: Final = 5
-
 #: A line farther from the centre of mass than this share of the object's radius is drawn exp(-1/2) times as often.
 CENTRAL: Final = 0.35
 

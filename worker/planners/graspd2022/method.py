@@ -100,47 +100,28 @@ METHOD: Final = Method(
     uses=("face_error_m",),
     quick={"steps": 60},
 )
-
 #: Hand points: the source's hand has 778 vertices.
 POINTS: Final = 778
-
 #: The source's constants, SI units: stiffness, viscous friction, friction, time step, speed, mass.
 STIFFNESS: Final = 1e5
-
 VISCOUS: Final = 1e3
-
 FRICTION: Final = 0.5
-
 STEP_S: Final = 1e-5
-
 SPEED: Final = 0.01
-
 MASS: Final = 1.0
-
 LEAK: Final = 0.1
-
 MISMATCH: Final = 1e-2
-
 TOLERANCE_N: Final = 10.0
-
 DAMPING: Final = 1.0
-
 FORCE_RATE: Final = 1e-2
-
 #: Rates of Adam: root position [m], root rotation (1e-3 on a quaternion's numbers) [rad], joints [rad].
 RATES: Final = (1e-3, 2e-3, 3e-3)
-
 BETAS: Final = (0.9, 0.999)
-
 WARMUP: Final = 200
-
 #: The dilated object starts this far from the hand [m]; hands start this far behind the nearest free place [m].
 APART_M: Final = 0.01
-
 BACKOFF_M: Final = 0.05
-
 CHUNK: Final = 25
-
 #: How far the grid reaches beyond the object's box [m].
 PAD_M: Final = 0.10
 

@@ -171,40 +171,26 @@ METHOD: Final = Method(
     uses=("face_error_m",),
     quick={"steps": FIRST_STEP + 400},
 )
-
 #: Bounds of the palm's place about the object's centre of mass [m] and its largest jump (GraspIt!'s, in mm there).
 PLACE: Final = ((-0.25, 0.25), (-0.25, 0.25), (-0.25, 0.35))
-
 PLACE_JUMP: Final = 0.15
-
 #: theta, phi, alpha: axis and angle of the rotation; phi wraps around.
 ANGLES: Final = ((0.0, np.pi), (-np.pi, np.pi), (0.0, np.pi))
-
 ANGLE_JUMPS: Final = (np.pi / 5, np.pi / 2, np.pi / 2)
-
 PHI: Final = 4
-
 #: Postures a side at which the hand is tested against itself, and the overlap real hand models have at rest [m].
 CLASH_GRID: Final = 49
-
 CLASH_M: Final = 2e-3
-
 #: Uniform draws for a legal start, and rounds between two looks at cancellation.
 START_TRIES: Final = 5000
-
 ROUNDS: Final = 500
-
 #: Rounds without a free neighbour count too, up to so many times the moves.
 PATIENCE: Final = 3
-
 #: Two states of the list are alike below this (GraspIt!).
 ALIKE: Final = 0.2
-
 NOT_YET: Final = 1e9
-
 #: Contacts on each link that closes, and on the palm.
 EACH: Final = 2
-
 ON_PALM: Final = 3
 
 
@@ -248,12 +234,9 @@ def virtual_contacts(hand: HandModel) -> SurfacePoints:
 
 #: Weights of a finger's first, second and later closing joints in the human hand's eigengrasps.
 FLEXION: Final = (1.0, 0.3, 0.15)
-
 SECOND: Final = (-1.0, 1.0, 0.3)
-
 #: Where closing joints stand in the mean posture, as a share of their range (Barrett's origin: 0.79 of 2.44 rad).
 ORIGIN: Final = 0.33
-
 #: Largest amplitude.
 AMPLITUDE: Final = 4.0
 

@@ -82,10 +82,8 @@ METHOD: Final = Method(
 
 #: Steps back along the way in while something touches [m].
 RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08)
-
 #: Proposals of a grasp, shared out to its starts: as many as are computed at once.
 PROPOSALS: Final = 32
-
 #: A palm that is farther from the object's bounding ball is no start [m].
 FAR_M: Final = 0.15
 
@@ -198,17 +196,12 @@ def _clear(
 #: Elevation of a camera above the table [rad]; share of its field of view (half of it [rad]) that the object's bounding
 #: ball fills; nearest distance of the ball [m]: as pictures of a job have them.
 ELEVATION: Final = (np.radians(18.0), np.radians(62.0))
-
 HALF_FIELD: Final = np.radians(20.0)
-
 FILL: Final = (0.7, 1.0)
-
 NEAREST_M: Final = 0.25
-
 #: Points of the surface, and pixels across the bounding ball, each of which shows the nearest point in it: about five
 #: visible ones fall into each, so that little shows through where a thing is hollow.
 DENSE: Final = 32768
-
 PIXELS: Final = 48
 
 

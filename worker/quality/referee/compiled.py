@@ -42,7 +42,6 @@ class _Asked:
 
 
 _models: LRUCache[str, Any] = LRUCache(KEPT)
-
 _lock = threading.Lock()
 
 
@@ -77,7 +76,6 @@ def _kept(asked: _Asked, make: Callable[[], Any]) -> Any:
 
 
 Test = TypeVar("Test")
-
 Answer = TypeVar("Answer")
 
 

@@ -27,34 +27,23 @@ from worker.simulation.surroundings import CLEAR_M, Neighbour, Obstacle
 
 #: Sliding and torsional friction; `hard` scales them by `HARD`.
 FRICTION: Final = (SLIDING, 0.02)
-
 HARD: Final = (0.5, 0.1)
-
 #: Joint damping over position gain [s]: 0.1 N m s/rad at the protocol's gain of 5.
 DAMPING_TIME: Final = 0.02
-
 HAND_SOLIMP: Final = (0.5, 0.99, 1e-4, 0.5, 2.0)
-
 HAND_SOLREF: Final = (0.005, 1.0)
-
 #: Couplings are stiffer than contacts, or a pressed finger would stretch them; 2 steps is MuJoCo's floor.
 COUPLING_SOLREF: Final = (0.008, 1.0)
-
 COUPLING_SOLIMP: Final = (0.98, 0.999, 1e-4, 0.5, 2.0)
-
 #: What the engine does by default today and did not in 3.3.2, the version that DexGraspBench pins: several contacts for
 #: a pair of convex pieces, and a solver for each island of contacts.
 NOT_IN_3_3_2: Final = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
-
 #: Degrees of freedom from which on sparse Jacobians cost less, though the engine's own rule has 60: lifts .77 of the
 #: time with 28 (Allegro), .73 with 34 (Shadow); 1.09 with 20 (Barrett). Verdicts are the same but for rounding.
 SPARSE: Final = 24
-
 #: Inertia of a body without geometry: that of a ball of this radius [m].
 _BARE_RADIUS: Final = 0.01
-
 _MIN_MASS: Final = 1e-3
-
 #: Fingertips that are told to touch a support are in it by as much at most, for the way is looked at in steps [m].
 TOUCH_ROUNDING_M: Final = 1e-4
 

@@ -42,13 +42,10 @@ from worker.simulation.surroundings import Placed
 
 #: The payload is told downwards, to this ratio.
 TOLD: Final = 1.03
-
 #: Share of the friction bound that is tried first, its median over the grasps of `benchmarks.payload`; and the first
 #: step from there.
 FIRST: Final = 0.75
-
 STEP: Final = math.sqrt(2)
-
 #: Stages that a load is watched at most.
 WATCHED: Final = 10
 
@@ -196,11 +193,9 @@ def payloads(
 #: Grasps that must lift what weighs little, before what they lift is told as the hand's limit: else their shape may be
 #: why. It weighs as much as an object of which nothing is said, or this share of what is wanted.
 LEAST: Final = 2
-
 LIGHT: Final = 1 / 8
 #: So many grasps show that no further ones need be tried.
 ENOUGH: Final = 8
-
 #: What is wanted over what the best of them lifts, from which on no further ones are tried.
 HOPELESS: Final = 2.0
 
@@ -279,11 +274,8 @@ def limit_of(
 
 #: Amplitude [m], frequency [Hz] and periods along each axis: at most 7.1 m/s2.
 AMPLITUDE_M: Final = 0.02
-
 FREQUENCY_HZ: Final = 3.0
-
 PERIODS: Final = 3
-
 #: The force changes in steps of this length [s].
 STEP_S: Final = 0.008
 

@@ -37,7 +37,6 @@ from worker.run import ALONE, Run
 from worker.simulation.surroundings import Placed
 
 NOT_JUDGED: Final = -1
-
 #: Shares are wanted to this: 0.9 of 10 models is 9 of them.
 _EXACT: Final = 1e-9
 
@@ -186,7 +185,6 @@ def _words(grasps: GraspSet, row: int) -> tuple[int, ...]:
 
 
 NOISE_M: Final = 1e-3
-
 NOISE_RAD: Final = float(np.radians(1.0))
 
 

@@ -39,43 +39,30 @@ _T = TypeVar("_T")
 #: The root is fixed: a hand that hangs on a spring, as the protocol has it, costs twice as much. In so short a time
 #: nothing slips that would not slip without it: no iterations against slip.
 PHYSICS: Final = MujocoOptions(timestep=0.006, root="fixed", noslip_iterations=0)
-
 #: The same of a lift: under the weight of a real object coarser contacts creep.
 LIFTING: Final = MujocoOptions(root="fixed")
-
 #: Stages of closing and of squeezing, then of hanging.
 CLOSING: Final = 2
-
 HANGING: Final = 6
-
 #: The same of a free object, and of a push.
 FREE_CLOSING: Final = 3
-
 PUSHED: Final = 2
-
 #: Pull while the object hangs at half the friction, at the whole of it, and of a push, in its weights. A hand that is
 #: turned away costs more than one that the whole test then drops. Of 32 hands of Allegro that lift at half the friction
 #: 1.3 weights turn away 19, these 9; of 63 that hold a free object at half of it 14 were turned away with 2 weights and
 #: two stages of closing, now 9. What nothing holds must be gone when a push ends. At the whole friction the pull is
 #: more than the weight: of 25 hands that lift .8 of it another lift test drops 10, of 21 that lift 1.3 of it 3.
 HANGS: Final = 0.8
-
 HANGS_WHOLE: Final = 1.3
-
 PULL: Final = 1.8
-
 #: What has passed a limit by so much is lost.
 GONE: Final = 1.5
-
 #: Where a free object is pushed: no direction is farther from all of them than 71 degrees.
 CORNERS: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
-
 #: How far supports go away [m]: farther than any scene is high.
 AWAY_M: Final = 10.0
-
 #: Added to the score of what holds at the whole friction only.
 SLIPS: Final = 1.0
-
 #: Score of what starts too deep.
 DEEP: Final = 20.0
 
@@ -237,13 +224,10 @@ def push_trial(
 
 #: Stages of closing and of squeezing.
 HANGING_CLOSING: Final = 4
-
 #: Pull of an object that hangs, in its weights: the mean of a smooth rise while it speeds up (`lift.SMOOTHLY`).
 RISING: Final = 1.06
-
 #: A change of the load comes over this time, in steps [s]: at once it would weigh up to twice.
 LOADING_S: Final = 0.04
-
 LOADS: Final = 5
 
 

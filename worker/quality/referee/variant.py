@@ -22,24 +22,16 @@ Vector = tuple[float, float, float]
 
 #: How far each axis goes. Shapes stand out or back by this [m].
 GROWTH_M: Final = 1e-3
-
 #: Factors of drives and of the mass.
 FACTOR: Final = 2.0
-
 #: Armature [kg m^2] and dry friction [N m] of DexGraspBench's Shadow, which the protocol otherwise leaves out.
 ARMATURE: Final = 2e-4
-
 DRY_FRICTION: Final = 0.01
-
 #: Sliding friction over the nominal 0.6; the torsional coefficient goes with it.
 FRICTIONS: Final = (0.4 / 0.6, 0.8 / 0.6)
-
 CENTRE_M: Final = 5e-3
-
 SHIFT_M: Final = 2e-3
-
 TURN: Final = float(np.radians(2.0))
-
 #: The last finger begins so much later than the first, as a share of the time of closing (0.8 s).
 LATEST: Final = 0.25
 

@@ -47,10 +47,8 @@ log = logging.getLogger(__name__)
 
 #: Worlds of a pool, for few grasps and for many: pools of any size would be made anew for nearly every launch.
 WORLDS: Final = {"cuda": (256, 1024), "cpu": (8, 32)}
-
 #: Pools that are kept, each with its model, arrays and graph: those of the pairs that were judged last.
 _KEPT_POOLS: Final = 4
-
 #: Share of audited verdicts that the CPU may contradict, beyond one, before the first judge is not believed.
 _MOST_CONTRADICTED: Final = 0.05
 
@@ -238,7 +236,6 @@ class WorldPool:
 
 
 _pools: OrderedDict[tuple[str, str, int], WorldPool] = OrderedDict()
-
 _lock = threading.Lock()
 
 
@@ -357,12 +354,9 @@ def _trial(found: FirstTrials, row: int, scene: Scene) -> Trial:
 
 #: Contacts and constraint rows that a world has room for at first: twice what grasps of three hands were seen to need.
 CONTACTS: Final = 96
-
 ROWS: Final = 256
-
 #: Room is doubled up to this many times where it did not do.
 DOUBLINGS: Final = 3
-
 #: Overflows that leave contacts or constraints out. The others are limits of iterations, which MuJoCo has as well.
 _VOIDING: Final = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")
 
