@@ -1,7 +1,4 @@
-"""The context of a piece of work: on what it runs, whom it tells how far it is, and who may stop it.
-
-Lanes: threads that go their own ways with parts of one piece of work, and share the cores.
-"""
+"""The context of a piece of work: device, progress, cancellation, and the threads that share its cores."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Who sees which rows: conditions of queries.
-
-Opaque keyset cursors: the sort key of the last row of a page, so that a page costs the same wherever it starts.
-"""
+"""Common parts of queries: conditions of the caller's scope, and opaque keyset cursors of pages."""
 
 from __future__ import annotations
 

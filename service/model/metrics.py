@@ -1,13 +1,10 @@
-"""The metrics of a grasp: one table, from which all follows that stores, indexes, filters, shows and documents them.
+"""The metrics of a grasp: one table, from which all follows that stores, indexes, filters, shows and documents them;
+and the axes of robustness, grasp types and directions.
 
 Shards (`service.store.columns`), manifests, the index, the API, the dashboard, a dataset's card and the docs read this
 table. A new metric is a row here and the function that computes it (`MEASURES` in `worker.quality.table`); make it
 `optional`, since older shards lack it. The index gets its column when it is opened next
 (`service.index.database`). What says yes or no of a grasp is a verdict and no metric.
-
-Words of robustness: the axes along which a model of a hand and an object may be another than ours.
-
-How different grasps are, in words and numbers that all rooms share: types, directions of approach, entropy.
 """
 
 from __future__ import annotations

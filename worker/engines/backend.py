@@ -1,8 +1,6 @@
-"""Warp, started quietly: on a machine without a GPU its C++ side says so on stderr at every start.
+"""Warp started quietly, its kernel cache, and kernels compiled ahead of time.
 
 Compiled kernels are kept where Warp would, or where this user can write.
-
-Kernels compiled ahead of time, and names of compiled kernels: a fresh machine with such an image compiles nothing.
 
 A folder of such kernels is laid out as Warp's cache is, VERSION/MODULE/FILE. Names of files hold what they are good
 for: the digest of the module's source and options, the GPU's architecture, or the instructions of the CPU that they

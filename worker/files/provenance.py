@@ -1,8 +1,6 @@
-"""The hand and the object of a shard: what it notes of them, and how their files are found again.
+"""The hand and the object of a shard: what it notes of them and of its grasps, and how their files are found again.
 
 They are known by their digests, so a file that was changed or is another one is never taken for them.
-
-What a base shard says at its root of the grasps in it; `service.store.columns` has the schema.
 """
 
 from __future__ import annotations

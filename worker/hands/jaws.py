@@ -1,9 +1,8 @@
-"""The jaws of a gripper: which surfaces meet when it closes, how far they open, and along which line.
+"""The jaws of a gripper and the pads of a hand: which surfaces meet when it closes, how far they open, along which
+line.
 
 A gripper is a hand whose closing is one motion of at most two degrees of freedom that brings opposing surfaces, the
 pads, together. Everything is found from geometry, so a joint at 0 may as well be open as closed.
-
-Where a hand presses: the pads of its jaws, or those of its fingertips.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Arrays on this machine that take long to compute and follow from little: read in a millisecond by later processes.
-
-What a model holds, as a key for caches: of one file there are as many models as there are ways to prepare it.
-"""
+"""Disk cache of arrays that take long to compute and follow from little, and the content of models as keys."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
-"""What the peers of `fast_graspd` share: hand and object on a device, free starts, the way from hands to grasps.
+"""Common parts of the baselines: hand and object on a device, free starts, inner surfaces, the way from hands to
+grasps.
 
 Peers see the object as flat triangles (no Phong smoothing) and take their starts, postures around the grasp and
 quality from the same code as `fast_graspd`, so that what is compared is the search alone.
-
-The inside of a hand: surface that moves ahead when the fingers close, and the palm.
 """
 
 from __future__ import annotations

@@ -79,9 +79,13 @@ def _load(forces: Floats, moments: Floats, torques: Floats, efforts: Floats, alo
     exerted = np.column_stack([np.vstack([torques.T, -torques.T]), np.zeros(len(efforts))])
     limited = np.isfinite(efforts)
     solved = linprog(
-        np.append(np.zeros(count), -1.0), A_ub=exerted[limited], b_ub=efforts[limited], A_eq=balance,
-        b_eq=np.zeros(6), bounds=(0, None),
-    )  # fmt: skip
+        np.append(np.zeros(count), -1.0),
+        A_ub=exerted[limited],
+        b_ub=efforts[limited],
+        A_eq=balance,
+        b_eq=np.zeros(6),
+        bounds=(0, None),
+    )
     if solved.status == _UNBOUNDED:
         return math.inf
     return -float(solved.fun) if solved.fun is not None else 0.0

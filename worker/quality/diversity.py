@@ -1,7 +1,5 @@
-"""How different the grasps of a set are: variance (DexGraspBench), and near-duplicates.
-
-From where hands come: directions on the sphere in cells of equal area.
-"""
+"""Diversity of a set of grasps: variance (DexGraspBench), near-duplicates, and directions of approach in cells of
+equal area."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Which pieces of a hand share volume with the object: the others need no boolean of solids.
-
-Depth of penetration between hand and object.
-"""
+"""Overlap of hand and object: pieces that share volume, and the depth of penetration."""
 
 from __future__ import annotations
 
@@ -57,8 +54,11 @@ class Overlap:
         with wp.ScopedDevice("cpu"):
             crossed = wp.zeros(len(piece), dtype=wp.int32)
             inputs = [
-                self._probe.mesh.id, self._solids, wp.array(piece, dtype=wp.int32), wp.array(given, dtype=wp.transform)
-            ]  # fmt: skip
+                self._probe.mesh.id,
+                self._solids,
+                wp.array(piece, dtype=wp.int32),
+                wp.array(given, dtype=wp.transform),
+            ]
             launch(kernels.faces_in_solids, len(piece), inputs=inputs, outputs=[crossed], device="cpu")
             found: NDArray[np.bool_] = crossed.numpy() != 0
         return found

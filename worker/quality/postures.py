@@ -1,8 +1,7 @@
-"""The postures around a grasp: before contact, fingers open and clear; and the commanded one that presses.
+"""Postures around a grasp: the pregrasp, open, clear and raised where fingers would dip into a support; and the
+squeeze, which presses.
 
 They decide more of a grasp's success than the optimiser does (Dexonomy, table VI).
-
-Pregrasps raised where fingers that open sideways would dip into what the object stands on.
 
 A finger that stands on the table swings through it when it opens: its hand comes from a little higher.
 """
@@ -73,9 +72,7 @@ def pregrasp(
     return found if placed is None else raised(hand, grasp, found, placed)
 
 
-def wide_open(
-    hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: Placed, *, device: str = "cpu"
-) -> Floats:  # fmt: skip
+def wide_open(hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: Placed, *, device: str = "cpu") -> Floats:
     """(N, J) joint positions in which a hand comes to its pregrasp: fingers plainly opened as far as `WIDE` of their
     range, or until they would run into one another or into an obstacle."""
     posing, joints = (
@@ -106,9 +103,7 @@ def squeeze(
     if (jaws := jaws_of(hand)) is not None:
         probe = posing_of(hand, obj, points=_POINTS, device=device).probe
         return jaw_squeeze(probe, jaws, grasp, total_normal_force=force)
-    holds = hold_forces(
-        hand, obj, grasp, total_normal_force=force, friction=friction, closing=CLOSING_M, device=device
-    )  # fmt: skip
+    holds = hold_forces(hand, obj, grasp, total_normal_force=force, friction=friction, closing=CLOSING_M, device=device)
     q = hand.reduce(grasp.joint_positions) + holds.torque / hand.stiffness
     return Posture(np.array(grasp.hand_pose, float), hand.expand(q))
 
@@ -127,9 +122,14 @@ def hold_forces(
     nothing press with their points that are nearer than `closing` [m]."""
     posing = posing_of(hand, obj, points=_POINTS, device=device)
     return balanced(
-        posing, grasp, total_normal_force=normal_force(obj) if total_normal_force is None else total_normal_force,
-        friction=friction, within=PRESSING_M, most=MAX_PRESSING, closing=closing,
-    )  # fmt: skip
+        posing,
+        grasp,
+        total_normal_force=normal_force(obj) if total_normal_force is None else total_normal_force,
+        friction=friction,
+        within=PRESSING_M,
+        most=MAX_PRESSING,
+        closing=closing,
+    )
 
 
 def normal_force(obj: ObjectModel) -> float:

@@ -1,9 +1,7 @@
-"""Contact forces that hold an object, and the torques with which a position-controlled hand exerts them.
+"""Contact forces that balance and hold an object, and the torques with which a position-controlled hand exerts them.
 
 q_squeeze = q + Kp^-1 sum_i J_i^T f_i (Dexonomy), with f a non-negative combination of friction pyramid edges that
 leaves no net wrench and whose normal components sum to a given force.
-
-Forces that balance, of many grasps at once: non-negative least squares on the CPU or a GPU.
 """
 
 from __future__ import annotations
@@ -43,9 +41,15 @@ class Holds:
 
 
 def balanced(
-    posing: Posing, grasp: Posture, *, total_normal_force: float, friction: float, within: float, most: int,
+    posing: Posing,
+    grasp: Posture,
+    *,
+    total_normal_force: float,
+    friction: float,
+    within: float,
+    most: int,
     closing: float = 0.0,
-) -> Holds:  # fmt: skip
+) -> Holds:
     """Balanced contact forces of N grasps within the hand's torque limits.
 
     Where the torques exceed a limit all forces shrink together, so the balance stays.
@@ -78,17 +82,29 @@ def _balanced(
         touches = wp.empty((count, posing.fingers), dtype=wp.bool)
         chosen, used = wp.empty((count, most), dtype=wp.int32), wp.empty(count, dtype=wp.int32)
         launch(
-            touching.choose, count,
+            touching.choose,
+            count,
             inputs=[posing.points, posing.finger, near, *reach, wp.float64(FACING_COS), wp.float64(radius)],
             outputs=[touches, *scratch, chosen, used],
-        )  # fmt: skip
+        )
         matrix = wp.empty((count, most * int(touching.EDGES), rows), dtype=wp.float64)
         launch(
-            touching.columns, chosen.shape,
-            inputs=[posing.chain, posing.effort, posing.points, bodies, near, chosen, used, wp.float64(friction),
-                    wp.float64(radius), wp.float64(SUM)],
+            touching.columns,
+            chosen.shape,
+            inputs=[
+                posing.chain,
+                posing.effort,
+                posing.points,
+                bodies,
+                near,
+                chosen,
+                used,
+                wp.float64(friction),
+                wp.float64(radius),
+                wp.float64(SUM),
+            ],
             outputs=[matrix],
-        )  # fmt: skip
+        )
         unit = wp.empty(count, dtype=wp.float64)
         launch(touching.scale_torques, count, inputs=[wp.float64(TORQUE)], outputs=[used, matrix, unit])
         target = np.zeros(rows)
@@ -97,9 +113,11 @@ def _balanced(
         residual = wp.empty(count, dtype=wp.float64)
         torque = wp.empty((count, posing.hand.dofs), dtype=wp.float64)
         launch(
-            touching.hold, count, inputs=[posing.effort, matrix, share, used, unit, wp.float64(total)],
+            touching.hold,
+            count,
+            inputs=[posing.effort, matrix, share, used, unit, wp.float64(total)],
             outputs=[residual, torque],
-        )  # fmt: skip
+        )
     return residual, torque
 
 
@@ -121,9 +139,11 @@ def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
         x = wp.empty((batch, columns), dtype=wp.float64)
         sound = wp.empty(batch, dtype=wp.int32)
         launch(
-            kernels.nonnegative, batch,
-            inputs=[matrix, wp.array(target, dtype=wp.float64), wp.float64(ridge), count], outputs=[work, x, sound],
-        )  # fmt: skip
+            kernels.nonnegative,
+            batch,
+            inputs=[matrix, wp.array(target, dtype=wp.float64), wp.float64(ridge), count],
+            outputs=[work, x, sound],
+        )
     unsolved = np.flatnonzero(sound.numpy() == 0)
     if len(unsolved):
         found, columns, used = x.numpy(), matrix.numpy(), count.numpy()

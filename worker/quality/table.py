@@ -1,6 +1,4 @@
-"""The quality table: every metric of every grasp of one hand on one object.
-
-Which type a grasp is of: power, precision or lateral, by what of the hand touches.
+"""The quality table: every metric of every grasp of one hand on one object, and the type of each grasp.
 
 Types are those of Napier (1956) and of the GRASP taxonomy (Feix et al., IEEE THMS 2016), told by the opposition that
 Iberall (1987) found in them:
@@ -83,20 +81,21 @@ class _Pair:
     def spaces(self, found: Distances) -> tuple[Floats, Floats]:
         """(B, T) epsilon and volume of the wrench space of B grasps."""
         near = self.probe.facing(found)[:, None] & (np.abs(found.distance)[:, None] < self.thresholds[:, None])
-        chosen, count = spread_contacts(
-            near, found.closest, found.normal, scale=self.obj.radius, limit=MAX_CONTACTS
-        )  # fmt: skip
+        chosen, count = spread_contacts(near, found.closest, found.normal, scale=self.obj.radius, limit=MAX_CONTACTS)
         rows = np.arange(len(chosen))[:, None, None]
         counts = (np.arange(MAX_CONTACTS) < count[..., None])[..., None]
         inward = np.where(counts, -found.normal[rows, chosen], [0.0, 0.0, 1.0])
         edges = wrenches(
-            found.closest[rows, chosen], inward, friction=self.friction, centre=self.obj.centre_of_mass,
+            found.closest[rows, chosen],
+            inward,
+            friction=self.friction,
+            centre=self.obj.centre_of_mass,
             radius=self.obj.radius,
-        )  # fmt: skip
+        )
         wanted = np.broadcast_to(self.with_volume, count.shape)
         epsilon, volume = measure_spaces(
             edges.reshape(-1, *edges.shape[2:]), count.ravel(), wanted.ravel(), norm=self.norm
-        )  # fmt: skip
+        )
         return epsilon.reshape(count.shape), volume.reshape(count.shape)
 
 
@@ -182,9 +181,13 @@ def _measured(terms: _Terms, postures: Sequence[Posture], done: Count, run: Run)
     """The columns of each chunk, by threads or by the processes of a pool."""
     if run.pool is not None:
         return run.pool.map(
-            _columns, content_of(terms), terms, postures, cancelled=run.cancelled,
+            _columns,
+            content_of(terms),
+            terms,
+            postures,
+            cancelled=run.cancelled,
             done=lambda k: done.add(len(postures[k])),
-        )  # fmt: skip
+        )
     pair = terms.pair
 
     def work(posture: Posture) -> Columns:

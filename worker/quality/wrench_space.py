@@ -7,8 +7,6 @@ torque about the centre of mass is divided by the object's largest radius. The L
 
 Epsilon is the radius of the largest ball around the origin inside the space, hence 0 where the origin is not inside
 (GraspIt! reports -1 there); flat spaces have epsilon 0 and volume 0.
-
-Inner radius and volume of convex hulls in six dimensions: five times as fast as qhull on wrench spaces.
 """
 
 from __future__ import annotations
@@ -291,15 +289,20 @@ def _grown(
             kernels.measure_hulls,
             1,
             inputs=[
-                wp.array(points - middle[:, None], dtype=kernels.vec6), wp.array(count, dtype=wp.int32),
-                wp.array(whole, dtype=wp.int32), wp.array(corners, dtype=wp.int32),
-                wp.array(normal, dtype=kernels.vec6), wp.array(offset, dtype=wp.float64),
-                wp.array(-middle, dtype=kernels.vec6), wp.array(_ROUNDING * scale, dtype=wp.float64), space.marks,
+                wp.array(points - middle[:, None], dtype=kernels.vec6),
+                wp.array(count, dtype=wp.int32),
+                wp.array(whole, dtype=wp.int32),
+                wp.array(corners, dtype=wp.int32),
+                wp.array(normal, dtype=kernels.vec6),
+                wp.array(offset, dtype=wp.float64),
+                wp.array(-middle, dtype=kernels.vec6),
+                wp.array(_ROUNDING * scale, dtype=wp.float64),
+                space.marks,
                 space.stamps(len(points) * points.shape[1]),
             ],
             outputs=[space.hull, result],
             device="cpu",
-        )  # fmt: skip
+        )
         found = result.numpy().copy()
     found[found[:, 2] == 0] = np.nan
     return found[:, 0], found[:, 1]

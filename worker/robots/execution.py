@@ -1,7 +1,5 @@
-"""Grasps ready to be carried out: six postures each, in one frame that the user names, and the trajectory between
+"""Grasps ready to be carried out: six postures each, in a frame that the user names, and the timed trajectory between
 them.
-
-Times for the motions of a grasp, within the velocity limits of joints and hand.
 
 Each motion starts and ends at rest: its share s of the way follows 10 u^3 - 15 u^4 + 6 u^5 of the share u of its time
 (minimum jerk, Flash and Hogan 1985), whose steepest slope is 15/8.

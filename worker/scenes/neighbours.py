@@ -1,9 +1,7 @@
-"""Several objects on one table: dropped together, at rest each on its own, hands kept clear of the others.
+"""Several objects in a scene: dropped together on a table, or laid beside one at rest; hands kept clear of the others.
 
 Collision shapes are the convex hulls. That is exact against the table and careful among objects: nothing is ever put
 into another one's hollow.
-
-Neighbours laid beside an object that is at rest: between walls, on a face that was chosen, or where many find room.
 
 Each one rests as it fell by itself, so its pose is exact; the place and the turn about the vertical are drawn until its
 hull is clear of walls and of the others.

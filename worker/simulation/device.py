@@ -1,8 +1,5 @@
-"""A hand and an object as arrays on a Warp device. Made once, shared by every simulation of the pair.
-
-The bodies of many hands, placed by a kernel: what looks at hundreds of postures would spend most of its
-time in NumPy's `body_poses` otherwise. Double precision, as there.
-"""
+"""A hand and an object as arrays on a Warp device, made once for a pair; and bodies of many hands, placed by a
+kernel."""
 
 from __future__ import annotations
 

@@ -75,9 +75,25 @@ def test_what_is_wanted_is_told_with_what_the_best_grasp_lifts() -> None:
 @pytest.mark.parametrize("wanted", [ENOUGH // 2, ENOUGH])
 def test_a_weight_out_of_reach_ends_the_work_with_what_the_hand_lifts(tmp_path: Path, wanted: int) -> None:
     words = [
-        "synth", "--hand", "allegro", "--object", "block", "--mass", "20", "--scene", "table", "-n", str(wanted),
-        "--fidelity", "draft", "--seed", "3", "--json", "-o", str(tmp_path / "g.h5"),
-    ]  # fmt: skip
+        "synth",
+        "--hand",
+        "allegro",
+        "--object",
+        "block",
+        "--mass",
+        "20",
+        "--scene",
+        "table",
+        "-n",
+        str(wanted),
+        "--fidelity",
+        "draft",
+        "--seed",
+        "3",
+        "--json",
+        "-o",
+        str(tmp_path / "g.h5"),
+    ]
     result = CliRunner().invoke(build(), words)
     told = json.loads(result.stdout.splitlines()[-1])
     assert result.exit_code == 3

@@ -1,6 +1,5 @@
-"""The planner: a random free start, the palm goes on until something is near, the fingers close until contact.
-
-Approach and closing of a batch of hands by conservative advancement: no step is longer than the gap it crosses.
+"""GraspIt!'s autograsp: a random free start, the palm advances until something is near, the fingers close until
+contact.
 
 GraspIt! closes joints in small steps and goes back when something is hit; here steps follow from distances, which gives
 the same end, contact within `TOUCH_M`, without tunnelling.

@@ -1,8 +1,5 @@
-"""The planner: DexGraspNet's starts around the convex hull (the palm looks at it from some way off, joints near the
-pre-shape), then annealed descent. All hands are given; info tells which would pass.
-
-The Metropolis-adjusted descent of a batch of hands, as a fixed list of launches.
-"""
+"""Differentiable force closure: DexGraspNet's starts around the convex hull, then annealed descent. All hands are
+given; info tells which would pass."""
 
 from __future__ import annotations
 

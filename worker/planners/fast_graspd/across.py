@@ -1,12 +1,10 @@
-"""Starts across an object: a hand whose fingers oppose one another, opened a little wider than the object is there.
+"""Antipodal starts: a hand whose fingers oppose one another, opened a little wider than the object is there.
 
 An object is held where two patches of its surface look away from each other (antipodal points: Nguyen, "Constructing
 force-closure grasps", 1988). They are found by comparing samples of the surface with one another.
 
 How far hands must rise until they are clear of what stands around, told by a few points of their outline: cheap
 enough for many more hands than are looked at exactly.
-
-Whether fingertips fit beside an object in its scenes, and the geometric reason where they do not.
 
 A fingertip is taken as a ball as wide as the thinnest fingertip of the hand, beside an end of a pair of points that the
 hand could hold between. This is necessary for a grasp between opposed fingertips and not sufficient.

@@ -1,7 +1,4 @@
-"""Candidates of a grasp, tried one after another in the order of their merit until one is good enough.
-
-Which of several hands makes the better grasp: how well its contacts balance, and how little the object moved.
-"""
+"""Candidates of a grasp, ranked by the balance of their contacts and tried in turn until one is good enough."""
 
 from __future__ import annotations
 

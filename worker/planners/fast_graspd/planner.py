@@ -1,8 +1,6 @@
 """The planner: starts, coarse phase, fine phase, projection, of one batch or of several in one launch.
 
 A launch is cut into one part per CPU thread. Which grasps it holds besides does not matter to a grasp.
-
-How `fast_graspd` is offered.
 """
 
 from __future__ import annotations

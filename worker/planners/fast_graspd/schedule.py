@@ -1,7 +1,5 @@
-"""What each iteration weighs: the coarse phase shrinks the dilation, the fine phase seats the hand.
-
-Where hands set out in scenes when another method proposes it; descent, trials and verdicts are the same.
-"""
+"""Weights of each iteration (the coarse phase shrinks the dilation, the fine phase seats the hand), and starts that
+another method proposes."""
 
 from __future__ import annotations
 

@@ -1,11 +1,8 @@
-"""Approach sampling: where the hands start. Of the starts of a grasp every second one has the palm look at a random
-point of the surface, from a little way off, the others reach across the object between opposed fingers (`reaching`), as
-all do where it is too small or too wide for the pads; jaws of a gripper stand around two opposite places
-(`jaw_starts`).
+"""Starts of hands. Every second start of a grasp has the palm look at a random point of the surface, from a little way
+off; the others reach across the object between opposed fingers (`reaching`), as all do where it is too small or too
+wide for the pads. Jaws of a gripper stand around two opposite places.
 
 A start is taken only if nothing touches: hands that start inside a thin wall never leave it.
-
-Starts of grippers: the object between the open jaws, pads along its opposite sides.
 
 A pair of opposite surface points is drawn, the jaws are opened a little wider than it is and put around it, turned by a
 random angle about the line that joins the points.

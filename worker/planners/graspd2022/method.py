@@ -1,6 +1,4 @@
-"""The planner: free starts, descent with relaxed forces, no selection and no repair: as the source has it.
-
-The optimisation of a batch of hands: kinematics, forces, gradient, Adam, as a fixed list of launches.
+"""Grasp'D: free starts, descent with relaxed forces, no selection and no repair, as the source has it.
 
 The object is a grid of signed distances, read by trilinear interpolation: an error of second order in the cell.
 """

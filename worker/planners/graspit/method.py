@@ -1,11 +1,7 @@
-"""The planner: a chain of simulated annealing for each grasp, then autograsp from the chain's best state.
-
-The annealing of a batch of chains on a device, and the contacts that it wants on the object.
+"""GraspIt!'s annealing: a chain for each grasp over eigengrasps, then autograsp from the chain's best state.
 
 Virtual contacts are few places of a hand: two on each link's inside, and on the palm. GraspIt! ships them as files for
 its own hands; here they are found for any hand.
-
-Two eigengrasps of any hand, after those that GraspIt! ships.
 
 GraspIt! has eigengrasps for Barrett (spread; all fingers) and the human hand (flexion of the knuckles with a little of
 the joints beyond; the knuckles against the joints beyond), none for Allegro or Shadow. Here a hand whose fingers have

@@ -1,9 +1,5 @@
-"""How `learned` is offered.
-
-A network's proposals as starts of fast_graspd's descent: the open hand of each, where it is clear.
-
-What a camera would see of an object as it lies: its visible points, found on its mesh.
-"""
+"""The method `learned`: a network sees the object's visible points, and its proposals are starts of fast_graspd's
+descent."""
 
 from __future__ import annotations
 

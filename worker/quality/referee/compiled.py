@@ -1,7 +1,5 @@
-"""Compiled models of the engine, kept for a hand that meets an object again: one costs as much as half a verdict.
-
-Simulated tests of many grasps, each thread with a test of its own: a test owns the state of its simulation.
-"""
+"""Compiled models of the engine, kept for pairs that meet again, and threads of simulated tests: a compilation costs
+as much as half a verdict."""
 
 from __future__ import annotations
 
@@ -108,9 +106,14 @@ def answers(
 
 
 def measured(
-    count: int, held: NDArray[np.bool_] | None, make: Callable[[], Test], ask: Callable[[Test, int], float], *,
-    run: Run, name: str,
-) -> NDArray[np.float64]:  # fmt: skip
+    count: int,
+    held: NDArray[np.bool_] | None,
+    make: Callable[[], Test],
+    ask: Callable[[Test, int], float],
+    *,
+    run: Run,
+    name: str,
+) -> NDArray[np.float64]:
     """(count,) what tests measure of the grasps that are `held` (count,), None: of all; nan of the others.
 
     Args:

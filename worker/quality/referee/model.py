@@ -1,7 +1,5 @@
-"""A hand and an object in MuJoCo, as DexGraspBench has them. The object's body frame stands in its centre of mass.
-
-Drives of a hand in MuJoCo: which joint carries a dof's actuator, and actuators on tendons.
-"""
+"""A hand with its drives and an object in MuJoCo, as DexGraspBench has them. The object's body frame stands in its
+centre of mass."""
 
 from __future__ import annotations
 

@@ -1,10 +1,9 @@
-"""Payload of grasps: the heaviest mass that each lifts out of its scene, or holds under the six pushes.
+"""Payload of grasps: the heaviest mass that each lifts, holds under the six pushes, or keeps when shaken; and the
+hand's limit.
 
 The hand closes once around the object with its own mass. Then the object hangs, or is pushed, with other masses until
 its motion tells how that ends: first what the forces of the closed hand and friction bear, then nearer and nearer, each
 from where the heaviest one so far hangs.
-
-What a hand lifts at best, where none of its grasps lifts what it should: measured, and bounded by its actuators.
 
 The shake: what was lifted is moved to and fro, first along x of the scene, then along y.
 

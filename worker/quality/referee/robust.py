@@ -1,10 +1,8 @@
-"""Whether grasps hold in other models of the same hand and object, and along which axis they fail first.
+"""Robustness of grasps: verdicts in other models of the same hand and object, and with the object displaced.
 
 A grasp is judged in k models, each of which departs from the nominal one along one axis (`variant`). Axes take turns
 in an order at random; all is drawn from the seed and the grasp's own numbers, so a grasp meets the same models wherever
 it stands, and the first 8 of 16 are those of 8.
-
-How many verdicts survive when the object is not quite where it was thought to be.
 """
 
 from __future__ import annotations

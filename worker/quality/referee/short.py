@@ -1,12 +1,10 @@
-"""Short tests in coarse physics: what a planner asks of its candidates before it chooses.
+"""Short tests in coarse physics: rollouts that rank a planner's candidates.
 
 The hand closes and squeezes around the object in a fraction of the time of the whole test. In a scene the support is
 then gone, and for a moment most of the object's weight pulls; a free object is pushed towards the corners of a
 tetrahedron, nearly twice as hard as it weighs. All this at half the friction: what slips is pulled once more, from the
 same closed hand, at the whole friction, and by a third more than the weight in a scene. Not a verdict: it ranks
 candidates for a fifth of a verdict's cost, and what it chooses the whole test judges all the same.
-
-Lifts as the hand sees them: its root is fixed, the support goes, and the object hangs. Half the price of a rise.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""Variants of the referee's model: other shapes, drives, masses and places that a real hand might as well have.
+"""Variants of the validator's model: other shapes, drives, tendons, masses and places that a real hand might as well
+have.
 
 A `Variant` says how a model departs from the nominal one, `draw` draws one along an axis, `varied.Models` judges in it.
-
-The same hand with its tendons read otherwise: each joint with a drive of its own, or joints at a fixed ratio.
 """
 
 from __future__ import annotations
@@ -141,8 +140,12 @@ def together(variants: Iterable[Variant]) -> Variant:
 
 #: Ways in which collision shapes differ.
 SHAPES: Final[tuple[tuple[Fit, float], ...]] = (
-    ("hull", 0.0), ("primitive", 0.0), ("capsule", 0.0), ("own", GROWTH_M), ("own", -GROWTH_M),
-)  # fmt: skip
+    ("hull", 0.0),
+    ("primitive", 0.0),
+    ("capsule", 0.0),
+    ("own", GROWTH_M),
+    ("own", -GROWTH_M),
+)
 
 
 def _shapes(hand: HandModel) -> list[int]:
@@ -189,10 +192,19 @@ def recoupled(hand: HandModel, coupling: Coupling) -> HandModel:
     rate[moved] = hand.multiplier[moved] * sign[hand.dof[moved]]
     pulls = np.abs(drives)
     return replace(
-        hand, tendons=(), dof=dof, multiplier=rate, dof_names=tuple(hand.dof_names[d] for d in kept), lower=lower,
-        upper=upper, effort=pulls @ hand.effort, stiffness=pulls @ hand.stiffness, preshape=hand.preshape[kept],
-        closing=hand.closing[kept], velocity=hand.velocity[kept] if len(hand.velocity) else hand.velocity,
-    )  # fmt: skip
+        hand,
+        tendons=(),
+        dof=dof,
+        multiplier=rate,
+        dof_names=tuple(hand.dof_names[d] for d in kept),
+        lower=lower,
+        upper=upper,
+        effort=pulls @ hand.effort,
+        stiffness=pulls @ hand.stiffness,
+        preshape=hand.preshape[kept],
+        closing=hand.closing[kept],
+        velocity=hand.velocity[kept] if len(hand.velocity) else hand.velocity,
+    )
 
 
 def nearest(hand: HandModel, joints: Floats) -> Floats:

@@ -1,7 +1,5 @@
-"""Pages of pictures: the best grasps with their figures, grasps from three sides, the views of a shard.
-
-Text and colour for pictures that people read.
-"""
+"""Pages of pictures with their text and colours: the best grasps with figures, grasps from three sides, views of a
+shard."""
 
 from __future__ import annotations
 

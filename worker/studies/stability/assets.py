@@ -1,6 +1,5 @@
-"""Objects that are hard: thin, sharp, pierced, open, inside out, tiny and huge; through ingest to the referee.
-
-Hands that are hard: few fingers and many, small ones and large ones, drives that move several joints.
+"""Objects and hands that are hard: thin, sharp, open, tiny, huge; few fingers and many, coupled drives. They go
+through ingest.
 
 A family of hands stands for them: like fingers of three joints in a ring around a palm, which lean outward while they
 are open.

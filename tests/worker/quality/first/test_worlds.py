@@ -99,10 +99,13 @@ def test_the_band_is_clear_of_neither_side() -> None:
     n, held = 4, [Outcome.HELD] * 6
     lost = [Outcome.DISPLACED] + [Outcome.NOT_TRIED] * 5
     found = FirstTrials(
-        outcome=np.array([held, held, lost, lost], np.uint8), margin=np.array([0.79, 0.81, 1.19, 1.21]),
-        penetration_m=np.zeros(n), self_penetration_m=np.zeros(n), overflow=np.zeros(n, bool),
+        outcome=np.array([held, held, lost, lost], np.uint8),
+        margin=np.array([0.79, 0.81, 1.19, 1.21]),
+        penetration_m=np.zeros(n),
+        self_penetration_m=np.zeros(n),
+        overflow=np.zeros(n, bool),
         ticks=np.zeros(n, np.int32),
-    )  # fmt: skip
+    )
     assert found.clearly_held.tolist() == [True, False, False, False]
     assert found.clearly_failed.tolist() == [False, False, False, True]
 

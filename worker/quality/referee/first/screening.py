@@ -1,15 +1,12 @@
-"""The first judge beside the CPU: it gives the clear verdicts, and MuJoCo on the CPU all others and a sample of these.
+"""The GPU prefilter in MuJoCo Warp: it gives the clear verdicts, and MuJoCo on the CPU all others and a sample of
+these.
 
 At level `certificate` it only refuses: what clearly fails goes no further, and whatever may hold is certified on the
 CPU. At level `screen` its clear verdicts stand both ways. It has no part in the letter, and none in lifts.
 
-Worlds of one hand and one object in MuJoCo Warp, which judge grasps by the schedule of `kernels`.
-
 The model is the referee's own, compiled once; what differs between grasps (postures, commands, pushes) is data. A pool
 of worlds takes grasps from a queue on the device, so a launch stays full until the queue is empty, and one graph serves
 any number of grasps.
-
-MuJoCo Warp, where it is installed: MuJoCo's physics as Warp kernels, many worlds at once.
 """
 
 from __future__ import annotations
@@ -191,9 +188,11 @@ class WorldPool:
             self._engine.fwd_position(self._model, data)
             contact = data.contact
             wp.launch(
-                kernels.depths, data.naconmax,
-                inputs=[first, self._of_hand, data.nacon, contact.worldid, contact.geom, contact.dist], outputs=[out],
-            )  # fmt: skip
+                kernels.depths,
+                data.naconmax,
+                inputs=[first, self._of_hand, data.nacon, contact.worldid, contact.geom, contact.dist],
+                outputs=[out],
+            )
             most = max(int(data.nacon.numpy()[0]), int(data.ncollision.numpy()[0]))
             short[first : first + self.worlds] = most > data.naconmax
         return out.numpy().astype(float), short
@@ -203,9 +202,11 @@ class WorldPool:
         self.launches = 0
         self._state.assign(np.array([0, self.worlds, count], np.int32))
         wp.launch(
-            kernels.begin, self.worlds, inputs=[self._terms, self._asked],
+            kernels.begin,
+            self.worlds,
+            inputs=[self._terms, self._asked],
             outputs=[self._worlds, self._arrays, self._state],
-        )  # fmt: skip
+        )
         while True:
             taken, alive, _ = self._state.numpy()
             run.progress(min(int(taken), count) - int(alive), count, "first judge")
@@ -230,9 +231,11 @@ class WorldPool:
         for _ in range(self._steps):
             self._engine.step(self._model, self._data)
         wp.launch(
-            kernels.look, self.worlds, inputs=[self._terms, self._asked],
+            kernels.look,
+            self.worlds,
+            inputs=[self._terms, self._asked],
             outputs=[self._worlds, self._arrays, self._found, self._state],
-        )  # fmt: skip
+        )
 
 
 _pools: OrderedDict[tuple[str, str, int], WorldPool] = OrderedDict()
