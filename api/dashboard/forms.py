@@ -22,7 +22,7 @@ from api.dashboard.form_uploads import FILE_FIELDS, UNITS, Chosen, choices, chos
 from api.dashboard.rendering import render
 from api.routes.dependencies import AssetsOf, JobsOf, may_read, may_submit
 from service.index.index import Index
-from service.index.queries.usage import BatchCost, Costs
+from service.index.queries.overview import BatchCost, Costs
 from service.model.base import refusal, words
 from service.model.domain import JobRequest
 from service.model.errors import GraspdError, InputError

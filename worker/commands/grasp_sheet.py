@@ -18,9 +18,9 @@ from worker.files.provenance import neighbours_of_shard, placed_of_shard
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.rendering.pages.pictures import SAMPLES, THREE_SIDES, grasp_pictures
-from worker.rendering.pages.sheets import contact_sheet, figures, label_page, three_sides_sheet
-from worker.rendering.pages.way_pictures import FREE_STRIP, STRIP, Around, animation, animation_kind, way_pictures
+from worker.rendering.pictures import SAMPLES, THREE_SIDES, grasp_pictures
+from worker.rendering.sheets import contact_sheet, figures, label_page, three_sides_sheet
+from worker.rendering.way_pictures import FREE_STRIP, STRIP, Around, animation, animation_kind, way_pictures
 from worker.robots.execution import (
     STEP_S,
     Executions,

@@ -27,10 +27,10 @@ from service.model.errors import (
     QueueUnavailable,
     UnavailableError,
 )
-from service.model.finding import Finding, bad, good, skipped, warning
 from service.pipeline.identity import Identity, recorded, service_ids
 from service.queue.connection import connect, redis_url, socket_path
 from service.queue.rq_queue import open_queue
+from service.run.doctor.checks import Finding, bad, good, skipped, warning
 from service.run.doctor.machine import existing, local_store
 from service.run.embedded import find_server
 from service.settings import Settings

@@ -15,8 +15,7 @@ from graspd.cli import build
 from service.model.matter import ACCELERATION, FRICTION
 from tests.worker.quality.test_mass import BOX, HAND, LEVER_M, PIECES, TABLE, TORQUE, pinch
 from worker.grasps import Posture
-from worker.quality.capacity import AT_STOP, capacities
-from worker.quality.referee.payload import ENOUGH, HOPELESS, LEAST, Limit, limit_of
+from worker.quality.referee.payload import AT_STOP, ENOUGH, HOPELESS, LEAST, Limit, capacities, limit_of
 from worker.quality.wrench_space import EDGES
 
 UP = np.array([[[0.0, 1.0, 0.0]]])

@@ -21,10 +21,9 @@ from service.model.errors import InputError
 from service.model.transforms import Floats, cross, quat_from_axis_angle, quat_from_matrix, quat_multiply, quat_rotate
 from worker.hands.jaws import Jaws, jaws_of
 from worker.hands.model import HandModel
-from worker.objects.antipodal import Pairs
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.reaching import LOOKS, Reaching
-from worker.planners.fitting import fitting_pairs
+from worker.planners.fitting import Pairs, fitting_pairs
 from worker.simulation.data import Data, HandState
 from worker.simulation.model import Model
 from worker.simulation.record import record_placement

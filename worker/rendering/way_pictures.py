@@ -23,7 +23,7 @@ from worker.objects.mesh_geometry import to_centre
 from worker.objects.model import ObjectModel
 from worker.rendering.cameras import intrinsics, look_at
 from worker.rendering.hands import drawn_bodies, drawn_parts, drawn_poses
-from worker.rendering.pages.pictures import (
+from worker.rendering.pictures import (
     FIELD_OF_VIEW,
     FLOOR,
     FLOOR_SIZE,
