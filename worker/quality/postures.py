@@ -180,13 +180,13 @@ def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: Plac
 
 #: Room that the open hand has, and that it has while it closes [m]: a little more than is asked for, since ways are
 #: looked at in steps.
-OPEN_M: Final = CLEAR_M + 0.0025
+RAISE_OPEN_M: Final = CLEAR_M + 0.0025
 
-LIFTED_CLOSING_M: Final = CLEAR_M + 0.0003
+RAISE_CLOSING_M: Final = CLEAR_M + 0.0003
 #: Shares of the way to the grasp that are looked at: those of the sweep, but for the grasp itself.
-LOOKS: Final = tuple(np.arange(8) / 8)
+RAISE_LOOKS: Final = tuple(np.arange(8) / 8)
 #: A hand is raised by no more than this [m]: from higher it would come down on the object.
-HIGHEST_M: Final = 0.008
+HIGHEST_RAISE_M: Final = 0.008
 
 
 def raised(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: Placed) -> Posture:
@@ -199,20 +199,20 @@ def raised(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: Placed) -
         return pregrasp
     lack = _lack(hand, grasp.take(rows), pregrasp.take(rows), placed.take(rows))
     # What the root is raised by at first is less and less on the way.
-    height = (lack / (1 - np.array(LOOKS))).max(axis=1)
-    height = np.where(height <= HIGHEST_M, height, 0.0)
+    height = (lack / (1 - np.array(RAISE_LOOKS))).max(axis=1)
+    height = np.where(height <= HIGHEST_RAISE_M, height, 0.0)
     up = np.array([scene.up for scene in placed.scenes])[placed.index[rows]]
     poses[rows, :3] += height[:, None] * up
     return Posture(poses, pregrasp.joint_positions)
 
 
 def _lack(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: Placed) -> Floats:
-    """(n, looks) what hands lack of their room at the shares `LOOKS` of their way."""
-    share = np.array(LOOKS)[None, :, None]
+    """(n, looks) what hands lack of their room at the shares `RAISE_LOOKS` of their way."""
+    share = np.array(RAISE_LOOKS)[None, :, None]
     pose = (1 - share) * pregrasp.hand_pose[:, None] + share * grasp.hand_pose[:, None]
     pose[..., 3:] = pregrasp.hand_pose[:, None, 3:]  # a pregrasp is never turned against its grasp
     joints = (1 - share) * pregrasp.joint_positions[:, None] + share * grasp.joint_positions[:, None]
     postures = Posture(pose.reshape(-1, 7), joints.reshape(-1, joints.shape[-1]))
-    room = obstacle_room(hand, postures, placed.scenes, np.repeat(placed.index, len(LOOKS)))
-    wanted = np.where(np.array(LOOKS) > 0, LIFTED_CLOSING_M, OPEN_M)
+    room = obstacle_room(hand, postures, placed.scenes, np.repeat(placed.index, len(RAISE_LOOKS)))
+    wanted = np.where(np.array(RAISE_LOOKS) > 0, RAISE_CLOSING_M, RAISE_OPEN_M)
     return np.maximum(0.0, wanted - room.reshape(len(grasp), -1))

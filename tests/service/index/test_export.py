@@ -17,7 +17,7 @@ pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed; pi
 
 
 def test_every_row_and_value_of_a_table_is_in_its_file(services: Services, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("service.run.store_commands.GROUP", 7)  # several groups of rows, the last one not full
+    monkeypatch.setattr("service.index.export.GROUP", 7)  # several groups of rows, the last one not full
     make(services, enter(services, "vision", 1, batches=2))
     counts = export(services.index.database, tmp_path)
     assert counts["grasps"] == 64 and counts["jobs"] == 1 and counts["shards"] == counts["tasks"] > 1
