@@ -25,8 +25,8 @@ from worker.quality.postures import hold_forces
 from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
 from worker.quality.referee.judge import judge
 from worker.quality.table import measure
-from worker.rendering.pages.pictures import grasp_pictures
-from worker.rendering.pages.sheets import contact_sheet
+from worker.rendering.pictures import grasp_pictures
+from worker.rendering.sheets import contact_sheet
 
 #: Objects of a hand that are shown, and failures of each beside one that holds.
 WORST, SHOWN = 3, 3

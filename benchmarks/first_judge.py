@@ -20,12 +20,11 @@ import numpy as np
 
 from benchmarks.cells import Cell, cell_parser, cells, write_json
 from worker.engines.devices import Device, cpu_name
-from worker.engines.mujoco_warp import mujoco_warp
 from worker.grasps import GraspSet, Posture
 from worker.quality.intervals import wilson
 from worker.quality.referee.decomposition import decompose
+from worker.quality.referee.first.screening import WorldPool, mujoco_warp
 from worker.quality.referee.first.trials import FirstTrials
-from worker.quality.referee.first.worlds import WorldPool
 from worker.quality.referee.model import MujocoOptions, build
 
 OBJECTS = ("005_tomato_soup_can", "025_mug", "011_banana", "035_power_drill")

@@ -27,7 +27,7 @@ from service.model.version import STAGE_REVISIONS
 from worker.hands.jaws import jaws_of
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
-from worker.rendering.pages.pictures import grasp_pictures
+from worker.rendering.pictures import grasp_pictures
 from worker.stages.hand_self_test import GRASPS, READY, Best, failed, self_test
 
 PACKAGES = "airo-models example-robot-data robosuite robosuite-models robopianist"

@@ -34,9 +34,8 @@ from worker.quality.postures import squeeze
 from worker.quality.referee.compiled import scene_of
 from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.lift import LiftOutcome
-from worker.quality.referee.limit import limit_of
 from worker.quality.referee.model import MujocoOptions
-from worker.quality.referee.payload import LIFTING, LiftPayload, PushPayload
+from worker.quality.referee.payload import LIFTING, LiftPayload, PushPayload, limit_of
 from worker.quality.referee.protocol import DIRECTIONS, Outcome, Trial
 from worker.scenes.beside import scenes_of
 from worker.simulation.surroundings import Placed

@@ -31,7 +31,7 @@ EXTRAS: Final = ("", "api", "worker", "all", "dev")
 LARGEST: Final = 6
 _COMMAND: Final = "import sys; sys.argv = ['graspd', {}]; import graspd.cli; graspd.cli.main()"
 _OURS: Final = "from service.model.libraries import imports, own_process; own_process()\nwith imports(): {}"
-_ENGINE: Final = "import worker.certified, worker.planners.fast_graspd.method"
+_ENGINE: Final = "import worker.certified, worker.planners.fast_graspd.planner"
 #: What somebody waits for, and what does it.
 STARTS: Final = {
     "Python alone": "pass",

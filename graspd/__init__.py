@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     __version__: str
 
 _ERRORS: Final = "service.model.errors"
-
 #: Name, the module it lives in.
 _LIVES_IN: Final = {
     "synthesize": "graspd.synthesis",

@@ -32,7 +32,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("pictures", "worker.commands.render", "Use grasps", "Draw the best grasps of a file on one sheet."),
     ("view", "worker.commands.render", "Use grasps", "Show grasps of a file in 3D in the browser."),
     ("grasps", "worker.commands.curate", "Use grasps", "Select grasps of files and datasets by their metrics."),
-    ("clouds", "worker.commands.exchange", "Use grasps", "Write pictures as point clouds, with their grasps."),
+    ("clouds", "worker.commands.curate", "Use grasps", "Write pictures as point clouds, with their grasps."),
     ("export", "worker.commands.exchange", "Use grasps", "Export grasps and pictures to other formats."),
     ("import", "worker.commands.exchange", "Use grasps", "Import grasps from other formats, and validate them."),
     ("up", "service.run.commands", "Service", "Run the whole service on this machine, until Ctrl-C."),
@@ -70,7 +70,7 @@ JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("objects", "check", "worker.commands.objects", "Say whether a mesh can be used, and what was repaired."),
     ("datasets", "balance", "worker.commands.curate", "Draw a part in which no kind of grasps is more frequent."),
     ("datasets", "diff", "worker.commands.curate", "Compare two datasets."),
-    ("datasets", "card", "worker.commands.curate", "Write a dataset's card: contents, quality, biases, plots."),
+    ("datasets", "card", "worker.commands.exchange", "Write a dataset's card: contents, quality, biases, plots."),
 )
 
 #: What a room cannot work without, and the extra that brings it: an image has only the rooms it needs.

@@ -141,7 +141,7 @@ def print_results(console: Console, best: list[GraspView], job: JobDetail, paths
 
 def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
     """The contact sheet of the best grasps, the views of the first batch, and an index.html that shows both."""
-    from worker.rendering.pages.sheets import views_page
+    from worker.rendering.sheets import views_page
 
     pictures = []
     bases = [path for path in shards if path.name.startswith("base")]
@@ -163,8 +163,8 @@ def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     from worker.engines import backend
     from worker.hands.load import load_hand
     from worker.objects.prepare import load_object
-    from worker.rendering.pages.pictures import grasp_pictures
-    from worker.rendering.pages.sheets import best, contact_sheet, figures
+    from worker.rendering.pictures import grasp_pictures
+    from worker.rendering.sheets import best, contact_sheet, figures
 
     backend.start()
     hand_files, object_files = (

@@ -16,13 +16,11 @@ import typer
 from graspd.cli import missing_extra
 from service.cli import JsonFlag, emit, load_settings, reporting_errors
 from service.model.errors import InputError
-from service.model.finding import Condition, Finding, skipped
 from service.run.doctor import backends, fleet, machine
-from service.run.doctor.patience import THREADS, Check, run_checks
+from service.run.doctor.checks import THREADS, Check, Condition, Finding, run_checks, skipped
 from service.settings import Settings
 
 app = typer.Typer(no_args_is_help=False)
-
 _COLOURS: Final = {
     Condition.GOOD: typer.colors.GREEN,
     Condition.WARNING: typer.colors.YELLOW,

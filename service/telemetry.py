@@ -1,12 +1,7 @@
-"""Log lines of every process: JSON for machines, text on a terminal, each with the request, job and task it is about.
+"""Telemetry of every process: log lines (JSON for machines, text on a terminal), OpenTelemetry spans, and a heartbeat
+file for health checks.
 
 `bind` says what a piece of work is about; every line written within carries that, whichever module writes it.
-
-OpenTelemetry spans, where the operator asks for them: OTEL_EXPORTER_OTLP_ENDPOINT set and `graspd[otel]` installed.
-
-Off, nothing of OpenTelemetry is imported and a span costs a comparison.
-
-A file that a process touches while it lives: a health check is then a look at its age, and no process of ours.
 """
 
 from __future__ import annotations
@@ -32,11 +27,8 @@ if TYPE_CHECKING:
 
 #: What a line can be about, in the order in which it is shown.
 SUBJECTS: Final = ("request", "key", "job", "task", "attempt", "worker")
-
 _bound: ContextVar[Mapping[str, Any]] = ContextVar("bound", default=MappingProxyType({}))
-
 _ORDINARY: Final = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "about", "taskName"}
-
 #: RQ tells of every idle poll, httpx of every request.
 _TALKATIVE: Final = ("rq.worker", "rq.job", "rq.queue", "httpx")
 
@@ -132,9 +124,7 @@ def _time(record: logging.LogRecord) -> str:
 
 
 log = logging.getLogger(__name__)
-
 _ASKED_BY: Final = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
-
 _tracer: Any = None
 
 

@@ -27,7 +27,7 @@ from worker.hands.model import HandModel
 from worker.hands.oppositions import require_opposing
 from worker.objects.model import ObjectModel
 from worker.planners import NoPlace, Trial, Wanted, fitting_pairs, method, synthesize
-from worker.planners.fast_graspd.gaps import why_narrow
+from worker.planners.fast_graspd.across import why_narrow
 from worker.quality.diversity import POINTS, distinct, hand_points
 from worker.quality.gate import GATES, failed_gate, passes
 from worker.quality.referee.decomposition import ConvexPieces, decompose
@@ -37,12 +37,9 @@ from worker.quality.referee.judge import judge
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lift import LiftOutcome
 from worker.quality.referee.lifting import judge_lifts, lift_key
-from worker.quality.referee.limit import ENOUGH, Limit, limit_of
-from worker.quality.referee.payload import payloads
+from worker.quality.referee.payload import ENOUGH, Limit, limit_of, payloads, shake_margins
 from worker.quality.referee.protocol import DIRECTIONS, Outcome
-from worker.quality.referee.robust import reaches, robust
-from worker.quality.referee.robustness import robustness
-from worker.quality.referee.shake import shake_margins
+from worker.quality.referee.robust import reaches, robust, robustness
 from worker.quality.table import measure
 from worker.rounds import ROUND_STRIDE, Arrays, Round, enough, lanes_of, next_round, taken
 from worker.run import ALONE, Run
@@ -56,19 +53,30 @@ from worker.simulation.surroundings import Placed, Scenes
 REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "fragile", "weak", "alike")
 #: Outcomes that are not told by the word of their rejection.
 _REJECTION_OF: Final = {
-    "no_place": "blocked", "diverged": "diverged", "fragile": "fragile", "weak": "weak", "alike": "alike",
+    "no_place": "blocked",
+    "diverged": "diverged",
+    "fragile": "fragile",
+    "weak": "weak",
+    "alike": "alike",
     **{f"gate_{name}": "gate" for name in GATES},
-}  # fmt: skip
+}
 #: Names of the outcomes of a push and of a lift that drops a grasp.
 _PUSHED: Final = {
-    Outcome.PENETRATION: "penetration", Outcome.LOST_WHILE_CLOSING: "lost_while_closing",
-    Outcome.DISPLACED: "slipped", Outcome.ROTATED: "turned", Outcome.DIVERGED: "unstable",
-}  # fmt: skip
+    Outcome.PENETRATION: "penetration",
+    Outcome.LOST_WHILE_CLOSING: "lost_while_closing",
+    Outcome.DISPLACED: "slipped",
+    Outcome.ROTATED: "turned",
+    Outcome.DIVERGED: "unstable",
+}
 _LIFTED: Final = {
-    LiftOutcome.PENETRATION: "penetration", LiftOutcome.TOUCHED_ON_THE_WAY: "touched_on_the_way",
-    LiftOutcome.LOST_WHILE_CLOSING: "lost_while_closing", LiftOutcome.NOT_LIFTED: "not_lifted",
-    LiftOutcome.TURNED: "turned", LiftOutcome.DIVERGED: "unstable", LiftOutcome.NEIGHBOUR_MOVED: "neighbour_moved",
-}  # fmt: skip
+    LiftOutcome.PENETRATION: "penetration",
+    LiftOutcome.TOUCHED_ON_THE_WAY: "touched_on_the_way",
+    LiftOutcome.LOST_WHILE_CLOSING: "lost_while_closing",
+    LiftOutcome.NOT_LIFTED: "not_lifted",
+    LiftOutcome.TURNED: "turned",
+    LiftOutcome.DIVERGED: "unstable",
+    LiftOutcome.NEIGHBOUR_MOVED: "neighbour_moved",
+}
 #: Shares of a round's progress: planned, judged, measured.
 _PARTS: Final = (0.6, 0.8, 1.0)
 
@@ -240,9 +248,14 @@ class _Work:
         latest = max(ENOUGH, sum(map(len, made[-1].planned)))
         planned = planned.take(slice(max(0, len(planned) - latest), None))
         self.limit = limit_of(
-            self.hand, self.obj, planned, wanted=max(self.obj.mass, self.request.min_payload),
-            pieces=self.pieces.result(), placed=self._placed(planned), run=self._run.quiet(),
-        )  # fmt: skip
+            self.hand,
+            self.obj,
+            planned,
+            wanted=max(self.obj.mass, self.request.min_payload),
+            pieces=self.pieces.result(),
+            placed=self._placed(planned),
+            run=self._run.quiet(),
+        )
         return self.limit is not None and self.limit.hopeless
 
     @property
@@ -291,10 +304,10 @@ class _Work:
         number_of_batch = self.batch + number * ROUND_STRIDE
         wanted = Wanted(
             len(rows), request.knobs, request.seed, number_of_batch, placed, self._trial(), rows.start, known
-        )  # fmt: skip
+        )
         planned = synthesize(
             self.hand, self.obj, wanted, run.part(0.0, _PARTS[0]), method=request.method, options=request.options
-        )  # fmt: skip
+        )
         # Verdicts and metrics are many short pieces of work: all cores may take them, whatever other lanes are at.
         # What is judged is what is told: positions are on the grid before.
         planned = replace(planned, scene=index).moved(np.zeros(3))
@@ -327,9 +340,17 @@ class _Work:
         if self.repeated:
             outcomes["repeated"] = self.repeated
         found = Certified(
-            grasps, columns, tried, rejected, outcomes, None, len(fates), self.seconds, self._shares(rounds),
+            grasps,
+            columns,
+            tried,
+            rejected,
+            outcomes,
+            None,
+            len(fates),
+            self.seconds,
+            self._shares(rounds),
             limit=None if len(grasps) else self.limit,
-        )  # fmt: skip
+        )
         if self.pieces is None:
             return found
         columns |= self._second_opinions(grasps, columns["quality/valid"])
@@ -344,9 +365,13 @@ class _Work:
     def _key(self, pieces: ConvexPieces) -> str:
         if self.scenes is None:
             return verdict_key(
-                self.hand, self.obj, self._level, False, pieces=pieces,
+                self.hand,
+                self.obj,
+                self._level,
+                False,
+                pieces=pieces,
                 first_judge=first_terms(self.hand, self._level, self._run),
-            )  # fmt: skip
+            )
         placed = self.scenes.placed(np.zeros(0, int))
         return lift_key(self.hand, self.obj, placed, lift_level(self.request.referee), False, pieces=pieces)
 
@@ -448,9 +473,15 @@ class _Work:
         pieces = None if self.pieces is None else self.pieces.result()
         began = time.perf_counter()
         grasps, columns, counts = scene_verdicts(
-            self.hand, self.obj, grasps, scenes, level=lift_level(self.request.referee), pieces=pieces,
-            known=self._known, run=run.part(*_PARTS[:2]),
-        )  # fmt: skip
+            self.hand,
+            self.obj,
+            grasps,
+            scenes,
+            level=lift_level(self.request.referee),
+            pieces=pieces,
+            known=self._known,
+            run=run.part(*_PARTS[:2]),
+        )
         seconds["referee"] += time.perf_counter() - began
         return grasps, columns, counts
 
@@ -458,9 +489,14 @@ class _Work:
         if self.pieces is None:
             return {}
         verdicts = judge(
-            self.hand, self.obj, grasps, level=self._level, pieces=self.pieces.result(),
-            known=self._known, run=run.part(*_PARTS[:2]),
-        )  # fmt: skip
+            self.hand,
+            self.obj,
+            grasps,
+            level=self._level,
+            pieces=self.pieces.result(),
+            known=self._known,
+            run=run.part(*_PARTS[:2]),
+        )
         seconds["referee"] += verdicts.seconds
         return {
             "quality/success": verdicts.success,
@@ -469,17 +505,23 @@ class _Work:
             **({"quality/judged_by": verdicts.judged_by} if first_terms(self.hand, self._level, self._run) else {}),
         }
 
-    def _in_models(
-        self, grasps: GraspSet, held: NDArray[np.bool_], run: Run, seconds: dict[str, float]
-    ) -> Arrays:  # fmt: skip
+    def _in_models(self, grasps: GraspSet, held: NDArray[np.bool_], run: Run, seconds: dict[str, float]) -> Arrays:
         """Share of the models in which those that hold do, told whole of raw grasps, and what they fail first of."""
         assert self.pieces is not None
         wish = self.request
         found = robust(
-            self.hand, self.obj, grasps, held=held, placed=self._placed(grasps), level=lift_level(wish.referee),
-            models=wish.models, seed=wish.seed, pieces=self.pieces.result(),
-            wanted=wish.robust if wish.want == "valid" else 0, run=run.quiet(),
-        )  # fmt: skip
+            self.hand,
+            self.obj,
+            grasps,
+            held=held,
+            placed=self._placed(grasps),
+            level=lift_level(wish.referee),
+            models=wish.models,
+            seed=wish.seed,
+            pieces=self.pieces.result(),
+            wanted=wish.robust if wish.want == "valid" else 0,
+            run=run.quiet(),
+        )
         seconds["referee"] += found.seconds
         return found.columns
 
@@ -497,9 +539,14 @@ class _Work:
         assert self.pieces is not None
         began = time.perf_counter()
         found = payloads(
-            self.hand, self.obj, grasps, pieces=self.pieces.result(), placed=self._placed(grasps), held=held,
+            self.hand,
+            self.obj,
+            grasps,
+            pieces=self.pieces.result(),
+            placed=self._placed(grasps),
+            held=held,
             run=run.quiet(),
-        )  # fmt: skip
+        )
         seconds["referee"] += time.perf_counter() - began
         return np.where(held & np.isnan(found), self.obj.mass, found)
 
@@ -539,9 +586,15 @@ class _Work:
             columns["quality/audit"] = audit
         if repeats := self.request.robustness:
             columns["quality/robustness"] = robustness(
-                self.hand, self.obj, grasps, held=valid, repeats=repeats, seed=self.request.seed,
-                pieces=self.pieces.result(), run=self._run.quiet(),
-            )  # fmt: skip
+                self.hand,
+                self.obj,
+                grasps,
+                held=valid,
+                repeats=repeats,
+                seed=self.request.seed,
+                pieces=self.pieces.result(),
+                run=self._run.quiet(),
+            )
         self.seconds["referee"] += time.perf_counter() - began
         return columns
 

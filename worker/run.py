@@ -1,4 +1,4 @@
-"""The context of a piece of work: on what it runs, whom it tells how far it is, and who may stop it."""
+"""The context of a piece of work: device, progress, cancellation, and the threads that share its cores."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ from typing import Final, Literal
 
 from service.model.cores import available_cores
 from service.model.errors import TaskCancelled
-from worker.lanes import Lanes
 from worker.meeting import Meeting
 from worker.pool.pool import Pool
 
 FirstJudge = Literal["auto", "on", "off"]
 Progress = Callable[[float, float, str], None]
+
 """Told what is done, of how much, and a word on it; from any thread, often."""
+
 Cancelled = Callable[[], bool]
+
 """Asked often, from any thread: whether to stop."""
 
 
@@ -26,6 +28,19 @@ def _silent(done: float, total: float, message: str) -> None:
 
 def _never() -> bool:
     return False
+
+
+class Lanes:
+    """How many lanes share the cores; one that ends leaves its own to the others."""
+
+    def __init__(self, members: int) -> None:
+        self.members = members
+        self._lock = threading.Lock()
+
+    def leave(self) -> None:
+        """One lane needs no cores any more."""
+        with self._lock:
+            self.members -= 1
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar
 
-from worker.lanes import Lanes
-from worker.run import Progress, Run
+from worker.run import Lanes, Progress, Run
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -29,22 +29,14 @@ from worker.scenes.neighbours import Neighbours
 
 #: Points of the hand whose distance from the object is shown, where it is less than this [m].
 POINTS: Final = 3000
-
 NEAR_M: Final = 0.005
-
 _OBJECT: Final = (232, 184, 120)
-
 _NEIGHBOUR: Final = (180, 174, 191)
-
 _TABLE: Final = (207, 212, 214)
-
 _WALL: Final = (143, 163, 176)
-
 _DISC_M: Final = 0.32
-
 #: Signed distance [m] and colour: red inside, green touching, blue near; lightness changes too.
 _STOPS: Final = (-0.001, -0.0002, 0.0003, 0.002, NEAR_M)
-
 _COLOURS: Final = np.array([(209, 38, 60), (240, 128, 60), (20, 184, 122), (53, 162, 240), (185, 212, 245)], np.float64)
 
 Supports = Sequence[HalfSpace | Box]
@@ -173,15 +165,11 @@ def _srgb(linear: float) -> float:
 
 #: Seconds from one named posture to the next while the way is played, and from picture to picture.
 STOP_S: Final = 1.2
-
 FRAME_S: Final = 0.04
-
 #: Contact threshold at which epsilon is quoted [m].
 _QUOTED_M: Final = 0.005
-
 #: How far the first view is from the object, and how far its sides are apart [m], [rad].
 _EYE_M: Final = 0.7
-
 _STEP: Final = np.pi / 8
 
 

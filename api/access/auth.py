@@ -33,7 +33,6 @@ from service.model.projects import EVERYTHING, PATTERN, ProjectScope
 from service.settings import Settings
 
 SESSION_COOKIE: Final = "graspd_session"
-
 #: Headers that a proxy adds: while the service is open they mean that somebody else's requests arrive here.
 _OF_PROXIES: Final = ("x-forwarded-for", "x-forwarded-host", "forwarded", "via", "x-real-ip")
 
@@ -171,14 +170,10 @@ def _is_elsewhere(address: str) -> bool:
 
 
 GROUPS: Final = "x-forwarded-groups"
-
 #: In the place of a group: whoever is signed in.
 ANYBODY: Final = "*"
-
 _LEAST_SECRET: Final = 16
-
 _LONGEST_USER: Final = 200
-
 _USER: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@+-]*")
 
 

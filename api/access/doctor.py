@@ -9,7 +9,7 @@ from typing import Final
 from api.access.auth import Proxy
 from api.access.keys import Key, KeyFile, Scope
 from service.model.errors import GraspdError
-from service.model.finding import Finding, bad, good, warning
+from service.run.doctor.checks import Finding, bad, good, warning
 from service.settings import Settings
 
 _LOCAL: Final = ("127.0.0.1", "::1", "localhost")

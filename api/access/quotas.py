@@ -23,10 +23,8 @@ from service.model.errors import QuotaError
 from service.settings import Settings
 
 log = logging.getLogger(__name__)
-
 #: A key that submits nothing for this long is forgotten [s].
 _KEPT_S: Final = 30 * 86400
-
 _AT_ONCE: Final = 1000
 
 #: A submission that has not ended after this long died with its process [s].

@@ -146,7 +146,6 @@ class Datasets:
 
 #: Cells of a dataset that are compared one by one: nobody reads more rows.
 MOST_CELLS: Final = 1000
-
 _AT_ONCE: Final = 200
 
 

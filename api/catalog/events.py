@@ -29,10 +29,8 @@ from service.pipeline.backends import Services
 from service.pipeline.recording import recording
 
 POLL_S: Final = 0.5
-
 #: A client that reconnects waits this long.
 RETRY_MS: Final = 2000
-
 _ENDS_AT_ONCE: Final = 100
 
 

@@ -41,7 +41,6 @@ from service.store.shards import Shard, read_shard
 from service.store.store import Store
 
 _KEPT_HISTOGRAMS: Final = 256
-
 MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(metric.name for metric in indexed(Indexed.OFFERED))
 
 
@@ -176,20 +175,14 @@ def _bounded(query: GraspQuery) -> GraspFilter:
 
 #: A base shard of 32 grasps is some 60 kB; a page of grasps reads as many as it has rows, at worst.
 _KEPT_SHARDS: Final = 64
-
 _POSTURES: Final = ("pregrasp", "grasp", "squeeze")
-
 _OUTCOME: Final = "quality/verdict_outcome"
-
 #: What the numbers of the column mean, as its description in the schema says.
 OUTCOMES: Final = {
     int(code): words for code, words in re.findall(r"(\d) ([a-z ]+)", SCHEMAS["base"][_OUTCOME].description)
 }
-
 DIRECTIONS: Final = ("+x", "−x", "+y", "−y", "+z", "−z")
-
 _LIFT: Final = "quality/lift_outcome"
-
 #: What the numbers of the column mean, as its description in the schema says.
 LIFT_OUTCOMES: Final = {
     int(code): words for code, words in re.findall(r"(\d) ([a-z ]+)", SCHEMAS["base"][_LIFT].description)

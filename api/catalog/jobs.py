@@ -24,16 +24,11 @@ from service.pipeline.backends import Services
 from service.telemetry import bind
 
 log = logging.getLogger(__name__)
-
 _PAGE: Final = 200
-
 #: Waiting tasks among which one is sought that says why it waits.
 _LOOKED_AT: Final = 20
-
 _ORDER: Final = {stage: place for place, stage in enumerate(Stage)}
-
 _KEPT_LOSSES: Final = 256
-
 _LOSS_BATCHES: Final = 8
 
 
@@ -211,10 +206,8 @@ class Jobs:
 
 #: A shorter look at a task says more about when its progress was reported than about its speed.
 _LEAST_SPAN_S: Final = 1.0
-
 #: A task that has only begun spent its time on loading, not on its work.
 _LEAST_SHARE: Final = 0.03
-
 _KEPT_TASKS: Final = 4096
 
 

@@ -29,9 +29,7 @@ from service.pipeline.leading import PART
 from service.queue.port import QueueNow
 
 _DAMAGE_SHOWN: Final = 5
-
 _JOBS_WATCHED: Final = 20
-
 #: The fingerprint is made anew at most this often, however many pages watch it [s].
 FINGERPRINT_S: Final = 1.0
 
@@ -156,10 +154,8 @@ def _seconds(part: Part) -> float | None:
 
 #: The parts are asked anew at most this often [s].
 KEPT_S: Final = 2.0
-
 #: A part that has not answered by then counts as away [s].
 PATIENCE_S: Final = 2.0
-
 _INCOMPLETE: Final = "the controller makes it from the store now; until it has, jobs are missing from it"
 
 
@@ -258,9 +254,7 @@ class _Probe:
 
 #: Days that are told where nobody asks for others.
 DAYS: Final = 31
-
 MOST_DAYS: Final = 366
-
 _COLUMNS: Final = tuple(UsageDay.model_fields)
 
 

@@ -21,21 +21,15 @@ keys_app = typer.Typer(no_args_is_help=True, help="Make, list, rotate, limit and
 _UNITS: Final = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days"}
 
 NameArgument = Annotated[str, typer.Argument(help="Whose key it is.")]
-
 ProjectOption = Annotated[
     str, typer.Option(help="Project that it belongs to; keys of other projects see nothing of it.", metavar="NAME")
 ]
-
 LifetimeOption = Annotated[
     str | None, typer.Option("--expires", help="How long it lives: 90d, 12h; default: for ever.")
 ]
-
 RequestsOption = Annotated[int | None, typer.Option(min=0, help="Requests a minute; 0: no limit.")]
-
 ConcurrencyOption = Annotated[int | None, typer.Option(min=0, help="Requests answered at once; 0: no limit.")]
-
 GraspsOption = Annotated[int | None, typer.Option(min=0, help="Grasps in unfinished jobs; 0: no limit.")]
-
 JobsOption = Annotated[int | None, typer.Option(min=0, help="New jobs a day (UTC); 0: no limit.")]
 
 

@@ -54,14 +54,10 @@ from service.store.object_sets import SUFFIXES as MESHES
 from service.store.object_sets import Objects, files_of_set
 
 NameOption = Annotated[str | None, typer.Option("--name", help="Name to give it; default: the file's.")]
-
 SharedOption = Annotated[bool, typer.Option("--shared", help="Let every project use it, not only that of the key.")]
-
 WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until a worker has checked it.")]
-
 #: How long a check is waited for, without and with a self-test [s].
 _CHECK_S: Final = 120.0
-
 _SELF_TEST_S: Final = 900.0
 
 

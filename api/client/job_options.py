@@ -37,9 +37,7 @@ _HELP: Final = {
     "touch": "mm that fingertips keep from supports: 2 as the rest of the hand; 0: they touch; to -1: they press.",
     "faces": "In a scene: drawn, as drops fall, or all, a scene for each stable face.",
 }
-
 _SHORT: Final = {"grasps": "-n"}
-
 #: Where a field goes by another word; the name of a dataset is an argument.
 _FLAGS: Final = {"options": "--option", "neighbours": "--with", "name": "NAME"}
 

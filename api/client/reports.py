@@ -284,9 +284,7 @@ def _rate_words(stage: StageStatus, job: Job, pace: float) -> str:
 
 #: A table with more hands does not fit a terminal: then each cell has a line.
 _MOST_COLUMNS: Final = 6
-
 _SHOWN_RATES: Final = 8
-
 _STYLES: Final = {
     State.SUCCEEDED: "green",
     State.RUNNING: "cyan",

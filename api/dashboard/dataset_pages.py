@@ -32,14 +32,10 @@ from service.model.states import AssetKind, State
 from service.pipeline.datasets.spec import DatasetRequest
 
 PAGE_SIZE: Final = 20
-
 #: A matrix of more cells is shown as a list, a page at a time: nobody reads a table of ten thousand fields.
 MATRIX_CELLS: Final = 1000
-
 _CELLS_AT_ONCE: Final = 200
-
 _MAX_FIELDS: Final = 4000
-
 _DONE: Final = {"submit": "submitted", "retry": "retried", "cancel": "cancelled", "snapshot": "taken as a snapshot"}
 
 #: Fields of the form of a dataset, and what stands there at first.

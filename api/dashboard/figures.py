@@ -21,7 +21,6 @@ from service.store.store import Store
 
 #: Coordinates of a chart's inside; the SVG stretches it to the page.
 WIDTH: Final = 600.0
-
 HEIGHT: Final = 160.0
 
 
@@ -144,7 +143,6 @@ def _share(value: float, low: float, high: float) -> float:
 
 #: Steps of the colour scale; the style sheet has a class for each.
 STEPS: Final = 10
-
 #: More objects than this are too long a page; those with work come first.
 _ROWS: Final = 60
 

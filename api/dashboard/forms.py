@@ -22,7 +22,7 @@ from api.dashboard.form_uploads import FILE_FIELDS, UNITS, Chosen, choices, chos
 from api.dashboard.rendering import render
 from api.routes.dependencies import AssetsOf, JobsOf, may_read, may_submit
 from service.index.index import Index
-from service.index.queries.usage import BatchCost, Costs
+from service.index.queries.overview import BatchCost, Costs
 from service.model.base import refusal, words
 from service.model.domain import JobRequest
 from service.model.errors import GraspdError, InputError
@@ -59,7 +59,6 @@ DEFAULTS: Final[dict[str, Any]] = {
     "min_distance": 0.005,
     "robust": 0.0,
 }
-
 #: Fields where a rule over several of them is told, by a word of the rule.
 _WHOLE: Final = {"robust": "robust", "payload": "min_payload", "shake": "shake", "mass": "mass"}
 
@@ -179,7 +178,6 @@ def _form(
 
 #: Costs of batches change slowly, and reading two thousand of them takes as long as a page may.
 KEPT_S: Final = 60.0
-
 WORDS: Final = {
     "draft": "Fewest points and starts. For a first look.",
     "standard": "The balance that the docs measure.",

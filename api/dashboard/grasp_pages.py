@@ -29,13 +29,10 @@ from service.model.metrics import AXIS_MEANINGS, GRASP_METRICS, GraspType, Index
 from service.model.states import AssetKind
 
 PAGE_SIZES: Final = {"cards": 24, "table": 50}
-
 #: Sort key, label, unit of the metrics that lists of grasps show.
 COLUMNS: Final = tuple((metric.name, metric.column_title, metric.unit) for metric in indexed(Indexed.OFFERED))
-
 #: Metrics of which less is better: a first click sorts them upwards.
 _LESS_IS_BETTER: Final = frozenset(metric.name for metric in indexed() if metric.less_is_better)
-
 #: Metrics that stand beside the verdict of a grasp.
 _BESIDE_VERDICT: Final = frozenset({"contact_links", "robustness", "robust_share", "grasp_type", "approach_cell"})
 
@@ -166,21 +163,15 @@ def _view_link(request: Request, view: str) -> str:
 
 
 _MAX_FIELDS: Final = 400
-
 #: Longest query of a list that a form gives back.
 _LONGEST_FILTER: Final = 40_000
-
 _PAGES: Final = re.compile(r"/grasps(/[0-9a-f]{32}/[0-9]{1,10})?|/jobs/[0-9a-f]{32}")
-
 _NAME: Final[TypeAdapter[str]] = TypeAdapter(TagName)
-
 _FORMAT: Final[TypeAdapter[Format]] = TypeAdapter(Format)
-
 _DONE: Final = {
     "tagged": "{done} {grasps} given the tag {tag}.",
     "untagged": "The tag {tag} taken off {done} {grasps}.",
 }
-
 T = TypeVar("T")
 
 

@@ -24,7 +24,6 @@ from service.store.shards import open_shard
 from service.store.store import Store
 
 _SHOWN_PICTURES: Final = 8
-
 _SHOWN_GRASPS: Final = 10
 
 router = APIRouter(include_in_schema=False)
@@ -108,15 +107,12 @@ def _pictures(job: JobDetail) -> list[dict[str, Any]]:
 
 #: A views shard of 48 pictures is a few megabytes; a page asks for several pictures of the same one.
 _KEPT_SHARDS: Final = 2
-
 #: Near to far: light and warm to dark and cool, with lightness falling all the way.
 _DEPTH_COLOURS: Final = np.array(
     [(252, 244, 190), (250, 203, 116), (240, 148, 87), (205, 92, 103), (142, 58, 121), (78, 38, 108), (24, 18, 56)],
     np.float64,
 )
-
 _NOTHING: Final = (12, 15, 20)
-
 #: Background, table, object, then the neighbours.
 _CLASSES: Final = np.array(
     [(24, 29, 33), (96, 108, 118), (23, 163, 152), (227, 171, 98), (88, 134, 214), (190, 98, 160), (150, 178, 82)],

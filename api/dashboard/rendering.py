@@ -17,9 +17,7 @@ from api.models import GraspDetail, JobDetail
 from service.model.version import PACKAGE_VERSION
 
 _HERE: Final = Path(__file__).parent
-
 STATIC: Final = _HERE / "static"
-
 NAVIGATION: Final = (
     ("/", "Home"),
     ("/datasets", "Datasets"),
@@ -29,7 +27,6 @@ NAVIGATION: Final = (
     ("/chart", "Chart"),
     ("/stability", "Stability"),
 )
-
 #: Where there are keys, somebody may ask who used what.
 _WITH_KEYS: Final = (("/usage", "Usage"),)
 

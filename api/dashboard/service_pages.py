@@ -33,13 +33,9 @@ from service.model.states import State
 from service.store.records import What
 
 PAGE_SIZE: Final = 25
-
 _LOST_SHOWN: Final = timedelta(minutes=10)
-
 _MINUTES: Final = 60
-
 _DATASETS: Final = 6
-
 #: A study takes minutes, and nothing tells when it is published.
 _STUDY_S: Final = 10
 
@@ -206,7 +202,6 @@ def usage_page(
 
 #: Letters of a job's id that its page shows, and that its deletion is confirmed by.
 SHORT_ID = 12
-
 Typed = Annotated[str, Form(max_length=64)]
 
 

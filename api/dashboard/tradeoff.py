@@ -19,17 +19,12 @@ from service.store.records import CHARTS, latest, scene_kinds
 from service.store.store import Store
 
 WIDTH: Final = 860
-
 HEIGHT: Final = 420
-
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 24, 16, 46
-
 #: A letter of a label, and a line of it; from a point to its label, and the point itself [px].
 _LETTER, _LINE, _AWAY, _DOT = 6.9, 15.0, 12.0, 7.0
-
 #: How far a label may move up or down from its point, the wanted places first [px].
 _MOVES: Final = (0.0, 15.0, -15.0, 30.0, -30.0, 45.0, -45.0, 60.0, -60.0)
-
 #: Of methods that know no fidelities; their label is their name.
 _NO_FIDELITY: Final = "as published"
 
@@ -54,7 +49,6 @@ FREE: Final[dict[str, Axis]] = {
     "epsilon": Axis("ε", "", factor=1.0),
     "pd_mm": Axis("Penetration", "mm", more_is_better=False, factor=1.0),
 }
-
 IN_SCENES: Final[dict[str, Axis]] = {
     "lift": Axis("Lifted, of all tries"),
     "lift_letter": Axis("Lifted by the letter"),

@@ -136,14 +136,10 @@ def _refusal(admission: Admission, allowance: Allowance, headers: dict[str, str]
 
 
 log = logging.getLogger(__name__)
-
 WINDOW_S: Final = 60
-
 #: A request that gives no sign for this long is no longer counted as being answered [s].
 HELD_S: Final = 60.0
-
 _ANSWER_S: Final = 0.5
-
 #: After a failure Redis is left alone for this long [s]: a limit is not worth making every request wait.
 _PAUSE_S: Final = 1.0
 

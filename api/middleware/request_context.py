@@ -27,14 +27,12 @@ from service.model.errors import GraspdError
 from service.telemetry import bind
 
 _access = logging.getLogger("graspd.access")
-
 #: Asked every few seconds by whatever watches the service.
 _QUIET: Final = ("/static/", "/healthz", "/readyz", "/metrics")
 
 SAFE_METHODS: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 
 _METHODS: Final = SAFE_METHODS | {"POST", "PUT", "PATCH", "DELETE"}
-
 _REQUEST_ID: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 CONTENT_SECURITY_POLICY: Final = (
@@ -165,7 +163,6 @@ def _is_taken(scope: Scope) -> bool:
 
 #: An attribute whose value is an address on this host. What a user wrote holds no quotes in a page.
 _ADDRESS: Final = re.compile(r'(?<=\s)((?:href|src|action|formaction|hx-[a-z-]+|data-[a-z-]+)=")(?=/(?!/))')
-
 _COOKIE_PATH: Final = re.compile(r";\s*Path=/(?=;|$)", re.IGNORECASE)
 
 

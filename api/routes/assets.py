@@ -24,14 +24,11 @@ from service.model.states import AssetKind
 from service.store.descriptions import HandCorrections
 
 _GLB: Final = "model/gltf-binary"
-
 #: Uploads being unpacked and packed in this process; each may hold one file of its size in memory.
 _AT_ONCE: Final = BoundedSemaphore(UPLOADS)
-
 _TURN_S: Final = 20.0
 
 _ZIPPED: Final = "Upload a file, or a ZIP of its folder. It is checked by a worker before the first job uses it."
-
 #: What the document says of an upload.
 _ADDED: Final = {
     AssetKind.HAND: _ZIPPED,

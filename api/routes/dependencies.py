@@ -80,33 +80,19 @@ def _provided(name: str) -> Callable[[Request], Coroutine[Any, Any, Any]]:
 
 
 JobsOf = Annotated[Jobs, Depends(_provided("jobs"))]
-
 DatasetsOf = Annotated[Datasets, Depends(_provided("datasets"))]
-
 ComparisonsOf = Annotated[Comparisons, Depends(_provided("comparisons"))]
-
 AssetsOf = Annotated[Assets, Depends(_provided("assets"))]
-
 GraspsOf = Annotated[Grasps, Depends(_provided("grasps"))]
-
 ShardsOf = Annotated[Shards, Depends(_provided("shards"))]
-
 StoreOf = Annotated[Store, Depends(_provided("store"))]
-
 UsageOf = Annotated[Usage, Depends(_provided("usage"))]
-
 TagsOf = Annotated[Tags, Depends(_provided("tags"))]
-
 ExportsOf = Annotated[GraspExports, Depends(_provided("grasp_exports"))]
-
 DeletionsOf = Annotated[Deletions, Depends(_provided("deletions"))]
-
 WebhooksOf = Annotated[Webhooks, Depends(_provided("webhooks"))]
-
 OverviewOf = Annotated[Overview, Depends(_provided("overview"))]
-
 Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="items on a page")]
-
 Cursor = Annotated[str | None, Query(max_length=512, description="`next` of the page before")]
 
 
@@ -123,18 +109,13 @@ def next_address(request: Request, cursor: str) -> str:
 
 
 T = TypeVar("T")
-
 #: Uploads that are unpacked and packed at once; each may hold one file of its size in memory.
 UPLOADS: Final = 4
-
 #: Forms with an upload: they wait for its check too.
 FORMS: Final = 8
-
 #: Files of chosen grasps that are written at once.
 EXPORTS: Final = 2
-
 _WAITING: Final = 32
-
 _PATIENCE_S: Final = 20.0
 
 

@@ -80,9 +80,7 @@ def _day(said: object) -> object:
 
 
 Day = Annotated[date, BeforeValidator(_day)]
-
 Since = Annotated[Day | None, Query(description="first day (UTC); default: a month before the last")]
-
 Until = Annotated[Day | None, Query(description="last day (UTC); default: today")]
 
 
@@ -114,7 +112,6 @@ def get_usage_csv(usage: UsageOf, since: Since = None, until: Until = None) -> R
 deletion_router = APIRouter(tags=["deletions"])
 
 Name = Annotated[str, Path(max_length=64, description="its name, or its id")]
-
 KINDS: Final[tuple[What, ...]] = get_args(What)
 
 

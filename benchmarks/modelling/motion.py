@@ -16,7 +16,7 @@ from scipy.stats import rankdata
 from benchmarks.modelling.common import Bools, Floats, Row, Subject, cpu, ranking, share, verdicts
 from benchmarks.modelling.steps import rollout
 from worker.objects.convex import union_volume
-from worker.planners.fast_graspd.selection import FRICTION
+from worker.planners.fast_graspd.candidates import FRICTION
 from worker.quality.postures import hold_forces
 from worker.quality.probe import probe_of
 from worker.quality.referee.decomposition import ConvexPieces

@@ -11,7 +11,7 @@ from benchmarks.modelling.common import SEED, Row, cpu, hand_of, mean, object_of
 from service.model.fidelity import FIDELITIES
 from worker.planners import synthesize
 from worker.planners.port import Wanted
-from worker.quality.penetration import penetration_depth
+from worker.quality.overlap import penetration_depth
 from worker.quality.probe import probe_of
 from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.model import MujocoOptions, build

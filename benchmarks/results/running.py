@@ -28,7 +28,7 @@ from service.model.cores import available_cores
 from service.model.version import STAGE_REVISIONS
 from service.run.supervisor import Supervisor
 from service.settings import Settings
-from worker.rendering.pages.sheets import png
+from worker.rendering.sheets import png
 
 #: Mean difference of a channel, of 255, from which on a palette shows steps in what fades, a depth image say.
 STEPS: Final = 0.45

@@ -15,8 +15,8 @@ from examples.train_grasp_predictor.samples import Floats
 from service.model.transforms import apply, quat_rotate
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.rendering.pages.pictures import grasp_pictures
-from worker.rendering.pages.sheets import label_page
+from worker.rendering.pictures import grasp_pictures
+from worker.rendering.sheets import label_page
 
 SIDE: Final = 200
 #: Pictures of each object whose first proposal is drawn.

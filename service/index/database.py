@@ -26,27 +26,19 @@ from service.model.errors import IndexDamaged, IndexUnavailable, InputError
 from service.model.metrics import indexed
 
 log = logging.getLogger(__name__)
-
 T = TypeVar("T")
-
 #: Revision of `service.index.tables`: another number for every change of them but for new metrics.
 REVISION: Final = "0021"
-
 #: Table that names the revision. A graspd of 0.2 reads it, and refuses an index of a revision that it does not know.
 REVISION_TABLE: Final = "alembic_version"
-
 #: A job of a million grasps is one transaction of a few seconds; others wait for it.
 _BUSY_TIMEOUT_S: Final = 20.0
-
 #: Key of PostgreSQL's advisory lock that lets one process make tables at a time: the letters "grsp".
 _TABLES_LOCK: Final = 0x67727370
-
 #: Of the one that lets one process write at a time; it ends with its transaction: the letters "grsq".
 _TURN_LOCK: Final = 0x67727371
-
 #: What SQLAlchemy raises for a URL.
 UNUSABLE: Final = (ArgumentError, NoSuchModuleError, ModuleNotFoundError, ValueError)
-
 #: Codes of SQLite for a file whose content makes no sense.
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
@@ -333,7 +325,6 @@ def _add_missing_metrics(connection: Connection) -> list[str]:
 
 #: What SQLite keeps beside the file while it is open: the log of writes and its shared memory.
 _COMPANIONS: Final = ("-wal", "-shm")
-
 Identity = tuple[int, int] | None
 
 

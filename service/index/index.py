@@ -15,9 +15,8 @@ from service.index.queries.datasets import Datasets
 from service.index.queries.feed import DatasetFeed, Feed
 from service.index.queries.grasps import Grasps
 from service.index.queries.jobs import Jobs, Shards
-from service.index.queries.overview import Overview
+from service.index.queries.overview import Costs, Overview, Usage
 from service.index.queries.statistics import Statistics
-from service.index.queries.usage import Costs, Usage
 from service.index.tags import Tags
 
 

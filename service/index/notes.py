@@ -15,17 +15,11 @@ from service.index.tables import damage, notes
 from service.model.clock import timestamp
 
 _REBUILT: Final = "rebuilt"
-
 _SCAN: Final = "integrity scan"
-
 _CHANGES: Final = "changes"
-
 _MARK: Final = "mark"
-
 _SCAN_TURN: Final = "integrity scan turn"
-
 _SERVICE: Final = "service"
-
 #: Names of records that are kept; the count is of all.
 _NAMED: Final = 50
 

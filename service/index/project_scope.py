@@ -1,7 +1,4 @@
-"""Who sees which rows: conditions of queries.
-
-Opaque keyset cursors: the sort key of the last row of a page, so that a page costs the same wherever it starts.
-"""
+"""Common parts of queries: conditions of the caller's scope, and opaque keyset cursors of pages."""
 
 from __future__ import annotations
 
@@ -73,7 +70,6 @@ def jobs_of(scope: ProjectScope) -> Select[tuple[str]]:
 
 
 MAX_LIMIT: Final = 200
-
 #: Every database holds whole numbers up to here.
 _MOST: Final = 2**63
 

@@ -20,20 +20,15 @@ class Model(BaseModel):
 
 #: A name a user gives: used in file names and URLs, so letters, digits, dot, dash and underscore only.
 NAME: Final = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
-
 Name = Annotated[str, Field(pattern=NAME)]
-
 #: A name a user gives to grasps: words of such characters with one space between.
 TagName = Annotated[
     str,
     StringConstraints(strip_whitespace=True, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*( [A-Za-z0-9._-]+)*$"),
 ]
-
 #: Lower-case hexadecimal SHA-256, shortened to 32 digits (128 bits).
 DIGEST: Final = r"^[0-9a-f]{32}$"
-
 Digest = Annotated[str, Field(pattern=DIGEST)]
-
 #: An id or nothing. Whoever writes to Redis may say anything, so what is read from there is bounded like this.
 Word = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{0,64}$")]
 
@@ -49,17 +44,12 @@ _WORDS: Final = {
     **dict.fromkeys(("float_type", "float_parsing"), "must be a number"),
     **dict.fromkeys(("bool_type", "bool_parsing"), "must be true or false"),
 }
-
 #: Kinds of errors about a bound, and how pydantic names it.
 _BOUNDS: Final = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_equal": "le", "less_than": "lt"}
-
 _NAMES: Final = "must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores"
-
 #: How pydantic begins: of what, not of which field.
 _SUBJECT: Final = re.compile(r"^(Value error, )|^\w+ should ")
-
 _CLASS: Final = re.compile(r"_[A-Z]\w*$")
-
 #: How typer names the choices of an option; pydantic gives them as `expected`.
 _CHOICES: Final = re.compile(r"'(?P<word>.*?)' is not one of (?P<expected>'.*')")
 

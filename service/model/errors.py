@@ -40,7 +40,6 @@ from typing import Any, ClassVar, Final, Self
 
 #: Line breaks with the space around them, all that `str.splitlines` knows; control characters.
 _BREAK: Final = re.compile(r"\s*[\n\r\v\f\x1c-\x1e\x85\u2028\u2029]\s*")
-
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
@@ -247,11 +246,9 @@ ERRORS: Final[dict[str, type[GraspdError]]] = {
 
 #: User and password of a URL, up to the last @: a password that nobody quoted may hold one, and a slash.
 _LOGIN: Final = re.compile(r"(?<=://)[^/\s\"'<>][^\s\"'<>]*@")
-
 _PARAMETER: Final = re.compile(
     r"([?&][\w.%-]*(?:password|passwd|token|secret|signature|credential|sig|key)=)[^&\s\"'<>]+", re.IGNORECASE
 )
-
 _API_KEY: Final = re.compile(r"\bgd_[A-Za-z0-9_-]{8,}")
 
 
@@ -264,7 +261,6 @@ def without_secrets(text: str) -> str:
 
 #: Names among which a similar one is sought, and those that a message lists.
 SEARCHED: Final = 1000
-
 _LISTED: Final = 20
 
 

@@ -1,13 +1,10 @@
-"""The metrics of a grasp: one table, from which all follows that stores, indexes, filters, shows and documents them.
+"""The metrics of a grasp: one table, from which all follows that stores, indexes, filters, shows and documents them;
+and the axes of robustness, grasp types and directions.
 
 Shards (`service.store.columns`), manifests, the index, the API, the dashboard, a dataset's card and the docs read this
 table. A new metric is a row here and the function that computes it (`MEASURES` in `worker.quality.table`); make it
 `optional`, since older shards lack it. The index gets its column when it is opened next
 (`service.index.database`). What says yes or no of a grasp is a verdict and no metric.
-
-Words of robustness: the axes along which a model of a hand and an object may be another than ours.
-
-How different grasps are, in words and numbers that all rooms share: types, directions of approach, entropy.
 """
 
 from __future__ import annotations
@@ -323,7 +320,7 @@ def axis_word(number: int) -> str | None:
 
 
 class GraspType(IntEnum):
-    """What a hand does in a grasp, by the opposition in it; `worker.quality.taxonomy` has the rule."""
+    """What a hand does in a grasp, by the opposition in it; `worker.quality.table` has the rule."""
 
     NONE = 0
     """Not told: one digit alone touches, or nothing does."""
@@ -334,7 +331,6 @@ class GraspType(IntEnum):
 
 #: Directions fall into cells of equal area: bands of equal height z (Archimedes), each cut into equal azimuths.
 BANDS: Final = 4
-
 SECTORS: Final = 12
 
 DIRECTION_CELLS: Final = BANDS * SECTORS

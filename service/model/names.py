@@ -11,29 +11,17 @@ from service.model.errors import InputError
 from service.model.states import AssetKind, Stage
 
 ASSETS: Final = "assets"
-
 JOBS: Final = "jobs"
-
 TASKS: Final = "tasks"
-
 SHARDS: Final = "shards"
-
 DATASETS: Final = "datasets"
-
 OBJECT_SETS: Final = "object_sets"
-
 DELETIONS: Final = "deletions"
-
 RELEASED: Final = "released"
-
 REMOVED: Final = "removed"
-
 WEBHOOKS: Final = "webhooks"
-
 TAGS: Final = "tags"
-
 SERVICE: Final = "service"
-
 MARKS: Final = "marks"
 
 #: Folder under `shards/` and HDF5 kind of what each stage makes.
@@ -171,7 +159,6 @@ def deletion(what: str, name: str) -> str:
 
 
 MOST: Final = 64
-
 log = logging.getLogger(__name__)
 
 

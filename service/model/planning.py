@@ -1,11 +1,9 @@
-"""From a job to its tasks, from facts about tasks to their states, and fair scheduling. Pure functions: no store, no
-clock.
+"""From a job to its tasks, from facts about tasks to their states, fair scheduling, outcomes of candidates. Pure
+functions: no store, no clock.
 
 A job is cut into batches of `BATCH_SIZE` grasps, the unit of seeds and launches, and its batches into ranges of
 `JobRecord.span`. Each range is a chain of tasks, one a stage as far as asked: synthesize -> scene -> render, or where
 grasps are planned in scenes, scene -> synthesize -> render.
-
-What became of the candidates of a job, by name, and the sentence that says why it found fewer grasps than asked.
 """
 
 from __future__ import annotations
@@ -212,10 +210,8 @@ def _own_state(facts: TaskFacts, *, job_cancelled: bool) -> State:
 
 
 T = TypeVar("T")
-
 #: Jobs fed in one round; the others have their turn in the next ones.
 JOBS_A_ROUND: Final = 64
-
 #: Turns remembered: more than there are jobs with waiting tasks, or a forgotten one would come first again.
 _REMEMBERED: Final = 100_000
 

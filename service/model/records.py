@@ -1,9 +1,7 @@
-"""JSON records that the store keeps besides shards: jobs, datasets, what users did to them, failed attempts.
+"""JSON records that the store keeps besides shards: jobs, datasets, tags, what users did to them, failed attempts.
 
 `datasets/{name}/dataset.json` names the jobs of its cells, so that a dataset stays what it was when graspd's
 algorithms, or the meaning of a name, change later.
-
-Tags: names that users give to grasps, to find them again and to take them away together.
 """
 
 from __future__ import annotations
@@ -285,12 +283,9 @@ def object_set_of(
 
 #: Tags of one project (of one key, where it belongs to none), and grasps of one tag.
 MOST_TAGS: Final = 100
-
 MOST_TAGGED: Final = 20_000
-
 #: A grasp: its shard, and its row there.
 Grasp = tuple[str, int]
-
 Row = Annotated[int, Field(ge=0, lt=2**31)]
 
 

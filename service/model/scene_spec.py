@@ -18,41 +18,26 @@ from service.model.errors import InputError, did_you_mean
 
 #: Kinds of scenes; `free` is an object that floats, `file` one whose supports are given.
 SceneKind = Literal["free", "table", "bin", "shelf", "file"]
-
 KINDS: Final = ("free", "table", "bin", "shelf")
-
 MOST_SUPPORTS: Final = 32
-
 #: Distance that fingertips keep from supports [mm]: least, that of the whole hand, and unless a user says otherwise.
 LEAST_TOUCH: Final = -1.0
-
 MOST_TOUCH: Final = 2.0
-
 TOUCH: Final = 0.0
-
 SCENE_FILES: Final = (".json", ".yaml", ".yml")
-
 MOST_NEIGHBOURS: Final = 8
-
 #: Scenes that the grasps of one call are shared out to, at most.
 MOST_SCENES: Final = 4096
-
 #: A scene is no larger than this [m].
 FARTHEST_M: Final = 10.0
-
 #: Largest scene file [bytes].
 MAX_FILE_BYTES: Final = 64 * 1024
 
 _Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
-
 _Extent = Annotated[float, Field(gt=1e-4, le=2 * FARTHEST_M, allow_inf_nan=False)]
-
 _Number = Annotated[float, Field(ge=-2.0, le=2.0, allow_inf_nan=False)]
-
 Touch = Annotated[float, Field(ge=LEAST_TOUCH, le=MOST_TOUCH, allow_inf_nan=False)]
-
 Vector = tuple[_Metres, _Metres, _Metres]
-
 Pose = tuple[_Metres, _Metres, _Metres, _Number, _Number, _Number, _Number]
 
 
@@ -250,16 +235,11 @@ def check_quaternion(pose: tuple[float, ...]) -> None:
 
 #: Inner size of a bin, height of its walls and their thickness [m].
 BIN_SIZE: Final = (0.40, 0.30)
-
 BIN_HEIGHT: Final = 0.15
-
 WALL: Final = 0.02
-
 #: Width and depth of a shelf's boards, and the height between them [m]; it is open towards -x.
 SHELF_SIZE: Final = (0.80, 0.35)
-
 SHELF_HEIGHT: Final = 0.35
-
 #: A half-space whose normal is so upright (cosine) is a table.
 UPRIGHT: Final = 1 - 1e-6
 

@@ -17,7 +17,6 @@ Outcome = Literal["good", "weak", "broken", "refused"]
 
 #: From best to worst; refused stands apart: the guard spoke before anything was computed.
 OUTCOMES: Final[tuple[Outcome, ...]] = ("good", "weak", "broken", "refused")
-
 #: JSON knows no nan.
 _Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
 
@@ -195,12 +194,10 @@ _RECORD: Final = TypeAdapter(Stability)
 
 #: Ways of a row of a chart in scenes: planned for the scene, or around a free object and put there afterwards.
 IN_SCENE: Final = "in the scene"
-
 FILTERED: Final = "free, filtered"
 
 #: Accuracies that a target may name, and whether more is better: of grasps around a free object, and in scenes.
 FREE: Final = {"gsr": True, "letter": True, "hard": True, "robust": True, "epsilon": True, "pd_mm": False}
-
 IN_SCENES: Final = {"lift": True, "lift_letter": True, "lift_hard": True, "robust": True}
 
 #: Speeds, end to end before the planner's own, which is all that charts of graspd 0.1 have.

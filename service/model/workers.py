@@ -19,7 +19,6 @@ from service.model.version import OLDEST_TASK_SCHEMA, STAGE_REVISIONS, TASK_SCHE
 
 #: Anybody who writes to Redis may say anything: what is read from there is as long and as large as ours can be.
 HostWord = Annotated[str, Field(max_length=300)]
-
 Count = Annotated[int, Field(ge=0, lt=2**31)]
 
 

@@ -24,8 +24,10 @@ _TARGET: Final = re.compile(r"\s*([a-z_]+)\s*(>=|<=)\s*([0-9]*\.?[0-9]+)\s*")
 _EXAMPLES: Final = {False: "gsr>=0.6, epsilon>=0.2 or pd_mm<=1", True: "lift>=0.9, lift_hard>=0.7 or robust>=0.95"}
 #: What runs of a chart have in common with a request, the nearest first.
 _NEAR: Final[tuple[tuple[Near, tuple[str, ...]], ...]] = (
-    ("hand and object", ("hand", "object")), ("hand", ("hand",)), ("all", ()),
-)  # fmt: skip
+    ("hand and object", ("hand", "object")),
+    ("hand", ("hand",)),
+    ("all", ()),
+)
 
 
 class Found(NamedTuple):

@@ -50,10 +50,23 @@ _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
 )
 #: In the order of the controller's rounds, which remember a place in it.
 FOLDERS: Final = (
-    names.SHARDS, names.ASSETS, names.JOBS, names.TASKS, names.DATASETS, names.OBJECT_SETS,
-    names.DELETIONS, names.RELEASED, names.WEBHOOKS, names.TAGS, CHARTS, IN_SCENES, STABILITY,
-    names.MARKS, names.SERVICE, names.REMOVED,
-)  # fmt: skip
+    names.SHARDS,
+    names.ASSETS,
+    names.JOBS,
+    names.TASKS,
+    names.DATASETS,
+    names.OBJECT_SETS,
+    names.DELETIONS,
+    names.RELEASED,
+    names.WEBHOOKS,
+    names.TAGS,
+    CHARTS,
+    IN_SCENES,
+    STABILITY,
+    names.MARKS,
+    names.SERVICE,
+    names.REMOVED,
+)
 _SEALED: Final = (".json", ".zip", ".npz", ".glb")
 _UPLOAD: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(files\.zip|check\.json)")
 _SHARD: Final = re.compile(r"shards/(base|scene|views)/([0-9a-f]{32})\.(h5|json)")

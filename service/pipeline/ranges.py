@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from service.index.queries.usage import BatchCost
+from service.index.queries.overview import BatchCost
 from service.model.domain import JobRequest, batches_of
 from service.model.projects import EVERYTHING, ProjectScope
 from service.model.records import MOST_BATCHES, JobRecord

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from statistics import median, quantiles
 from typing import Final
 
-from service.index.queries.usage import BatchCost
+from service.index.queries.overview import BatchCost
 from service.model.domain import BATCH_SIZE, JobOptions
 from service.model.scene_spec import TOUCH
 

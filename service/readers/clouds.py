@@ -23,21 +23,14 @@ Array = NDArray[Any]
 
 
 Ints = NDArray[np.intp]
-
 #: From a base shard and K of its rows to points (K, H, 3) on the hand's surface in the object's frame [m].
 HandSurface = Callable[[Shard, Ints], Floats]
-
 Frame = Literal["camera", "table", "object"]
-
 FRAMES: Final[tuple[Frame, ...]] = ("camera", "table", "object")
-
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
-
 #: Beginnings of the keys that have a row for each grasp.
 OF_GRASPS: Final = ("pregrasp/", "grasp/", "squeeze/", "quality/")
-
 _NOWHERE: Final = np.array([0.0, 0, 0, 1, 0, 0, 0])
-
 #: The hand touches a point when its surface is at most this far from it [m]: the middle contact threshold of shards.
 TOUCH_M: Final = 0.005
 
@@ -263,14 +256,10 @@ def graspness(points: NDArray[Any], hands: NDArray[Any], *, touch_m: float = TOU
 
 
 COLUMNS: Final = ("image/depth", "image/segmentation", "camera/intrinsics", "camera/extrinsics")
-
 _OBJECT: Final = 2
-
 #: Planes are fitted to noisy points in windows of 7 x 7 pixels, which are let reach this many deviations in depth.
 _RADIUS: Final = 3
-
 _DEVIATIONS: Final = 4.0
-
 #: Steepest surface within such a window: its depth grows by this many times the way across.
 _SLOPE: Final = 3.0
 

@@ -39,18 +39,13 @@ Span = tuple[int, memoryview]
 
 #: Bytes of one request, at most, where pictures are read in turn; a shard no larger than this is read whole.
 AHEAD_BYTES: Final = 4 << 20
-
 #: Bytes that are held of all shards together.
 HELD_BYTES: Final = 64 << 20
-
 _OBJECTS: Final = 256
-
 #: Ranges with no more than this between them are one request [bytes]: that much costs less than a request.
 GAP_BYTES: Final = 1 << 16
-
 #: Of what HDF5 says of itself, so much is read at once [bytes]; it lies at the beginning and here and there.
 _BLOCK_BYTES: Final = 1 << 14
-
 #: Threads ask for neighbouring pictures in nearly the order in which these are wanted.
 _NEARLY: Final = 16
 
@@ -244,12 +239,10 @@ def _cut(spans: Sequence[Span], one: Range) -> memoryview:
 
 
 Array = NDArray[Any]
-
 #: (offset, length) pairs [bytes] to their bytes.
 ReadRanges = Callable[[list[tuple[int, int]]], Sequence[bytes | memoryview]]
 
 _SHUFFLE: Final = h5py.h5z.FILTER_SHUFFLE
-
 _DEFLATE: Final = h5py.h5z.FILTER_DEFLATE
 
 

@@ -19,15 +19,12 @@ from pathlib import Path
 from typing import IO, Final
 
 log = logging.getLogger(__name__)
-
 #: Variable of a child by which a later `graspd up` knows it.
 _TOKEN: Final = "GRASPD_CHILD_TOKEN"
 #: Pause between two looks at whether a child ended [s].
 _WATCH_S: Final = 0.1
 _FIRST_PAUSE_S: Final = 0.2
-
 _LONGEST_PAUSE_S: Final = 10.0
-
 #: A child that lived this long was well: the next restart is quick again [s].
 _WELL_AFTER_S: Final = 20.0
 
@@ -168,7 +165,6 @@ def _ended(code: int) -> str:
 
 
 _BOOT: Final = Path("/proc/sys/kernel/random/boot_id")
-
 #: Place of the start time among the words after the name of a program in /proc/PID/stat.
 _STARTED: Final = 19
 

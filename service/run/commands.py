@@ -194,8 +194,8 @@ def export(
     json: JsonFlag = False,
 ) -> None:
     """Write grasps, shards, jobs, tasks, assets, datasets and usage as Parquet files, for DuckDB or pandas."""
+    from service.index.export import export as write
     from service.index.index import Index
-    from service.run.store_commands import export as write
 
     index = Index(load_settings(data_dir=data_dir).resolved_index_url)
     try:

@@ -1,26 +1,18 @@
-"""`graspd admin store`, and tables of the index as Parquet files."""
+"""`graspd admin store`: whether the store still holds what was put into it."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated
 
 import typer
-from sqlalchemy import JSON, BigInteger, Boolean, Column, Connection, Float, Integer, Table, select
 
 from service.cli import JsonFlag, emit, load_settings, reporting_errors
-from service.index.database import Database
-from service.index.tables import assets, attempts, dataset_cells, datasets, grasps, jobs, shards, spent, tasks
 from service.model import names
 from service.model.errors import ConflictError
-from service.parquet import schema_of, write
 
 app = typer.Typer(no_args_is_help=True)
-
 store_app = typer.Typer(no_args_is_help=True, help="Check the store, and mend it.")
-
 app.add_typer(store_app, name="store")
 
 
@@ -104,49 +96,3 @@ def upgrade(
         emit({"shards": shards})
     else:
         typer.echo(f"{shards} shards were taken out of packs", err=True)
-
-
-#: What is exported. The rest is of the moment (workers, notes) or for the service alone.
-TABLES: Final[Mapping[str, Table]] = {
-    table.name: table for table in (grasps, shards, jobs, tasks, attempts, assets, datasets, dataset_cells, spent)
-}
-
-#: Rows of a row group, which is what one file has in memory.
-GROUP: Final = 20_000
-
-
-def export(database: Database, folder: Path) -> dict[str, int]:
-    """Write each of `TABLES` as `folder/NAME.parquet`, all as they were at one moment; what is there is replaced.
-
-    Whole numbers are int64, numbers float64, JSON is text; rows are in the order of their primary key.
-
-    Returns:
-        rows of each table.
-
-    Raises:
-        InputError: pyarrow is not installed.
-        IndexUnavailable: the database does not answer.
-    """
-    # Before the database is asked: whoever lacks the package is told at once.
-    schemas = {name: schema_of({c.name: _word(c) for c in table.columns}) for name, table in TABLES.items()}
-    with database.reading() as connection:
-        return {
-            name: write(folder / f"{name}.parquet", schemas[name], _groups(connection, table))
-            for name, table in TABLES.items()
-        }
-
-
-def _groups(connection: Connection, table: Table) -> Iterator[list[dict[str, Any]]]:
-    documents = [column.name for column in table.columns if isinstance(column.type, JSON)]
-    query = select(table).order_by(*table.primary_key.columns).execution_options(yield_per=GROUP)
-    for part in connection.execute(query).mappings().partitions():
-        rows = [dict(row) for row in part]
-        for row in rows:
-            row.update({name: json.dumps(row[name]) for name in documents if row[name] is not None})
-        yield rows
-
-
-def _word(column: Column[Any]) -> str:
-    """The type of a column in the words of `service.parquet.type_of`."""
-    kinds = {BigInteger: "int64", Integer: "int64", Float: "float64", Boolean: "bool_"}
-    return next((word for kind, word in kinds.items() if isinstance(column.type, kind)), "text")

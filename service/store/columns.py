@@ -293,7 +293,6 @@ _TYPES: Final[Mapping[str, tuple[type, ...]]] = {
     "number": (int, float),
     "texts": (list,),
 }
-
 _BASE: Final = ("base",)
 
 ATTRIBUTES: Final[dict[str, RootAttribute]] = {

@@ -17,13 +17,9 @@ from service.model.errors import ConflictError, InputError
 
 #: The built-in hands need 2 KB; the facts stand in every list of hands or objects.
 MAX_BYTES: Final = 64 << 10
-
 MAX_FACTS_BYTES: Final = 8 << 10
-
 _MAX_DEPTH: Final = 6
-
 _MAX_NUMBER: Final = 2**53
-
 _BOM: Final = b"\xef\xbb\xbf"
 
 
@@ -81,21 +77,15 @@ def _is_plain(value: Any, depth: int) -> bool:
 
 #: Far more than any hand has; the largest in use have some sixty joints.
 MAX_ENTRIES: Final = 256
-
 #: No palm lies farther from its link's frame [m].
 MAX_CENTRE_M: Final = 2.0
-
 #: Numbers in messages and in glTF are rounded.
 _ROUNDING: Final = 1e-6
 
 Text = Annotated[str, StringConstraints(min_length=1, max_length=255)]
-
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-
 Length = Annotated[float, Field(ge=-MAX_CENTRE_M, le=MAX_CENTRE_M)]
-
 Share = Annotated[float, Field(ge=-1e3, le=1e3)]
-
 Direction = Literal[-1, 0, 1]
 
 

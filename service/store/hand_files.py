@@ -20,19 +20,13 @@ DESCRIPTIONS: Final = ("asset.json", "hand.json")
 
 #: What the name of a description may end with; which of them it is, its root element tells.
 SUFFIXES: Final = (".urdf", ".xacro", ".xml", ".mjcf")
-
 #: Of a folder only these are taken, beside its descriptions.
 _TAKEN: Final = (*SUFFIXES, ".yaml", ".yml", ".stl", ".obj", ".ply", ".off", ".glb", ".dae", ".msh")
-
 _REFERENCE: Final = re.compile(r"""file(?:name)?\s*=\s*["']([^"']+)["']""")
-
 _FOLDER: Final = re.compile(r"""(?:mesh|asset)dir\s*=\s*["']([^"']*)["']""")
-
 _MAX_INCLUDED: Final = 32
-
 #: Folders of a ROS package in which descriptions lie: their meshes lie beside them, not below.
 _OF_PACKAGES: Final = ("urdf", "robots", "xacro", "mjcf")
-
 _ABOVE: Final = 4
 
 
@@ -179,20 +173,13 @@ def _inside(file: Path, root: Path) -> bool:
 
 
 Format = Literal["urdf", "xacro", "mjcf"]
-
 #: A root element that begins later than this is none that a tool wrote [bytes].
 _HEAD_BYTES: Final = 1 << 16
-
 _PROLOG: Final = re.compile(r"\s*(?:<\?.*?\?>|<!--.*?-->|<!DOCTYPE(?:[^\[>]|\[.*?\])*>)", re.DOTALL)
-
 _ROOT: Final = re.compile(r"\s*<([A-Za-z_][\w:.-]*)")
-
 _COMMENT: Final = re.compile(r"<!--.*?-->", re.DOTALL)
-
 _MACROS: Final = ("<xacro:", "${", "$(")
-
 _FORMATS_OF: Final[dict[str, Format]] = {"robot": "urdf", "mujoco": "mjcf"}
-
 #: What a file in an encoding begins with, its mark of byte order or that of `<`; a longer one goes first.
 _MARKS: Final = (
     (b"\xff\xfe\0\0", "utf-32"),
@@ -204,11 +191,8 @@ _MARKS: Final = (
     (b"<\0", "utf-16-le"),
     (b"\0<", "utf-16-be"),
 )
-
 _DECLARED: Final = re.compile(rb"""\s*<\?xml[^>]{0,100}encoding\s*=\s*["']([\w.:-]{1,40})""")
-
 _DECLARATION: Final = re.compile(r"<\?xml\s[^>]{0,200}\?>")
-
 #: Encodings that a file may name; all else is UTF-8, whatever it says.
 _NAMED: Final = re.compile(r"iso-?8859|latin|windows-12|cp12|gb|big5|shift|euc|koi8", re.IGNORECASE)
 

@@ -27,16 +27,11 @@ from service.store.store import STREAM_BYTES, Stamp, Store
 
 #: Lists of checksums that exports and cards write, looked for in the folder of a shard and in the two above it.
 CHECKSUM_LISTS: Final = ("SHA256SUMS", "checksums.sha256")
-
 _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
-
 _LEVELS: Final = 3
-
 MEND: Final = "`graspd admin store verify --repair` makes it again where that is possible"
-
 #: Bits may rot without a new time of change, so that what was found intact is not believed for ever [s].
 _BELIEVED_S: Final = 3600.0
-
 _REMEMBERED: Final = 100_000
 
 
@@ -208,23 +203,15 @@ def _listed(sums: Path, _changed: int) -> dict[str, str]:
 
 
 _ZEROS: Final = b"0" * 64
-
 _DIGITS: Final = re.compile(rb"[0-9a-f]{64}")
-
 _JSON: Final = b'{"checksum":"'
-
 _GLB: Final = b'{"extras":{"checksum":"'
-
 _ZIP: Final = b"sha256:"
-
 #: A document's header and the header of its first chunk [bytes].
 _GLB_AT: Final = 20
-
 #: Head of an object in which digits would stand if some bytes before them were lost or added [bytes].
 _SLACK: Final = 4
-
 _END: Final = struct.Struct("<4s4H2LH")
-
 _END_MARK: Final = b"PK\x05\x06"
 
 

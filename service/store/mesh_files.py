@@ -15,7 +15,6 @@ from service.model.errors import InputError
 from service.store.assets import check_path
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(/*)")
-
 #: Of them the rest is a path; what comes first in it, a package or folders of another machine, may be left out.
 _OURS: Final = frozenset({"package", "model", "file"})
 
@@ -83,23 +82,17 @@ def _inside(path: str, base: str) -> str:
 
 #: Names that one file may give: more is no material library.
 MAX_NAMES: Final = 64
-
 #: How much of a file is looked at for such names, which stand at its top [bytes].
 HEAD_BYTES: Final = 2**20
-
 _SPACES: Final = rb"[ \t]+"
-
 _NAMED_BY: Final = {
     ".obj": re.compile(rb"^mtllib" + _SPACES + rb"([^\r\n]+)", re.MULTILINE),
     ".mtl": re.compile(rb"^[ \t]*map_Kd" + _SPACES + rb"([^\r\n]+)", re.MULTILINE | re.IGNORECASE),
     ".dae": re.compile(rb"<init_from>\s*(?:<ref>)?\s*([^<>\r\n]+?)\s*<"),
 }
-
 #: Meshes that may name such files.
 MESHES: Final = (".obj", ".dae")
-
 _PICTURES: Final = (".png", ".jpg", ".jpeg")
-
 _TAKEN: Final = (".mtl", *_PICTURES)
 
 

@@ -27,35 +27,23 @@ from service.store.assets import asset_json
 from service.store.descriptions import json_object, parse_description
 
 SCHEMA: Final = "graspd/proposals@1"
-
 #: Most that a file may hold, packed or not; a network of 22 joints takes 5.4 MB [bytes].
 MAX_BYTES: Final = 64 << 20
-
 #: Numbers of a point, as the encoder takes them; widths of its layers, the last one before the maximum over points.
 ENCODER: Final = (7, 64, 128, 256)
-
 FEATURE: Final = 256
-
 #: The feature of the cloud, its height above the table, and the label.
 CONDITION: Final = FEATURE + 2
-
 #: Sines and cosines of time.
 TIME_FEATURES: Final = 8
-
 HIDDEN: Final = 512
-
 BLOCKS: Final = 2
-
 #: Numbers of a grasp besides its joints: position, two columns of the rotation, way in.
 POSE: Final = 12
-
 _META: Final = "meta"
-
 #: A text array keeps four bytes a letter; a header of its own comes before each array.
 _MOST_META: Final = 4 * (64 << 10)
-
 _HEADER: Final = 4096
-
 Floats32 = NDArray[np.float32]
 
 

@@ -28,7 +28,6 @@ from service.store.integrity import get_document, is_sealed, put_document, put_s
 from service.store.store import Store
 
 RecordT = TypeVar("RecordT", bound=BaseModel)
-
 #: Writes a record under a key if there is none; whether there was none.
 Put = Callable[[str, BaseModel], bool]
 
@@ -172,9 +171,7 @@ def set_mark(store: Store, mark: str) -> None:
 
 
 CHARTS: Final = "charts"
-
 IN_SCENES: Final = "scene_charts"
-
 STABILITY: Final = "stability"
 
 
@@ -228,7 +225,6 @@ def latest_key(store: Store, kind: str) -> str:
 
 
 _DIGITS: Final = re.compile(r"\D")
-
 What = Literal["hand", "object", "network", "job", "dataset", "tag"]
 
 

@@ -24,24 +24,17 @@ from service.store.columns import SCHEMAS, Attribute, ShardKind, check_attribute
 from service.store.integrity import check_file
 
 Arrays = Mapping[str, NDArray[np.generic]]
-
 #: Attribute of each dataset: SHA-256 of its values, so that a file that left the store still shows damage.
 _DIGEST: Final = "sha256"
-
 #: A shard has some fifty datasets and groups.
 _MOST_ITEMS: Final = 1000
-
 #: No byte of deflate becomes more than so many; and what a dataset may claim without having been written [bytes].
 _MOST_DEFLATED: Final = 1032
-
 _FREE_BYTES: Final = 1 << 16
-
 #: What a whole file may unpack to, whatever its size, and how often its size beyond that [bytes]: masks shrink a
 #: thousandfold, and no shard is made of them alone.
 _FREE_IN_ALL: Final = 1 << 28
-
 _MOST_IN_ALL: Final = 64
-
 #: What h5py and the filters of HDF5 raise where they meet bytes that make no sense.
 _UNREADABLE: Final = (OSError, KeyError, ValueError, TypeError, RuntimeError, OverflowError, MemoryError)
 

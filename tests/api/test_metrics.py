@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from service.model.worker_beat import WorkerBeat
 
 from api.metrics import Metrics, Snapshot
 from service.model.states import Stage
+from service.model.workers import WorkerBeat
 from service.pipeline.metrics import SERIES
 from service.queue.port import QueueNow
 

@@ -17,11 +17,10 @@ from worker import certified
 from worker.certified import Certified, certified_grasps
 from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
-from worker.lanes import Lanes
 from worker.objects.prepare import object_from_path
 from worker.planners import NoPlace, Wanted, synthesize
 from worker.rounds import LANE, lanes_of
-from worker.run import Run
+from worker.run import Lanes, Run
 from worker.scenes.kinds import rest_poses, supports_of
 from worker.side_by_side import side_by_side
 from worker.simulation.surroundings import Scenes

@@ -21,7 +21,7 @@ from worker.cards.numbers import numbers
 from worker.cards.page import page
 from worker.cards.plots import draw
 from worker.cards.tally import tally_of
-from worker.rendering.pages import sheets
+from worker.rendering import sheets
 
 #: Pictures out of the dataset.
 SHEET: Final = "samples.jpg"

@@ -33,7 +33,6 @@ from service.store.shards import json_attribute, open_shard, read_column
 from service.store.store import Store
 
 Pair = tuple[str, str]
-
 _BUILTIN_LICENCE: Final = "Apache-2.0"
 
 
@@ -229,11 +228,8 @@ COLUMNS: Final[dict[str, tuple[str, ...]]] = {
     "scene": ("grasp/base_index", "grasp/hand_pose", "grasp/valid", "grasp/rejection", "scene/object_pose"),
     "views": (),
 }
-
 _STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
-
 _AT_ONCE: Final = 64
-
 _THREADS: Final = 8
 
 

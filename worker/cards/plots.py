@@ -12,7 +12,6 @@ from service.model.metrics import GRASP_METRICS
 from worker.cards.tally import Tally, cell_counts
 
 Row = Mapping[str, Any]
-
 COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
 INK: Final = "#1f2937"
 #: A matrix with more objects is drawn without names and numbers.

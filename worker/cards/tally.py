@@ -17,7 +17,7 @@ from service.store import validity
 from service.store.manifests import INDEX_THRESHOLD_M
 from worker.cards.contents import AssetFacts, Contents, Pair, Piece
 from worker.grasps import Posture
-from worker.quality.approach import cells_of
+from worker.quality.diversity import cells_of
 
 #: Bins between a joint's limits.
 BINS: Final = 200
@@ -81,15 +81,11 @@ class JointUse:
 
 
 Array = NDArray[Any]
-
 Floats32 = NDArray[np.float32]
-
 #: Grasps of a cell on which its diversity is measured, the first ones.
 SAMPLED: Final = 512
-
 #: So many arrays of a cell are packed into one.
 _UNPACKED: Final = 16
-
 #: Grasps that agree in all numbers to so many digits (metres, radians) are counted as one.
 _DIGITS: Final = 6
 
@@ -300,7 +296,6 @@ def _add_scene(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts, va
 
 #: Fewer grasps leave cells empty by chance: with this many uniform ones e^-5 of a cell, 0.3 of all 48.
 ENOUGH: Final = 5 * DIRECTION_CELLS
-
 #: Elevations from -90 to 90 degrees.
 ELEVATION_BINS: Final = 36
 

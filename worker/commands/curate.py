@@ -1,4 +1,4 @@
-"""Command line: `graspd grasps where`, `graspd datasets balance`, `diff` and `card`."""
+"""Command line: `graspd grasps where`, `graspd datasets balance`, `diff`, and `graspd clouds`."""
 
 from __future__ import annotations
 
@@ -6,25 +6,24 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from service.cli import JsonFlag, emit, load_settings, plain_console, plain_table, reporting_errors
+from service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
 from service.model.errors import InputError
+from service.readers import Pictures
+from service.readers.clouds import Frame
+from service.readers.depth_noise import NOISES
 from service.readers.where import parse
-from service.store.store import open_store
+from worker.files.clouds import hand_surface, write_clouds
 from worker.files.curation import KINDS, Balance, difference
 from worker.files.subsets import Subset, shards_of, write_subset
 
 app = typer.Typer(no_args_is_help=True, add_completion=False)
-
 group = typer.Typer(no_args_is_help=True, help="Grasps of files and datasets, chosen by their numbers.")
-
 app.add_typer(group, name="grasps")
 
 SourceArgument = Annotated[
     str, typer.Argument(help="A file, a folder of shards, or a dataset of the store by its name.")
 ]
-
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="The folder to write; it must not be there.")]
 
 
@@ -130,49 +129,52 @@ def _tell(found: Subset, out: Path, *, json: bool) -> None:
         typer.echo(f"{found.passed_over} shards of scenes and pictures are not carried over", err=True)
 
 
-@app.command(epilog="graspd datasets card kitchen -o kitchen-v1 --licence CC-BY-4.0")
+@app.command(epilog="graspd clouds kitchen --points 1024 --noise stereo -o clouds")
 @reporting_errors
-def card(
-    source: Annotated[
-        str, typer.Argument(metavar="NAME", help="A dataset of the store; or a folder of shards: ./kitchen-v1.")
-    ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write the card into.")],
-    snapshot: Annotated[str | None, typer.Option(help="Digest of a snapshot; default: the newest.")] = None,
-    licence: Annotated[str, typer.Option(help="Licence of the grasps and pictures, as SPDX names it: CC-BY-4.0.")] = "",
-    text: Annotated[str, typer.Option("--source", help="A sentence on where it comes from, or whom to ask.")] = "",
-    assets: Annotated[
-        Path | None, typer.Option(help="JSON with licence and source of hands and objects that were added without.")
+def clouds(
+    source: Annotated[str, typer.Argument(help="A folder of shards with pictures, or a dataset of the store.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write; it must be new or empty.")],
+    points: Annotated[int, typer.Option(min=1, max=10_000_000, help="Points of each cloud.")] = 1024,
+    noise: Annotated[str, typer.Option(help=f"A depth camera: {', '.join(NOISES)}; none.")] = "none",
+    frame: Annotated[
+        Frame | None, typer.Option(help="camera, table or object; default: the camera's, of fused views the table's.")
     ] = None,
-    data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Folder of graspd; GRASPD_DATA_DIR.")] = None,
+    fuse: Annotated[bool, typer.Option("--fuse", help="One cloud of all views of a scene.")] = False,
+    scene: Annotated[bool, typer.Option("--scene", help="Table and neighbours too.")] = False,
+    voxel: Annotated[float, typer.Option(min=0.0, help="One point of each cube with this edge [m]; 0: all.")] = 0.0,
+    graspness: Annotated[
+        bool, typer.Option("--graspness", help="Of each point the share of grasps whose hand touches it.")
+    ] = False,
+    unjudged: Annotated[bool, typer.Option("--unjudged", help="Grasps that are sound and that nobody judged.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same clouds.")] = 0,
     json: JsonFlag = False,
 ) -> None:
-    """Write a dataset's card: what it holds, how it was made, how good and biased it is; with plots and checksums."""
-    from worker.cards.card import write_card
-    from worker.cards.contents import contents_of_folder, contents_of_store, with_provenance
+    """Write the pictures of a dataset as point clouds with their grasps: docs/how-to/clouds.md.
 
-    if "/" in source or source in (".", ".."):
-        if snapshot is not None:
-            raise InputError(f"{source} is a folder; --snapshot goes with the name of a dataset")
-        contents = contents_of_folder(Path(source))
-    else:
-        contents = contents_of_store(
-            open_store(load_settings(data_dir=data_dir).resolved_store_url, make=False), source, snapshot
-        )
-    if assets is not None:
-        contents = with_provenance(contents, assets)
-    columns = (TextColumn("shards"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    console = plain_console(stderr=True)
-    with Progress(*columns, console=console, disable=json or not console.is_terminal, transient=True) as bar:
-        task = bar.add_task("", total=len(contents.shards))
-        found = write_card(
-            contents, out, licence=licence, source=text, progress=lambda done, total: bar.update(task, completed=done)
-        )
-    made = found["composition"]
-    told = {"out": str(out), "dataset": found["name"], "snapshot": (found["snapshot"] or {}).get("digest")}
-    told |= {"grasps": made["grasps"], "valid": made["valid"], "pictures": made["pictures"], "plots": found["plots"]}
+    Who reads with graspd needs no files: `Pictures(shards).clouds()` makes the same when it is asked for.
+    """
+    pictures = Pictures(shards_of(source), unjudged=unjudged)
+    if not len(pictures):
+        raise InputError(f"{source} has no pictures; take some: graspd render")
+    camera = None if noise == "none" else noise
+    surface = hand_surface if graspness else None
+    found = pictures.clouds(
+        points, noise=camera, frame=frame, fuse=fuse, scene=scene, voxel_m=voxel, hand_surface=surface, seed=seed
+    )
+    said = {
+        "source": source,
+        "points": points,
+        "noise": noise,
+        "frame": found.frame,
+        "fuse": fuse,
+        "scene": scene,
+        "voxel_m": voxel,
+        "graspness": graspness,
+        "unjudged": unjudged,
+        "seed": seed,
+    }
+    done = write_clouds(found, out, said)
     if json:
-        emit(told)
-    else:
-        typer.echo(
-            f"{out}/README.md: {made['valid']:,} valid grasps, {len(found['plots'])} plots, checksums, card.json"
-        )
+        emit({"folder": str(out), **done})
+        return
+    typer.echo(f"{out}: {done['clouds']} clouds in {done['files']} files, {done['empty']} of them empty")

@@ -18,9 +18,9 @@ from worker.files.provenance import neighbours_of_shard, placed_of_shard
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.rendering.pages.pictures import SAMPLES, THREE_SIDES, grasp_pictures
-from worker.rendering.pages.sheets import contact_sheet, figures, label_page, three_sides_sheet
-from worker.rendering.pages.way_pictures import FREE_STRIP, STRIP, Around, animation, animation_kind, way_pictures
+from worker.rendering.pictures import SAMPLES, THREE_SIDES, grasp_pictures
+from worker.rendering.sheets import contact_sheet, figures, label_page, three_sides_sheet
+from worker.rendering.way_pictures import FREE_STRIP, STRIP, Around, animation, animation_kind, way_pictures
 from worker.robots.execution import (
     STEP_S,
     Executions,
@@ -34,7 +34,6 @@ from worker.robots.execution import (
 from worker.run import Run
 
 Kind = Literal["one side", "three sides", "way"]
-
 #: Edge of a grasp's picture [px] and rays a pixel. Tracing costs what goes with both: three sides half of one alone.
 LOOKS: Final[dict[Kind, tuple[int, int]]] = {"one side": (300, SAMPLES), "three sides": (160, 8), "way": (300, SAMPLES)}
 
@@ -137,18 +136,14 @@ def _named(way: list[Waypoint], name: str) -> Waypoint:
 
 #: Width of the film [px], and its height as a share of that.
 WIDTH: Final = 480
-
 HIGH: Final = 0.75
 
 #: Rays a pixel: shadows that move show what is coarse in them.
 FILM_SAMPLES: Final = 24
-
 #: Share of the velocity limits of joints and hand that is used.
 SPEED: Final = 0.5
-
 #: The open hand is shown for so long before it sets out, and the lifted object before all begins anew [s].
 BEFORE_S: Final = 0.4
-
 AFTER_S: Final = 1.4
 
 

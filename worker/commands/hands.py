@@ -125,7 +125,7 @@ def _bar(what: str, first: str = "", *, quiet: bool) -> Iterator[Run]:
 
 def _draw(hand: HandModel, picture: Path, *, collision: bool) -> None:
     from worker.rendering.hands import without_visuals
-    from worker.rendering.pages.portraits import above, hand_portrait, hand_sides, write_png
+    from worker.rendering.portraits import above, hand_portrait, hand_sides, write_png
 
     shown = without_visuals(hand) if collision else hand
     write_png(above(hand_portrait(shown), hand_sides(hand)), picture)

@@ -65,7 +65,7 @@ def check(
         return
     report = report_object(file, options)
     if picture and report["verdict"] != "refuse":
-        from worker.rendering.pages.portraits import object_portrait, write_png
+        from worker.rendering.portraits import object_portrait, write_png
 
         write_png(object_portrait(object_from_path(file, options=options)), picture)
     if json:

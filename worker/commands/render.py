@@ -38,17 +38,16 @@ from worker.files.subsets import EveryOption, UnjudgedOption, choose
 from worker.rendering.annotate import parse_channels
 from worker.rendering.cameras import BASELINE_M, SAMPLED, read_cameras
 from worker.rendering.hands import DrawnHand
-from worker.rendering.pages.sheets import best, best_in_scenes, best_kept, views_page, with_palette
-from worker.rendering.pages.way_pictures import animation_kind
 from worker.rendering.scenery import TABLE
+from worker.rendering.sheets import best, best_in_scenes, best_kept, views_page, with_palette
 from worker.rendering.views import Extras
 from worker.rendering.views import render as render_views
+from worker.rendering.way_pictures import animation_kind
 from worker.run import Run
 
 app = typer.Typer(add_completion=False)
 
 _Device = Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")]
-
 _Object = Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")]
 
 

@@ -1,9 +1,4 @@
-"""Command line: `graspd bench`.
-
-Command line: `graspd stability`.
-
-Command line: `graspd chart`.
-"""
+"""Command line: `graspd bench`, `graspd stability` and `graspd chart`."""
 
 from __future__ import annotations
 

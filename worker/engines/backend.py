@@ -1,8 +1,6 @@
-"""Warp, started quietly: on a machine without a GPU its C++ side says so on stderr at every start.
+"""Warp started quietly, its kernel cache, and kernels compiled ahead of time.
 
 Compiled kernels are kept where Warp would, or where this user can write.
-
-Kernels compiled ahead of time, and names of compiled kernels: a fresh machine with such an image compiles nothing.
 
 A folder of such kernels is laid out as Warp's cache is, VERSION/MODULE/FILE. Names of files hold what they are good
 for: the digest of the module's source and options, the GPU's architecture, or the instructions of the CPU that they
@@ -29,11 +27,8 @@ import warp as wp
 from service import user_cache
 
 _HARMLESS = b"Could not find or load the NVIDIA CUDA driver"
-
 _lock = threading.Lock()
-
 _started = False
-
 log = logging.getLogger(__name__)
 
 
@@ -106,7 +101,6 @@ def kernel_cache() -> Path | None:
 
 #: Names the folder of kernels that were compiled ahead.
 VARIABLE: Final = "GRASPD_KERNELS"
-
 #: A100, H100 and H200, B200.
 ARCHITECTURES: Final = (80, 90, 100)
 

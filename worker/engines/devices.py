@@ -25,10 +25,8 @@ from service import user_cache
 from service.model.errors import GraspdError, InputError
 
 log = logging.getLogger(__name__)
-
 #: Processes on one GPU that are counted; more make no difference.
 _MOST: Final = 64
-
 #: Locks of this process, until it ends.
 _held: list[IO[bytes]] = []
 

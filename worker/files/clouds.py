@@ -68,7 +68,6 @@ def stacked(samples: list[dict[str, Any]]) -> dict[str, Any]:
 
 #: Points on a hand: some 5 mm apart on one as large as a man's.
 POINTS: Final = 2048
-
 _hands: LRUCache[Any, HandModel] = LRUCache(8)
 
 

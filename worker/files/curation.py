@@ -23,9 +23,7 @@ from worker.quality.diversity import distinct, hand_points
 
 #: What grasps can be shared out by.
 KINDS: Final = ("type", "direction", "face")
-
 _COLUMNS: Final = {"type": "quality/grasp_type", "direction": "quality/approach_cell"}
-
 #: Two scenes have the object on one face where their down, in its frame, differ by less than this [cosine of 20 deg].
 _SAME_FACE: Final = float(np.cos(np.radians(20)))
 
@@ -111,7 +109,6 @@ def faces(down: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 Row = dict[str, Any]
-
 #: Root attributes of base shards that are compared.
 _SETTINGS: Final = (
     "method",
@@ -126,7 +123,6 @@ _SETTINGS: Final = (
     "hand_digest",
     "object_digest",
 )
-
 #: Grasps that agree in pose and joints to so many digits (metres, radians) are one.
 _DIGITS: Final = 6
 

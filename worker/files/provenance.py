@@ -1,8 +1,6 @@
-"""The hand and the object of a shard: what it notes of them, and how their files are found again.
+"""The hand and the object of a shard: what it notes of them and of its grasps, and how their files are found again.
 
 They are known by their digests, so a file that was changed or is another one is never taken for them.
-
-What a base shard says at its root of the grasps in it; `service.store.columns` has the schema.
 """
 
 from __future__ import annotations
@@ -44,10 +42,8 @@ from worker.simulation.surroundings import Placed, Scenes
 
 #: What a file may be called that describes a hand or an object.
 SUFFIXES: Final = {AssetKind.HAND: (".urdf", ".xml", ".zip"), AssetKind.OBJECT: (*READERS, ".zip")}
-
 #: Files of the shard's folder, and of the folders in it, that are looked at.
 LOOKED_AT: Final = 200
-
 _FILES: Final[dict[AssetKind, Callable[[Path], tuple[str, dict[str, bytes], dict[str, Any]]]]] = {
     AssetKind.HAND: hand_files,
     AssetKind.OBJECT: object_files,
@@ -163,7 +159,6 @@ def options_of(attribute: object) -> dict[str, Any]:
 
 #: Neighbours are looked at and kept clear of, not grasped.
 NEIGHBOUR_FACE_ERROR_M: Final = 3e-4
-
 _MATTER: Final = {"object_mass_kg": MASS_KG, "object_friction": FRICTION}
 
 

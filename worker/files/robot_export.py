@@ -18,7 +18,7 @@ from worker.files.exchange.robots.bundle import Bundle, Carrier
 from worker.files.provenance import hand_files_of_shard
 from worker.files.subsets import choose
 from worker.quality.referee.decomposition import decompose
-from worker.rendering.pages.sheets import best as best_of
+from worker.rendering.sheets import best as best_of
 from worker.robots.arm import Description, describe, read_arm
 from worker.robots.execution import (
     ASSUMED_M_S,

@@ -93,7 +93,6 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
 UnjudgedOption = Annotated[
     bool, typer.Option("--unjudged", help="Instead of valid grasps those that are sound and that nobody judged.")
 ]
-
 EveryOption = Annotated[bool, typer.Option("--all", help="All grasps, also those that failed.")]
 
 

@@ -37,7 +37,7 @@ from worker.objects.options import as_asked
 from worker.objects.prepare import object_from_path
 from worker.planners import planner
 from worker.pool.pool import MODULES, Pool, processes_at_once
-from worker.quality.referee.limit import Limit
+from worker.quality.referee.payload import Limit
 from worker.run import FirstJudge, Progress, Run
 from worker.scenes.beside import scenes_of
 from worker.scenes.rest import rolling_poses

@@ -81,7 +81,6 @@ def _allegro_thumb(hand: UrdfWriter) -> None:
 
 #: The distal joint turns one third as far as the medial one: both hang on one motor.
 DISTAL_RATIO = 1 / 3
-
 MEDIAL_MAX = 2.44
 
 
@@ -159,17 +158,11 @@ def _outer_finger(hand: UrdfWriter, finger: int, parent: str, xyz: Vector, rpy: 
 Vector = tuple[float, float, float]
 
 X: Final[Vector] = (1.0, 0.0, 0.0)
-
 Y: Final[Vector] = (0.0, 1.0, 0.0)
-
 MINUS_Y: Final[Vector] = (0.0, -1.0, 0.0)
-
 SPREAD: Final = (-0.349065850, 0.349065850)
-
 KNUCKLE: Final = (-0.261799388, math.pi / 2)
-
 FLEX: Final = (0.0, math.pi / 2)
-
 METACARPAL_TURN: Final = 0.959931089
 
 

@@ -1,9 +1,8 @@
-"""The jaws of a gripper: which surfaces meet when it closes, how far they open, and along which line.
+"""The jaws of a gripper and the pads of a hand: which surfaces meet when it closes, how far they open, along which
+line.
 
 A gripper is a hand whose closing is one motion of at most two degrees of freedom that brings opposing surfaces, the
 pads, together. Everything is found from geometry, so a joint at 0 may as well be open as closed.
-
-Where a hand presses: the pads of its jaws, or those of its fingertips.
 """
 
 from __future__ import annotations
@@ -26,40 +25,28 @@ Ints = NDArray[np.intp]
 
 #: Most degrees of freedom of a gripper's closing.
 MAX_DOFS: Final = 2
-
 #: Points that stand for the hand's surface.
 _POINTS: Final = 1600
-
 #: Two surfaces face each other where their normals are opposite to within 37 degrees ...
 _FACING_COS: Final = 0.8
-
 #: ... and one lies before the other, no farther to the side than so many distances between sample points.
 _ASIDE: Final = 1.5
-
 #: Of facing surfaces the ones that come together count: those with this share of the fastest approach.
 _FAST: Final = 0.5
-
 #: A pad is what of a jaw lies within this of the place that touches first [m].
 _PAD_DEPTH_M: Final = 0.003
-
 #: Shares of the limits at which the hand is looked at for surfaces that others hide.
 _LOOKS: Final = (0.5, 0.02, 0.98)
-
 #: Surfaces look where they go if they move along their normals with this share of the fastest point's speed.
 _LEADING: Final = 0.3
-
 #: A body carries a pad if it faced the other jaw with this share of the area of the one that faced it most.
 _PAD_SHARE: Final = 0.4
-
 #: Postures between open and closed that are looked at.
 _STEPS: Final = 17
-
 #: Pads face each other where the difference of their mean normals is longer than this: up to 120 degrees between them.
 _TOWARDS: Final = 1.0
-
 #: Pads that are this near touch [m].
 _TOUCH_M: Final = 2e-4
-
 #: Least over greatest singular value of the ends' motions from which on they are in no plane.
 _IN_SPACE: Final = 0.2
 
@@ -139,7 +126,6 @@ def jaws_of(hand: HandModel) -> Jaws | None:
 
 
 _found: LRUCache[str, Jaws | None] = LRUCache(32)
-
 _lock = threading.Lock()
 
 
@@ -333,10 +319,8 @@ def slides(hand: HandModel) -> NDArray[np.bool_]:
 
 #: Share of a fingertip's speed, and so of its length, within which its points are its pad.
 PAD: Final = 0.5
-
 #: Least cosine of a pad's normals with its motion.
 _AHEAD: Final = 0.7
-
 #: Directions in which a fingertip is measured.
 _DIRECTIONS: Final = 256
 

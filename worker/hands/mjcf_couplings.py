@@ -20,7 +20,6 @@ from worker.hands.mjcf_servos import driven, joints_on_tendon
 from worker.hands.robot import Mimic
 
 _RANGE_POINTS: Final = 41
-
 #: Coefficients of the joints that a tendon pulls, by the name of its drive.
 Tendons = dict[str, dict[int, float]]
 
@@ -200,14 +199,10 @@ def _range(model: Any, joint: int) -> tuple[float, float]:
 
 
 _STEPS: Final = 33
-
 _ROUNDS: Final = 60
-
 #: Ends of a loop that stay further apart than this do not meet [m].
 _OPEN_M: Final = 2e-4
-
 _ONE_VALUE: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-
 #: A passive joint that leaves its line by more than this does not follow it [rad].
 MAX_ERROR_RAD: Final = 0.08
 

@@ -37,10 +37,9 @@ WIDTHS_M: Final = (0.004, 0.12)
 _TIP_POINTS: Final = 120
 _OTHER_POINTS: Final = 20
 _DENSE: Final = 8000
-#: A fingertip that ends farther above the plane than this share of the height misses the object; what that and a
-#: difference of width cost is counted in these lengths [m].
+#: A fingertip that ends farther above the plane than this share of the height misses the object; a difference of width
+#: is counted in these lengths [m].
 REACHES: Final = 0.4
-SHORT_M: Final = 0.004
 WIDTH_M: Final = 0.02
 #: Least height of the rest of the hand above the plane [m].
 OVER_M: Final = 0.008

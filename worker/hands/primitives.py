@@ -1,8 +1,6 @@
-"""Convex solids: tessellation, area, surface samples and signed distance, exact for the round kinds.
+"""Convex solids: tessellation, area, surface samples, signed distance, and their features (balls, rims, edges).
 
 All functions work in the solid's own frame; cylinders and capsules stand along z, centred.
-
-What of a hand can touch first: points with a radius (balls), circles about an axis (rims), edges.
 """
 
 from __future__ import annotations

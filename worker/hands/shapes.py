@@ -28,7 +28,6 @@ from worker.objects.formats import read_mesh
 
 #: A hull of V corners has at most 2 V - 4 triangles: 96 here. Every plane costs time in each distance query.
 MAX_HULL_VERTICES: Final = 50
-
 #: A link longer than this [m] is a mesh in millimetres without a scale.
 MAX_PIECE_M: Final = 2.0
 
@@ -133,12 +132,9 @@ def _outside(points: Floats, corners: Floats) -> Floats:
 
 #: A hull whose error is larger than this [m] is taken apart: an object would rest that far off the finger.
 MAX_ERROR_M: Final = 4e-3
-
 #: Pieces of a link at most: each costs time in every distance query.
 MAX_PIECES: Final = 8
-
 _THRESHOLDS: Final = (0.1, 0.05)
-
 _COACD: Final = {
     "preprocess_mode": "auto",
     "preprocess_resolution": 40,
@@ -148,32 +144,21 @@ _COACD: Final = {
     "max_convex_hull": MAX_PIECES,
     "seed": 1,
 }
-
 #: A mesh is simplified to so many faces before it is taken apart.
 _FACES: Final = 1200
-
 #: Computing that a run of CoACD may take [s]: twice what the most tangled of 1200 faces took (58 s).
 _CPU_S: Final = 120
-
 _POINTS: Final = 200
-
 _SHARE: Final = 0.9
-
 #: What lies no deeper beneath the hull makes no hollow [m].
 _FLAT_M: Final = 5e-4
-
 #: The six axes and the eight diagonals, a little turned: meshes have many faces along the axes.
 _TURN: Final = quat_to_matrix(np.array([0.9974, 0.0312, 0.0417, 0.0503]))
-
 _WAYS: Final = np.array([d for d in np.ndindex(3, 3, 3) if sum(k != 1 for k in d) in (1, 3)]) - 1.0
-
 _DIRECTIONS: Final = (_WAYS / np.linalg.norm(_WAYS, axis=1, keepdims=True)) @ _TURN.T
-
 #: A ray begins this far off its point [m].
 _START_M: Final = 1e-5
-
 _BLOCK: Final = 64
-
 #: Pieces thinner than this are splinters [m].
 _MIN_EXTENT_M: Final = 1e-3
 

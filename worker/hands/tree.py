@@ -20,10 +20,8 @@ from worker.hands.tendons import check_tendons
 
 #: Share of its range that a drive may lose without a word.
 _TOLD_CUT: Final = 0.01
-
 #: A follower does not go farther [rad], [m].
 _MOST: Final = (200 * math.pi, MAX_LENGTH_M)
-
 #: A joint with a smaller range stands still [rad or m].
 LEAST_RANGE: Final = 1e-5
 
@@ -303,7 +301,6 @@ def joint_type(joint: Joint | None) -> JointType:
 
 #: No finger reaches farther than this from where the fingers of its hand part [m]; legs and arms do.
 MAX_FINGER_M = 0.35
-
 #: What reaches farther than this from its first joint is no hand by itself [m].
 MAX_HAND_M = 0.5
 

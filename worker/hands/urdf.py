@@ -23,10 +23,8 @@ from service.store.hand_files import text_of
 from worker.hands.robot import MAX_LENGTH_M, MOVING, UNLIMITED_M, Joint, Link, Mimic, Robot, Shape, build_robot
 
 MAX_BYTES: Final = 4 * 2**20
-
 #: Visual elements beyond this many are not drawn.
 MAX_VISUALS: Final = 1024
-
 Colour = tuple[float, float, float]
 
 
@@ -259,9 +257,7 @@ def quat_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
 
 
 _PREFIX: Final = re.compile(r"[<\s/]([A-Za-z_][\w.-]{0,40}):[A-Za-z_]")
-
 _FIRST: Final = re.compile(r"<[A-Za-z_][\w:.-]*")
-
 _MAX_PREFIXES: Final = 100
 
 

@@ -24,12 +24,9 @@ from worker.objects.stand_ins import refuse_stand_in
 
 #: Largest hands on arms take a tenth of it [s].
 CPU_LIMIT_S: Final = 10
-
 MEMORY_LIMIT_BYTES: Final = 2**30
-
 #: The limit above ends what computes; this one a child that waits, on however busy a machine [s].
 _WALL_LIMIT_S: Final = 1800.0
-
 #: What an expansion may read; meshes are only named.
 _READ: Final = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
 

@@ -1,7 +1,4 @@
-"""Arrays on this machine that take long to compute and follow from little: read in a millisecond by later processes.
-
-What a model holds, as a key for caches: of one file there are as many models as there are ways to prepare it.
-"""
+"""Disk cache of arrays that take long to compute and follow from little, and the content of models as keys."""
 
 from __future__ import annotations
 
@@ -27,12 +24,10 @@ from service.model.libraries import version_of
 
 #: Libraries that go into the arrays.
 _LIBRARIES: Final = ("numpy", "scipy")
-
 #: All entries of a kind together; one has some 100 kB.
 _LIMIT_BYTES: Final = 256 << 20
 
 Arrays = Mapping[str, NDArray[Any]]
-
 _recalled: ContextVar[dict[str, NDArray[Any]] | None] = ContextVar("recalled", default=None)
 
 
@@ -131,7 +126,6 @@ def _revision(files: tuple[str, ...]) -> str:
 
 #: How a model is called says nothing of what it is.
 _NAMES: Final = frozenset({"name", "digest"})
-
 #: Metadata of a field that says nothing while it has its default.
 TOLD_IF_SET: Final = MappingProxyType({"told_if_set": True})
 

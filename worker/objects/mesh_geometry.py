@@ -170,7 +170,6 @@ def _apart(low: Floats, high: Floats, i: int) -> Floats:
 #: Digits of the longest extent to which coordinates are rounded, so that no sliver collapses; and the fewest of them in
 #: which a mesh of decimals is looked for.
 DIGITS: Final = 9
-
 LEAST_DIGITS: Final = 5
 
 

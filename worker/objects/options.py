@@ -15,7 +15,6 @@ from service.model.matter import Density, Friction, Mass
 from worker.objects.model import ObjectModel
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-
 #: Keys that decide how heavy and how slippery the object is, and not its shape.
 OF_MATTER: Final = ("density", "mass", "friction")
 

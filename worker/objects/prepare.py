@@ -38,7 +38,6 @@ from worker.objects.topology import Indices
 
 #: Names of files that say nothing of what is in them: the objects of such a set differ by their folders.
 PLAIN_STEMS: Final = ("clean", "mesh", "model", "textured", "nontextured", "simplified")
-
 #: Libraries whose results go into a prepared object.
 _LIBRARIES: Final = ("numpy", "scipy", "manifold3d", "fast-simplification")
 
@@ -229,21 +228,15 @@ Mesh = tuple[Floats, Indices]
 
 #: Meshes with no more faces are left as they are: fewer would not make a query faster.
 FEW_FACES: Final = 64
-
 #: Meshes with more faces are first brought near this number.
 MANY_FACES: Final = 40_000
-
 #: The search stops when two targets differ by less than this factor.
 STEP: Final = 1.12
-
 #: Surface samples, besides the vertices, at which trials are held to a little less than the bound ...
 SAMPLES: Final = 4000
-
 MARGIN: Final = 0.9
-
 #: ... and those at which the mesh that is returned is measured.
 DENSE_SAMPLES: Final = 30_000
-
 #: Aggressiveness of the collapse: the slowest that still reaches its target; it errs least and breaks least.
 PATIENCE: Final = 3
 
@@ -376,7 +369,6 @@ _ARRAYS: Final = (
     "hull_vertices",
     "hull_faces",
 )
-
 _NAMES: Final = ("name", "digest", "about_centre")
 
 

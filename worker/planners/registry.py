@@ -22,7 +22,7 @@ GROUP: Final = "graspd.planners"
 
 #: Method name -> module and attribute of its `Method`. Modules are imported when used.
 PLANNERS: Final[dict[str, tuple[str, str]]] = {
-    "fast_graspd": ("worker.planners.fast_graspd.method", "METHOD"),
+    "fast_graspd": ("worker.planners.fast_graspd.planner", "METHOD"),
     "graspit": ("worker.planners.graspit.method", "METHOD"),
     "graspd2022": ("worker.planners.graspd2022.method", "METHOD"),
     "dfc": ("worker.planners.dfc.method", "METHOD"),

@@ -11,9 +11,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from service.model.finding import Finding, bad, good, warning
 from service.model.states import Stage
-from service.run.doctor.patience import Check
+from service.run.doctor.checks import Check, Finding, bad, good, warning
 from service.settings import Settings
 
 _MODULE: Final = "worker.process.doctor"

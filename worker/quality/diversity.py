@@ -1,13 +1,15 @@
-"""How different the grasps of a set are: variance (DexGraspBench), and near-duplicates."""
+"""Diversity of a set of grasps: variance (DexGraspBench), near-duplicates, and directions of approach in cells of
+equal area."""
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats, apply
+from service.model.metrics import BANDS, SECTORS
+from service.model.transforms import Floats, apply, quat_rotate
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
@@ -109,3 +111,18 @@ def _rotation_vector(quaternion: Floats) -> Floats:
     sine = np.linalg.norm(q[:, 1:], axis=1)
     angle = 2 * np.arctan2(sine, q[:, 0])
     return q[:, 1:] * (angle / np.maximum(sine, 1e-12))[:, None]
+
+
+def approach_cells(hand: HandModel, quaternions: NDArray[np.float64]) -> NDArray[np.int32]:
+    """(B,) cell from which the palm comes in B grasps, of which the root's quaternions (B, 4) are given."""
+    return cells_of(-quat_rotate(quaternions, hand.palm.approach)).astype(np.int32)
+
+
+def cells_of(directions: NDArray[Any], bands: int = BANDS, sectors: int = SECTORS) -> NDArray[np.int64]:
+    """(N,) cell of unit vectors (N, 3): band times `sectors` plus sector; band 0 is the lowest, sector 0 begins at
+    azimuth -180 degrees."""
+    z = np.clip(directions[:, 2], -1.0, 1.0)
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0])
+    band = np.minimum((bands * (z + 1) / 2).astype(np.int64), bands - 1)
+    sector = np.minimum((sectors * (azimuth + np.pi) / (2 * np.pi)).astype(np.int64), sectors - 1)
+    return np.asarray(band * sectors + sector)

@@ -88,14 +88,20 @@ class Openings:
         self._leave(grasp, first)
         self._step(first)
         launch(
-            opening.open_plainly, self.count, inputs=[self.fingers, STUCK_M, first], outputs=[plain, self.step],
+            opening.open_plainly,
+            self.count,
+            inputs=[self.fingers, STUCK_M, first],
+            outputs=[plain, self.step],
             device=self.posing.device,
-        )  # fmt: skip
+        )
         self._step(plain)
         launch(
-            opening.take_opening, (self.count, self.posing.hand.dofs),
-            inputs=[self.fingers, self.hands, STUCK_M, first, plain], outputs=[self.open], device=self.posing.device,
-        )  # fmt: skip
+            opening.take_opening,
+            (self.count, self.posing.hand.dofs),
+            inputs=[self.fingers, self.hands, STUCK_M, first, plain],
+            outputs=[self.open],
+            device=self.posing.device,
+        )
 
     def without_jams(self, blocked: Blocked | None = None) -> Floats:
         """(N, D) where fingers are to go, held back towards the grasp where they would run into one another or where
@@ -115,9 +121,12 @@ class Openings:
             less = wp.float64(0.5 if look < JAM_LOOKS - 1 else 0.0)
             launch(jamming.hold_back, self.count, inputs=[less], outputs=[jams], device=device)
         launch(
-            jamming.take_way, (self.count, self.posing.hand.dofs), inputs=[self.fingers, self.hands, jams],
-            outputs=[self.open], device=device,
-        )  # fmt: skip
+            jamming.take_way,
+            (self.count, self.posing.hand.dofs),
+            inputs=[self.fingers, self.hands, jams],
+            outputs=[self.open],
+            device=device,
+        )
         found: Floats = self.open.numpy().copy()
         return found
 
@@ -134,11 +143,19 @@ class Openings:
             approach = wp.vec3d(*posing.hand.palm.approach)
             for step, way in enumerate(RETREATS_M):
                 launch(
-                    jamming.hand_clearance, (self.count, posing.lanes),
-                    inputs=[posing.probe.skin, posing.points, posing.lane, approach, PALM_CLEARANCE_M, wp.float64(way),
-                            self.bodies],
+                    jamming.hand_clearance,
+                    (self.count, posing.lanes),
+                    inputs=[
+                        posing.probe.skin,
+                        posing.points,
+                        posing.lane,
+                        approach,
+                        PALM_CLEARANCE_M,
+                        wp.float64(way),
+                        self.bodies,
+                    ],
                     outputs=[back],
-                )  # fmt: skip
+                )
                 launch(jamming.judge_retreat, self.count, inputs=[PALM_CLEARANCE_M, step], outputs=[back])
         poses = self.hand_pose.copy()
         away = np.array(RETREATS_M)[back.chosen.numpy()]
@@ -161,27 +178,34 @@ class Openings:
         with wp.ScopedDevice(posing.device):
             wrench = [wp.empty((self.count, hand.bodies), dtype=wp.vec3d) for _ in range(2)]
             launch(
-                opening.body_wrenches, (self.count, hand.bodies),
-                inputs=[posing.points, bodies, near, CLEARANCE_M], outputs=wrench,
-            )  # fmt: skip
+                opening.body_wrenches,
+                (self.count, hand.bodies),
+                inputs=[posing.points, bodies, near, CLEARANCE_M],
+                outputs=wrench,
+            )
             away = wp.empty((self.count, hand.dofs), dtype=wp.float64)
             launch(
-                opening.leave, self.count,
-                inputs=[posing.chain, self.fingers, wp.float64(PLAIN_OPENING), bodies], outputs=[*wrench, away, sweep],
-            )  # fmt: skip
+                opening.leave,
+                self.count,
+                inputs=[posing.chain, self.fingers, wp.float64(PLAIN_OPENING), bodies],
+                outputs=[*wrench, away, sweep],
+            )
 
     def _step(self, sweep: Any) -> None:
         """Step by step along the way of a sweep, until all fingers are clear."""
         posing, out = self.posing, Launches(self.posing.device)
         out.add(
-            opening.place_opening, self.count,
-            inputs=[posing.chain, self.fingers, self.hands, CLEARANCE_M, self.step], outputs=[sweep, self.bodies],
-        )  # fmt: skip
+            opening.place_opening,
+            self.count,
+            inputs=[posing.chain, self.fingers, self.hands, CLEARANCE_M, self.step],
+            outputs=[sweep, self.bodies],
+        )
         out.add(
-            opening.finger_clearance, (self.count, posing.lanes),
+            opening.finger_clearance,
+            (self.count, posing.lanes),
             inputs=[posing.probe.skin, posing.points, self.fingers, posing.lane, CLEARANCE_M, self.bodies],
             outputs=[sweep],
-        )  # fmt: skip
+        )
         out.add(opening.judge_opening, self.count, inputs=[CLEARANCE_M, self.step], outputs=[sweep])
         out.add(optimizers.advance, 1, inputs=[], outputs=[self.step])
         out.run(OPENING_STEPS + 1)
@@ -197,10 +221,11 @@ class Openings:
 
     def _place(self, out: Launches, jams: Any, way: float) -> Launches:
         out.add(
-            jamming.place_on_way, self.count,
+            jamming.place_on_way,
+            self.count,
             inputs=[self.posing.chain, self.fingers, self.hands, jams, self.open, wp.float64(way)],
             outputs=[self.bodies],
-        )  # fmt: skip
+        )
         return out
 
     def _depths(self, jams: Any) -> list[Launches]:
@@ -214,15 +239,17 @@ class Openings:
         for way in (0.0, *WAY):
             out = self._place(Launches(posing.device), jams, way)
             out.add(
-                distance.place_pieces, shape,
+                distance.place_pieces,
+                shape,
                 inputs=[posing.probe.pieces, wp.vec3d(), *posing.probe.frames, *bodies],
                 outputs=frames,
-            )  # fmt: skip
+            )
             out.add(
-                jamming.finger_depth, (self.count, posing.hand.bodies),
+                jamming.finger_depth,
+                (self.count, posing.hand.bodies),
                 inputs=[posing.probe.pieces, posing.probe.body_points, self.fingers, self.bodies, *frames],
                 outputs=[jams],
-            )  # fmt: skip
+            )
             found.append(out)
         return found
 

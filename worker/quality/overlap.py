@@ -1,4 +1,4 @@
-"""Which pieces of a hand share volume with the object: the others need no boolean of solids."""
+"""Overlap of hand and object: pieces that share volume, and the depth of penetration."""
 
 from __future__ import annotations
 
@@ -54,8 +54,11 @@ class Overlap:
         with wp.ScopedDevice("cpu"):
             crossed = wp.zeros(len(piece), dtype=wp.int32)
             inputs = [
-                self._probe.mesh.id, self._solids, wp.array(piece, dtype=wp.int32), wp.array(given, dtype=wp.transform)
-            ]  # fmt: skip
+                self._probe.mesh.id,
+                self._solids,
+                wp.array(piece, dtype=wp.int32),
+                wp.array(given, dtype=wp.transform),
+            ]
             launch(kernels.faces_in_solids, len(piece), inputs=inputs, outputs=[crossed], device="cpu")
             found: NDArray[np.bool_] = crossed.numpy() != 0
         return found
@@ -85,3 +88,14 @@ def _planes(piece: ConvexPiece) -> Floats:
     # One of planes that are the same but for rounding, itself unrounded.
     _, first = np.unique(np.round(np.column_stack([normal, offset]), _DIGITS), axis=0, return_index=True)
     return np.column_stack([normal, offset])[first]
+
+
+def penetration_depth(found: Distances) -> Floats:
+    """(B,) deepest penetration, asked from both sides: hand points in the object, object points in the hand [m].
+
+    One side alone is blind: a thin wall passes between hand points, a small fingertip between object points.
+    """
+    hand_in_object = np.maximum(0.0, -found.distance).max(axis=1)
+    object_in_hand = np.maximum(0.0, -found.piece_distance).max(axis=1)
+    deepest: Floats = np.maximum(hand_in_object, object_in_hand)
+    return deepest

@@ -49,10 +49,13 @@ class Posing:
                 wp.load_module(module=module, device=probe.device)
             finger = finger_of_body(probe.hand)
             return cls(
-                probe, chain_of(probe.hand, probe.device), _points(probe),
-                wp.array(probe.hand.effort, dtype=wp.float64), wp.array(finger, dtype=wp.int32),
+                probe,
+                chain_of(probe.hand, probe.device),
+                _points(probe),
+                wp.array(probe.hand.effort, dtype=wp.float64),
+                wp.array(finger, dtype=wp.int32),
                 max(1, int(finger.max()) + 1),
-            )  # fmt: skip
+            )
 
     @property
     def hand(self) -> HandModel:
@@ -107,9 +110,11 @@ class Posing:
             near.distance, near.cosine = wp.empty(shape, dtype=wp.float32), wp.empty(shape, dtype=wp.float64)
             near.closest, near.normal = (wp.empty(shape, dtype=wp.vec3) for _ in range(2))
             launch(
-                touching.touch, (count, self.lanes), inputs=[self.probe.skin, self.points, self.lane, bodies, reach],
+                touching.touch,
+                (count, self.lanes),
+                inputs=[self.probe.skin, self.points, self.lane, bodies, reach],
                 outputs=[near],
-            )  # fmt: skip
+            )
         return bodies, near
 
     def touching_links(self, posture: Posture) -> NDArray[np.int32]:

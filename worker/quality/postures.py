@@ -1,6 +1,9 @@
-"""The postures around a grasp: before contact, fingers open and clear; and the commanded one that presses.
+"""Postures around a grasp: the pregrasp, open, clear and raised where fingers would dip into a support; and the
+squeeze, which presses.
 
 They decide more of a grasp's success than the optimiser does (Dexonomy, table VI).
+
+A finger that stands on the table swings through it when it opens: its hand comes from a little higher.
 """
 
 from __future__ import annotations
@@ -19,10 +22,9 @@ from worker.objects.model import ObjectModel
 from worker.quality.jaw_squeeze import jaw_squeeze
 from worker.quality.opening import Blocked, Openings, count_fingers, fingers_of_bodies, fingers_of_dofs
 from worker.quality.posed import posing_of
-from worker.quality.raising import raised
 from worker.quality.squeeze import Holds, balanced
-from worker.simulation.obstacles import body_room
-from worker.simulation.surroundings import Placed
+from worker.simulation.obstacles import body_room, obstacle_room
+from worker.simulation.surroundings import CLEAR_M, Placed
 
 #: Distance that opening fingers keep from obstacles [m].
 ROOM_M: Final = 0.0025
@@ -70,9 +72,7 @@ def pregrasp(
     return found if placed is None else raised(hand, grasp, found, placed)
 
 
-def wide_open(
-    hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: Placed, *, device: str = "cpu"
-) -> Floats:  # fmt: skip
+def wide_open(hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: Placed, *, device: str = "cpu") -> Floats:
     """(N, J) joint positions in which a hand comes to its pregrasp: fingers plainly opened as far as `WIDE` of their
     range, or until they would run into one another or into an obstacle."""
     posing, joints = (
@@ -103,9 +103,7 @@ def squeeze(
     if (jaws := jaws_of(hand)) is not None:
         probe = posing_of(hand, obj, points=_POINTS, device=device).probe
         return jaw_squeeze(probe, jaws, grasp, total_normal_force=force)
-    holds = hold_forces(
-        hand, obj, grasp, total_normal_force=force, friction=friction, closing=CLOSING_M, device=device
-    )  # fmt: skip
+    holds = hold_forces(hand, obj, grasp, total_normal_force=force, friction=friction, closing=CLOSING_M, device=device)
     q = hand.reduce(grasp.joint_positions) + holds.torque / hand.stiffness
     return Posture(np.array(grasp.hand_pose, float), hand.expand(q))
 
@@ -124,9 +122,14 @@ def hold_forces(
     nothing press with their points that are nearer than `closing` [m]."""
     posing = posing_of(hand, obj, points=_POINTS, device=device)
     return balanced(
-        posing, grasp, total_normal_force=normal_force(obj) if total_normal_force is None else total_normal_force,
-        friction=friction, within=PRESSING_M, most=MAX_PRESSING, closing=closing,
-    )  # fmt: skip
+        posing,
+        grasp,
+        total_normal_force=normal_force(obj) if total_normal_force is None else total_normal_force,
+        friction=friction,
+        within=PRESSING_M,
+        most=MAX_PRESSING,
+        closing=closing,
+    )
 
 
 def normal_force(obj: ObjectModel) -> float:
@@ -173,3 +176,43 @@ def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: Plac
     for f in np.unique(finger[finger >= 0]):
         out[:, f] = found[:, finger == f].min(axis=1)
     return out
+
+
+#: Room that the open hand has, and that it has while it closes [m]: a little more than is asked for, since ways are
+#: looked at in steps.
+RAISE_OPEN_M: Final = CLEAR_M + 0.0025
+
+RAISE_CLOSING_M: Final = CLEAR_M + 0.0003
+#: Shares of the way to the grasp that are looked at: those of the sweep, but for the grasp itself.
+RAISE_LOOKS: Final = tuple(np.arange(8) / 8)
+#: A hand is raised by no more than this [m]: from higher it would come down on the object.
+HIGHEST_RAISE_M: Final = 0.008
+
+
+def raised(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: Placed) -> Posture:
+    """Pregrasps (N) whose root went against gravity by what the hand lacks of its room on the straight way from there
+    to the grasp; those that lack nothing, or too much, are as they were."""
+    poses = np.array(pregrasp.hand_pose, float)
+    near = np.array([any(one.tips_m is not None for one in scene.obstacles) for scene in placed.scenes], bool)
+    rows = np.flatnonzero(near[placed.index])
+    if not len(rows):
+        return pregrasp
+    lack = _lack(hand, grasp.take(rows), pregrasp.take(rows), placed.take(rows))
+    # What the root is raised by at first is less and less on the way.
+    height = (lack / (1 - np.array(RAISE_LOOKS))).max(axis=1)
+    height = np.where(height <= HIGHEST_RAISE_M, height, 0.0)
+    up = np.array([scene.up for scene in placed.scenes])[placed.index[rows]]
+    poses[rows, :3] += height[:, None] * up
+    return Posture(poses, pregrasp.joint_positions)
+
+
+def _lack(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: Placed) -> Floats:
+    """(n, looks) what hands lack of their room at the shares `RAISE_LOOKS` of their way."""
+    share = np.array(RAISE_LOOKS)[None, :, None]
+    pose = (1 - share) * pregrasp.hand_pose[:, None] + share * grasp.hand_pose[:, None]
+    pose[..., 3:] = pregrasp.hand_pose[:, None, 3:]  # a pregrasp is never turned against its grasp
+    joints = (1 - share) * pregrasp.joint_positions[:, None] + share * grasp.joint_positions[:, None]
+    postures = Posture(pose.reshape(-1, 7), joints.reshape(-1, joints.shape[-1]))
+    room = obstacle_room(hand, postures, placed.scenes, np.repeat(placed.index, len(RAISE_LOOKS)))
+    wanted = np.where(np.array(RAISE_LOOKS) > 0, RAISE_CLOSING_M, RAISE_OPEN_M)
+    return np.maximum(0.0, wanted - room.reshape(len(grasp), -1))

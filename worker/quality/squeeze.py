@@ -1,4 +1,4 @@
-"""Contact forces that hold an object, and the torques with which a position-controlled hand exerts them.
+"""Contact forces that balance and hold an object, and the torques with which a position-controlled hand exerts them.
 
 q_squeeze = q + Kp^-1 sum_i J_i^T f_i (Dexonomy), with f a non-negative combination of friction pyramid edges that
 leaves no net wrench and whose normal components sum to a given force.
@@ -11,12 +11,13 @@ from typing import Any, Final
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from service.model.transforms import Floats
 from worker.grasps import Posture
-from worker.quality.balance import solved
 from worker.quality.posed import Posing
 from worker.quality.probe import FACING_COS
+from worker.simulation.kernels import balance as kernels
 from worker.simulation.kernels import touching
 from worker.simulation.launches import launch
 
@@ -40,9 +41,15 @@ class Holds:
 
 
 def balanced(
-    posing: Posing, grasp: Posture, *, total_normal_force: float, friction: float, within: float, most: int,
+    posing: Posing,
+    grasp: Posture,
+    *,
+    total_normal_force: float,
+    friction: float,
+    within: float,
+    most: int,
     closing: float = 0.0,
-) -> Holds:  # fmt: skip
+) -> Holds:
     """Balanced contact forces of N grasps within the hand's torque limits.
 
     Where the torques exceed a limit all forces shrink together, so the balance stays.
@@ -75,17 +82,29 @@ def _balanced(
         touches = wp.empty((count, posing.fingers), dtype=wp.bool)
         chosen, used = wp.empty((count, most), dtype=wp.int32), wp.empty(count, dtype=wp.int32)
         launch(
-            touching.choose, count,
+            touching.choose,
+            count,
             inputs=[posing.points, posing.finger, near, *reach, wp.float64(FACING_COS), wp.float64(radius)],
             outputs=[touches, *scratch, chosen, used],
-        )  # fmt: skip
+        )
         matrix = wp.empty((count, most * int(touching.EDGES), rows), dtype=wp.float64)
         launch(
-            touching.columns, chosen.shape,
-            inputs=[posing.chain, posing.effort, posing.points, bodies, near, chosen, used, wp.float64(friction),
-                    wp.float64(radius), wp.float64(SUM)],
+            touching.columns,
+            chosen.shape,
+            inputs=[
+                posing.chain,
+                posing.effort,
+                posing.points,
+                bodies,
+                near,
+                chosen,
+                used,
+                wp.float64(friction),
+                wp.float64(radius),
+                wp.float64(SUM),
+            ],
             outputs=[matrix],
-        )  # fmt: skip
+        )
         unit = wp.empty(count, dtype=wp.float64)
         launch(touching.scale_torques, count, inputs=[wp.float64(TORQUE)], outputs=[used, matrix, unit])
         target = np.zeros(rows)
@@ -94,7 +113,61 @@ def _balanced(
         residual = wp.empty(count, dtype=wp.float64)
         torque = wp.empty((count, posing.hand.dofs), dtype=wp.float64)
         launch(
-            touching.hold, count, inputs=[posing.effort, matrix, share, used, unit, wp.float64(total)],
+            touching.hold,
+            count,
+            inputs=[posing.effort, matrix, share, used, unit, wp.float64(total)],
             outputs=[residual, torque],
-        )  # fmt: skip
+        )
     return residual, torque
+
+
+def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
+    """(B, K) the x >= 0 that minimise |M x - t|^2 + ridge^2 |x|^2 for each of B systems, on their device.
+
+    Args:
+        matrix: (B, K, R) columns of M, a Warp array in double precision.
+        target: (R,) t.
+        ridge: weight of x itself, above 0.
+        count: (B,) columns of each system that are used, a Warp array; x is 0 for the others.
+    """
+    (batch, columns, rows), device = matrix.shape, matrix.device
+    with wp.ScopedDevice(device):
+        work = kernels.Workspace()
+        work.normal, work.factor = (wp.empty((batch, rows, rows), dtype=wp.float64) for _ in range(2))
+        work.residual, work.wanted = (wp.empty((batch, rows), dtype=wp.float64) for _ in range(2))
+        work.used = wp.empty((batch, columns), dtype=wp.int32)
+        x = wp.empty((batch, columns), dtype=wp.float64)
+        sound = wp.empty(batch, dtype=wp.int32)
+        launch(
+            kernels.nonnegative,
+            batch,
+            inputs=[matrix, wp.array(target, dtype=wp.float64), wp.float64(ridge), count],
+            outputs=[work, x, sound],
+        )
+    unsolved = np.flatnonzero(sound.numpy() == 0)
+    if len(unsolved):
+        found, columns, used = x.numpy(), matrix.numpy(), count.numpy()
+        for b in unsolved:
+            found[b] = _plain(columns[b], target, ridge, int(used[b]))
+        x.assign(found)
+    return x
+
+
+def nonnegative_weights(matrix: Floats, target: Floats, ridge: float, count: NDArray[np.integer[Any]]) -> Floats:
+    """`solved` for systems that are in NumPy, on the CPU."""
+    if not len(matrix):
+        return np.zeros(matrix.shape[:2])
+    with wp.ScopedDevice("cpu"):
+        given = wp.array(matrix, dtype=wp.float64), wp.array(count, dtype=wp.int32)
+    found: Floats = np.array(solved(given[0], target, ridge, given[1]).numpy())
+    return found
+
+
+def _plain(matrix: Floats, target: Floats, ridge: float, count: int) -> Floats:
+    """One system by SciPy, the ridge as rows of its own."""
+    from scipy.optimize import nnls
+
+    system = np.vstack([matrix[:count].T, ridge * np.eye(count)])
+    out = np.zeros(len(matrix))
+    out[:count] = nnls(system, np.concatenate([target, np.zeros(count)]))[0]
+    return out

@@ -1,4 +1,18 @@
-"""The quality table: every metric of every grasp of one hand on one object."""
+"""The quality table: every metric of every grasp of one hand on one object, and the type of each grasp.
+
+Types are those of Napier (1956) and of the GRASP taxonomy (Feix et al., IEEE THMS 2016), told by the opposition that
+Iberall (1987) found in them:
+
+    power      palm opposition: the palm touches, or two digits at least wrap: they touch with more than their last
+               links, and not by a side
+    lateral    side opposition: half at least of the digits that touch do so by a side
+    precision  pad opposition: all others in which two digits touch
+
+They are asked in this order. A *digit* is a chain of bodies that ends in a fingertip; all other bodies
+are palm. A digit touches *by a side* where more than half of its surface within 2 mm of the object looks along the axis
+of its flexion, to within 45 degrees. Robots have other hands than people: a jaw has no side, so a gripper's grasps are
+of precision, or of power where its palm touches.
+"""
 
 from __future__ import annotations
 
@@ -15,19 +29,25 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.metrics import GRASP_METRICS
+from service.model.integers import distinct_values
+from service.model.metrics import GRASP_METRICS, GraspType
 from service.model.transforms import Floats
 from service.store.manifests import INDEX_THRESHOLD_M
 from worker.grasps import GraspSet, Posture
-from worker.hands.model import HandModel
+from worker.hands.model import HandModel, JointType
 from worker.objects.disk_cache import content_of
 from worker.objects.model import ObjectModel
-from worker.quality.approach import approach_cells
-from worker.quality.contact import MAX_CONTACTS, contact_area_cm2, contact_links, spread_contacts
-from worker.quality.overlap import Overlap
-from worker.quality.penetration import penetration_depth
-from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, probe_of
-from worker.quality.taxonomy import grasp_types
+from worker.quality.contact import (
+    LINK_CONTACT_M,
+    MAX_CONTACTS,
+    contact_area_cm2,
+    contact_links,
+    finger_of_body,
+    spread_contacts,
+)
+from worker.quality.diversity import approach_cells
+from worker.quality.overlap import Overlap, penetration_depth
+from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, Probe, probe_of
 from worker.quality.volume import SharedVolume
 from worker.quality.wrench_space import Norm, measure_spaces, wrenches
 from worker.run import ALONE, Count, Run
@@ -39,6 +59,46 @@ DEFAULT_THRESHOLDS_M: Final = (0.002, 0.005, 0.009)
 DEFAULT_FRICTION: Final = 1.0
 #: Grasps a thread works on at a time: small enough to cancel soon, large enough to fill a kernel launch.
 CHUNK: Final = 16
+
+
+class _Pair:
+    """What the chunks of tables of one pair share. Safe to use from several threads."""
+
+    def __init__(self, terms: _Terms) -> None:
+        hand, obj = terms.hand, terms.obj
+        self.obj, self.friction, self.norm = obj, terms.friction, terms.norm
+        self.thresholds = np.array(terms.thresholds)
+        told = int(np.argmin(np.abs(self.thresholds - INDEX_THRESHOLD_M)))
+        self.with_volume = (np.arange(len(self.thresholds)) == told) | terms.every_volume
+        self.probe = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
+        self.volume = SharedVolume(hand, obj)
+        self.overlap = Overlap(hand, self.probe)
+
+    def columns(self, posture: Posture) -> Columns:
+        chunk = _Chunk(self, self.probe.measure(posture))
+        return {f"quality/{name}": measured(chunk) for name, measured in MEASURES.items()}
+
+    def spaces(self, found: Distances) -> tuple[Floats, Floats]:
+        """(B, T) epsilon and volume of the wrench space of B grasps."""
+        near = self.probe.facing(found)[:, None] & (np.abs(found.distance)[:, None] < self.thresholds[:, None])
+        chosen, count = spread_contacts(near, found.closest, found.normal, scale=self.obj.radius, limit=MAX_CONTACTS)
+        rows = np.arange(len(chosen))[:, None, None]
+        counts = (np.arange(MAX_CONTACTS) < count[..., None])[..., None]
+        inward = np.where(counts, -found.normal[rows, chosen], [0.0, 0.0, 1.0])
+        edges = wrenches(
+            found.closest[rows, chosen],
+            inward,
+            friction=self.friction,
+            centre=self.obj.centre_of_mass,
+            radius=self.obj.radius,
+        )
+        wanted = np.broadcast_to(self.with_volume, count.shape)
+        epsilon, volume = measure_spaces(
+            edges.reshape(-1, *edges.shape[2:]), count.ravel(), wanted.ravel(), norm=self.norm
+        )
+        return epsilon.reshape(count.shape), volume.reshape(count.shape)
+
+
 _pairs: LRUCache[str, _Pair] = LRUCache(4)
 _lock = threading.Lock()
 # Solids that outlive the interpreter are told as leaks by their library.
@@ -121,9 +181,13 @@ def _measured(terms: _Terms, postures: Sequence[Posture], done: Count, run: Run)
     """The columns of each chunk, by threads or by the processes of a pool."""
     if run.pool is not None:
         return run.pool.map(
-            _columns, content_of(terms), terms, postures, cancelled=run.cancelled,
+            _columns,
+            content_of(terms),
+            terms,
+            postures,
+            cancelled=run.cancelled,
             done=lambda k: done.add(len(postures[k])),
-        )  # fmt: skip
+        )
     pair = terms.pair
 
     def work(posture: Posture) -> Columns:
@@ -138,43 +202,6 @@ def _measured(terms: _Terms, postures: Sequence[Posture], done: Count, run: Run)
 
 def _columns(terms: _Terms, posture: Posture) -> Columns:
     return terms.pair.columns(posture)
-
-
-class _Pair:
-    """What the chunks of tables of one pair share. Safe to use from several threads."""
-
-    def __init__(self, terms: _Terms) -> None:
-        hand, obj = terms.hand, terms.obj
-        self.obj, self.friction, self.norm = obj, terms.friction, terms.norm
-        self.thresholds = np.array(terms.thresholds)
-        told = int(np.argmin(np.abs(self.thresholds - INDEX_THRESHOLD_M)))
-        self.with_volume = (np.arange(len(self.thresholds)) == told) | terms.every_volume
-        self.probe = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
-        self.volume = SharedVolume(hand, obj)
-        self.overlap = Overlap(hand, self.probe)
-
-    def columns(self, posture: Posture) -> Columns:
-        chunk = _Chunk(self, self.probe.measure(posture))
-        return {f"quality/{name}": measured(chunk) for name, measured in MEASURES.items()}
-
-    def spaces(self, found: Distances) -> tuple[Floats, Floats]:
-        """(B, T) epsilon and volume of the wrench space of B grasps."""
-        near = self.probe.facing(found)[:, None] & (np.abs(found.distance)[:, None] < self.thresholds[:, None])
-        chosen, count = spread_contacts(
-            near, found.closest, found.normal, scale=self.obj.radius, limit=MAX_CONTACTS
-        )  # fmt: skip
-        rows = np.arange(len(chosen))[:, None, None]
-        counts = (np.arange(MAX_CONTACTS) < count[..., None])[..., None]
-        inward = np.where(counts, -found.normal[rows, chosen], [0.0, 0.0, 1.0])
-        edges = wrenches(
-            found.closest[rows, chosen], inward, friction=self.friction, centre=self.obj.centre_of_mass,
-            radius=self.obj.radius,
-        )  # fmt: skip
-        wanted = np.broadcast_to(self.with_volume, count.shape)
-        epsilon, volume = measure_spaces(
-            edges.reshape(-1, *edges.shape[2:]), count.ravel(), wanted.ravel(), norm=self.norm
-        )  # fmt: skip
-        return epsilon.reshape(count.shape), volume.reshape(count.shape)
 
 
 @dataclass(frozen=True)
@@ -210,3 +237,46 @@ MEASURES: Final[dict[str, Callable[[_Chunk], NDArray[np.generic]]]] = {
     "grasp_type": lambda chunk: grasp_types(chunk.pair.probe, chunk.found),
     "approach_cell": lambda chunk: approach_cells(chunk.pair.probe.hand, chunk.found.bodies[:, 0, 3:]),
 }
+
+#: Cosine between a digit's surface and its axis of flexion above which the surface is a side: 45 degrees.
+SIDE_COS: Final = float(np.sqrt(0.5))
+#: Digits that must touch with more than their last links where the palm is free.
+ENVELOPING: Final = 2
+
+
+def grasp_types(probe: Probe, found: Distances) -> NDArray[np.int32]:
+    """(B,) `GraspType` of B grasps."""
+    hand = probe.hand
+    finger = finger_of_body(hand)
+    touching = probe.body_distance(found) < LINK_CONTACT_M
+    digits = np.array(distinct_values(finger[finger >= 0]), finger.dtype)
+    inner = np.array([body for body in np.flatnonzero(finger >= 0) if body not in hand.fingertips], np.intp)
+    palm = touching[:, finger < 0].any(axis=1)
+    touches = np.stack([touching[:, finger == digit].any(axis=1) for digit in digits], axis=1)
+    wraps = np.stack([touching[:, inner[finger[inner] == digit]].any(axis=1) for digit in digits], axis=1)
+    sides = touches & _by_sides(probe, found, finger, digits)
+    count = touches.sum(axis=1)
+    lateral = sides.any(axis=1) & (2 * sides.sum(axis=1) >= count)
+    power = palm | ((wraps & ~sides).sum(axis=1) >= ENVELOPING)
+    told = np.where(lateral, GraspType.LATERAL, GraspType.PRECISION)
+    told = np.where(power, GraspType.POWER, told)
+    return np.where(count + palm < 2, GraspType.NONE, told).astype(np.int32)
+
+
+def _by_sides(
+    probe: Probe, found: Distances, finger: NDArray[np.int32], digits: NDArray[np.int32]
+) -> NDArray[np.bool_]:
+    """(B, digits) whether more than half of what is near of a digit are its sides."""
+    points = probe.points
+    near = np.where(np.abs(found.distance) < LINK_CONTACT_M, points.area, 0.0)
+    side = np.abs(np.einsum("ni,ni->n", points.normal, _flexion(probe.hand)[points.body])) > SIDE_COS
+    mine = finger[points.body][:, None] == digits
+    return np.asarray(near @ (mine & side[:, None]) > 0.5 * (near @ mine))
+
+
+def _flexion(hand: HandModel) -> Floats:
+    """(L, 3) axis in the body's own frame about which a body closes; 0 where its joint does not close or turn."""
+    # A body turns about its joint's axis, which therefore stands still in it.
+    bends = (hand.joint_type == JointType.REVOLUTE) & (hand.dof >= 0)
+    bends &= np.where(hand.dof >= 0, hand.closing[hand.dof], 0.0) != 0
+    return np.where(bends[:, None], hand.axis, 0.0)

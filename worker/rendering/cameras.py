@@ -19,18 +19,13 @@ from service.model.pinhole import pixel_rays
 from service.model.transforms import Floats
 
 FIELD_OF_VIEW: Final = np.radians(40.0)
-
 BASELINE_M: Final = 0.06
-
 #: Elevation of a sampled camera above the table [rad].
 ELEVATION: Final = (np.radians(18.0), np.radians(62.0))
-
 #: Share of the smaller field of view that the object's bounding ball fills.
 FILL: Final = (0.7, 1.0)
-
 #: Nearer than this a stereo pair no longer has the whole object in both pictures [m].
 NEAREST_M: Final = 0.25
-
 #: How far the optical axis passes from the object's middle, in bounding radii.
 AIM_JITTER: Final = 0.15
 
@@ -142,9 +137,7 @@ def stereo_pair(extrinsics: Floats, baseline: float) -> tuple[Floats, Floats]:
 ROTATION_ERROR: Final = 1e-5
 
 _Point = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
-
 _Row3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
-
 _Row4 = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
 
 

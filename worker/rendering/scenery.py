@@ -96,10 +96,8 @@ Supports = Sequence[HalfSpace | BoxSupport]
 
 #: A half-space is drawn as a slab whose top is its plane [m].
 TABLE_SIZE: Final = (1.2, 0.9, 0.04)
-
 #: What objects stand on where nothing else is said.
 TABLE: Final = (HalfSpace(),)
-
 #: A slab lies below the origin; below the object where that lies farther off [m].
 _FAR_M: Final = 0.35
 

@@ -1,7 +1,5 @@
-"""Grasps ready to be carried out: six postures each, in one frame that the user names, and the trajectory between
+"""Grasps ready to be carried out: six postures each, in a frame that the user names, and the timed trajectory between
 them.
-
-Times for the motions of a grasp, within the velocity limits of joints and hand.
 
 Each motion starts and ends at rest: its share s of the way follows 10 u^3 - 15 u^4 + 6 u^5 of the share u of its time
 (minimum jerk, Flash and Hogan 1985), whose steepest slope is 15/8.
@@ -30,7 +28,6 @@ from worker.simulation.surroundings import STANDOFF_M, Placed
 #: Postures of a grasp in their order. The hand comes from `standoff` to `arrival` with open fingers, takes the shape of
 #: `pregrasp`, closes to `grasp`, is commanded to `squeeze`, and rises to `lift`.
 POSTURES: Final = ("standoff", "arrival", "pregrasp", "grasp", "squeeze", "lift")
-
 #: Motions from one posture to the next.
 PHASES: Final = ("approach", "shape", "close", "squeeze", "lift")
 
@@ -233,19 +230,13 @@ def _is_pose(text: str) -> bool:
 
 #: Velocity of a joint whose description states none [rad/s, m/s].
 ASSUMED_RAD_S: Final = 1.0
-
 ASSUMED_M_S: Final = 0.05
-
 #: The hand as a whole moves and turns no faster [m/s, rad/s].
 HAND_M_S: Final = 0.25
-
 HAND_RAD_S: Final = 1.0
-
 #: Shortest motion, and time between points [s].
 SHORTEST_S: Final = 0.4
-
 STEP_S: Final = 0.05
-
 _STEEPEST: Final = 15 / 8
 
 

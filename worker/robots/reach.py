@@ -28,24 +28,16 @@ from worker.simulation.surroundings import Obstacle
 
 #: The hand is where it should be within this [m, rad].
 NEAR_M: Final = 1e-4
-
 NEAR_RAD: Final = 1e-3
-
 #: Postures from which the arm sets out to find the grasp, and steps of each search.
 STARTS: Final = 24
-
 STEPS: Final = 80
-
 #: Farthest that a joint moves from one point of the way to the next, 5 mm [rad or m].
 JUMP: Final = 0.25
-
 #: Points of the two long motions, and of those in which mainly the fingers move.
 LONG: Final = 21
-
 SHORT: Final = 5
-
 _LONG_PHASES: Final = ("approach", "lift")
-
 #: Why an arm does not carry out a grasp.
 REASONS: Final = ("out of reach", "way not possible", "collision")
 
@@ -195,15 +187,11 @@ class Reach:
 
 #: Pairs of bodies that touch in this share of random postures cannot be apart: their hulls are larger than they are.
 ALWAYS: Final = 0.95
-
 SAMPLES: Final = 100
-
 #: Name of the frame that carries the hand.
 MOUNT: Final = "mount"
-
 #: The arm meets everything; the hand, the object and supports meet the arm alone: the rest was looked at before.
 _ARM: Final = {"contype": 1, "conaffinity": 1}
-
 _OTHER: Final = {"contype": 0, "conaffinity": 1}
 
 

@@ -21,8 +21,7 @@ from worker.objects.mesh_geometry import to_centre, to_file
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import decompose
 from worker.scenes.kinds import SUNK, check_free, inside, rest_poses, room_in, supports_of
-from worker.scenes.laid import lay_beside
-from worker.scenes.neighbours import drop_together
+from worker.scenes.neighbours import drop_together, lay_beside
 from worker.simulation.surroundings import Neighbour, Obstacle, Scenes
 
 #: Convex pieces of a neighbour at most: no hand is put into a neighbour's hollow, so hollows may be filled.
@@ -224,9 +223,7 @@ def gaps_between(things: Sequence[Neighbour], poses: Floats, farthest: float = 0
 
 #: Faces of a solid at most, and what it may stand out from its piece before it needs more [m].
 MOST_PLANES: Final = 48
-
 ENOUGH_M: Final = 1e-3
-
 #: Corners nearer than this are one [m].
 _SAME_M: Final = 1e-7
 

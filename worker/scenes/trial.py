@@ -28,14 +28,11 @@ from worker.simulation.surroundings import Placed, Scenes
 #: Added to the score of a hand that would lift but cannot come: worse than any that can and lets the object fall, since
 #: most of these come freely, better than what is lost.
 BLOCKED: Final = 8.0
-
 #: Added where only the referee sees the hand touch on its way, for the object's convex pieces stand out from it:
 #: the letter does not ask for the way.
 TOUCHES: Final = 2.0
-
 #: What a hand that holds for the short time of a trial but does not lift is worse than one that lifts.
 FALLS: Final = 0.4
-
 #: Highest score of what lifts at half the friction.
 BEST: Final = 0.99
 

@@ -32,12 +32,9 @@ from worker.simulation.obstacles import obstacle_room
 from worker.simulation.surroundings import RISE_M, STANDOFF_M, Placed, Surroundings
 
 _POINTS: Final = 600
-
 #: Around a free object: tilts of the retreat from the palm's own direction [rad], each to so many sides.
 TILTS: Final = (0.4, 0.8, 1.2)
-
 SIDES: Final = 8
-
 #: Points of hand and object with which a way around a free object is looked at.
 _FREE_POINTS: Final = (2000, 3000)
 
@@ -195,23 +192,16 @@ def _gaps(probe: Probe, postures: Posture) -> Floats:
 #: On its way the hand's points stay this far from the object [m], if they can at least so far: between points that are
 #: looked at, and where the object's convex pieces stand out, it is nearer.
 OBJECT_MARGIN_M: Final = 0.001
-
 OBJECT_WANTED_M: Final = 0.004
-
 #: By this much the hand may come nearer to the object than its pregrasp is [m].
 NEARER_M: Final = 5e-4
-
 #: Postures stored on the approach, the standoff first, the pregrasp last; so many are looked at between two, and
 #: while the hand then closes to the pregrasp.
 WAYPOINTS: Final = 6
-
 LOOKS: Final = 4
-
 _CLOSING: Final = 4
-
 #: Directions of retreat that are tried: the palm's own, mixed with these shares of the direction against gravity.
 SHARES_UP: Final = (0.0, 0.25, 0.5, 0.75, 1.0)
-
 #: How wide the hand comes: shares of the way from the pregrasp to wide open. Each is tried with all directions.
 OPENNESS: Final = (1.0, 0.5, 0.0)
 

@@ -1,8 +1,5 @@
-"""A hand and an object as arrays on a Warp device. Made once, shared by every simulation of the pair.
-
-The bodies of many hands, placed by a kernel: what looks at hundreds of postures would spend most of its
-time in NumPy's `body_poses` otherwise. Double precision, as there.
-"""
+"""A hand and an object as arrays on a Warp device, made once for a pair; and bodies of many hands, placed by a
+kernel."""
 
 from __future__ import annotations
 
@@ -25,10 +22,8 @@ from worker.simulation.kernels import kinematics, nearest, pieces, surface
 
 #: Kernels' numbers for `ConvexPiece.kind`.
 _KINDS: Final = {"box": 0, "sphere": 1, "cylinder": 2, "capsule": 3, "hull": 4}
-
 #: Cells that samples of the object are sorted by [m].
 SAMPLE_CELL_M: Final = 0.008
-
 #: Way of a sliding joint that moves a fingertip as a revolute joint of a finger does by one radian [m].
 SLIDE_M: Final = 0.05
 
@@ -244,7 +239,6 @@ def room_for_bodies(hand: HandModel, count: int) -> Any:
 
 
 _chains: LRUCache[tuple[str, str], Any] = LRUCache(8)
-
 _lock = threading.Lock()
 
 

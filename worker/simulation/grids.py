@@ -24,10 +24,8 @@ Arrays = Mapping[str, NDArray[Any]]
 
 #: Distances farther than this from the surface are never asked for [m].
 FIELD_REACH: Final = 0.06
-
 #: Cells that come as near to the surface as this and the grid's error list their nearest faces [m].
 LISTED_M: Final = 0.004
-
 #: Cells a side at most: a large object has a coarser grid, whose larger error is accounted for.
 _MOST_CELLS: Final = 96
 

@@ -43,10 +43,8 @@ from worker.stages.context import TaskContext
 from worker.stages.models import SHOWN_ERROR_M, publish_model
 
 T = TypeVar("T")
-
 #: Loaded assets kept: a worker in a hands x objects dataset alternates between a few.
 _cache: LRUCache[Hashable, object] = LRUCache(16)
-
 _lock = threading.RLock()
 
 

@@ -1,7 +1,4 @@
-"""What a stage knows of the task it does: where to read, where to say how far it is, and whether to stop.
-
-What a stage hands back, and how that becomes a shard with its manifest.
-"""
+"""The context of a task (what to read, progress, cancellation), and its output as a shard with a manifest."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object
 from worker.quality.postures import squeeze
 from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.limit import Limit, limit_of
+from worker.quality.referee.payload import Limit, limit_of
 from worker.quality.referee.protocol import Outcome
 from worker.run import ALONE, Run
 from worker.scenes.beside import scenes_of
@@ -51,7 +51,6 @@ _IDENTITY: Final = np.array([0.0, 0, 0, 1, 0, 0, 0])
 
 #: Servos that go from nothing to their limit within less of a fingertip's way press by chance [m].
 SOFT_M: Final = 0.0015
-
 log = logging.getLogger(__name__)
 
 

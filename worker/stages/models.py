@@ -37,7 +37,6 @@ from worker.objects.prepare import load_object
 
 #: Simplification of a shown object [m]: that of the standard fidelity, so that people see what is grasped.
 SHOWN_ERROR_M: Final = Fidelity().face_error_m
-
 _BUILTIN: Final = Path(__file__).parents[2] / "service" / "builtin" / "models"
 
 
@@ -65,13 +64,10 @@ def write_builtins(folder: Path = _BUILTIN) -> None:
 
 #: Points on the hand from which a viewer measures its distance to the object.
 SURFACE_POINTS: Final = 3000
-
 #: Triangles of a hand's visual meshes together: a browser draws them at once.
 MAX_FACES: Final = 60_000
-
 #: Points of a pad at most.
 PAD_POINTS: Final = 60
-
 #: sRGB of parts without a colour beside parts with one.
 _GREY: Final = (0.45, 0.5, 0.55)
 

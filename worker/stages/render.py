@@ -14,7 +14,7 @@ from service.store.columns import Attribute
 from service.store.shards import Shard, json_attribute
 from worker.rendering import Extras, render
 from worker.rendering.hands import DrawnHand
-from worker.rendering.pages.sheets import best_in_scenes
+from worker.rendering.sheets import best_in_scenes
 from worker.scenes.neighbours import Neighbours
 from worker.stages.assets import beside_attributes, hand_of, input_of, neighbours_of, object_of
 from worker.stages.context import Output, TaskContext, batch_seed

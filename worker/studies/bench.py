@@ -30,7 +30,6 @@ from worker.studies.timing import host_ms, kernel_shares
 LARGE: Final = 1024
 
 Load = Callable[[float], ObjectModel]
-
 Say = Callable[[str], None]
 
 

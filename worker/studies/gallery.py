@@ -18,7 +18,7 @@ from worker.objects.model import ObjectModel
 from worker.planners import Wanted, synthesize
 from worker.rendering.cameras import FIELD_OF_VIEW, GivenCameras, distance_to_fill, look_at
 from worker.rendering.hands import DrawnHand
-from worker.rendering.pages.sheets import label_page, scene_cells, with_palette
+from worker.rendering.sheets import label_page, scene_cells, with_palette
 from worker.rendering.views import Extras, render
 from worker.run import Run
 from worker.scenes import Neighbours, drop, drop_together, transfer

@@ -21,12 +21,9 @@ from service.model.states import State
 from service.store.manifests import ShardManifest
 
 Row = dict[str, Any]
-
 #: Facts, repairs and message of a hand or object stand in every list, and follow from files of a stranger's.
 _MOST_FACTS: Final = 64 << 10
-
 _MOST_REPAIRS: Final = 100
-
 _LONGEST_TEXT: Final = 2000
 
 
@@ -195,7 +192,6 @@ def _short(facts: dict[str, Any]) -> dict[str, Any]:
 
 #: Jobs whose states are derived in one go.
 _JOBS_AT_ONCE: Final = 200
-
 _FACTS = (
     tasks.c.id,
     tasks.c.batch,
@@ -210,10 +206,8 @@ _FACTS = (
 
 #: Option of a connection on which nothing that ends is told.
 QUIET: Final = "graspd_quiet"
-
 #: Beginning of the name of a note: tasks of the job whose id follows are yet to be entered.
 ENTERING: Final = "entering "
-
 _WHOSE: Final = (jobs.c.project, jobs.c.owner)
 
 

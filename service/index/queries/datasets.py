@@ -246,9 +246,6 @@ def _made(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
     return dict(connection.execute(query).mappings().one())
 
 
-_OF_A_CELL: Final = ("position", "hand", "object", "job_id", "choice", "state", "planned", "reason")
-
-
 def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions) -> list[CellView]:
     ids = [row["job_id"] for row in rows]
     work = _work_by_job(connection, ids)

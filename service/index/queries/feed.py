@@ -140,7 +140,6 @@ class Feed:
 
 
 _OF_THE_JOB = ("request", "revisions", "span", "origin", "hand_digest", "object_digest")
-
 _WAITING = (tasks.c.ready.is_(True), tasks.c.queued.is_(False))
 
 

@@ -60,7 +60,6 @@ class GraspSort(Model):
 
 
 _BEST_FIRST = GraspSort()
-
 #: Grasps that one statement names: two parameters each.
 _AT_ONCE: Final = 400
 
@@ -119,15 +118,11 @@ def _view(row: Any) -> GraspView:
 
 #: So many rows are fetched by an index and sorted in less time than all of a million are read.
 SORTED_AT_ONCE: Final = 40_000
-
 #: Rows looked at in the wanted order: a few first, since most filters fill a page from them.
 LOOKED_AT: Final = (1000, 20_000)
-
 #: Columns by name, of the table of grasps or of rows drawn from it.
 Columns = Any
-
 _METRICS: Final = frozenset(metric.name for metric in indexed())
-
 _OPERATORS: Final[dict[str, Callable[[Any, Any], ColumnElement[bool]]]] = {
     "<": operator.lt,
     "<=": operator.le,
@@ -136,7 +131,6 @@ _OPERATORS: Final[dict[str, Callable[[Any, Any], ColumnElement[bool]]]] = {
     "=": operator.eq,
     "!=": operator.ne,
 }
-
 _FLAGS: Final[dict[str, Callable[[Columns], ColumnElement[bool]]]] = {
     "judged": lambda grasps: grasps.success.is_not(None),
     "valid": lambda grasps: grasps.valid.is_(True),

@@ -1,7 +1,4 @@
-"""Queries on jobs, tasks and attempts, and the outcomes of a job's candidates.
-
-Queries on shards.
-"""
+"""Queries on jobs, tasks, attempts and shards, and the outcomes of a job's candidates."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from functools import partial
 from typing import Final
 
 from service.index.index import Index
-from service.index.queries.usage import BatchCost
+from service.index.queries.overview import BatchCost
 from service.model.domain import BATCH_SIZE, JobOptions, JobRequest
 from service.model.errors import LimitError
 from service.model.planning import stages_of

@@ -61,9 +61,14 @@ class DatasetRequest(Matrix):
 
 
 def describe(
-    name: str, hands: Sequence[Member], objects: Sequence[Member], options: JobOptions,
-    choose: Callable[[JobRequest], tuple[JobRequest, Choice | None]], owner: str = "", project: str = "",
-) -> DatasetRecord:  # fmt: skip
+    name: str,
+    hands: Sequence[Member],
+    objects: Sequence[Member],
+    options: JobOptions,
+    choose: Callable[[JobRequest], tuple[JobRequest, Choice | None]],
+    owner: str = "",
+    project: str = "",
+) -> DatasetRecord:
     """The record of a dataset. Equal hands, objects, options and chosen fidelities have the same digest, whatever the
     name.
 

@@ -27,10 +27,10 @@ from service.model.errors import (
     QueueUnavailable,
     UnavailableError,
 )
-from service.model.finding import Finding, bad, good, skipped, warning
 from service.pipeline.identity import Identity, recorded, service_ids
 from service.queue.connection import connect, redis_url, socket_path
 from service.queue.rq_queue import open_queue
+from service.run.doctor.checks import Finding, bad, good, skipped, warning
 from service.run.doctor.machine import existing, local_store
 from service.run.embedded import find_server
 from service.settings import Settings
@@ -40,13 +40,9 @@ from service.store.store import Store, open_store
 _OLDEST: Final = (6, 2)
 
 _SLOW_REDIS_S: Final = 0.02
-
 _FULL: Final = 0.9
-
 _TIMEOUT_S: Final = 5.0
-
 _LOCAL: Final = ("127.0.0.1", "localhost", "::1")
-
 _START: Final = "start it, or set GRASPD_REDIS_URL=redis://:PASSWORD@HOST:6379/0"
 
 
@@ -193,16 +189,12 @@ def _line(error: Exception) -> str:
 _NONE_HERE: Final = (
     "no index is here: GRASPD_INDEX_URL is unset and there is no index.sqlite; only api and controller need one"
 )
-
 _REBUILD: Final = (
     "graspd admin index rebuild --check shows all of it; graspd admin index rebuild mends it while the service runs"
 )
-
 _CROWDED: Final = 0.8
-
 #: With more shards than this only a sample is compared.
 _ALL_SHARDS: Final = 2000
-
 #: What a controller has to take up between two looks [s].
 _SETTLES_S: Final = 3.0
 
@@ -370,10 +362,8 @@ _FOLDER: Final = "health"
 
 #: For a dozen requests.
 _SLOW_STORE_S: Final = 5.0
-
 #: Who put the same name at once; one may win.
 _RIVALS: Final = 4
-
 _CREDENTIALS: Final = (
     "see bucket, region and credentials (AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION, AWS_ENDPOINT_URL; "
     "GOOGLE_APPLICATION_CREDENTIALS; AZURE_STORAGE_ACCOUNT_NAME, ..._KEY): they must allow get, put, list and delete"

@@ -23,7 +23,6 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.index.database import connect_postgres
 from service.model.errors import GraspdError, QueueUnavailable
-from service.model.finding import Finding, bad, good, skipped, warning
 from service.model.states import Stage
 from service.model.version import PACKAGE_VERSION
 from service.model.workers import WorkerBeat
@@ -31,14 +30,13 @@ from service.pipeline.leading import PART
 from service.queue.rq_queue import RqQueue, open_queue
 from service.run.address import recorded_address
 from service.run.doctor.backends import is_there, redis_connection
+from service.run.doctor.checks import Finding, bad, good, skipped, warning
 from service.run.doctor.machine import local_store
 from service.settings import Settings
 from service.store.store import open_store
 
 _HTTP_S: Final = 5.0
-
 _IDLE: Final = "no service runs on this data folder"
-
 _AWAY: Final = "Redis does not answer"
 
 
@@ -179,9 +177,7 @@ def _bind(name: str, settings: Settings, where: str) -> Finding:
 
 
 _OFF_S: Final = 2.0
-
 _WRONG_S: Final = 300.0
-
 _MEND: Final = "timedatectl set-ntp true, or chronyd, on the machine that is wrong: it differs from all others"
 
 

@@ -19,8 +19,8 @@ from packaging.version import Version
 
 from service import user_cache
 from service.model.cores import available_cores, available_memory
-from service.model.finding import Finding, bad, good, warning
 from service.model.version import PACKAGE_VERSION
+from service.run.doctor.checks import Finding, bad, good, warning
 from service.settings import Settings
 from service.store.store import local_folder
 

@@ -9,7 +9,7 @@ import pytest
 
 from api.access.doctor import keys
 from api.access.keys import KeyFile, Scope
-from service.model.finding import Condition
+from service.run.doctor.checks import Condition
 from service.settings import Settings
 
 

@@ -21,9 +21,15 @@ from tests.fakes import request
 
 def run(fidelity: str, speed: float, gsr: float, *, hand: str = "allegro", object_: str = "mug") -> dict[str, Any]:
     return {
-        "method": "fast_graspd", "fidelity": fidelity, "hand": hand, "object": object_, "valid_per_second": speed,
-        "gsr": gsr, "epsilon": gsr / 2, "pd_mm": 1 - gsr,
-    }  # fmt: skip
+        "method": "fast_graspd",
+        "fidelity": fidelity,
+        "hand": hand,
+        "object": object_,
+        "valid_per_second": speed,
+        "gsr": gsr,
+        "epsilon": gsr / 2,
+        "pd_mm": 1 - gsr,
+    }
 
 
 CHART = {
@@ -36,14 +42,28 @@ CHART = {
 
 
 def lifts(
-    fidelity: str, speed: float, lift: float, *, hand: str = "allegro", object_: str = "mug", way: str = "in the scene",
+    fidelity: str,
+    speed: float,
+    lift: float,
+    *,
+    hand: str = "allegro",
+    object_: str = "mug",
+    way: str = "in the scene",
     robust: float | None = 0.9,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     return {
-        "way": way, "method": "fast_graspd", "fidelity": fidelity, "hand": hand, "object": object_,
-        "end_to_end_per_second": speed, "valid_per_second": 100 - speed, "lift": lift, "lift_letter": lift,
-        "lift_hard": lift / 2, "robust": robust,
-    }  # fmt: skip
+        "way": way,
+        "method": "fast_graspd",
+        "fidelity": fidelity,
+        "hand": hand,
+        "object": object_,
+        "end_to_end_per_second": speed,
+        "valid_per_second": 100 - speed,
+        "lift": lift,
+        "lift_letter": lift,
+        "lift_hard": lift / 2,
+        "robust": robust,
+    }
 
 
 def scene_chart(kind: str = "table", *, created: str = "2026-11-21T10:00:00.000Z", **more: Any) -> dict[str, Any]:
@@ -52,11 +72,15 @@ def scene_chart(kind: str = "table", *, created: str = "2026-11-21T10:00:00.000Z
         "created": created,
         "scene": SceneSpec(kind=kind, **more).model_dump(mode="json"),
         "runs": [
-            lifts("draft", 17, 0.7), lifts("standard", 14, 0.85), lifts("fine", 10, 0.95),
-            lifts("draft", 18, 0.95, object_="drill"), lifts("fine", 9, 1.0, object_="drill"),
-            lifts("draft", 99, 0.99, way="free, filtered"), lifts("standard", 20, 0.9, hand="barrett", object_="bowl"),
+            lifts("draft", 17, 0.7),
+            lifts("standard", 14, 0.85),
+            lifts("fine", 10, 0.95),
+            lifts("draft", 18, 0.95, object_="drill"),
+            lifts("fine", 9, 1.0, object_="drill"),
+            lifts("draft", 99, 0.99, way="free, filtered"),
+            lifts("standard", 20, 0.9, hand="barrett", object_="bowl"),
         ],
-    }  # fmt: skip
+    }
 
 
 def pick(target: str, hand: str = "allegro", object_: str = "mug", chart: dict[str, Any] = CHART) -> str:
@@ -65,9 +89,14 @@ def pick(target: str, hand: str = "allegro", object_: str = "mug", chart: dict[s
 
 @pytest.mark.parametrize(
     ("target", "expected"),
-    [("gsr>=0.4", "draft"), ("gsr >= 0.6", "standard"), ("gsr>=.85", "fine"), ("epsilon>=0.3", "standard"),
-     ("pd_mm<=0.15", "fine")],
-)  # fmt: skip
+    [
+        ("gsr>=0.4", "draft"),
+        ("gsr >= 0.6", "standard"),
+        ("gsr>=.85", "fine"),
+        ("epsilon>=0.3", "standard"),
+        ("pd_mm<=0.15", "fine"),
+    ],
+)
 def test_the_fastest_fidelity_that_meets_the_target_is_taken(target: str, expected: str) -> None:
     assert pick(target) == expected
 

@@ -40,8 +40,9 @@ def finish(services: Services, delivery: Delivery) -> None:
 def _event(delivery: Delivery, kind: EventKind) -> Event:
     message = delivery.message
     output = "" if kind is EventKind.STARTED else message.output  # type: ignore[union-attr]
-    return Event(kind=kind, at=timestamp(), task_id=message.task_id, stage=message.stage, worker=delivery.worker,
-                 output=output)  # fmt: skip
+    return Event(
+        kind=kind, at=timestamp(), task_id=message.task_id, stage=message.stage, worker=delivery.worker, output=output
+    )
 
 
 def test_the_next_stage_is_queued_without_waiting_for_a_sweep(services: Services) -> None:

@@ -54,20 +54,46 @@ def ear() -> Iterator[tuple[str, list[Any]]]:
 @pytest.mark.parametrize(
     ("address", "public"),
     [
-        ("8.8.8.8", True), ("2606:4700::1111", True),
-        ("127.0.0.1", False), ("127.9.9.9", False), ("0.0.0.0", False), ("10.0.0.1", False), ("172.16.3.4", False),
-        ("192.168.1.1", False), ("169.254.169.254", False), ("100.64.0.1", False), ("224.0.0.1", False),
-        ("255.255.255.255", False), ("192.0.2.1", False), ("240.0.0.1", False),
-        ("192.0.0.10", False), ("192.88.99.1", False), ("161.26.0.10", False), ("166.9.0.1", False),
-        ("64:ff9b::a83f:8110", False), ("2002:a83f:8110::", False), ("3fff::1", False),
-        ("::1", False), ("::", False), ("fe80::1", False), ("fd00::1", False), ("fec0::1", False), ("ff02::1", False),
-        ("::ffff:127.0.0.1", False), ("::ffff:169.254.169.254", False), ("2002:7f00:1::", False),
-        ("64:ff9b::a9fe:a9fe", False), ("64:ff9b:1::808:808", False),
+        ("8.8.8.8", True),
+        ("2606:4700::1111", True),
+        ("127.0.0.1", False),
+        ("127.9.9.9", False),
+        ("0.0.0.0", False),
+        ("10.0.0.1", False),
+        ("172.16.3.4", False),
+        ("192.168.1.1", False),
+        ("169.254.169.254", False),
+        ("100.64.0.1", False),
+        ("224.0.0.1", False),
+        ("255.255.255.255", False),
+        ("192.0.2.1", False),
+        ("240.0.0.1", False),
+        ("192.0.0.10", False),
+        ("192.88.99.1", False),
+        ("161.26.0.10", False),
+        ("166.9.0.1", False),
+        ("64:ff9b::a83f:8110", False),
+        ("2002:a83f:8110::", False),
+        ("3fff::1", False),
+        ("::1", False),
+        ("::", False),
+        ("fe80::1", False),
+        ("fd00::1", False),
+        ("fec0::1", False),
+        ("ff02::1", False),
+        ("::ffff:127.0.0.1", False),
+        ("::ffff:169.254.169.254", False),
+        ("2002:7f00:1::", False),
+        ("64:ff9b::a9fe:a9fe", False),
+        ("64:ff9b:1::808:808", False),
         ("168.63.129.16", False),
-        ("::ffff:168.63.129.16", False), ("100.100.100.200", False), ("192.0.0.192", False),
-        ("fd00:ec2::254", False), ("2001:0:1::1", False),
+        ("::ffff:168.63.129.16", False),
+        ("100.100.100.200", False),
+        ("192.0.0.192", False),
+        ("fd00:ec2::254", False),
+        ("2001:0:1::1", False),
     ],
-)  # fmt: skip
+)
 def test_only_machines_of_the_internet_are_public(address: str, public: bool) -> None:
     assert is_public(ipaddress.ip_address(address)) is public
 
@@ -130,9 +156,18 @@ def test_an_address_that_never_answers_is_given_up() -> None:
 
 @pytest.mark.parametrize(
     "url",
-    ["ftp://a.example/", "file:///etc/passwd", "https://", "https://me:pw@a.example/", "https://a.example/\r\nX: y",
-     "https://a.example:99999/", "https://" + "a" * 600, "https://[::1", "https://ä.example/"],
-)  # fmt: skip
+    [
+        "ftp://a.example/",
+        "file:///etc/passwd",
+        "https://",
+        "https://me:pw@a.example/",
+        "https://a.example/\r\nX: y",
+        "https://a.example:99999/",
+        "https://" + "a" * 600,
+        "https://[::1",
+        "https://ä.example/",
+    ],
+)
 def test_what_is_no_address_is_refused_when_it_is_made(url: str) -> None:
     with pytest.raises(InputError):
         check_url(url)

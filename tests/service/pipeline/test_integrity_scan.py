@@ -171,8 +171,10 @@ def test_the_controller_scans_beside_its_rounds_unless_it_is_off(
     flip(services.store, shards[0].key)
     set_so = Services(
         services.settings.model_copy(update={"integrity_scan_mb_per_s": rate, "controller_interval_s": 0.05}),
-        services.store, services.index, services.queue,
-    )  # fmt: skip
+        services.store,
+        services.index,
+        services.queue,
+    )
     stop = threading.Event()
     thread = threading.Thread(target=Controller(set_so).run, args=(stop,))
     thread.start()

@@ -87,9 +87,18 @@ def test_unfinished_jobs_and_the_yield_of_the_last_minute_are_told(services: Ser
 
 
 _BUSY = {
-    "name": "w1", "host": "here", "pid": 1, "device": "cpu", "device_name": "", "stages": [], "version": "0",
-    "state": "busy", "task_id": "", "started": "", "seen": "",
-}  # fmt: skip
+    "name": "w1",
+    "host": "here",
+    "pid": 1,
+    "device": "cpu",
+    "device_name": "",
+    "stages": [],
+    "version": "0",
+    "state": "busy",
+    "task_id": "",
+    "started": "",
+    "seen": "",
+}
 
 
 def test_depth_age_and_workers_are_told_from_redis(rq_queue: RqQueue) -> None:

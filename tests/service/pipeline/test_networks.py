@@ -151,8 +151,10 @@ def test_a_forged_entry_cannot_name_a_network_without_its_digest(services: Servi
 
 def test_only_workers_that_know_networks_are_asked_for_one(services: Services) -> None:
     add(services)
-    asked = [message_of(job, next(plan(job)), attempt=1, max_attempt=3).schema_
-             for job in (submit(services), submit(services, method="fast_graspd", options={}))]  # fmt: skip
+    asked = [
+        message_of(job, next(plan(job)), attempt=1, max_attempt=3).schema_
+        for job in (submit(services), submit(services, method="fast_graspd", options={}))
+    ]
     assert asked == [SCHEMA_OF_NETWORKS, OLDEST_TASK_SCHEMA]
 
 

@@ -97,11 +97,19 @@ def test_readers_name_the_command_and_then_read_a_snapshot_of_places_in_packs(se
     found = open_shards(services.store, job=job, cache=services.settings.data_dir / "cache")
     shards = [
         {
-            "id": file.id, "kind": "base", "key": f"packs/{'a' * 32}/{'b' * 32}.pack@{row}+100", "sha256": file.sha256,
-            "size_bytes": 1, "count": 32, "valid": 1, "hand": "gripper", "object": "ball", "batch": row,
+            "id": file.id,
+            "kind": "base",
+            "key": f"packs/{'a' * 32}/{'b' * 32}.pack@{row}+100",
+            "sha256": file.sha256,
+            "size_bytes": 1,
+            "count": 32,
+            "valid": 1,
+            "hand": "gripper",
+            "object": "ball",
+            "batch": row,
         }
         for row, file in enumerate(found)
-    ]  # fmt: skip
+    ]
     sums = {"complete": True, "grasps": 64, "valid": 2, "size_bytes": 2, "dataset_digest": "d" * 32}
     taken = Snapshot(dataset="d", digest="c" * 32, created=timestamp(), shards=shards, **sums)
     put_record(services.store, f"{names.DATASETS}/d/snapshots/{taken.digest}.json", taken)

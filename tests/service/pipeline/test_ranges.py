@@ -42,9 +42,20 @@ def services(services: Services) -> Services:
 def worker(name: str = "w", *, device: str = "cpu", schemas: tuple[int, int] = (2, TASK_SCHEMA)) -> WorkerBeat:
     now = timestamp()
     return WorkerBeat(
-        name=name, host="h", pid=1, device=device, device_name="d", stages=tuple(Stage), version="0", state="idle",
-        task_id="", started=now, seen=now, schemas=schemas, revisions=dict(STAGE_REVISIONS),
-    )  # fmt: skip
+        name=name,
+        host="h",
+        pid=1,
+        device=device,
+        device_name="d",
+        stages=tuple(Stage),
+        version="0",
+        state="idle",
+        task_id="",
+        started=now,
+        seen=now,
+        schemas=schemas,
+        revisions=dict(STAGE_REVISIONS),
+    )
 
 
 def here(services: Services, *workers: WorkerBeat) -> None:
@@ -156,8 +167,11 @@ def test_rates_and_workers_are_read_once_for_many_jobs(services: Services) -> No
     here(services, worker())
     now = 0.0
     ranges = TaskRanges(services, clock=lambda: now)
-    job = job_actions.prepare(replace(services, settings=services.settings.model_copy(update={"task_s": 0.0})),
-                              request(grasps=3200), lane=Lane.BULK)  # fmt: skip
+    job = job_actions.prepare(
+        replace(services, settings=services.settings.model_copy(update={"task_s": 0.0})),
+        request(grasps=3200),
+        lane=Lane.BULK,
+    )
     assert ranges.sized(job).span == 4
     measured(services, 0.01)
     assert ranges.sized(job).span == 4

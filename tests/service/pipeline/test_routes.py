@@ -44,7 +44,7 @@ NEXT = beat(revision=REVISION + 1)
         ([beat(schemas=(2, 9)), beat(schemas=(2, 2))], replace(NEED, schema=3, newest=9), Place(apart=True)),
         ([beat(schemas=(4, 9))], replace(NEED, schema=2, newest=5), Place()),
     ],
-)  # fmt: skip
+)
 def test_a_task_goes_where_those_look_who_can_do_it(present: list[WorkerBeat], need: Need, place: Place) -> None:
     assert Routes(present).place(need) == place
 
@@ -57,7 +57,7 @@ def test_a_task_goes_where_those_look_who_can_do_it(present: list[WorkerBeat], n
         ([beat(schemas=(2, 2))], replace(NEED, schema=3, newest=3), "schema 3 of tasks is needed, and 2 is the newest"),
         ([beat(schemas=(5, 6))], replace(NEED, newest=4), "schema 4 of tasks is the newest it may have"),
     ],
-)  # fmt: skip
+)
 def test_what_nobody_can_do_is_held_back_with_the_reason(present: list[WorkerBeat], need: Need, why: str) -> None:
     assert why in Routes(present).place(need).held
 

@@ -30,9 +30,16 @@ def fail(services: Services, job: JobRecord, batch: int, kind: str, number: int 
     """The last attempt at a batch's grasps."""
     task = next(task for task in plan(job) if task.stage is Stage.SYNTHESIZE and task.batch == batch)
     attempt = AttemptRecord(
-        task_id=task.id, job_id=job.id, stage=task.stage, number=number, kind=kind,
-        reason="none of 128 grasps tried is valid in its scene", worker="w", ended=timestamp(), last=True,
-    )  # fmt: skip
+        task_id=task.id,
+        job_id=job.id,
+        stage=task.stage,
+        number=number,
+        kind=kind,
+        reason="none of 128 grasps tried is valid in its scene",
+        worker="w",
+        ended=timestamp(),
+        last=True,
+    )
     put_record(services.store, names.attempt(task.id, number), attempt)
     services.index.write.add_attempt(attempt)
 
@@ -46,8 +53,10 @@ def test_scenes_are_made_before_grasps_and_told_in_that_order(services: Services
     assert len(services.queue.waiting()) == 2, "the scenes of both batches"
     told = services.index.jobs.get(job.id).stages
     assert [(stage.stage, stage.tasks) for stage in told] == [
-        (Stage.SCENE, 2), (Stage.SYNTHESIZE, 2), (Stage.RENDER, 2)
-    ]  # fmt: skip
+        (Stage.SCENE, 2),
+        (Stage.SYNTHESIZE, 2),
+        (Stage.RENDER, 2),
+    ]
     make(services, job, Stage.SCENE)
     ready = [(task.task.batch, task.task.stage) for task in services.index.feed.ready_of_job(job.id, limit=9)]
     assert ready == [(0, Stage.SYNTHESIZE)], "the other batch's scenes are queued already"

@@ -29,9 +29,18 @@ from tests.indexes import empty_index
 WIP = "rq:wip:interactive-synthesize"
 WAITING = "rq:queue:interactive-synthesize"
 BEAT = {
-    "name": "w", "host": "h", "pid": 2**70, "device": "cpu", "device_name": "", "stages": [], "version": "0",
-    "state": "idle", "task_id": "", "started": "", "seen": "",
-}  # fmt: skip
+    "name": "w",
+    "host": "h",
+    "pid": 2**70,
+    "device": "cpu",
+    "device_name": "",
+    "stages": [],
+    "version": "0",
+    "state": "idle",
+    "task_id": "",
+    "started": "",
+    "seen": "",
+}
 EVENT = {"kind": EventKind.FINISHED.value, "at": timestamp(), "stage": "synthesize", "task_id": "t"}
 
 

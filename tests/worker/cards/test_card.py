@@ -19,7 +19,7 @@ from tests.worker.cards.makers import HANDS, OBJECTS, dataset
 from worker.cards.card import write_card
 from worker.cards.contents import contents_of_folder, contents_of_store, with_provenance
 from worker.cards.findings import _qualities
-from worker.commands.curate import app
+from worker.commands.exchange import app
 
 
 def test_the_head_of_the_page_is_yaml_that_says_licence_and_size(kitchen: Case) -> None:

@@ -14,7 +14,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from graspd.cli import build
-from worker.rendering.pages import portraits
+from worker.rendering import portraits
 
 #: Colours of the arrow on the palm and of the prepared mesh: red exceeds blue by at least this [of 255].
 WARM = 60

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from service.readers import Pictures, open_shards
 from service.readers.clouds import OF_GRASPS
 from tests.service.readers import box_scenes
-from worker.commands.exchange import app
+from worker.commands.curate import app
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from worker.files.cases import load_case
 from worker.files.evaluate import evaluate
 from worker.files.synthesis import Synthesized, synthesized
 from worker.objects.prepare import object_from_path
-from worker.rendering.pages.pictures import grasp_pictures
+from worker.rendering.pictures import grasp_pictures
 from worker.stages.models import object_glb
 
 PLACES = {"origin": (0.0, 0.0, 0.0), "6 m": (5.0, -3.0, 2.0), "UTM": (500_000.0, 4_500_000.0, 300.0)}

@@ -16,7 +16,7 @@ from graspd.cli import build
 from tests.conftest import REPOSITORY
 from tests.worker.hands.my_hand import asset_json_of, write_all
 from worker.hands.model import HandModel
-from worker.rendering.pages import portraits
+from worker.rendering import portraits
 from worker.run import Run
 from worker.stages import hand_self_test
 from worker.stages.hand_self_test import SelfTest

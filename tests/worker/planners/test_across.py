@@ -19,11 +19,10 @@ from worker.hands.load import hand_from_path
 from worker.hands.oppositions import oppositions_of
 from worker.hands.pinches import pinches_of
 from worker.objects.prepare import object_from_path
-from worker.planners.fast_graspd.across import ACROSS, NEAR_M, Openings, across, crossings_of, promising
-from worker.planners.fast_graspd.outlines import outlines_of
+from worker.planners.fast_graspd.across import ACROSS, NEAR_M, Openings, across, crossings_of, outlines_of, promising
+from worker.planners.fast_graspd.candidates import posture_of
 from worker.planners.fast_graspd.pairs import pair_of
 from worker.planners.fast_graspd.scene_starts import REACHING, clear_scene_starts, free_ways
-from worker.planners.fast_graspd.selection import posture_of
 from worker.planners.fast_graspd.starts import CLEAR, start_generator
 from worker.planners.fast_graspd.withdrawal import hindrance
 from worker.simulation.data import HandState

@@ -8,7 +8,7 @@ import trimesh
 
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.planners.autograsp import kernels
-from worker.planners.autograsp.closing import TOUCH_M, Closed, Closer
+from worker.planners.autograsp.method import TOUCH_M, Closed, Closer
 from worker.planners.peers import ground_of
 from worker.simulation.data import HandState
 

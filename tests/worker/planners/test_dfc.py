@@ -9,9 +9,8 @@ import warp as wp
 
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.planners.dfc import kernels
-from worker.planners.dfc.method import DISTANCE, sample_starts
+from worker.planners.dfc.method import DISTANCE, Descent, sample_starts
 from worker.planners.dfc.schedule import step_size, temperature
-from worker.planners.dfc.search import Descent
 from worker.planners.peers import ground_of
 from worker.planners.threads import Steps
 from worker.run import ALONE

@@ -17,8 +17,7 @@ from worker.files.synthesis import synthesized
 from worker.hands.jaws import thinnest_fingertip
 from worker.hands.load import hand_from_path
 from worker.hands.oppositions import oppositions_of
-from worker.planners.fast_graspd.across import Openings, crossings_of, room_beside
-from worker.planners.fast_graspd.gaps import why_narrow
+from worker.planners.fast_graspd.across import Openings, crossings_of, room_beside, why_narrow
 from worker.run import Run
 from worker.simulation.surroundings import Obstacle, Scenes, Surroundings
 

@@ -12,7 +12,7 @@ import warp as wp
 
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.planners.graspd2022 import kernels
-from worker.planners.graspd2022.search import (
+from worker.planners.graspd2022.method import (
     FRICTION,
     LEAK,
     MISMATCH,

@@ -10,9 +10,8 @@ import warp as wp
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.hands.load import hand_from_path
 from worker.planners.graspit import kernels
-from worker.planners.graspit.eigengrasps import eigengrasps
+from worker.planners.graspit.method import Search, eigengrasps, virtual_contacts
 from worker.planners.graspit.schedule import FIRST_STEP, acceptance, jump_share, temperature
-from worker.planners.graspit.search import Search, virtual_contacts
 from worker.planners.peers import ground_of
 from worker.planners.threads import Steps
 from worker.run import ALONE, Run

@@ -15,9 +15,9 @@ from tests.worker.simulation.rigs import object_of
 from worker.hands.jaws import fingertip_pad
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
+from worker.planners.fast_graspd.candidates import posture_of
 from worker.planners.fast_graspd.pairs import pair_of
 from worker.planners.fast_graspd.reaching import Reaching
-from worker.planners.fast_graspd.selection import posture_of
 from worker.planners.fast_graspd.starts import CLEAR, RETREATS, clear_starts, start_generator
 from worker.simulation.data import HandState
 from worker.simulation.model import Model

@@ -82,9 +82,12 @@ def test_a_device_that_works_is_not_blamed() -> None:
 
 
 def test_the_worker_ends_and_leaves_the_other_tasks(
-    rq_queue: RqQueue, redis_server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    rq_queue: RqQueue,
+    redis_server: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
-) -> None:  # fmt: skip
+) -> None:
     monkeypatch.setattr(engine, "Runner", partial(Runner, check_device=broken))
     rq_queue.enqueue([message_for(), message_for(seed=1)], Lane.BULK)
     settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from service.model.finding import Condition
+from service.run.doctor.checks import Condition
 from service.settings import Settings
 from worker.process import doctor
 from worker.process.selfcheck import EngineError

@@ -135,9 +135,7 @@ def test_a_disk_without_room_costs_no_attempt_wherever_it_is_found(bench: Bench)
     message = message_for(attempt=3)
     outcome = bench.run(message, full)
     assert outcome is not None
-    assert (outcome.kind, outcome.message) == (
-        EventKind.DEFERRED, "No space left on device: no file could be written",
-    )  # fmt: skip
+    assert (outcome.kind, outcome.message) == (EventKind.DEFERRED, "No space left on device: no file could be written")
     assert task_attempts(bench.store, message.task_id) == []
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from worker.quality import balance
-from worker.quality.balance import nonnegative_weights
+from worker.quality import squeeze
+from worker.quality.squeeze import nonnegative_weights
 
 TARGET = np.zeros(23)
 TARGET[6] = 10.0
@@ -28,13 +28,13 @@ def test_weights_are_scipy_s(columns: int, seed: int) -> None:
     made = systems(16, columns, seed)
     count = np.random.default_rng(seed).integers(1, columns + 1, 16)
     found = nonnegative_weights(made, TARGET, 0.1, count)
-    wanted = [balance._plain(made[b], TARGET, 0.1, int(count[b])) for b in range(16)]
+    wanted = [squeeze._plain(made[b], TARGET, 0.1, int(count[b])) for b in range(16)]
     # Both are exact but for rounding; the normal equations square the condition, some 1e5 here.
     np.testing.assert_allclose(found, wanted, atol=1e-9)
 
 
 def test_the_kernel_needs_no_second_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(balance, "_plain", None)
+    monkeypatch.setattr(squeeze, "_plain", None)
     nonnegative_weights(systems(64, 96, 9), TARGET, 0.1, np.full(64, 96))
 
 

@@ -41,7 +41,7 @@ def test_the_same_pair_is_compiled_once() -> None:
         (PADS, BOX, WHOLE, MujocoOptions().hardened()),
         (PADS, BOX, WHOLE, MujocoOptions(), [TABLE]),
     ],
-)  # fmt: skip
+)
 def test_whatever_moves_a_verdict_gives_another_model(other: tuple) -> None:
     assert scene_of(*other) is not scene_of(PADS, BOX, WHOLE, MujocoOptions())
 

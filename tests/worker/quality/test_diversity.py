@@ -18,8 +18,7 @@ from worker.grasps import Posture
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.quality import diversity
-from worker.quality.approach import approach_cells, cells_of
-from worker.quality.diversity import POINTS, distances, distinct, hand_points, nearest
+from worker.quality.diversity import POINTS, approach_cells, cells_of, distances, distinct, hand_points, nearest
 from worker.quality.table import measure
 
 FIRST, SECOND = np.array([0]), np.array([1])

@@ -10,9 +10,8 @@ import pytest
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from worker.quality import hull
-from worker.quality.hull import MAX_POINTS, measure_hulls, radius, radius_and_volume
-from worker.quality.wrench_space import measure_space, wrenches
+from worker.quality import wrench_space
+from worker.quality.wrench_space import MAX_POINTS, measure_hulls, measure_space, radius, radius_and_volume, wrenches
 
 #: Both hulls joggle their points, ours by 1e-8; slivers between nearly coplanar points multiply that.
 JOGGLED = 1e-6
@@ -70,14 +69,14 @@ def test_threads_do_not_disturb_one_another() -> None:
 def test_stamps_begin_anew_before_they_run_out(monkeypatch: pytest.MonkeyPatch) -> None:
     points = contacts(6)
     before = radius_and_volume(points)
-    monkeypatch.setattr(hull._workspace, "next_stamp", hull._LAST_STAMP - 1)
+    monkeypatch.setattr(wrench_space._workspace, "next_stamp", wrench_space._LAST_STAMP - 1)
     assert radius_and_volume(points) == before
-    assert hull._workspace.next_stamp < 1000
+    assert wrench_space._workspace.next_stamp < 1000
 
 
 def test_too_many_facets_are_no_hull(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hull, "CAPACITY", 200)
-    monkeypatch.setattr(hull, "_workspace", hull._Workspace())
+    monkeypatch.setattr(wrench_space, "CAPACITY", 200)
+    monkeypatch.setattr(wrench_space, "_workspace", wrench_space._Workspace())
     assert radius_and_volume(contacts(12)) is None
 
 

@@ -44,9 +44,10 @@ def pad_forces(hand: HandModel, obj: ObjectModel, grasp: Posture) -> list[float]
 
 
 @pytest.mark.parametrize(
-    ("coupled", "effort", "each"), [(True, 20.0, 10.0), (False, 20.0, 20.0), (False, 100.0, 25.0)],
+    ("coupled", "effort", "each"),
+    [(True, 20.0, 10.0), (False, 20.0, 20.0), (False, 100.0, 25.0)],
     ids=["one drive shares its limit", "two drives", "no more than is asked for"],
-)  # fmt: skip
+)
 def test_pads_press_with_the_limit_of_their_drive(coupled: bool, effort: float, each: float) -> None:
     hand = gripper(coupled=coupled, effort=effort)
     # A drive that stalls presses with its limit, to within a hundredth when contacts have come to rest. Drives that

@@ -15,8 +15,7 @@ from graspd.cli import build
 from service.model.matter import ACCELERATION, FRICTION
 from tests.worker.quality.test_mass import BOX, HAND, LEVER_M, PIECES, TABLE, TORQUE, pinch
 from worker.grasps import Posture
-from worker.quality.capacity import AT_STOP, capacities
-from worker.quality.referee.limit import ENOUGH, HOPELESS, LEAST, Limit, limit_of
+from worker.quality.referee.payload import AT_STOP, ENOUGH, HOPELESS, LEAST, Limit, capacities, limit_of
 from worker.quality.wrench_space import EDGES
 
 UP = np.array([[[0.0, 1.0, 0.0]]])
@@ -75,9 +74,25 @@ def test_what_is_wanted_is_told_with_what_the_best_grasp_lifts() -> None:
 @pytest.mark.parametrize("wanted", [ENOUGH // 2, ENOUGH])
 def test_a_weight_out_of_reach_ends_the_work_with_what_the_hand_lifts(tmp_path: Path, wanted: int) -> None:
     words = [
-        "synth", "--hand", "allegro", "--object", "block", "--mass", "20", "--scene", "table", "-n", str(wanted),
-        "--fidelity", "draft", "--seed", "3", "--json", "-o", str(tmp_path / "g.h5"),
-    ]  # fmt: skip
+        "synth",
+        "--hand",
+        "allegro",
+        "--object",
+        "block",
+        "--mass",
+        "20",
+        "--scene",
+        "table",
+        "-n",
+        str(wanted),
+        "--fidelity",
+        "draft",
+        "--seed",
+        "3",
+        "--json",
+        "-o",
+        str(tmp_path / "g.h5"),
+    ]
     result = CliRunner().invoke(build(), words)
     told = json.loads(result.stdout.splitlines()[-1])
     assert result.exit_code == 3

@@ -23,8 +23,7 @@ from worker.objects.prepare import object_from_path
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lifting import judge_lifts
-from worker.quality.referee.payload import payloads
-from worker.quality.referee.shake import AMPLITUDE_M, FREQUENCY_HZ, shake_margins
+from worker.quality.referee.payload import AMPLITUDE_M, FREQUENCY_HZ, payloads, shake_margins
 from worker.simulation.surroundings import Obstacle, Placed
 
 #: A box between the fingertips of the two-finger hand, whose pads are 58 mm apart and 68 mm above its joints.
@@ -118,9 +117,23 @@ def test_what_is_said_with_a_job_goes_over_what_the_file_says() -> None:
 
 def test_whoever_says_what_the_object_weighs_is_told_what_the_grasps_lift(tmp_path: Path) -> None:
     words = [
-        "synth", "--hand", "barrett", "--object", "block", "--scene", "table", "-n", "1", "--fidelity", "draft",
-        "--seed", "3", "--json", "-o", str(tmp_path / "g.h5"),
-    ]  # fmt: skip
+        "synth",
+        "--hand",
+        "barrett",
+        "--object",
+        "block",
+        "--scene",
+        "table",
+        "-n",
+        "1",
+        "--fidelity",
+        "draft",
+        "--seed",
+        "3",
+        "--json",
+        "-o",
+        str(tmp_path / "g.h5"),
+    ]
     keys = {"mass_kg", "lift_share", "lift_hard_share", "payload_kg"}
     for more, told in ((["--mass", "0.37"], keys), (["--mass", "0.37", "--no-payload"], keys - {"payload_kg"})):
         said = json.loads(CliRunner().invoke(build(), words + more).stdout.splitlines()[-1])
@@ -133,10 +146,30 @@ def test_a_job_counts_grasps_that_lift_the_wanted_payload(
     tmp_path: Path, least: float, kept: int, outcomes: dict[str, int]
 ) -> None:
     words = [
-        "synth", "--hand", "barrett", "--object", "block", "--mass", "0.2", "--scene", "table", "-n", "2", "--budget",
-        "1", "--fidelity", "draft", "--seed", "3", "--min-payload", str(least), "--shake", "--json",
-        "-o", str(tmp_path / "g.h5"),
-    ]  # fmt: skip
+        "synth",
+        "--hand",
+        "barrett",
+        "--object",
+        "block",
+        "--mass",
+        "0.2",
+        "--scene",
+        "table",
+        "-n",
+        "2",
+        "--budget",
+        "1",
+        "--fidelity",
+        "draft",
+        "--seed",
+        "3",
+        "--min-payload",
+        str(least),
+        "--shake",
+        "--json",
+        "-o",
+        str(tmp_path / "g.h5"),
+    ]
     told = json.loads(CliRunner().invoke(build(), words).stdout.splitlines()[-1])
     shard = read_shard(tmp_path / "g.h5")
     assert (told["grasps"], told["mass_kg"], shard.attributes["object_mass_kg"]) == (kept, 0.2, 0.2)

@@ -34,10 +34,17 @@ def coupled_hand() -> HandModel:
     """The two-finger hand with both joints driven by one dof: the right one half as fast."""
     return dataclasses.replace(
         two_finger_hand(),
-        dof=np.array([-1, 0, 0], np.int32), multiplier=np.array([1.0, 1.0, 0.5]), offset=np.array([0, 0, 0.1]),
-        dof_names=("grip",), lower=np.array([-0.3]), upper=np.array([1.2]), effort=np.ones(1),
-        stiffness=np.full(1, 10.0), preshape=np.zeros(1), closing=np.ones(1),
-    )  # fmt: skip
+        dof=np.array([-1, 0, 0], np.int32),
+        multiplier=np.array([1.0, 1.0, 0.5]),
+        offset=np.array([0, 0, 0.1]),
+        dof_names=("grip",),
+        lower=np.array([-0.3]),
+        upper=np.array([1.2]),
+        effort=np.ones(1),
+        stiffness=np.full(1, 10.0),
+        preshape=np.zeros(1),
+        closing=np.ones(1),
+    )
 
 
 @pytest.mark.parametrize(

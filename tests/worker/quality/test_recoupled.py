@@ -14,8 +14,7 @@ from worker.hands.model import HandModel
 from worker.hands.tendons import Tendon
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.model import MujocoOptions
-from worker.quality.referee.recoupled import nearest, recoupled
-from worker.quality.referee.variant import NOMINAL, Variant, couplings_of
+from worker.quality.referee.variant import NOMINAL, Variant, couplings_of, nearest, recoupled
 from worker.quality.referee.varied import Models
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))

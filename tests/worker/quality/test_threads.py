@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.model.errors import TaskCancelled
-from worker.quality.referee.threads import measured
+from worker.quality.referee.compiled import measured
 from worker.run import ALONE, Run
 
 

@@ -258,10 +258,17 @@ def test_only_coupled_hands_vary_in_couplings() -> None:
 def one_drive() -> HandModel:
     """Two fingers on one dof."""
     return dataclasses.replace(
-        two_finger_hand(), digest="1" * 32, dof=np.array([-1, 0, 0], np.int32), dof_names=("both",),
-        lower=np.full(1, -0.3), upper=np.full(1, 1.2), effort=np.ones(1), stiffness=np.full(1, 10.0),
-        preshape=np.zeros(1), closing=np.ones(1),
-    )  # fmt: skip
+        two_finger_hand(),
+        digest="1" * 32,
+        dof=np.array([-1, 0, 0], np.int32),
+        dof_names=("both",),
+        lower=np.full(1, -0.3),
+        upper=np.full(1, 1.2),
+        effort=np.ones(1),
+        stiffness=np.full(1, 10.0),
+        preshape=np.zeros(1),
+        closing=np.ones(1),
+    )
 
 
 def test_a_compliant_coupling_gives_way_under_load() -> None:

@@ -12,7 +12,7 @@ from service.model.errors import InputError
 from service.model.transforms import apply, compose, invert
 from worker.commands.grasp_sheet import waypoints
 from worker.grasps import Posture
-from worker.rendering.pages.way_pictures import KINDS, animation
+from worker.rendering.way_pictures import KINDS, animation
 from worker.robots.execution import POSTURES, Executions, ToolFrame, straight_paths, timed
 
 SECONDS = [0.5, 0.05, 1.2]

@@ -11,8 +11,8 @@ from PIL import Image
 
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.rendering import render
-from worker.rendering.pages.pictures import THREE_SIDES, grasp_pictures
-from worker.rendering.pages.sheets import (
+from worker.rendering.pictures import THREE_SIDES, grasp_pictures
+from worker.rendering.sheets import (
     GAP,
     MARGIN,
     PAPER,

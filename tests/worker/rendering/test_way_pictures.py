@@ -14,7 +14,7 @@ from service.readers.ways import Waypoint
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.hands.kinematics import body_poses
 from worker.rendering.hands import DrawnHand, drawn_bodies
-from worker.rendering.pages.way_pictures import Around, way_pictures
+from worker.rendering.way_pictures import Around, way_pictures
 
 HAND = two_finger_hand()
 REST = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])

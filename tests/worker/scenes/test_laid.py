@@ -12,7 +12,7 @@ from service.model.transforms import quat_rotate
 from tests.worker.models import object_from_mesh
 from worker.scenes.beside import gaps_between, neighbour_of, scenes_of
 from worker.scenes.kinds import GAP, room_in
-from worker.scenes.laid import BETWEEN
+from worker.scenes.neighbours import BETWEEN
 
 
 def box(*size: float, name: str = "box"):

@@ -19,9 +19,9 @@ from worker.hands.primitives import tessellate
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
+from worker.planners.fast_graspd.candidates import posture_of
 from worker.planners.fast_graspd.pairs import pair_of
 from worker.planners.fast_graspd.scene_starts import clear_scene_starts, free_ways
-from worker.planners.fast_graspd.selection import posture_of
 from worker.planners.fast_graspd.starts import CLEAR, start_generator
 from worker.planners.port import Wanted
 from worker.run import ALONE

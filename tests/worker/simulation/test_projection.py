@@ -12,7 +12,7 @@ from service.model.transforms import quat_from_axis_angle, quat_multiply
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.hands.kinematics import body_poses, generalized_forces
 from worker.hands.surface import sample_surface
-from worker.planners.fast_graspd.selection import posture_of
+from worker.planners.fast_graspd.candidates import posture_of
 from worker.simulation.data import Data, HandState, still_schedule
 from worker.simulation.device import DeviceHand, DeviceObject
 from worker.simulation.kernels import projection as kernels

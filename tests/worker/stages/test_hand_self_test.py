@@ -21,7 +21,7 @@ from worker.hands.load import hand_from_path, load_hand
 from worker.hands.model import HandModel
 from worker.hands.oppositions import oppositions_of
 from worker.objects.model import ObjectModel
-from worker.quality.referee.limit import Limit
+from worker.quality.referee.payload import Limit
 from worker.run import Run
 from worker.stages import hand_self_test
 from worker.stages.hand_self_test import (

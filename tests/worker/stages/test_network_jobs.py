@@ -29,7 +29,7 @@ from tests.networks import LEARNED, network_files, random_network
 from worker.files.synthesis import synthesized
 from worker.hands.load import hand_from_path
 from worker.planners.learned import known
-from worker.planners.learned.seeds import table_height
+from worker.planners.learned.method import table_height
 from worker.planners.registry import of_this_machine
 from worker.process.runner import Runner
 from worker.run import Run

@@ -26,12 +26,9 @@ from worker.hands.model import ConvexPiece, HandModel, JointType
 
 #: Joint damping over position gain [s]: that of DexGraspBench's Allegro hand.
 _DAMPING_TIME: Final = 0.02
-
 #: A coupling is stiffer than a contact, or a pressed finger would stretch it.
 _COUPLING: Final = {"solref": "0.008 1", "solimp": "0.98 0.999 0.0001 0.5 2"}
-
 _BARE: Final = {"mass": 1e-3, "radius": 0.01}
-
 _COLOUR: Final = (0.87, 0.45, 0.2, 1.0)
 
 
@@ -214,12 +211,9 @@ def _text(values: Any) -> str:
 
 #: Folder of the grasps of an experiment; the mapping lies beside it.
 GRASPS: Final = "graspdata"
-
 #: Folder of grasps that were collected for training.
 COLLECTED: Final = "succ_collect"
-
 FILE: Final = "hand_mapping.json"
-
 #: Folders of files with the same fields: grasps, and what the evaluator makes of them.
 _FOLDERS: Final = (GRASPS, COLLECTED, "evaluation", "succgrasp")
 
@@ -304,9 +298,7 @@ _SHADOW: Final = tuple(
     for finger, count in (("FF", 4), ("MF", 4), ("RF", 4), ("LF", 5), ("TH", 5))
     for number in range(count, 0, -1)
 )
-
 _ALLEGRO: Final = tuple(f"{finger}j{number}" for finger in ("ff", "mf", "rf", "th") for number in range(4))
-
 _ALLEGRO_URDFS: Final = (
     tuple(f"joint_{number}.0" for number in range(16)),
     tuple(
@@ -315,10 +307,8 @@ _ALLEGRO_URDFS: Final = (
         for part in ("rotation" if finger == "thumb" else "abduction", "proximal", "middle", "distal")
     ),
 )
-
 #: Their Allegro palm lies turned in the model's world frame: quaternion 0 1 0 1.
 _ALLEGRO_ROOT: Final = (0.0, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, 0.5**0.5)
-
 #: Their Shadow palm keeps the place that it has above the wrist, which is left out.
 _SHADOW_ROOT: Final = (0.0, 0.0, 0.034, 1.0, 0.0, 0.0, 0.0)
 

@@ -46,7 +46,6 @@ from worker.objects.model import ObjectModel
 from worker.simulation.surroundings import Placed
 
 Row = dict[str, Any]
-
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 #: Prefix of the configurations of our hands, and name of the experiment that the grasps are.
 NAME: Final = "graspd"

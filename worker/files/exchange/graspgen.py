@@ -36,8 +36,8 @@ from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.autograsp import kernels
-from worker.planners.autograsp.closing import Closer
-from worker.planners.fast_graspd.selection import posture_of
+from worker.planners.autograsp.method import Closer
+from worker.planners.fast_graspd.candidates import posture_of
 from worker.planners.peers import ground_of
 from worker.simulation.data import HandState
 

@@ -1,8 +1,5 @@
-"""Grasps that came from elsewhere, before our quality stage has seen them.
-
-Objects at the scale that a source gives its grasps for.
-
-Pickled NumPy files of others, read without running what is in them.
+"""Grasps of others before our quality stage has seen them: objects at their scale, pickled NumPy files read without
+running them.
 
 A pickle may name any function to be called while it is read. Only arrays, numbers, words and their containers are
 let through here.

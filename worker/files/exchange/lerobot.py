@@ -36,21 +36,16 @@ from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
 
 VERSION: Final = "v3.0"
-
 FPS: Final = 10
-
 STATE, ACTION, OBJECT, PICTURE = (
     "observation.state",
     "action",
     "observation.environment_state",
     "observation.images.scene",
 )
-
 EPISODE: Final = "episode_index"
-
 #: What the list of episodes says besides.
 VERDICT: Final = "graspd/verdict"
-
 #: Columns that each frame has, whatever the features.
 NUMBERS: Final = {
     "timestamp": "float32",
@@ -59,14 +54,10 @@ NUMBERS: Final = {
     "index": "int64",
     "task_index": "int64",
 }
-
 #: Episodes in a file, and files in a folder.
 _EPISODES: Final = 100
-
 _FILES: Final = 1000
-
 _QUANTILES: Final = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-
 #: Tells pandas that the words of the tasks are the index of their table.
 _INDEXED: Final = {
     "index_columns": ["task"],
@@ -274,7 +265,6 @@ def _statistics(values: NDArray[Any], *, picture: bool) -> dict[str, Any]:
 
 #: Postures that end a way: pregrasp, grasp, squeeze, lift.
 _STOPS = 4
-
 #: What `info.json` may take [bytes].
 _LARGEST = 2**22
 

@@ -102,9 +102,7 @@ def _signs(hand: HandModel) -> np.ndarray:
 
 
 _TRANSLATION: Final = ("WRJTx", "WRJTy", "WRJTz")
-
 _ROTATION: Final = ("WRJRx", "WRJRy", "WRJRz")
-
 _MUJOCO: Final = "robot0:"
 
 

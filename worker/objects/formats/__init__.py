@@ -13,7 +13,7 @@ import numpy as np
 
 from service.model.errors import GraspdError, MeshError
 from worker.objects.formats import bare, dae, glb, obj
-from worker.objects.formats.looks import Nearby, nothing_nearby
+from worker.objects.formats.obj import Nearby, nothing_nearby
 from worker.objects.formats.soup import MAX_FACES, Soup, check_soup
 from worker.objects.stand_ins import other_format, refuse_stand_in
 

@@ -30,7 +30,6 @@ _TYPES = {
     "double": "f8",
     "float64": "f8",
 }
-
 _MAX_ELEMENTS = 16
 
 
@@ -195,13 +194,9 @@ class _Binary:
 
 
 _HEADER = 84
-
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-
 _FACET = re.compile(rb"\bfacet\s", re.IGNORECASE)
-
 _LOOP = re.compile(rb"\bouter\s+loop\b", re.IGNORECASE)
-
 _VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 
 

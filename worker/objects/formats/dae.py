@@ -16,7 +16,7 @@ from defusedxml import ElementTree as SafeTree
 from defusedxml.common import DefusedXmlException
 
 from service.model.errors import MeshError
-from worker.objects.formats.looks import Nearby, colour_of, nothing_nearby
+from worker.objects.formats.obj import Nearby, colour_of, nothing_nearby
 from worker.objects.formats.soup import Soup, check_face_count, triangulate
 
 _MAX_DEPTH: Final = 32

@@ -13,7 +13,7 @@ import numpy as np
 
 from service.model.errors import MeshError
 from service.model.transforms import Floats, quat_to_matrix
-from worker.objects.formats.looks import UNREADABLE, mean_colour
+from worker.objects.formats.obj import UNREADABLE, mean_colour
 from worker.objects.formats.soup import Soup, check_face_count
 
 _INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}

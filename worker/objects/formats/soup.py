@@ -13,7 +13,6 @@ from service.model.errors import LimitError, MeshError
 from service.model.transforms import Floats
 
 MAX_FACES: Final = 1_000_000
-
 #: Coordinates beyond this are no length in any unit.
 MAX_COORDINATE: Final = 1e11
 
@@ -67,7 +66,6 @@ Ints = NDArray[np.int64]
 
 #: The triangulator takes up to 2 ns times the square of the corners: the squares of a file's re-entrant polygons.
 MAX_SQUARES: Final = 10**9
-
 #: A triangle against the polygon's winding counts from this share of the polygon's area on.
 _AGAINST: Final = 1e-9
 

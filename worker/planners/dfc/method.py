@@ -1,27 +1,35 @@
-"""The planner: DexGraspNet's starts around the convex hull (the palm looks at it from some way off, joints near the
-pre-shape), then annealed descent. All hands are given; info tells which would pass."""
+"""Differentiable force closure: DexGraspNet's starts around the convex hull, then annealed descent. All hands are
+given; info tells which would pass."""
 
 from __future__ import annotations
 
 import time
-from typing import Final
+from itertools import combinations
+from typing import Any, Final
 
 import numpy as np
+import warp as wp
+from numpy.typing import NDArray
 from pydantic import Field
 
-from service.model.transforms import Floats, quat_from_axis_angle, quat_from_matrix, quat_multiply
+from service.model.transforms import IDENTITY_POSE, Floats, apply, quat_from_axis_angle, quat_from_matrix, quat_multiply
 from worker.grasps import GraspSet
+from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.objects.distance import sample_faces
 from worker.objects.model import ObjectModel
 from worker.planners.dfc import kernels
-from worker.planners.dfc.schedule import STEPS
-from worker.planners.dfc.search import Descent
-from worker.planners.peers import grasp_set, ground_of, joined
+from worker.planners.dfc.schedule import CONTACTS, SELF_GAP_M, STEPS
+from worker.planners.fast_graspd.pairs import Pair
+from worker.planners.peers import grasp_set, ground_of, inside_points, joined
 from worker.planners.port import Method, Options, Planner, Wanted
 from worker.planners.threads import Steps, cut, run_parts
 from worker.run import Run
-from worker.simulation.data import HandState
+from worker.simulation.data import Data, HandState
+from worker.simulation.kernels import optimizers
+from worker.simulation.launches import Launches
+from worker.simulation.model import Model
+from worker.simulation.record import add_poses, add_root_gradient
 
 #: Force closure, distance and penetration that the source lets pass.
 PASSES: Final = (0.3, 0.005, 0.001)
@@ -103,3 +111,134 @@ def _frame(z: np.ndarray) -> np.ndarray:
     x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
     x /= np.linalg.norm(x)
     return np.column_stack([x, np.cross(z, x), z])
+
+
+Ints = NDArray[np.int32]
+
+#: Places that may become contacts, on each link and on the palm.
+EACH: Final = 12
+ON_PALM: Final = 24
+#: Object samples asked for penetration.
+SAMPLES: Final = 2000
+#: Energies: force closure, distance, penetration, self-penetration, joint limits.
+TERMS: Final = 5
+CHUNK: Final = 50
+INFINITE: Final = 1e30
+
+
+def key_points(hand: HandModel) -> tuple[Ints, Floats, Ints, Ints]:
+    """Bodies (K,) and places (K, 3) of the middle of each piece, and the pairs (first, second) to be kept apart.
+
+    Pieces that are near each other at rest by their shape are no pair.
+    """
+    body = np.array([piece.body for piece in hand.pieces], np.int32)
+    place = np.array([piece.vertices.mean(axis=0) for piece in hand.pieces])
+    rest = apply(body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0][body], place)
+    pairs = [
+        (i, j)
+        for i, j in combinations(range(len(body)), 2)
+        if body[i] != body[j]
+        and (min(body[i], body[j]), max(body[i], body[j])) not in hand.neighbours
+        and np.linalg.norm(rest[i] - rest[j]) > SELF_GAP_M
+    ]
+    first, second = (np.array([pair[k] for pair in pairs], np.int32) for k in (0, 1))
+    return body, place, first, second
+
+
+class Descent:
+    """A batch of hands on one object."""
+
+    def __init__(self, pair: Pair, starts: HandState, seeds: list[list[int]]) -> None:
+        self.pair, self.n = pair, len(starts.pivot)
+        hand = pair.hand.model
+        self.obj = pair.fine.obj.thinned(SAMPLES)
+        self.candidates = inside_points(hand, each=EACH, on_palm=ON_PALM)
+        # Holds the proposals; only its kinematics is run.
+        self.model = Model.create(pair.hand, self.obj, pair.coarse.points, pair.coarse.own, pair.options)
+        self.proposal = Data(self.model, self.n)
+        self.device = self.model.device
+        generators = [np.random.default_rng([*seed, 1]) for seed in seeds]
+        random = np.array([g.integers(2**32, dtype=np.uint32) for g in generators], np.uint32)
+        contacts = np.array([g.integers(len(self.candidates), size=CONTACTS) for g in generators], np.int32)
+        with wp.ScopedDevice(self.device):
+            self.rng = wp.array(random, dtype=wp.uint32)
+            self._allocate(contacts)
+            self._upload(hand)
+        self.proposal.set_state(starts)
+        for mine, other in zip(self.state, self._proposed(), strict=True):
+            wp.copy(mine, other)
+        self.launches = self._record()
+
+    def _allocate(self, contacts: Ints) -> None:
+        n, dofs = self.n, self.pair.hand.model.dofs
+        self.state = [wp.zeros(n, dtype=wp.vec3), wp.zeros(n, dtype=wp.quat), wp.zeros((n, dofs), dtype=wp.float32)]
+        self.contact, self.new_contact = (wp.array(contacts, dtype=wp.int32) for _ in range(2))
+        self.terms = wp.full((n, TERMS), INFINITE, dtype=wp.float32)
+        self.new_terms = wp.zeros((n, TERMS), dtype=wp.float32)
+        self.gradient = wp.zeros((n, 6 + dofs), dtype=wp.float32)
+        self.moment = wp.zeros((n, 3), dtype=wp.float32)
+        self.taken = wp.zeros(n, dtype=wp.int32)
+
+    def _upload(self, hand: HandModel) -> None:
+        self.candidate_body = wp.array(self.candidates.body, dtype=wp.int32)
+        self.candidate_position = wp.array(self.candidates.position, dtype=wp.vec3)
+        body, place, first, second = key_points(hand)
+        self.pairs = len(first)
+        self.keys = [wp.array(v, dtype=wp.int32) for v in (first, second, body)] + [wp.array(place, dtype=wp.vec3)]
+
+    def _proposed(self) -> list[Any]:
+        return [self.proposal.pivot, self.proposal.rotation, self.proposal.q]
+
+    def _record(self) -> Launches:
+        s, m, n, out = self.proposal, self.model, self.n, Launches(self.device)
+        pose, own = [s.body_p, s.body_q], [self.new_terms, s.wrench]
+        out.add(
+            kernels.propose,
+            n,
+            inputs=[len(self.candidates), s.iteration, self.gradient, *self.state, self.contact],
+            outputs=[self.rng, self.moment, *self._proposed(), self.new_contact, self.new_terms],
+        )
+        add_poses(out, m, s)
+        out.add(
+            kernels.force_closure,
+            n,
+            inputs=[self.obj.surface, self.candidate_body, self.candidate_position, self.new_contact, *pose],
+            outputs=own,
+        )
+        out.add(
+            kernels.penetration,
+            (n, m.pieces),
+            inputs=[m.hand.pieces, self.obj.bvh.id, self.obj.samples, *pose],
+            outputs=own,
+        )
+        if self.pairs:
+            out.add(kernels.self_penetration, (n, self.pairs), inputs=[*self.keys, *pose], outputs=own)
+        add_root_gradient(out, m, s)
+        out.add(kernels.limits, n, inputs=[m.hand.lower, m.hand.upper, s.q], outputs=[self.new_terms, s.gradient])
+        out.add(
+            kernels.accept,
+            n,
+            inputs=[s.iteration, self.new_terms, s.gradient, *self._proposed(), self.new_contact],
+            outputs=[self.rng, self.terms, self.gradient, *self.state, self.contact, self.taken],
+        )
+        out.add(optimizers.advance, 1, inputs=[], outputs=[s.iteration])
+        return out
+
+    def run(self, steps: int, tell: Steps) -> None:
+        """So many proposals; raises TaskCancelled through `tell`."""
+        for first in range(0, steps, CHUNK):
+            count = min(CHUNK, steps - first)
+            self.launches.run(count)
+            tell(self.n * count, "annealing")
+
+    def hands(self) -> HandState:
+        """Where the hands are, joints inside their limits."""
+        for mine, other in zip(self._proposed(), self.state, strict=True):
+            wp.copy(mine, other)
+        found = self.proposal.state(self.n)
+        hand = self.pair.hand.model
+        return HandState(found.pivot, found.rotation, np.clip(found.q, hand.lower, hand.upper))
+
+    def energies(self) -> Floats:
+        """(n, 5) E_fc, E_dis, E_pen, E_spen, E_joints, unweighted."""
+        return self.terms.numpy().astype(float)

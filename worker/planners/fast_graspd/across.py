@@ -1,12 +1,19 @@
-"""Starts across an object: a hand whose fingers oppose one another, opened a little wider than the object is there.
+"""Antipodal starts: a hand whose fingers oppose one another, opened a little wider than the object is there.
 
 An object is held where two patches of its surface look away from each other (antipodal points: Nguyen, "Constructing
 force-closure grasps", 1988). They are found by comparing samples of the surface with one another.
+
+How far hands must rise until they are clear of what stands around, told by a few points of their outline: cheap
+enough for many more hands than are looked at exactly.
+
+A fingertip is taken as a ball as wide as the thinnest fingertip of the hand, beside an end of a pair of points that the
+hand could hold between. This is necessary for a grasp between opposed fingertips and not sufficient.
 """
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -14,15 +21,16 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats
+from service.model.transforms import IDENTITY_POSE, Floats, apply, spread_directions
 from worker.hands.jaws import thinnest_fingertip
+from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.hands.oppositions import Oppositions, oppositions_of
-from worker.hands.pinches import pinches_of
+from worker.hands.pinches import HEIGHTS_M, pinches_of
 from worker.objects.model import ObjectModel
-from worker.planners.fast_graspd.outlines import outlines_of
+from worker.simulation.mounting import OUTERMOST, points_of
 from worker.simulation.obstacles import MARGIN_M
-from worker.simulation.surroundings import Surroundings
+from worker.simulation.surroundings import CLEAR_M, Surroundings
 
 #: Points of the surface that pairs are made of, and how far their line may turn from their normals (cosine): within
 #: the cones of half the friction. With 0.9 Allegro lifts .39 of six objects at half of it and Shadow .30, with these
@@ -279,3 +287,128 @@ def frames(first: Floats, second: Floats) -> Floats:
     y = np.where(np.linalg.norm(y, axis=1, keepdims=True) > 1e-3, y, other)
     y /= np.linalg.norm(y, axis=1, keepdims=True)
     return np.stack([first, y, np.cross(first, y)], axis=-1)
+
+
+#: Directions in which a hand's outermost points are taken, of its fingertips and of the rest of it.
+DIRECTIONS: Final = 20
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """Outermost points of a hand in each of its K opposed postures, from the palm's centre."""
+
+    points: Floats
+    """(K, P, 3) [m]"""
+    tips: NDArray[np.bool_]
+    """(P,) those of fingertips."""
+    mounting: Floats
+    """(W, M, 3) outermost points of the mounting at each of its wrist positions, from the palm's centre [m]; W is 0
+    without one."""
+
+    def lacks(
+        self, posture: NDArray[np.intp], turn: Floats, centre: Floats, scene: Surroundings, *, room: float
+    ) -> Floats:
+        """(n,) what hands and their mountings lack of the distance from obstacles that they are to keep, and of `room`
+        besides [m]; 0 or more.
+
+        Args:
+            posture: (n,) which of the K.
+            turn: (n, 3, 3) rotations.
+            centre: (n, 3) centres of the palms, object frame [m].
+            scene: the obstacles.
+            room: [m]
+        """
+        place = np.matmul(self.points[posture], np.swapaxes(turn, -1, -2)) + centre[:, None]
+        lack = np.zeros(len(posture))
+        for obstacle in scene.obstacles:
+            wanted = np.where(self.tips, MARGIN_M if obstacle.tips_m is None else obstacle.tips_m, MARGIN_M) + room
+            lack = np.maximum(lack, (wanted - obstacle.distance(place)).max(axis=1))
+        return np.maximum(lack, self._mounting_lacks(turn, centre, scene, MARGIN_M + room))
+
+    def _mounting_lacks(self, turn: Floats, centre: Floats, scene: Surroundings, wanted: float) -> Floats:
+        """(n,) what mountings at the best of their wrist positions lack of the distance `wanted` from obstacles [m]."""
+        least = np.full(len(turn), np.inf if len(self.mounting) else 0.0)
+        for points in self.mounting:
+            rows = np.flatnonzero(least > 0.0)
+            place = points @ np.swapaxes(turn[rows], -1, -2) + centre[rows, None]
+            lack = [(wanted - obstacle.distance(place)).max(axis=1) for obstacle in scene.obstacles]
+            least[rows] = np.minimum(least[rows], np.maximum.reduce([*lack, np.zeros(len(rows))]))
+        return least
+
+
+_known_outlines: LRUCache[tuple[str, bytes], Outlines] = LRUCache(16)
+
+_outline_lock = threading.Lock()
+
+
+def outlines_of(hand: HandModel, postures: Oppositions) -> Outlines:
+    """The outlines of opposed postures of a hand, from memory where they are known."""
+    key = (hand.content, postures.q.tobytes())
+    with _outline_lock:
+        if key not in _known_outlines:
+            _known_outlines[key] = _outlines(hand, postures.q)
+        return _known_outlines[key]
+
+
+def _outlines(hand: HandModel, q: Floats) -> Outlines:
+    bodies = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))
+    points, tips = [], []
+    for tip in (True, False):
+        solid = [apply(bodies[:, p.body, None], p.vertices) for p in hand.pieces if (p.body in hand.fingertips) == tip]
+        if solid:
+            corners = np.concatenate(solid, axis=1)
+            far = (corners @ spread_directions(DIRECTIONS).T).argmax(axis=1)
+            points.append(np.take_along_axis(corners, far[..., None], axis=1))
+            tips.append(np.full(DIRECTIONS, tip))
+    mounting = np.zeros((0, 0, 3))
+    if hand.mounting is not None:
+        mounting = points_of(hand.mounting)[:, :OUTERMOST] - hand.palm.centre
+    return Outlines(np.concatenate(points, axis=1) - hand.palm.centre, np.concatenate(tips), mounting)
+
+
+#: A gap that is wider is as good as this, and how exactly others are told [m].
+WIDEST_M: Final = 0.064
+EXACT_M: Final = 0.0005
+
+
+def why_narrow(hand: HandModel, obj: ObjectModel, scenes: Sequence[Surroundings]) -> str | None:
+    """Why no fingertips of a hand can hold an object between them in any of the scenes; None: nothing tells."""
+    known, pairs = oppositions_of(hand), crossings_of(obj)
+    if not len(known) or not len(pairs):
+        return None
+    fits = pairs.width <= known.widest
+    if not fits.any():
+        return (
+            f"opposite sides of {obj.name} are at least {1e3 * pairs.width.min():.0f} mm apart, and {hand.name} opens "
+            f"to {1e3 * known.widest:.0f} mm"
+        )
+    height = max(float(np.ptp(obj.hull_vertices @ scene.up)) for scene in scenes)
+    if height <= HEIGHTS_M[-1] and not len(pinches_of(hand, height)):
+        return (
+            f"{obj.name} lies {1e3 * height:.0f} mm high, and fingertips of {hand.name} that rest beside it do not "
+            "face each other so near to their ends"
+        )
+    thin = thinnest_fingertip(hand)
+    gap = max(_widest_gap(pairs, fits, scene, thin) for scene in scenes)
+    if gap >= thin + CLEAR_M:
+        return None
+    return (
+        f"the gap of about {1e3 * gap:.0f} mm beside {obj.name} is thinner than the thinnest fingertip of {hand.name}, "
+        f"{1e3 * thin:.0f} mm, and the {1e3 * CLEAR_M:.0f} mm that it keeps"
+    )
+
+
+def _widest_gap(pairs: Crossings, fits: NDArray[np.bool_], scene: Surroundings, thin: float) -> float:
+    """The widest ball that fits beside both ends of one of the pairs that fit [m]; steep ones need room below them."""
+    level, above = np.abs(pairs.axis @ scene.up) < STEEP, np.ones(len(pairs), bool)
+    for obstacle in scene.obstacles:
+        above &= np.minimum(*(obstacle.distance(end) for end in pairs.ends())) >= thin
+    rows = fits & (level | above)
+    if not rows.any():
+        return 0.0
+    pairs = Crossings(pairs.middle[rows], pairs.axis[rows], pairs.width[rows])
+    low, high = 0.0, WIDEST_M
+    while high - low > EXACT_M:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if room_beside(pairs, scene, middle).max() >= 0.0 else (low, middle)
+    return low

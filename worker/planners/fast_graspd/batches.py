@@ -17,9 +17,8 @@ from service.model.transforms import Floats
 from worker.grasps import GraspSet
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.scene_starts import free_ways
-from worker.planners.fast_graspd.schedule import in_scene, with_trial
+from worker.planners.fast_graspd.schedule import WarmStart, in_scene, with_trial
 from worker.planners.fast_graspd.starts import start_generator
-from worker.planners.fast_graspd.warm import WarmStart
 from worker.planners.port import Asked
 from worker.planners.threads import Steps
 from worker.simulation.surroundings import Placed, placed_together

@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from service.model.fidelity import Fidelity
 from service.model.integers import distinct_values
 from service.model.transforms import Floats
 from worker.grasps import GraspSet, joined
@@ -22,23 +23,25 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd import scene_starts, starts
 from worker.planners.fast_graspd.batches import Batches, finalists
-from worker.planners.fast_graspd.candidates import TOGETHER, Seated, tried, with_postures
-from worker.planners.fast_graspd.pairs import Pair, pair_of
-from worker.planners.fast_graspd.schedule import AROUND, DILATION, coarse_schedule, fine_schedule
-from worker.planners.fast_graspd.selection import (
+from worker.planners.fast_graspd.candidates import (
     FRICTION,
     NEAR_M,
     NEARNESS,
     SCENE_FRICTION,
+    TOGETHER,
+    Seated,
     best_of_each,
     merits,
     posture_of,
     ranked,
+    tried,
+    with_postures,
 )
+from worker.planners.fast_graspd.pairs import Pair, pair_of
+from worker.planners.fast_graspd.schedule import AROUND, DILATION, WarmStart, coarse_schedule, fine_schedule
 from worker.planners.fast_graspd.starts import NO_PLACE, Probe
-from worker.planners.fast_graspd.warm import WarmStart
 from worker.planners.fast_graspd.withdrawal import hindrance
-from worker.planners.port import Asked, Wanted
+from worker.planners.port import Asked, Method, Wanted
 from worker.planners.threads import cut, run_parts
 from worker.quality.gate import MAX_PENETRATION_MM, MIN_CONTACT_LINKS
 from worker.quality.postures import standing_off, touching_links
@@ -474,3 +477,14 @@ def grasps_of(
     attempts = int(sum(part.attempts.sum() for part in parts))
     info = {"loss_curve": np.round(curve, 5).tolist(), "chunk": CHUNK}
     return replace(grasps, seconds=seconds, info=info, attempts=attempts)
+
+
+METHOD: Final = Method(
+    summary="gradient descent through a differentiable contact simulation",
+    source="D. Turpin et al., Fast-Grasp'D, ICRA 2023",
+    planner=lambda options: plan,
+    joined=lambda options: plan_joined,
+    in_scenes=True,
+    in_parts=True,
+    uses=tuple(name for name in Fidelity.model_fields if name != "name"),
+)

@@ -18,7 +18,7 @@ from service.model.transforms import Floats, quat_from_axis_angle, quat_from_mat
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.across import NEAR_M, Openings, Reaches, across, promising
-from worker.planners.fast_graspd.selection import posture_of
+from worker.planners.fast_graspd.candidates import posture_of
 from worker.planners.fast_graspd.starts import CLEAR, POSTURE_NOISE, TILT, Probe
 from worker.planners.port import NoPlace
 from worker.simulation.data import HandState

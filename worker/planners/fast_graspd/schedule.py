@@ -1,16 +1,19 @@
-"""What each iteration weighs: the coarse phase shrinks the dilation, the fine phase seats the hand."""
+"""Weights of each iteration (the coarse phase shrinks the dilation, the fine phase seats the hand), and starts that
+another method proposes."""
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Sequence
+from typing import Final, Protocol
 
 import numpy as np
 
 from service.model.fidelity import Fidelity
 from service.model.transforms import Floats
-from worker.simulation.data import Schedule
-from worker.simulation.model import LossOptions
+from worker.simulation.data import HandState, Schedule
+from worker.simulation.model import LossOptions, Model
 from worker.simulation.projection import ProjectionOptions
+from worker.simulation.surroundings import Placed
 
 #: Rates of Adam: translation [m], rotation [rad], joints [rad].
 COARSE_RATES: Final = (2e-3, 2e-2, 4e-2)
@@ -93,3 +96,16 @@ def fine_schedule(fidelity: Fidelity) -> Schedule:
     return Schedule(
         np.zeros(n), penetration, 0.3 * penetration, np.full(n, 3 * SELF_WEIGHT), _decayed(FINE_RATES, n, 0.1)
     )
+
+
+class WarmStart(Protocol):
+    """Starts of grasps in scenes."""
+
+    def adapted(self, fidelity: Fidelity) -> Fidelity:
+        """The fidelity of grasps in scenes, as `schedule.in_scene` gives it, with as many starts and finalists as these
+        starts need."""
+
+    def __call__(
+        self, model: Model, generators: list[np.random.Generator], *, each: int, placed: Placed, ways: Sequence[Floats]
+    ) -> tuple[HandState, Floats]:
+        """See `scene_starts.clear_scene_starts`."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.transforms import Floats, quat_rotate
-from worker.planners.fast_graspd.selection import posture_of
+from worker.planners.fast_graspd.candidates import posture_of
 from worker.planners.fast_graspd.starts import Probe
 from worker.quality.contact import finger_of_body
 from worker.simulation.data import HandState

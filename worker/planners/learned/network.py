@@ -55,7 +55,6 @@ __all__ = [
     "save",
     "weight_shapes",
 ]
-
 #: Lengths of the encoder's input and of the condition are in units of this [m].
 LENGTH_M: Final = 0.1
 #: Products of matrices are cut into ones of 32 rows and so few multiplications that OpenBLAS, which shares larger ones

@@ -41,11 +41,15 @@ class ForeignVerdicts:
             "judge_hand": self.same.theirs.name,
             "fingertips_mm": round(1e3 * self.same.fingertips_m, 6),
             "foreign_key": self.foreign.terms,
-            **share_counts({
-                "both": int((a & b).sum()), "nominal": int((a & ~b).sum()),
-                "foreign": int((~a & b).sum()), "neither": int((~a & ~b).sum()),
-            }),
-        }  # fmt: skip
+            **share_counts(
+                {
+                    "both": int((a & b).sum()),
+                    "nominal": int((a & ~b).sum()),
+                    "foreign": int((~a & b).sum()),
+                    "neither": int((~a & ~b).sum()),
+                }
+            ),
+        }
 
 
 def share_counts(held: Mapping[str, int]) -> dict[str, Any]:

@@ -29,22 +29,38 @@ _EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "SURE", "LOST_ROTATION")
 #: The constants that move a verdict, module by module, and those that only one level reads. A constant of these modules
 #: that stands in neither moves none.
 MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
-    protocol: (
-        "DIRECTIONS", "MAX_DISPLACEMENT_M", "MAX_ROTATION", "MAX_PENETRATION_M", "STAGES", "STAGE_S", "HOLD_S",
-    ),
+    protocol: ("DIRECTIONS", "MAX_DISPLACEMENT_M", "MAX_ROTATION", "MAX_PENETRATION_M", "STAGES", "STAGE_S", "HOLD_S"),
     matter: ("ACCELERATION",),
     model: (
-        "FRICTION", "HARD", "DAMPING_TIME", "HAND_SOLIMP", "HAND_SOLREF", "COUPLING_SOLREF",
-        "COUPLING_SOLIMP", "NOT_IN_3_3_2", "SPARSE", "_BARE_RADIUS", "_MIN_MASS",
+        "FRICTION",
+        "HARD",
+        "DAMPING_TIME",
+        "HAND_SOLIMP",
+        "HAND_SOLREF",
+        "COUPLING_SOLREF",
+        "COUPLING_SOLIMP",
+        "NOT_IN_3_3_2",
+        "SPARSE",
+        "_BARE_RADIUS",
+        "_MIN_MASS",
     ),
     opening: (
-        "CLEARANCE_M", "STUCK_M", "PALM_CLEARANCE_M", "PLAIN_OPENING", "OPENING_STEP", "SLIDING_STEP_M",
-        "OPENING_STEPS", "JAM_M", "WAY", "JAM_LOOKS", "RETREATS_M",
+        "CLEARANCE_M",
+        "STUCK_M",
+        "PALM_CLEARANCE_M",
+        "PLAIN_OPENING",
+        "OPENING_STEP",
+        "SLIDING_STEP_M",
+        "OPENING_STEPS",
+        "JAM_M",
+        "WAY",
+        "JAM_LOOKS",
+        "RETREATS_M",
     ),
     postures: ("PRESSING_M", "CLOSING_M", "TOTAL_NORMAL_FORCE", "OF_WEIGHT", "FRICTION", "MAX_PRESSING", "_POINTS"),
     squeeze: ("SPREAD", "TORQUE", "SUM"),
     jaw_squeeze: ("GAP_M", "STALL", "LEAST_WAY"),
-}  # fmt: skip
+}
 LEVEL_MOVES: Final[dict[Level, dict[ModuleType, tuple[str, ...]]]] = {
     "letter": {protocol: ("LETTER_INTERVAL_S",)},
     "certificate": {protocol: _EARLY},

@@ -18,12 +18,11 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality import postures
 from worker.quality.referee import lift as protocol
-from worker.quality.referee.compiled import scene_of
+from worker.quality.referee.compiled import answers, scene_of
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.key import postures_key, verdict_key
 from worker.quality.referee.lift import Lift, LiftOutcome, LiftTrial
 from worker.quality.referee.model import TOUCH_ROUNDING_M, MujocoOptions
-from worker.quality.referee.threads import answers
 from worker.run import ALONE, Run
 from worker.simulation import surroundings
 from worker.simulation.surroundings import Placed

@@ -1,4 +1,5 @@
-"""A hand and an object in MuJoCo, as DexGraspBench has them. The object's body frame stands in its centre of mass."""
+"""A hand with its drives and an object in MuJoCo, as DexGraspBench has them. The object's body frame stands in its
+centre of mass."""
 
 from __future__ import annotations
 
@@ -17,10 +18,9 @@ from worker.engines.mujoco_warnings import ARENA
 from worker.grasps import Posture
 from worker.hands.jaws import jaws_of
 from worker.hands.model import ConvexPiece, HandModel, JointType
-from worker.hands.tendons import actuators
+from worker.hands.tendons import Tendon, actuators
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
-from worker.quality.referee.drives import add_tendon, equality_data, leading_bodies, leading_joints
 from worker.simulation.surroundings import CLEAR_M, Neighbour, Obstacle
 
 #: Sliding and torsional friction; `hard` scales them by `HARD`.
@@ -407,3 +407,33 @@ def blend(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Float
     start, end = a.hand_pose[row], b.hand_pose[row]
     pose = np.concatenate([(1 - share) * start[:3] + share * end[:3], slerp(start[3:], end[3:], share)])
     return pose, (1 - share) * a.joint_positions[row] + share * b.joint_positions[row]
+
+
+def leading_joints(hand: HandModel) -> tuple[Floats, Floats]:
+    """Multiplier and offset of the first body that each dof drives."""
+    first = leading_bodies(hand)
+    return hand.multiplier[first], hand.offset[first]
+
+
+def leading_bodies(hand: HandModel) -> NDArray[np.intp]:
+    """(D,) the body whose joint carries each dof's actuator: of the first joint it drives, as `HandModel.reduce`."""
+    drives = hand.dof[hand.joint_body]
+    return np.array([hand.joint_body[int(np.flatnonzero(drives == d)[0])] for d in range(hand.dofs)], np.intp)
+
+
+def add_tendon(spec: Any, hand: HandModel, tendon: Tendon, name: str, leading: NDArray[np.intp]) -> None:
+    """One actuator on the sum of joints; nothing else holds them to each other."""
+    cord = spec.add_tendon(name=name)
+    for d, pull in zip(tendon.dofs, tendon.coefficients, strict=True):
+        cord.wrap_joint(f"joint{leading[d]}", pull)
+    actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_TENDON)
+    actuator.set_to_position(kp=tendon.gain(hand.stiffness))
+    limit = tendon.limit(hand.effort)
+    actuator.forcerange = [-limit, limit]
+    actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+
+
+def equality_data(*values: float) -> Floats:
+    data = np.zeros(mujoco.mjNEQDATA)
+    data[: len(values)] = values
+    return data

@@ -1,4 +1,4 @@
-"""Short tests in coarse physics: what a planner asks of its candidates before it chooses.
+"""Short tests in coarse physics: rollouts that rank a planner's candidates.
 
 The hand closes and squeezes around the object in a fraction of the time of the whole test. In a scene the support is
 then gone, and for a moment most of the object's weight pulls; a free object is pushed towards the corners of a
@@ -19,6 +19,7 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.matter import ACCELERATION
 from service.model.transforms import Floats
 from worker.engines.mujoco_warnings import void
 from worker.grasps import GraspSet
@@ -217,3 +218,29 @@ def push_trial(
         return pushes.scores(grasps)
 
     return trial
+
+
+#: Stages of closing and of squeezing.
+HANGING_CLOSING: Final = 4
+#: Pull of an object that hangs, in its weights: the mean of a smooth rise while it speeds up (`lift.SMOOTHLY`).
+RISING: Final = 1.06
+#: A change of the load comes over this time, in steps [s]: at once it would weigh up to twice.
+LOADING_S: Final = 0.04
+LOADS: Final = 5
+
+
+class Hanging(Lift):
+    """A scene whose root is fixed. Not for several threads at once."""
+
+    def _closed(self, grasps: GraspSet, row: int) -> bool:
+        """Whether the hand closes around the object and holds on to it."""
+        if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
+            return False
+        return self._close(grasps, row, give_up=True, stages=HANGING_CLOSING) and not void(self.data)
+
+    def _hang(self, before: float, mass: float) -> None:
+        """Let the object hang, and its weight change from that of `before` to that of `mass` [kg]."""
+        self.data.mocap_pos[1] = self._scene_pose[:3] - AWAY_M * self._up
+        for load in np.linspace(before, mass, LOADS + 1)[1:]:
+            self.data.xfrc_applied[self.scene.object_body, :3] = -RISING * ACCELERATION * load * self._up
+            self._run(LOADING_S / LOADS)

@@ -1,4 +1,5 @@
-"""Variants of the referee's model: other shapes, drives, masses and places that a real hand might as well have.
+"""Variants of the validator's model: other shapes, drives, tendons, masses and places that a real hand might as well
+have.
 
 A `Variant` says how a model departs from the nominal one, `draw` draws one along an axis, `varied.Models` judges in it.
 """
@@ -7,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from service.model.metrics import Axis
+from service.model.transforms import Floats
 from worker.hands.model import HandModel
-from worker.quality.referee.recoupled import Coupling
 from worker.quality.referee.refit import Fit, fits_of
 
 Vector = tuple[float, float, float]
@@ -32,6 +33,8 @@ SHIFT_M: Final = 2e-3
 TURN: Final = float(np.radians(2.0))
 #: The last finger begins so much later than the first, as a share of the time of closing (0.8 s).
 LATEST: Final = 0.25
+
+Coupling = Literal["own", "compliant", "separate", "ratio"]
 
 
 @dataclass(frozen=True)
@@ -137,8 +140,12 @@ def together(variants: Iterable[Variant]) -> Variant:
 
 #: Ways in which collision shapes differ.
 SHAPES: Final[tuple[tuple[Fit, float], ...]] = (
-    ("hull", 0.0), ("primitive", 0.0), ("capsule", 0.0), ("own", GROWTH_M), ("own", -GROWTH_M),
-)  # fmt: skip
+    ("hull", 0.0),
+    ("primitive", 0.0),
+    ("capsule", 0.0),
+    ("own", GROWTH_M),
+    ("own", -GROWTH_M),
+)
 
 
 def _shapes(hand: HandModel) -> list[int]:
@@ -155,3 +162,54 @@ def _vector(rng: np.random.Generator, most: float) -> Vector:
     direction = rng.normal(size=3)
     x, y, z = (most * rng.random() * direction / np.linalg.norm(direction)).tolist()
     return x, y, z
+
+
+def recoupled(hand: HandModel, coupling: Coupling) -> HandModel:
+    """The hand in another reading of its tendons; itself where it has none, or where the reading is of other things.
+
+    separate: each joint of a tendon has the drive that it would have without. ratio: joints of a tendon turn as one,
+    each by the same angle over its coefficient's sign, with the gain and the limit of all their drives together.
+    """
+    if not hand.tendons or coupling not in ("separate", "ratio"):
+        return hand
+    if coupling == "separate":
+        return replace(hand, tendons=())
+    leader = np.arange(hand.dofs)
+    sign = np.ones(hand.dofs)
+    for tendon in hand.tendons:
+        leader[list(tendon.dofs)] = tendon.dofs[0]
+        sign[list(tendon.dofs)] = np.sign(tendon.coefficients) * np.sign(tendon.coefficients[0])
+    kept = np.unique(leader)
+    drives = np.zeros((len(kept), hand.dofs))
+    drives[np.searchsorted(kept, leader), np.arange(hand.dofs)] = sign
+    ends = np.sort(np.stack([hand.lower, hand.upper]) * sign, axis=0)
+    lower, upper = ends[0][kept].copy(), ends[1][kept].copy()
+    for d, place in enumerate(np.searchsorted(kept, leader)):
+        lower[place], upper[place] = max(lower[place], ends[0][d]), min(upper[place], ends[1][d])
+    moved = hand.dof >= 0
+    dof, rate = hand.dof.copy(), hand.multiplier.copy()
+    dof[moved] = np.searchsorted(kept, leader[hand.dof[moved]])
+    rate[moved] = hand.multiplier[moved] * sign[hand.dof[moved]]
+    pulls = np.abs(drives)
+    return replace(
+        hand,
+        tendons=(),
+        dof=dof,
+        multiplier=rate,
+        dof_names=tuple(hand.dof_names[d] for d in kept),
+        lower=lower,
+        upper=upper,
+        effort=pulls @ hand.effort,
+        stiffness=pulls @ hand.stiffness,
+        preshape=hand.preshape[kept],
+        closing=hand.closing[kept],
+        velocity=hand.velocity[kept] if len(hand.velocity) else hand.velocity,
+    )
+
+
+def nearest(hand: HandModel, joints: Floats) -> Floats:
+    """Joint positions (N, J) that a hand of fewer dofs can take, nearest to those given."""
+    dof, rate = hand.dof[hand.joint_body], hand.multiplier[hand.joint_body]
+    drive = np.zeros((len(dof), hand.dofs))
+    drive[np.arange(len(dof)), dof] = rate
+    return hand.expand((joints - hand.offset[hand.joint_body]) @ np.linalg.pinv(drive).T)

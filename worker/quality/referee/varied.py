@@ -21,9 +21,8 @@ from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.lift import Lift, LiftTrial
 from worker.quality.referee.model import MujocoOptions, Scene, blend, build
 from worker.quality.referee.protocol import STAGES, Test, Trial
-from worker.quality.referee.recoupled import Coupling, nearest, recoupled
 from worker.quality.referee.refit import Fit, refitted
-from worker.quality.referee.variant import Variant
+from worker.quality.referee.variant import Coupling, Variant, nearest, recoupled
 from worker.simulation.surroundings import Neighbour, Obstacle, Placed
 
 #: What couples joints where it gives way: MuJoCo's default constraint, 2.5 times as slow as the protocol's and softer.
@@ -76,9 +75,12 @@ class Models:
         if moves_object(variant):
             pose = compose(placed.object_pose[number], motion_of(self.obj, variant))
             where = Placed(
-                placed.supports, pose[None], np.zeros(1, np.intp), placed.neighbours,
+                placed.supports,
+                pose[None],
+                np.zeros(1, np.intp),
+                placed.neighbours,
                 placed.neighbour_pose[number : number + 1],
-            )  # fmt: skip
+            )
         test = VariantLift(self.scene(variant), where, variant, self._lags(variant))
         one = self._taken(test.scene, one)
         return test.letter(one, 0) if letter else test.lift(one, 0)
@@ -168,8 +170,9 @@ class VariantLift(_OneByOne, Lift):
 def _with_numbers(scene: Scene, variant: Variant) -> Scene:
     """The scene with the numbers of a variant, in a copy of its model; itself where there is none to change."""
     compiled = "own" if variant.coupling == "compliant" else variant.coupling
-    plain = replace(variant, armature=None, dry_friction=None, damping=1.0, gain=1.0, friction=1.0, mass=1.0,
-                    coupling=compiled)  # fmt: skip
+    plain = replace(
+        variant, armature=None, dry_friction=None, damping=1.0, gain=1.0, friction=1.0, mass=1.0, coupling=compiled
+    )
     if variant == plain:
         return scene
     model = copy.copy(scene.model)

@@ -24,23 +24,17 @@ PANELS: Final = (
     ("ε (median)", "epsilon"),
     ("Penetration, mm (median; less is better)", "pd_mm"),
 )
-
 IN_SCENES: Final = (
     ("Lifted, share of all tries", "lift"),
     ("Lifted by the letter", "lift_letter"),
     ("Lifted at half the friction", "lift_hard"),
     ("Robust share of those lifted", "robust"),
 )
-
 SPEED: Final = "end_to_end_per_second"
-
 #: Shares.
 OF_ONE: Final = frozenset({"letter", "hard", "robust", "lift", "lift_letter", "lift_hard"})
-
 COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
-
 MARKERS: Final = ("o", "s", "D", "^", "v", "P", "X", "<")
-
 INK: Final = "#1f2937"
 
 
@@ -294,24 +288,17 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
 Boxes = NDArray[np.float64]
 
 SIZE_PT: Final = 8
-
 #: Distances of a word from its point [pt], the wanted one first: from the third on a line leads to it.
 _REACHES_PT: Final = (8.0, 15.0, 26.0, 38.0, 52.0)
-
 #: Directions from the point, the wanted ones first [degrees].
 _TURNS: Final = (30, -30, 150, -150, 90, -90, 0, 180, 60, -60, 120, -120)
-
 #: Half of a marker's width [pt], and half of a bar's.
 _MARKER_PT: Final = 5.5
-
 _BAR_PT: Final = 1.5
-
 #: What a covered share of a word costs: by another word or a point, by a bar, outside of the panel.
 _COVERED, _CROSSED, _OUTSIDE = 100.0, 8.0, 200.0
-
 #: What it costs to be farther away by a reach, to be nearer to another point, and to take the next direction.
 _FARTHER, _TAKEN, _TURNED = 1.0, 2.5, 0.05
-
 _ROUNDS: Final = 6
 
 

@@ -1,6 +1,5 @@
-"""Objects that are hard: thin, sharp, pierced, open, inside out, tiny and huge; through ingest to the referee.
-
-Hands that are hard: few fingers and many, small ones and large ones, drives that move several joints.
+"""Objects and hands that are hard: thin, sharp, open, tiny, huge; few fingers and many, coupled drives. They go
+through ingest.
 
 A family of hands stands for them: like fingers of three joints in a ring around a palm, which lean outward while they
 are open.
@@ -28,12 +27,9 @@ from worker.objects.prepare import load_object
 from worker.run import ALONE, Run
 
 MILLIMETRES: Final = 1e-3
-
 #: What maps of raw grasps tell of a cell, from where on it is bad, and how a user sees it.
 MEASURE: Final = "share of tries that are valid: certified by the referee, and past the geometric gate"
-
 BOUNDS: Final = "weak: under a half; broken: none, or a number that is none"
-
 SHOWS: Final = "few or no valid grasps: a job ends with a note that its budget found fewer than asked for"
 
 
@@ -92,7 +88,6 @@ FAMILIES: Final[dict[str, tuple[str, Callable[[float], Any], tuple[float, ...]]]
     "cross": ("depth of the corners [mm]", corner, (2, 5, 10, 20)),
     "cube": ("side [mm]", cube, (1, 3, 10, 30, 60, 100, 200, 500, 1000)),
 }
-
 #: Meshes with a defect, and the options they are given with.
 DEFECTS: Final[dict[str, tuple[Callable[[], Any], dict[str, Any]]]] = {
     "a side is missing": (_opened, {}),
@@ -100,7 +95,6 @@ DEFECTS: Final[dict[str, tuple[Callable[[], Any], dict[str, Any]]]] = {
     "inside out": (_inverted, {}),
     "every other face inside out": (_half_inverted, {}),
 }
-
 #: Those that ingest refuses or closes.
 CLOSED: Final = tuple(name for name, (_, options) in DEFECTS.items() if not options)
 
@@ -192,26 +186,19 @@ def refused(panel: str, x: float | str, y: float | str, error: GraspdError) -> M
 Coupling = Literal["each joint", "distal follows", "a drive a finger", "one drive"]
 
 FINGERS: Final = (1, 2, 3, 4, 5, 6, 8)
-
 COUPLINGS: Final[tuple[Coupling, ...]] = ("each joint", "distal follows", "a drive a finger", "one drive")
-
 #: Size over that of a human hand, whose fingers are about 10 cm long.
 SIZES: Final = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
-
 #: Turn of the distal joint over that of the one before it.
 RATIOS: Final = (-0.5, 0.0, 0.5, 1.0, 1.5, 2.0)
-
 #: What they hold [mm].
 CUBE_MM: Final = 50.0
 
 #: Palm, links and their radius [m] of a hand of size 1, from the palm outward.
 _PALM_M, _LINKS_M, _RADIUS_M = (0.032, 0.02), (0.045, 0.035, 0.027), 0.009
-
 #: How far open fingers lean outward, and the ends of their joints [rad].
 _LEAN: Final = 0.45
-
 _ENDS: Final = (1.7, 1.6, 1.3)
-
 #: Torque of a joint of a hand of size 1 [N m].
 _EFFORT: Final = 1.0
 

@@ -13,9 +13,9 @@ from service.model.studies import MapCell, StabilityMap, graded, reachable, shor
 from service.model.transforms import Floats, quat_rotate
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
+from worker.planners.fast_graspd.candidates import merits
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.schedule import AROUND, coarse_schedule, fine_schedule
-from worker.planners.fast_graspd.selection import merits
 from worker.planners.fast_graspd.starts import sample_starts
 from worker.simulation.data import Data, HandState, Schedule
 from worker.simulation.projection import Projection

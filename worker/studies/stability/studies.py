@@ -17,7 +17,6 @@ Say = Callable[[str], None]
 
 #: Hands beside the one that is named, for what depends on a hand's size and build.
 OTHER_HANDS: Final = ("barrett",)
-
 #: And for what depends on its drives.
 ALL_HANDS: Final = ("allegro", "barrett", "shadow")
 
@@ -111,7 +110,6 @@ def run(
 
 #: Methods around a free object; the first is graspd's own.
 METHODS: Final = ("fast_graspd", "autograsp", "dfc", "graspit", "graspd2022")
-
 #: Parameters of each family: an easy one and hard ones.
 SHAPES: Final[dict[str, tuple[float, ...]]] = {
     "plate": (1, 10),

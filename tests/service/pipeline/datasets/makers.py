@@ -51,9 +51,16 @@ def fail(services: Services, job: str, reason: str = "it broke") -> None:
             continue
         number = services.index.jobs.task(task.id).attempt
         attempt = AttemptRecord(
-            task_id=task.id, job_id=job, stage=task.stage, number=number, kind="ValueError", reason=reason,
-            worker="w", ended=timestamp(), last=True,
-        )  # fmt: skip
+            task_id=task.id,
+            job_id=job,
+            stage=task.stage,
+            number=number,
+            kind="ValueError",
+            reason=reason,
+            worker="w",
+            ended=timestamp(),
+            last=True,
+        )
         put_record(services.store, names.attempt(task.id, number), attempt)
         services.index.write.add_attempt(attempt)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.index.queries.usage import BatchCost
+from service.index.queries.overview import BatchCost
 from service.model.domain import JobRequest
 from service.model.errors import LimitError, NotFoundError
 from service.pipeline.backends import Services

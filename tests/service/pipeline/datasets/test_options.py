@@ -32,9 +32,15 @@ def chart(created: str = "2026-11-21T10:00:00.000Z", *, claw: str = "fine") -> d
 
     def run(fidelity: str, speed: float, gsr: float, hand: str, object_: str) -> dict[str, Any]:
         return {
-            "method": "fast_graspd", "fidelity": fidelity, "hand": hand, "object": object_, "valid_per_second": speed,
-            "gsr": gsr, "epsilon": 0.3, "pd_mm": 0.1,
-        }  # fmt: skip
+            "method": "fast_graspd",
+            "fidelity": fidelity,
+            "hand": hand,
+            "object": object_,
+            "valid_per_second": speed,
+            "gsr": gsr,
+            "epsilon": 0.3,
+            "pd_mm": 0.1,
+        }
 
     runs = [run("draft", 40, 0.3, "gripper", "ball"), run("standard", 15, 0.8, "gripper", "ball")]
     runs += [run("draft", 40, 0.9, "gripper", "cube"), run(claw, 6, 0.7, "claw", "elsewhere")]
@@ -79,8 +85,11 @@ def test_with_auto_each_cell_gets_what_the_chart_promises_for_it(either: Service
     publish(either.store, "charts", chart())
     actions.create(either, wanted(**AUTO))
     assert [(r.fidelity, r.target) for r in requests_of(either)] == [
-        ("standard", ""), ("draft", ""), ("fine", ""), ("fine", ""),
-    ]  # fmt: skip
+        ("standard", ""),
+        ("draft", ""),
+        ("fine", ""),
+        ("fine", ""),
+    ]
     cells = either.index.datasets.cells("grasps").items
     assert [cell.fidelity for cell in cells] == ["standard", "draft", "fine", "fine"]
     assert either.index.datasets.get("grasps").options.target == "gsr>=0.6"
@@ -149,8 +158,15 @@ def test_auto_and_target_go_together(changes: dict[str, str]) -> None:
 
 def test_each_cell_of_a_dataset_in_scenes_says_how_its_fidelity_was_chosen(either: Services) -> None:
     def run(fidelity: str, speed: float, lift: float, hand: str, object_: str) -> dict[str, Any]:
-        return {"way": IN_SCENE, "method": "fast_graspd", "fidelity": fidelity, "hand": hand, "object": object_,
-                "end_to_end_per_second": speed, "lift": lift}  # fmt: skip
+        return {
+            "way": IN_SCENE,
+            "method": "fast_graspd",
+            "fidelity": fidelity,
+            "hand": hand,
+            "object": object_,
+            "end_to_end_per_second": speed,
+            "lift": lift,
+        }
 
     runs = [run("draft", 20, 0.8, "gripper", "ball"), run("standard", 15, 0.95, "gripper", "ball")]
     runs += [run("draft", 20, 0.92, "gripper", "cube"), run("standard", 15, 0.99, "gripper", "cube")]
@@ -162,8 +178,11 @@ def test_each_cell_of_a_dataset_in_scenes_says_how_its_fidelity_was_chosen(eithe
     cells = either.index.datasets.cells("grasps").items
     assert [cell.fidelity for cell in cells] == ["standard", "draft", "standard", "standard"]
     assert [(c.choice.measured_on, c.choice.reached, c.choice.chart) for c in cells if c.choice] == [
-        ("hand and object", 0.95, key), ("hand and object", 0.92, key), ("all", 0.97, key), ("all", 0.97, key),
-    ]  # fmt: skip
+        ("hand and object", 0.95, key),
+        ("hand and object", 0.92, key),
+        ("all", 0.97, key),
+        ("all", 0.97, key),
+    ]
     plan_all(either)
     jobs = [read_record(JobRecord, either.store, names.job_record(job)) for job in jobs_of(either, "grasps")]
     assert [job.choice for job in jobs] == [cell.choice for cell in cells]

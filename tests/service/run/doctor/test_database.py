@@ -14,11 +14,11 @@ from service.index.index import Index
 from service.index.notes import Damage
 from service.index.rebuild import rebuild
 from service.model import names
-from service.model.finding import Condition, Finding
 from service.model.states import Stage
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
 from service.run.doctor import backends
+from service.run.doctor.checks import Condition, Finding
 from service.settings import Settings
 from service.store.store import open_store
 from tests.fakes import add_assets, request

@@ -14,13 +14,13 @@ from typing import Any
 import pytest
 
 from service.model.clock import timestamp
-from service.model.finding import Condition
 from service.model.states import Lane, Stage
 from service.model.version import PACKAGE_VERSION
 from service.model.workers import WorkerBeat
 from service.pipeline.leading import PART
 from service.queue.rq_queue import WORKERS, RqQueue, worker_key
 from service.run.address import record_address
+from service.run.doctor.checks import Condition
 from service.run.doctor.fleet import clocks, controller, port, workers
 from service.settings import Settings
 from tests.servers import PostgresServer, free_ports

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from service.model.finding import Condition
+from service.run.doctor.checks import Condition
 from service.run.doctor.machine import data_folder, disk, filesystem, limits, versions
 from service.settings import Settings
 

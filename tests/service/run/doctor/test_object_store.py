@@ -10,8 +10,8 @@ import obstore
 import pytest
 from obstore.store import MemoryStore
 
-from service.model.finding import Condition
 from service.run.doctor.backends import judge_store, store
+from service.run.doctor.checks import Condition
 from service.settings import Settings
 from service.store.store import Entry, Store, open_store
 

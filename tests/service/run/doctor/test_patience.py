@@ -5,8 +5,7 @@ from __future__ import annotations
 import threading
 
 from service.model.errors import StoreUnavailable
-from service.model.finding import Condition, Finding, good
-from service.run.doctor.patience import Check, run_checks
+from service.run.doctor.checks import Check, Condition, Finding, good, run_checks
 
 
 def test_findings_come_in_order_and_one_that_hangs_is_bad() -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from redis import Redis
 
-from service.model.finding import Condition
 from service.queue.connection import connect, redis_url
 from service.queue.rq_queue import RqQueue
 from service.run.doctor.backends import persistence, redis
+from service.run.doctor.checks import Condition
 from service.run.embedded import find_server, server_command
 from service.settings import Settings
 from tests.servers import free_ports

@@ -26,8 +26,8 @@ from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.scene_starts import ROOM, free_ways
 from worker.planners.fast_graspd.starts import CLEAR, Probe, start_generator
 from worker.planners.learned.known import keep_file
+from worker.planners.learned.method import RETREATS, Seeds
 from worker.planners.learned.network import Proposals, encode, save
-from worker.planners.learned.seeds import RETREATS, Seeds
 from worker.planners.registry import of_this_machine
 from worker.run import Run
 from worker.scenes.kinds import rest_poses, supports_of

@@ -9,7 +9,7 @@ import trimesh
 from service.model.transforms import apply, quat_from_axis_angle
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
-from worker.planners.learned.sight import ELEVATION, NEAREST_M, Seen
+from worker.planners.learned.method import ELEVATION, NEAREST_M, Seen
 
 POSE = np.concatenate([[0.2, -0.1, 0.05], quat_from_axis_angle(np.array([0.0, 0, 1]), np.asarray(0.7))])
 

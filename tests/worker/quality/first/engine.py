@@ -36,16 +36,26 @@ class Stand:
 
         room = nworld * nconmax
         contact = SimpleNamespace(
-            worldid=wp.zeros(room, dtype=wp.int32), geom=wp.zeros(room, dtype=wp.vec2i),
+            worldid=wp.zeros(room, dtype=wp.int32),
+            geom=wp.zeros(room, dtype=wp.vec2i),
             dist=wp.zeros(room, dtype=wp.float32),
-        )  # fmt: skip
+        )
         return SimpleNamespace(
-            each=[mujoco.MjData(model) for _ in range(nworld)], njmax=njmax, naconmax=room, contact=contact,
-            qpos=zeros(model.nq), qvel=zeros(model.nv), qacc_warmstart=zeros(model.nv), ctrl=zeros(model.nu),
-            mocap_pos=zeros(model.nmocap, dtype=wp.vec3), mocap_quat=zeros(model.nmocap, dtype=wp.quat),
-            xfrc_applied=zeros(model.nbody, dtype=wp.spatial_vector), overflow=zeros(dtype=wp.int32),
-            nacon=wp.zeros(1, dtype=wp.int32), ncollision=wp.zeros(1, dtype=wp.int32),
-        )  # fmt: skip
+            each=[mujoco.MjData(model) for _ in range(nworld)],
+            njmax=njmax,
+            naconmax=room,
+            contact=contact,
+            qpos=zeros(model.nq),
+            qvel=zeros(model.nv),
+            qacc_warmstart=zeros(model.nv),
+            ctrl=zeros(model.nu),
+            mocap_pos=zeros(model.nmocap, dtype=wp.vec3),
+            mocap_quat=zeros(model.nmocap, dtype=wp.quat),
+            xfrc_applied=zeros(model.nbody, dtype=wp.spatial_vector),
+            overflow=zeros(dtype=wp.int32),
+            nacon=wp.zeros(1, dtype=wp.int32),
+            ncollision=wp.zeros(1, dtype=wp.int32),
+        )
 
     _FIELDS = ("qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat", "xfrc_applied")
 

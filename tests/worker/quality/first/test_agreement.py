@@ -11,7 +11,7 @@ from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
 from worker.planners.port import Wanted
 from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.first.worlds import WorldPool
+from worker.quality.referee.first.screening import WorldPool
 from worker.quality.referee.judge import judge
 from worker.quality.referee.model import MujocoOptions, build
 

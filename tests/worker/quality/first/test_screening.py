@@ -18,10 +18,9 @@ from tests.worker.quality.first.engine import Stand
 from tests.worker.quality.first.test_worlds import every_kind
 from tests.worker.quality.test_referee import BOX, PADS, WHOLE
 from worker.certified import scored
-from worker.engines import mujoco_warp
 from worker.grasps import GraspSet
 from worker.meeting import Meeting
-from worker.quality.referee.first import screening, trials, worlds
+from worker.quality.referee.first import screening, trials
 from worker.quality.referee.first.trials import FirstTrials
 from worker.quality.referee.judge import Verdicts, judge
 from worker.quality.referee.key import Level
@@ -35,7 +34,7 @@ ON = Run(first_judge="on", threads=1)
 def stand_in(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stand]:
     """MuJoCo itself as the engine; the pads pass for a hand, which grippers do not."""
     engine = Stand()
-    monkeypatch.setattr(worlds, "mujoco_warp", lambda: engine)
+    monkeypatch.setattr(screening, "mujoco_warp", lambda: engine)
     monkeypatch.setattr(screening, "mujoco_warp_version", lambda: "stand-in 1")
     monkeypatch.setattr(screening, "jaws_of", lambda hand: None)
     monkeypatch.setattr(screening, "AUDIT_ONE_IN", 1 << 62)
@@ -92,7 +91,7 @@ def test_grippers_are_the_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_who_insists_on_it_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     monkeypatch.setattr(screening, "jaws_of", lambda hand: None)
-    monkeypatch.setattr(mujoco_warp, "has_mujoco_warp", lambda: False)
+    monkeypatch.setattr(screening, "has_mujoco_warp", lambda: False)
     with pytest.raises(InputError, match=r"pip install 'graspd\[gpu\]'"):
         verdicts(ON)
 
@@ -105,8 +104,8 @@ def lies(found: FirstTrials) -> FirstTrials:
 def test_a_first_judge_that_the_cpu_contradicts_is_not_believed(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    true = worlds.WorldPool.judge
-    monkeypatch.setattr(worlds.WorldPool, "judge", lambda *some, **more: lies(true(*some, **more)))
+    true = screening.WorldPool.judge
+    monkeypatch.setattr(screening.WorldPool, "judge", lambda *some, **more: lies(true(*some, **more)))
     unaudited = verdicts(ON, "screen")
     assert unaudited.success.all()
     assert unaudited.audited == 0
@@ -126,7 +125,7 @@ def test_where_a_gpu_has_no_memory_for_it_the_cpu_judges(
     def full(*_: Any) -> Any:
         raise RuntimeError("Failed to allocate 4096 bytes on device 'cuda:0'")
 
-    monkeypatch.setattr(worlds, "WorldPool", full)
+    monkeypatch.setattr(screening, "WorldPool", full)
     with caplog.at_level(logging.WARNING):
         found = verdicts(ON)
     assert (found.judged_by == JudgedBy.MUJOCO).all()

@@ -10,9 +10,9 @@ from tests.worker.quality.first.engine import Stand
 from tests.worker.quality.helpers import posture
 from tests.worker.quality.test_referee import BOX, PADS, WHOLE, grasp_of, many_grasps
 from worker.grasps import GraspSet, joined
-from worker.quality.referee.first import worlds
+from worker.quality.referee.first import screening
+from worker.quality.referee.first.screening import ROWS, WorldPool
 from worker.quality.referee.first.trials import FirstTrials
-from worker.quality.referee.first.worlds import ROWS, WorldPool
 from worker.quality.referee.judge import Verdicts, judge
 from worker.quality.referee.model import MujocoOptions, build
 from worker.quality.referee.protocol import Outcome
@@ -29,7 +29,7 @@ def every_kind() -> GraspSet:
 
 
 def pool(monkeypatch: pytest.MonkeyPatch, engine: Stand, size: int) -> WorldPool:
-    monkeypatch.setattr(worlds, "mujoco_warp", lambda: engine)
+    monkeypatch.setattr(screening, "mujoco_warp", lambda: engine)
     return WorldPool(build(PADS, BOX, WHOLE, MujocoOptions()), "cpu", size)
 
 
@@ -82,7 +82,7 @@ def test_grasps_that_need_more_room_are_judged_again_with_it(
 
 
 def test_what_finds_no_room_is_said_and_never_clear(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worlds, "DOUBLINGS", 1)
+    monkeypatch.setattr(screening, "DOUBLINGS", 1)
     found = pool(monkeypatch, Stand(needs_rows=1 << 30), 4).judge(grasp_of())
     assert found.held.all()
     assert found.overflow.all()
@@ -99,10 +99,13 @@ def test_the_band_is_clear_of_neither_side() -> None:
     n, held = 4, [Outcome.HELD] * 6
     lost = [Outcome.DISPLACED] + [Outcome.NOT_TRIED] * 5
     found = FirstTrials(
-        outcome=np.array([held, held, lost, lost], np.uint8), margin=np.array([0.79, 0.81, 1.19, 1.21]),
-        penetration_m=np.zeros(n), self_penetration_m=np.zeros(n), overflow=np.zeros(n, bool),
+        outcome=np.array([held, held, lost, lost], np.uint8),
+        margin=np.array([0.79, 0.81, 1.19, 1.21]),
+        penetration_m=np.zeros(n),
+        self_penetration_m=np.zeros(n),
+        overflow=np.zeros(n, bool),
         ticks=np.zeros(n, np.int32),
-    )  # fmt: skip
+    )
     assert found.clearly_held.tolist() == [True, False, False, False]
     assert found.clearly_failed.tolist() == [False, False, False, True]
 

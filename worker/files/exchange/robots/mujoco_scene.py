@@ -27,7 +27,6 @@ from worker.robots.execution import POSTURES, Executions
 
 #: Of the hand, the object, and all else.
 _COLOURS: Final = ("0.36 0.45 0.58 1", "0.87 0.45 0.2 1", "0.75 0.75 0.72 1")
-
 #: Attributes of MJCF that the specification knows by another name.
 _SPEC_NAMES: Final = {"vertex": "uservert"}
 

@@ -65,11 +65,8 @@ def _placed(pose: Floats | None) -> dict[str, Any]:
 
 
 Colour = tuple[float, float, float]
-
 OBJECT_COLOUR: Final[Colour] = (0.72, 0.2, 0.04)
-
 SUPPORT_COLOUR: Final[Colour] = (0.5, 0.5, 0.47)
-
 #: A half-space is shown as a slab of this width and thickness [m].
 SLAB_M: Final = (1.0, 0.02)
 

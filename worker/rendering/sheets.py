@@ -1,7 +1,5 @@
-"""Pages of pictures: the best grasps with their figures, grasps from three sides, the views of a shard.
-
-Text and colour for pictures that people read.
-"""
+"""Pages of pictures with their text and colours: the best grasps with figures, grasps from three sides, views of a
+shard."""
 
 from __future__ import annotations
 
@@ -18,28 +16,18 @@ from service.model.transforms import Floats
 from worker.rendering.annotate import OBJECT, TABLE
 
 MARGIN: Final = 40
-
 GAP: Final = 18
-
 _HEAD: Final = 74
-
 _CAPTION: Final = 44
-
 _NAME: Final = 22
-
 #: Contact threshold at which a sheet quotes epsilon and contact area [m].
 _QUOTED_THRESHOLD_M: Final = 0.005
-
 _SEGMENT: Final = np.array(
     [[214, 216, 219], [150, 168, 178], [224, 129, 63], [96, 122, 158], [122, 158, 112], [168, 118, 150]], np.uint8
 )
-
 _TIGHT: Final = (0, 214, 190)
-
 _LOOSE: Final = (255, 255, 255)
-
 _BOX_3D: Final = (255, 205, 60)
-
 _EDGES: Final = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
 
 Arrays = Mapping[str, NDArray[np.generic]]
@@ -268,13 +256,9 @@ def _boxes(views: Arrays, view: int) -> Image.Image:
 
 
 PAPER: Final = (250, 250, 249)
-
 INK: Final = (28, 32, 36)
-
 QUIET: Final = (122, 128, 134)
-
 RULE: Final = (222, 224, 226)
-
 ACCENT: Final = (31, 132, 126)
 
 #: Anchors of the depth colours, near to far: even steps of lightness from light to dark, hue from sand to indigo.

@@ -20,18 +20,10 @@ from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.objects.mesh_geometry import corner_normals, from_manifold
 from worker.objects.model import ObjectModel
+from worker.rendering import sheets
 from worker.rendering.cameras import intrinsics
 from worker.rendering.hands import drawn_bodies, hand_looks, hand_solids, without_visuals
-from worker.rendering.pages import sheets
-from worker.rendering.pages.pictures import (
-    FIELD_OF_VIEW,
-    FLOOR,
-    FLOOR_SIZE,
-    OBJECT_LOOK,
-    STUDIO,
-    TOWARD_LAMP,
-    fit_camera,
-)
+from worker.rendering.pictures import FIELD_OF_VIEW, FLOOR, FLOOR_SIZE, OBJECT_LOOK, STUDIO, TOWARD_LAMP, fit_camera
 from worker.rendering.scenery import Box, Look, Shot, Solid
 from worker.rendering.tracer import Tracer
 

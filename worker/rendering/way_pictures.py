@@ -23,7 +23,7 @@ from worker.objects.mesh_geometry import to_centre
 from worker.objects.model import ObjectModel
 from worker.rendering.cameras import intrinsics, look_at
 from worker.rendering.hands import drawn_bodies, drawn_parts, drawn_poses
-from worker.rendering.pages.pictures import (
+from worker.rendering.pictures import (
     FIELD_OF_VIEW,
     FLOOR,
     FLOOR_SIZE,
@@ -42,32 +42,21 @@ from worker.scenes.neighbours import Neighbours
 
 #: Postures that a strip shows; those that a grasp has.
 STRIP: Final = ("standoff", "pregrasp", "grasp", "lift")
-
 FREE_STRIP: Final = ("pregrasp", "grasp", "squeeze")
-
 #: Sides that are tried: so many around, at these heights above the horizon [rad].
 _AROUND: Final = 16
-
 _HEIGHTS: Final = tuple(np.radians([20.0, 35.0, 52.0]).tolist())
-
 #: Two sides of one grasp are this far apart at least [rad], if they can be.
 _APART: Final = np.radians(50.0)
-
 #: Edge of the pictures that sides are judged by [px].
 _GLANCE: Final = 48
-
 #: Towards the lamp where a board is above the object: from before it, as high as a room's window.
 _UNDER_A_BOARD: Final = np.array([0.85, -0.42, 0.32]) / np.linalg.norm([0.85, -0.42, 0.32])
-
 #: Hand parts farther than this from the object do not draw the camera back [m].
 _NEAR_M: Final = 0.14
-
 _HIGH_M: Final = 3.0
-
 _TABLE: Final = Look(hexadecimal("#b9bfc2"), roughness=0.85)
-
 _WALL: Final = Look(hexadecimal("#7f97a5"), roughness=0.8)
-
 _BESIDE: Final = Look(hexadecimal("#8d86a3"), roughness=0.6)
 
 
@@ -243,7 +232,6 @@ KINDS: Final[dict[str, dict[str, Any]]] = {
     ".webp": {"format": "WEBP", "quality": 82, "method": 4},
     ".png": {"format": "PNG", "default_image": False},
 }
-
 #: Pictures whose colours make the palette of a GIF.
 _PALETTE_OF: Final = 9
 

@@ -1,4 +1,5 @@
-"""Checks run side by side, each with a limit of time: one part that hangs must not hide how the others stand."""
+"""Checks of an installation: findings with their fixes, run side by side, each with a limit of time: one part that
+hangs must not hide how the others stand."""
 
 from __future__ import annotations
 
@@ -6,13 +7,41 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Final
 
 from service.model.errors import GraspdError
-from service.model.finding import Finding, bad
 
 #: How the names of the threads of checks begin.
 THREADS: Final = "doctor-"
+
+
+class Condition(StrEnum):
+    """How a thing stands."""
+
+    GOOD = "good"
+    WARNING = "warning"
+    """It works, and will cost something."""
+    BAD = "bad"
+    """Something does not work, or will lose what it should keep."""
+    SKIPPED = "skipped"
+    """It was not looked at; the message says why."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found about one thing."""
+
+    name: str
+    condition: Condition
+    message: str
+    mend: str = ""
+    """What to do; "" where nothing is to be done."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing has to be mended."""
+        return self.condition is not Condition.BAD
 
 
 @dataclass(frozen=True)
@@ -56,3 +85,19 @@ class _Run:
         except Exception as error:
             line = " ".join(f"{type(error).__name__}: {error}".split())[:300]
             self._finding = bad(self.check.name, f"the check itself broke off: {line}", "tell the authors of graspd")
+
+
+def good(name: str, message: str) -> Finding:
+    return Finding(name, Condition.GOOD, message)
+
+
+def warning(name: str, message: str, mend: str) -> Finding:
+    return Finding(name, Condition.WARNING, message, mend)
+
+
+def bad(name: str, message: str, mend: str) -> Finding:
+    return Finding(name, Condition.BAD, message, mend)
+
+
+def skipped(name: str, why: str) -> Finding:
+    return Finding(name, Condition.SKIPPED, why)

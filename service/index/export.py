@@ -1,0 +1,58 @@
+"""Tables of the index as Parquet files, for DuckDB, pandas and whatever else reads them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from sqlalchemy import JSON, BigInteger, Boolean, Column, Connection, Float, Integer, Table, select
+
+from service.index.database import Database
+from service.index.tables import assets, attempts, dataset_cells, datasets, grasps, jobs, shards, spent, tasks
+from service.parquet import schema_of, write
+
+#: What is exported. The rest is of the moment (workers, notes) or for the service alone.
+TABLES: Final[Mapping[str, Table]] = {
+    table.name: table for table in (grasps, shards, jobs, tasks, attempts, assets, datasets, dataset_cells, spent)
+}
+#: Rows of a row group, which is what one file has in memory.
+GROUP: Final = 20_000
+
+
+def export(database: Database, folder: Path) -> dict[str, int]:
+    """Write each of `TABLES` as `folder/NAME.parquet`, all as they were at one moment; what is there is replaced.
+
+    Whole numbers are int64, numbers float64, JSON is text; rows are in the order of their primary key.
+
+    Returns:
+        rows of each table.
+
+    Raises:
+        InputError: pyarrow is not installed.
+        IndexUnavailable: the database does not answer.
+    """
+    # Before the database is asked: whoever lacks the package is told at once.
+    schemas = {name: schema_of({c.name: _word(c) for c in table.columns}) for name, table in TABLES.items()}
+    with database.reading() as connection:
+        return {
+            name: write(folder / f"{name}.parquet", schemas[name], _groups(connection, table))
+            for name, table in TABLES.items()
+        }
+
+
+def _groups(connection: Connection, table: Table) -> Iterator[list[dict[str, Any]]]:
+    documents = [column.name for column in table.columns if isinstance(column.type, JSON)]
+    query = select(table).order_by(*table.primary_key.columns).execution_options(yield_per=GROUP)
+    for part in connection.execute(query).mappings().partitions():
+        rows = [dict(row) for row in part]
+        for row in rows:
+            row.update({name: json.dumps(row[name]) for name in documents if row[name] is not None})
+        yield rows
+
+
+def _word(column: Column[Any]) -> str:
+    """The type of a column in the words of `service.parquet.type_of`."""
+    kinds = {BigInteger: "int64", Integer: "int64", Float: "float64", Boolean: "bool_"}
+    return next((word for kind, word in kinds.items() if isinstance(column.type, kind)), "text")

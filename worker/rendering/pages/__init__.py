@@ -1,1 +1,0 @@
-"""Pictures for people: grasps, portraits, and the sheets that show them."""
