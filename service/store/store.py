@@ -1,7 +1,6 @@
 """The object store: create-only puts of immutable objects, on a local folder, S3, Google Cloud, Azure, or memory.
 
 Only what every back end offers is used: put if absent, get, range, list, delete; no overwrite, no compare-and-swap.
-What reads takes the name of a part of an object (`service.store.parts`) where it takes a key.
 """
 
 from __future__ import annotations

@@ -54,8 +54,8 @@ def test_a_task_is_in_the_trace_of_the_request_that_submitted_it(
 
 def test_without_an_endpoint_nothing_of_the_sdk_is_imported() -> None:
     code = (
-        "import sys; from service import tracing; tracing.set_up('api')\n"
-        "with tracing.span('x'): assert tracing.traceparent() == ''\n"
+        "import sys; from service import telemetry; telemetry.set_up_tracing('api')\n"
+        "with telemetry.span('x'): assert telemetry.traceparent() == ''\n"
         "assert not [name for name in sys.modules if name.startswith('opentelemetry')]"
     )
     environment = {"PATH": "/usr/bin:/bin"}

@@ -20,9 +20,9 @@ print(wp.config.kernel_cache_dir)
 """
 LOAD = START + f"wp.load_module(importlib.import_module({MODULE!r}), device='cpu')"
 BAKE = f"""
-from worker.engines import backend, baked
+from worker.engines import backend
 backend.start()
-baked.bake([{MODULE!r}], architectures=[90])
+backend.bake([{MODULE!r}], architectures=[90])
 """
 
 
