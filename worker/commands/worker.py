@@ -86,7 +86,7 @@ def run_workers(
     *,
     program: Sequence[str] = (sys.executable, "-m", "graspd"),
 ) -> None:
-    """Keep `count` processes alive until told to stop; number k of them takes the k-th GPU, see `worker.engines.devices.take`.
+    """Keep `count` processes alive until told to stop; number k of them takes the k-th GPU (`worker.engines.devices`).
 
     Args:
         arguments: command line of each; their settings come from the environment as well.
