@@ -107,7 +107,7 @@ class Prices:
     thousand_writes: float = 0.005
     thousand_reads: float = 0.0004
     service_hour: float = 0.25
-    """Redis, database, two front doors and controller, while the dataset is made."""
+    """Redis, database, two APIs and controller, while the dataset is made."""
 
 
 @dataclass(frozen=True)

@@ -103,30 +103,30 @@ def __dir__() -> list[str]:
     return __all__
 
 
-#: The packages that graspd is made of, besides its front door.
-_ROOMS: Final = ("service", "worker", "api")
+#: The packages that graspd is made of, besides this one.
+_PACKAGES: Final = ("service", "worker", "api")
 
 
-def _check_rooms() -> None:
+def _check_packages() -> None:
     """ImportError, in one line that names the folder, if a package of the user stands in the place of one of graspd's.
 
-    Nothing is imported. A room that is not there at all is told when it is needed.
+    Nothing is imported. A package that is not there at all is told when it is needed.
     """
     home = Path(__file__).resolve().parent.parent
-    for room in _ROOMS:
-        if not (home / room).is_dir():
+    for package in _PACKAGES:
+        if not (home / package).is_dir():
             continue
-        spec = find_spec(room)
-        if spec is None or spec.origin == str(home / room / "__init__.py"):
+        spec = find_spec(package)
+        if spec is None or spec.origin == str(home / package / "__init__.py"):
             continue
         places = [spec.origin] if spec.origin else list(spec.submodule_search_locations or [])
         found = Path(places[0]) if places else home
         if found.name == "__init__.py":
             found = found.parent
-        if found.resolve() != home / room:
+        if found.resolve() != home / package:
             raise ImportError(
-                f"graspd: {found} hides graspd's own package {room!r}; rename it, or start Python in another folder"
+                f"graspd: {found} hides graspd's own package {package!r}; rename it, or start Python in another folder"
             )
 
 
-_check_rooms()
+_check_packages()

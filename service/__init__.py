@@ -1,1 +1,1 @@
-"""What the front door and the engine room share: settings, domain model, queue, object store, index, pipeline."""
+"""What the API and the engine share: settings, domain model, queue, object store, index, pipeline."""

@@ -1,4 +1,4 @@
-"""What the commands of all rooms share: one-line errors with exit codes, JSON on the last line, logs."""
+"""What the commands of all packages share: one-line errors with exit codes, JSON on the last line, logs."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ class Origin(Model):
     key: str = Field("", max_length=64, description="name of the API key")
     traceparent: str = Field("", max_length=64, description="W3C trace context")
 
-    # A newer front door may say more.
+    # A newer API may say more.
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 

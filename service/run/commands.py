@@ -48,7 +48,7 @@ def up(
     json: JsonFlag = False,
 ) -> None:
     """The whole service on this machine, until Ctrl-C."""
-    _check_rooms(workers)
+    _check_extras(workers)
     from service.run.address import joining
     from service.run.supervisor import Supervisor
 
@@ -219,8 +219,8 @@ def path(data_dir: DataDir = None) -> None:
     typer.echo(without_secrets(url.render_as_string(hide_password=True)))
 
 
-def _check_rooms(workers: int) -> None:
-    """UnavailableError if a room that the children are of is not installed."""
+def _check_extras(workers: int) -> None:
+    """UnavailableError if libraries that the children need are not installed."""
     needed = ("httpx", "fastapi", "warp") if workers else ("httpx", "fastapi")
     if any(find_spec(library) is None for library in needed):
         raise UnavailableError("`graspd up` is not part of this install; run pip install 'graspd[all]'")

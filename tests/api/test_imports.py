@@ -1,4 +1,4 @@
-"""The front door is light: it pulls in no engine."""
+"""The API is light: it loads no engine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The socket of the front door."""
+"""The socket of the API."""
 
 from __future__ import annotations
 

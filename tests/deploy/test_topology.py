@@ -26,7 +26,7 @@ _READY_S = 120.0
 
 @dataclass
 class Topology:
-    """Two front doors, a controller and two workers without an engine."""
+    """Two APIs, a controller and two workers without an engine."""
 
     folder: Path
     variables: dict[str, str]

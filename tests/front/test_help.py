@@ -13,7 +13,7 @@ import graspd.cli
 
 
 def commands(command: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """A command and all below it, those of other rooms loaded."""
+    """A command and all below it, those of other packages loaded."""
     if isinstance(command, graspd.cli.Deferred):
         command = graspd.cli.load(command.module, path.rpartition(" ")[2])
     yield path, command

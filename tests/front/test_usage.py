@@ -76,7 +76,7 @@ def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
         ("datasets card --li", "--licence"),
     ],
 )
-def test_completion_knows_commands_of_rooms_without_the_engine(typed: str, offered: str) -> None:
+def test_completion_knows_commands_without_the_engine(typed: str, offered: str) -> None:
     code = "try: main()\nfinally: print('warp' in sys.modules, file=sys.stderr)"
     words = f"graspd {typed}"
     done = python(code, _GRASPD_COMPLETE="complete_bash", COMP_WORDS=words, COMP_CWORD=str(words.count(" ")))

@@ -1,4 +1,4 @@
-"""ARCHITECTURE.md is true: its fault table names tests that exist, its floors are kept, its files are there."""
+"""ARCHITECTURE.md is true: its fault table names tests that exist, its layers are kept, its files are there."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def rows_of(heading: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in table]
 
 
-@pytest.mark.parametrize("room", ["api", "worker", "service"])
-def test_the_floors_are_those_that_the_contracts_keep(room: str) -> None:
+@pytest.mark.parametrize("package", ["api", "worker", "service"])
+def test_the_floors_are_those_that_the_contracts_keep(package: str) -> None:
     contracts = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
-    (kept,) = [c["layers"] for c in contracts if c["type"] == "layers" and c["containers"] == [room]]
-    floors = [set(re.findall(r"`(\w+)`", first)) for first, _ in rows_of(f"floor of `{room}/` | what it is")]
-    assert floors == [set(re.findall(r"\w+", layer)) for layer in kept]
+    (kept,) = [c["layers"] for c in contracts if c["type"] == "layers" and c["containers"] == [package]]
+    layers = [set(re.findall(r"`(\w+)`", first)) for first, _ in rows_of(f"layer of `{package}/` | what it is")]
+    assert layers == [set(re.findall(r"\w+", layer)) for layer in kept]
 
 
 def test_the_files_to_open_for_a_change_are_there_and_as_many_as_it_says() -> None:

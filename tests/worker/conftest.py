@@ -1,4 +1,4 @@
-"""What tests of the engine room share with those of the service."""
+"""What tests of the engine share with those of the service."""
 
 from tests.service.conftest import redis_server, rq_queue
 

@@ -1,1 +1,1 @@
-"""The commands of the engine room, one module each."""
+"""The commands of the engine, one module each."""

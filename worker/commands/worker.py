@@ -1,4 +1,4 @@
-"""Commands of the engine room."""
+"""Commands of workers."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ class TaskContext:
         """`join` is how many batches one launch plans; `tell` takes done, total and a message."""
         self.store, self.device, self.join = store, run.device, join
         self.run = replace(run, progress=self.progress, cancelled=self.cancelled)
-        """What the engine room needs to know of the task."""
+        """What the engine needs to know of the task."""
         self._tell = tell
         self._tell_again = 0.0
         self._stop = threading.Event()

@@ -172,7 +172,7 @@ def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cp
 
         found = check_hand(files, name)
     elif AssetKind(kind) is AssetKind.NETWORK:
-        # The front door checks networks; this one's finding was lost or damaged.
+        # The API checks networks; this one's finding was lost or damaged.
         found = check_network(files, name)
     else:
         from worker.objects.check import check_object

@@ -79,8 +79,8 @@ def test_what_cannot_be_read_is_no_limit(tmp_path: Path, text: str) -> None:
 
 def test_no_other_count_of_cores_is_asked_for() -> None:
     here = Path(__file__).parents[3]
-    rooms = ("api", "service", "worker", "benchmarks", "examples")
-    files = [file for room in rooms for file in (here / room).rglob("*.py")] + list(here.glob("*.py"))
+    packages = ("api", "service", "worker", "benchmarks", "examples")
+    files = [file for package in packages for file in (here / package).rglob("*.py")] + list(here.glob("*.py"))
     asking = [
         str(file.relative_to(here))
         for file in files
