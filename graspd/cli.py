@@ -1,4 +1,4 @@
-"""The command line: mounts the command groups of the three rooms and imports each only when it is used."""
+"""The command line: mounts the command groups of the three packages and imports each only when it is used."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("datasets", "card", "worker.commands.exchange", "Write a dataset's card: contents, quality, biases, plots."),
 )
 
-#: What a room cannot work without, and the extra that brings it: an image has only the rooms it needs.
+#: What a package cannot work without, and the extra that brings it: an image has only the packages it needs.
 ROOMS: Final[dict[str, tuple[str, str]]] = {
     "api": ("fastapi", "api"),
     "worker": ("warp", "worker"),
@@ -86,7 +86,7 @@ UsageError: Final[Any] = typer.BadParameter.__base__
 
 
 class LazyGroup(TyperGroup):
-    """A group whose overview needs no import: a command's room is imported when the command is called."""
+    """A group whose overview needs no import: a command's package is imported when the command is called."""
 
     def main(self, *args: Any, **extra: Any) -> Any:
         """Run it; what cannot be understood is one line and exit code 2, as any other mistake of a caller."""
@@ -108,14 +108,14 @@ class LazyGroup(TyperGroup):
         if module is None or name is None or (ctx.resilient_parsing and missing_extra(module)):
             return name, command, rest
         # A worker's image has no API, but checks hands and objects.
-        room = next((room for parent, child, room, _ in JOINED if [parent, child] == [name, *rest[:1]]), None)
-        if room and missing_extra(module):
-            return f"{name} {rest[0]}", load(room, rest[0], ctx), rest[1:]
+        package = next((package for parent, child, package, _ in JOINED if [parent, child] == [name, *rest[:1]]), None)
+        if package and missing_extra(module):
+            return f"{name} {rest[0]}", load(package, rest[0], ctx), rest[1:]
         return name, load(module, name, ctx), rest
 
 
 class Deferred(TyperCommand):
-    """Stands for a command of another room in a group; that room is imported when the command is called."""
+    """Stands for a command of another package in a group; that package is imported when the command is called."""
 
     def __init__(self, name: str, module: str, help: str) -> None:
         super().__init__(name, help=help)
@@ -129,7 +129,7 @@ class Deferred(TyperCommand):
 
 
 def load(module: str, name: str, ctx: Any = None) -> Any:
-    """The command of a room, imported now; one line and exit code 1 where that room is not installed."""
+    """The command of a package, imported now; one line and exit code 1 where that package is not installed."""
     if missing := missing_extra(module):
         path = f"{ctx.command_path} {name}" if ctx else f"graspd {name}"
         typer.echo(f"graspd: `{path}` is not part of this install; run pip install 'graspd[{missing}]'", err=True)
@@ -139,9 +139,9 @@ def load(module: str, name: str, ctx: Any = None) -> Any:
     # A Typer with a single command is that command itself, not a group.
     command: Any = group.get_command(ctx, name) if isinstance(group, TyperGroup) else group
     if isinstance(command, TyperGroup):
-        for parent, child, room, text in JOINED:
+        for parent, child, package, text in JOINED:
             if parent == name:
-                command.add_command(Deferred(child, room, text))
+                command.add_command(Deferred(child, package, text))
     # A Typer of one command offers completion of its own, which would install that of `graspd`.
     command.params = [one for one in command.params if not str(one.name).endswith("_completion")]
     escape_help(command)

@@ -71,7 +71,7 @@ def _end(code: int) -> None:
 
 
 def all_checks(settings: Settings, *, full: bool = False) -> list[Check]:
-    """The checks of all rooms; those of a room that is not installed say so."""
+    """The checks of all packages; those of a package that is not installed say so."""
     return [*checks_of(settings, full=full), *_of_api(settings), *_of_worker(settings)]
 
 
