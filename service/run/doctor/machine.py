@@ -54,7 +54,7 @@ _NETWORK: Final = {
     "fuse.ceph-fuse",
 }
 #: Extras whose libraries the running service imports; the others are tools.
-_ROOMS: Final = ("api", "worker", "embedded", "postgres", "otel", "usd", "arm", "view")
+_EXTRAS: Final = ("api", "worker", "embedded", "postgres", "otel", "usd", "arm", "view")
 
 
 def local_store(settings: Settings) -> Path | None:
@@ -183,7 +183,7 @@ def versions(requirements: Iterable[str] | None = None) -> Finding:
 def _unmet(text: str) -> str:
     """What is wanted and found, where a requirement is not met; an extra that nobody installed is no fault."""
     wanted = Requirement(text)
-    extra = next((room for room in _ROOMS if wanted.marker and wanted.marker.evaluate({"extra": room})), "")
+    extra = next((extra for extra in _EXTRAS if wanted.marker and wanted.marker.evaluate({"extra": extra})), "")
     if wanted.marker and not extra and not wanted.marker.evaluate({"extra": ""}):
         return ""
     if wanted.name == "graspd":
