@@ -49,7 +49,7 @@ screenshots: $(STAMP) ## the dashboard's pages of a real service, for docs/how-t
 	$(BIN)/python -m tests.browser.screenshots
 
 docs: $(STAMP) ## rewrite the tables in the docs that follow from the code
-	$(BIN)/python -m service.docs
+	$(BIN)/python -m graspd.service.docs
 	$(BIN)/python -m benchmarks.results --pages
 
 docs-site: $(STAMP) ## the documentation as a site in build/site, with search; warnings are errors

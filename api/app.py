@@ -11,27 +11,27 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from fastapi.staticfiles import StaticFiles
 
-from api import problems
-from api.access.auth import Proxy
-from api.access.keys import KeyFile
-from api.dashboard import pages
-from api.dashboard.rendering import STATIC, problem_page
-from api.formatting import host_name, is_loopback
-from api.metrics import Metrics
-from api.middleware.body_limit import BodyLimit
-from api.middleware.rate_limit import RateLimit, Rates
-from api.middleware.request_context import Head, RequestContext, RootPath, SameOrigin
-from api.routes import assets, datasets, grasps, jobs, shards, system, webhooks
-from api.routes.assets import asset_router
-from api.routes.dependencies import EXPORTS, FORMS, UPLOADS, Turns, provide
-from service.index.rebuild import complete_if_new
-from service.model.errors import InputError, UnavailableError
-from service.model.states import AssetKind
-from service.model.version import PACKAGE_VERSION
-from service.pipeline.backends import Services
-from service.pipeline.identity import identify_if_redis_answers
-from service.queue.connection import redis_url
-from service.settings import Settings
+from graspd.api import problems
+from graspd.api.access.auth import Proxy
+from graspd.api.access.keys import KeyFile
+from graspd.api.dashboard import pages
+from graspd.api.dashboard.rendering import STATIC, problem_page
+from graspd.api.formatting import host_name, is_loopback
+from graspd.api.metrics import Metrics
+from graspd.api.middleware.body_limit import BodyLimit
+from graspd.api.middleware.rate_limit import RateLimit, Rates
+from graspd.api.middleware.request_context import Head, RequestContext, RootPath, SameOrigin
+from graspd.api.routes import assets, datasets, grasps, jobs, shards, system, webhooks
+from graspd.api.routes.assets import asset_router
+from graspd.api.routes.dependencies import EXPORTS, FORMS, UPLOADS, Turns, provide
+from graspd.service.index.rebuild import complete_if_new
+from graspd.service.model.errors import InputError, UnavailableError
+from graspd.service.model.states import AssetKind
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.identity import identify_if_redis_answers
+from graspd.service.queue.connection import redis_url
+from graspd.service.settings import Settings
 
 _log = logging.getLogger("graspd.api")
 #: Those of all documents but of assets and datasets, in the order of the OpenAPI document.

@@ -9,9 +9,9 @@ from typing import Any, Final
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 
-from service.index.queries.overview import IndexNow
-from service.pipeline.metrics import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S, parse_field
-from service.queue.port import QueueNow
+from graspd.service.index.queries.overview import IndexNow
+from graspd.service.pipeline.metrics import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S, parse_field
+from graspd.service.queue.port import QueueNow
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from service.index.views import AttemptView, GraspView, Judged, ShardView, StageProgress, TagView, WorkerView
-from service.model.base import TagName
-from service.model.domain import Digest, JobRequest
-from service.model.metric_fields import OfferedName, filters, means, with_fields
-from service.model.metrics import AXIS_WORDS, DIRECTION_CELLS
-from service.model.records import Choice
-from service.model.scene_spec import Box, HalfSpace, SceneKind
-from service.model.states import Stage, State
-from service.model.where import LONGEST
+from graspd.service.index.views import AttemptView, GraspView, Judged, ShardView, StageProgress, TagView, WorkerView
+from graspd.service.model.base import TagName
+from graspd.service.model.domain import Digest, JobRequest
+from graspd.service.model.metric_fields import OfferedName, filters, means, with_fields
+from graspd.service.model.metrics import AXIS_WORDS, DIRECTION_CELLS
+from graspd.service.model.records import Choice
+from graspd.service.model.scene_spec import Box, HalfSpace, SceneKind
+from graspd.service.model.states import Stage, State
+from graspd.service.model.where import LONGEST
 
 
 class StageStatus(StageProgress):

@@ -15,8 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
 from starlette.routing import Match
 
-from service.model.base import words
-from service.model.errors import GraspdError, InputError, RateError, StoreUnavailable
+from graspd.service.model.base import words
+from graspd.service.model.errors import GraspdError, InputError, RateError, StoreUnavailable
 
 MEDIA_TYPE: Final = "application/problem+json"
 RETRY_AFTER_S: Final = 2

@@ -20,9 +20,9 @@ import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 
-from api.app import create_app
-from service.model.errors import BusyError, InputError
-from service.settings import Settings
+from graspd.api.app import create_app
+from graspd.service.model.errors import BusyError, InputError
+from graspd.service.settings import Settings
 
 #: Open event streams end with their clients; a stop does not wait longer than this.
 _GRACE_S = 3

@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
-from service import telemetry
-from service.cli import keep_private, load_settings, log_to_stderr, reporting_errors
-from service.model.libraries import imports
+from graspd.service import telemetry
+from graspd.service.cli import keep_private, load_settings, log_to_stderr, reporting_errors
+from graspd.service.model.libraries import imports
 
 app = typer.Typer(add_completion=False)
 
@@ -21,7 +21,7 @@ def api(
 ) -> None:
     """Run the HTTP API and the dashboard."""
     with imports():
-        from api.server import serve
+        from graspd.api.server import serve
 
     settings = load_settings(host=host, port=port)
     log_to_stderr(settings, "api")

@@ -10,13 +10,13 @@ from collections.abc import Mapping, MutableMapping
 from pathlib import PurePosixPath
 from typing import IO, Final
 
-from service.model.errors import InputError, LimitError
-from service.model.names import refuse_long
-from service.model.states import AssetKind
-from service.store.assets import UNPACK_FACTOR, ZipFiles, asset_json, check_path
-from service.store.descriptions import json_object
-from service.store.hand_files import SUFFIXES, hand_name, main_of
-from service.store.network_file import NETWORK_FILE, check_size
+from graspd.service.model.errors import InputError, LimitError
+from graspd.service.model.names import refuse_long
+from graspd.service.model.states import AssetKind
+from graspd.service.store.assets import UNPACK_FACTOR, ZipFiles, asset_json, check_path
+from graspd.service.store.descriptions import json_object
+from graspd.service.store.hand_files import SUFFIXES, hand_name, main_of
+from graspd.service.store.network_file import NETWORK_FILE, check_size
 
 MAIN_SUFFIXES: Final[dict[AssetKind, tuple[str, ...]]] = {
     AssetKind.HAND: SUFFIXES,

@@ -19,20 +19,20 @@ from typing import Any
 
 import numpy as np
 
-from service.model.fidelity import FIDELITIES
-from service.model.version import STAGE_REVISIONS
-from worker.grasps import GraspSet, Posture
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
-from worker.planners.port import Wanted
-from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.judge import judge
-from worker.quality.referee.key import Level
-from worker.run import ALONE
-from worker.scenes.trial import trial_on
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.version import STAGE_REVISIONS
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import synthesize
+from graspd.worker.planners.port import Wanted
+from graspd.worker.run import ALONE
+from graspd.worker.scenes.trial import trial_on
+from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.key import Level
+from graspd.worker.validation.validator import judge
 
 HANDS = {
     "allegro": "allegro/allegro_hand_right.urdf",

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cells import cell_parser, cells, write_json
-from worker.quality.intervals import wilson
+from graspd.worker.quality.intervals import wilson
 
 CORES = 2
 LEVELS = ("letter", "certificate", "screen")

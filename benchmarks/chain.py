@@ -29,16 +29,16 @@ CHILD: Final = """
 import json, sys, time
 from dataclasses import replace
 import numpy as np
-from service.model.domain import JobOptions
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.planners import Run, Wanted
-from worker.planners.fast_graspd import planner
-from worker.quality.postures import pregrasp, squeeze
-from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.displacement import simulated_displacement_cm
-from worker.quality.referee.judge import judge
-from worker.quality.table import measure
+from graspd.service.model.domain import JobOptions
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import Run, Wanted
+from graspd.worker.planners.fast_graspd import planner
+from graspd.worker.control.postures import pregrasp, squeeze
+from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.displacement import simulated_displacement_cm
+from graspd.worker.validation.validator import judge
+from graspd.worker.quality.table import measure
 
 path, name, count, seed = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
 fidelity, run, spent = JobOptions(fidelity="standard").knobs, Run(threads=1), {}

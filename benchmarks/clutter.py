@@ -21,17 +21,17 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cells import HANDS
-from service.model.domain import BATCH_SIZE, JobOptions
-from service.model.errors import MeshError
-from service.model.fidelity import FIDELITIES
-from service.model.scene_spec import SceneSpec
-from worker.certified import certified_grasps
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import object_from_path
-from worker.run import Run
-from worker.scenes.beside import gaps_between, neighbour_of, scenes_of
+from graspd.service.model.domain import BATCH_SIZE, JobOptions
+from graspd.service.model.errors import MeshError
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.worker.certified import certified_grasps
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.run import Run
+from graspd.worker.scenes.beside import gaps_between, neighbour_of, scenes_of
 
 #: Not a seed that any setting was chosen with.
 SEED = 505

@@ -35,10 +35,10 @@ def lap(name):
     global last
     now = time.process_time()
     laps[name], last = now - last, now
-import worker.certified
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from service.model.domain import JobRequest
+import graspd.worker.certified
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.service.model.domain import JobRequest
 lap("imports")
 hand = hand_from_path(sys.argv[1])
 request = JobRequest(hand="h", object="o", grasps=1, fidelity="standard", seed=3)

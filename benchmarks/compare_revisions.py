@@ -46,8 +46,8 @@ _SHOWN: Final = 12
 DOCUMENT: Final = """
 import json, sys
 from pathlib import Path
-from api.app import create_app
-from service.settings import Settings
+from graspd.api.app import create_app
+from graspd.service.settings import Settings
 print(json.dumps(create_app(Settings(data_dir=Path(sys.argv[1]), host="127.0.0.1")).openapi()))
 """
 HELP: Final = """

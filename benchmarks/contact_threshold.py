@@ -19,8 +19,8 @@ from matplotlib.lines import Line2D
 
 from benchmarks.cells import Cell, cell_parser, cells, write_json
 from benchmarks.results_tables import PAPER, TOP, metrics
-from worker.grasps import GraspSet, Posture
-from worker.quality.table import measure
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.quality.table import measure
 
 THRESHOLDS_MM = tuple(range(1, 11))
 FRICTIONS = (1.0, 0.5)

@@ -18,10 +18,10 @@ from typing import Any, Final
 import trimesh
 
 from benchmarks.cells import HANDS
-from service.model.domain import JobOptions
-from service.model.errors import InputError
-from service.model.scene_spec import Box, HalfSpace, NeighbourSpec, SceneSpec
-from worker.files.synthesis import synthesized
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import InputError
+from graspd.service.model.scene_spec import Box, HalfSpace, NeighbourSpec, SceneSpec
+from graspd.worker.files.synthesis import synthesized
 
 #: Not a seed that any setting was chosen with.
 SEED = 1400

@@ -24,12 +24,12 @@ from typing import Any
 import httpx
 import uvicorn
 
-from api.app import create_app
-from api.server import bind
-from service.index.index import Index
-from service.pipeline.backends import Services
-from service.settings import Settings
-from service.store.store import open_store
+from graspd.api.app import create_app
+from graspd.api.server import bind
+from graspd.service.index.index import Index
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
 from tests.memory_queue import MemoryQueue
 
 _CHROMIUM = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic")

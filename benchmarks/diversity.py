@@ -12,9 +12,9 @@ from collections import Counter
 import numpy as np
 
 from benchmarks.cells import Cell, cell_parser, cells
-from service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits
-from worker.quality.diversity import distances, hand_points
-from worker.quality.table import measure
+from graspd.service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits
+from graspd.worker.quality.diversity import distances, hand_points
+from graspd.worker.quality.table import measure
 
 NEAR_MM = (5, 10, 20)
 

@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from benchmarks.cells import SEED, Cell, cell_parser, cells, write_json
-from service.model.version import STAGE_REVISIONS
-from worker.hands.oppositions import oppositions_of
-from worker.quality.contact import contact_distance_consistency_mm
-from worker.quality.postures import hold_forces
-from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
-from worker.quality.referee.judge import judge
-from worker.quality.table import measure
-from worker.rendering.pictures import grasp_pictures
-from worker.rendering.sheets import contact_sheet
+from graspd.service.model.version import STAGE_REVISIONS
+from graspd.worker.control.postures import hold_forces
+from graspd.worker.hands.oppositions import oppositions_of
+from graspd.worker.quality.contact import contact_distance_consistency_mm
+from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
+from graspd.worker.quality.table import measure
+from graspd.worker.rendering.pictures import grasp_pictures
+from graspd.worker.rendering.sheets import contact_sheet
+from graspd.worker.validation.validator import judge
 
 #: Objects of a hand that are shown, and failures of each beside one that holds.
 WORST, SHOWN = 3, 3

@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cells import Cell, cell_parser, cells, write_json
-from worker.engines.devices import Device, cpu_name
-from worker.grasps import GraspSet, Posture
-from worker.quality.intervals import wilson
-from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.first.screening import WorldPool, mujoco_warp
-from worker.quality.referee.first.trials import FirstTrials
-from worker.quality.referee.model import MujocoOptions, build
+from graspd.worker.engines.devices import Device, cpu_name
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.quality.intervals import wilson
+from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.model import MujocoOptions, build
+from graspd.worker.validation.prefilter.phases import FirstTrials
+from graspd.worker.validation.prefilter.prefilter import WorldPool, mujoco_warp
 
 OBJECTS = ("005_tomato_soup_can", "025_mug", "011_banana", "035_power_drill")
 #: Largest shift of a grasp that is judged again for its time [m].

@@ -18,10 +18,10 @@ import numpy as np
 import trimesh
 
 from benchmarks.cells import HANDS
-from service.model.domain import JobOptions
-from service.model.scene_spec import parse_scene
-from service.store.shards import write_shard
-from worker.files.synthesis import synthesized
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.scene_spec import parse_scene
+from graspd.service.store.shards import write_shard
+from graspd.worker.files.synthesis import synthesized
 
 #: Not a seed that any setting was chosen with.
 SEED = 1300

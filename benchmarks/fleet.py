@@ -30,16 +30,16 @@ from typing import Any, Final
 from sqlalchemy import func, select
 
 from benchmarks.service_load import cpu_s, say
-from service.index.tables import tasks
-from service.model import names
-from service.model.states import Lane, Stage, State
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.leading import PART
-from service.queue.lists import held_key, queue_name
-from service.queue.rq_queue import EVENTS, RqQueue
-from service.run.embedded import server_command
-from service.settings import Settings
+from graspd.service.index.tables import tasks
+from graspd.service.model import names
+from graspd.service.model.states import Lane, Stage, State
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.leading import PART
+from graspd.service.queue.lists import held_key, queue_name
+from graspd.service.queue.rq_queue import EVENTS, RqQueue
+from graspd.service.run.embedded import server_command
+from graspd.service.settings import Settings
 from tests.fakes import add_assets, request
 from tests.servers import PostgresServer, S3Server
 

@@ -25,20 +25,20 @@ from typing import Any, Final
 
 from rq.defaults import DEFAULT_WORKER_TTL as LEASE_KEPT_S
 
-from service.model import names
-from service.model.clock import timestamp
-from service.model.messages import TaskMessage
-from service.model.states import Lane, Stage
-from service.model.version import PACKAGE_VERSION
-from service.model.workers import own_ability
-from service.queue.lists import execution_keys, held_key, job_key, list_key, queue_name, rq_worker_key
-from service.queue.port import Event, EventKind, Report
-from service.queue.rq_queue import REPORTS, WORKERS, RqQueue, cancel_key, open_queue, put_event, worker_key
-from service.settings import Settings
-from service.store.store import Store, open_store
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.states import Lane, Stage
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.service.model.workers import own_ability
+from graspd.service.queue.lists import execution_keys, held_key, job_key, list_key, queue_name, rq_worker_key
+from graspd.service.queue.port import Event, EventKind, Report
+from graspd.service.queue.rq_queue import REPORTS, WORKERS, RqQueue, cancel_key, open_queue, put_event, worker_key
+from graspd.service.settings import Settings
+from graspd.service.store.store import Store, open_store
+from graspd.worker.process.heartbeat import BEAT_S
+from graspd.worker.stages.context import REPORT_EVERY_S
 from tests.fakes import make_shard
-from worker.process.heartbeat import BEAT_S
-from worker.stages.context import REPORT_EVERY_S
 
 _TICK_S: Final = 0.02
 _QUEUES: Final = tuple(queue_name(lane, Stage.SYNTHESIZE) for lane in Lane)

@@ -25,10 +25,10 @@ import numpy as np
 import trimesh
 import yourdfpy
 
-from service.model.domain import JobOptions
-from service.model.scene_spec import Box, NeighbourSpec, SceneSpec, supports_in
-from worker.files.synthesis import Synthesized, synthesized
-from worker.hands.load import hand_from_path
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.scene_spec import Box, NeighbourSpec, SceneSpec, supports_in
+from graspd.worker.files.synthesis import Synthesized, synthesized
+from graspd.worker.hands.load import hand_from_path
 
 OBJECTS = ("005_tomato_soup_can", "006_mustard_bottle", "025_mug", "011_banana", "035_power_drill", "077_rubiks_cube")
 

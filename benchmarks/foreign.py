@@ -23,16 +23,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cells import cell_parser, planned
-from service.model.fidelity import FIDELITIES
-from worker.grasps import GraspSet
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.hands.same_hand import SameHand, same_hand
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import object_from_path
-from worker.quality.intervals import wilson
-from worker.quality.referee.foreign import driven_as, in_other_model, with_our_shapes, with_their_shapes
-from worker.quality.referee.judge import judge
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.same_hand import SameHand, same_hand
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.quality.intervals import wilson
+from graspd.worker.validation.foreign import driven_as, in_other_model, with_our_shapes, with_their_shapes
+from graspd.worker.validation.validator import judge
 
 HAND = "hands/shadow/shadow_hand_right.urdf"
 OTHER = "robopianist/models/hands/third_party/shadow_hand/right_hand.xml"

@@ -22,13 +22,13 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from service.model.errors import GraspdError
-from service.model.version import STAGE_REVISIONS
-from worker.hands.jaws import jaws_of
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.rendering.pictures import grasp_pictures
-from worker.stages.hand_self_test import GRASPS, READY, Best, failed, self_test
+from graspd.service.model.errors import GraspdError
+from graspd.service.model.version import STAGE_REVISIONS
+from graspd.worker.hands.jaws import jaws_of
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.rendering.pictures import grasp_pictures
+from graspd.worker.stages.hand_self_test import GRASPS, READY, Best, failed, self_test
 
 PACKAGES = "airo-models example-robot-data robosuite robosuite-models robopianist"
 #: Under the folder of the docs.

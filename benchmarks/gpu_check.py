@@ -24,7 +24,7 @@ from pathlib import Path
 
 import warp as wp
 
-from worker.engines.backend import ARCHITECTURES, modules
+from graspd.worker.engines.backend import ARCHITECTURES, modules
 
 STACK_BYTES = 512
 HOT_REGISTERS = 128

@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 
 from benchmarks.gallery import HANDS
-from service.model.domain import JobOptions
-from service.model.errors import InputError
-from service.model.version import STAGE_REVISIONS
-from worker.certified import certified_grasps
-from worker.hands.jaws import jaws_of
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.objects.prepare import object_from_path
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import InputError
+from graspd.service.model.version import STAGE_REVISIONS
+from graspd.worker.certified import certified_grasps
+from graspd.worker.hands.jaws import jaws_of
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.prepare import object_from_path
 
 GRIPPERS = ("franka", "robotiq-2f-85", "schunk-egk40", "umi", "robotiq-2f-140", "rethink", "robotiq-3f")
 #: Not a seed that any setting was chosen with.

@@ -16,10 +16,10 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from service.queue.connection import connect, redis_url
-from service.queue.rq_queue import RqQueue
-from service.run.embedded import server_command
-from service.settings import Settings
+from graspd.service.queue.connection import connect, redis_url
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.run.embedded import server_command
+from graspd.service.settings import Settings
 
 _LONGEST_S = 300.0
 

@@ -20,22 +20,22 @@ from typing import Any, Final
 import numpy as np
 from sqlalchemy import Connection, Table
 
-from service.index.bulk import upsert
-from service.index.changes.rows import attempt_row, job_row, settle, shard_row, task_rows
-from service.index.index import Index
-from service.index.tables import attempts, grasps, jobs, metadata, shards, tasks
-from service.model import names
-from service.model.digests import digest_json, job_id
-from service.model.domain import JobRequest
-from service.model.metrics import Indexed, indexed
-from service.model.planning import PlannedTask, plan
-from service.model.records import AttemptRecord, JobRecord
-from service.model.states import AssetKind, Lane, Stage, State
-from service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
-from service.settings import Settings
-from service.store.library import publish_builtins
-from service.store.manifests import ShardManifest
-from service.store.store import Store, open_store
+from graspd.service.index.bulk import upsert
+from graspd.service.index.changes.rows import attempt_row, job_row, settle, shard_row, task_rows
+from graspd.service.index.index import Index
+from graspd.service.index.tables import attempts, grasps, jobs, metadata, shards, tasks
+from graspd.service.model import names
+from graspd.service.model.digests import digest_json, job_id
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.metrics import Indexed, indexed
+from graspd.service.model.planning import PlannedTask, plan
+from graspd.service.model.records import AttemptRecord, JobRecord
+from graspd.service.model.states import AssetKind, Lane, Stage, State
+from graspd.service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
+from graspd.service.settings import Settings
+from graspd.service.store.library import publish_builtins
+from graspd.service.store.manifests import ShardManifest
+from graspd.service.store.store import Store, open_store
 
 _CHUNK: Final = 20_000
 #: Of a hundred jobs so many are in each state; the running ones are half done.

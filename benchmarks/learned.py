@@ -22,21 +22,21 @@ from typing import Any
 
 import numpy as np
 
-from service.model.domain import JobOptions
-from service.model.errors import InputError
-from service.model.fidelity import FIDELITIES
-from service.model.scene_spec import SceneSpec
-from service.model.version import PACKAGE_VERSION
-from worker.certified import certified_grasps
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import object_from_path
-from worker.planners.learned.known import keep_file, kept
-from worker.quality.referee.decomposition import decompose
-from worker.run import Run
-from worker.scenes.beside import scenes_of
-from worker.simulation.surroundings import Scenes
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import InputError
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.worker.certified import certified_grasps
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners.known_networks import keep_file, kept
+from graspd.worker.run import Run
+from graspd.worker.scenes.beside import scenes_of
+from graspd.worker.simulation.surroundings import Scenes
+from graspd.worker.validation.decomposition import decompose
 
 #: Not a seed that any setting was chosen with.
 SEED = 404

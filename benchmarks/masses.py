@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.cells import HANDS
-from service.model.domain import JobOptions
-from service.model.matter import MASS_KG
-from service.model.scene_spec import parse_scene
-from worker.files.synthesis import synthesized
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.matter import MASS_KG
+from graspd.service.model.scene_spec import parse_scene
+from graspd.worker.files.synthesis import synthesized
 
 #: Not a seed that any setting was chosen with.
 SEED = 1200

@@ -23,11 +23,11 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from api.client.client import Client
-from api.formatting import duration, size
-from service.index.views import CellView, DatasetView
-from service.model.cores import available_cores
-from service.model.version import PACKAGE_VERSION
+from graspd.api.formatting import duration, size
+from graspd.client.client import Client
+from graspd.service.index.views import CellView, DatasetView
+from graspd.service.model.cores import available_cores
+from graspd.service.model.version import PACKAGE_VERSION
 
 #: Name in the service and URDF of each hand.
 HANDS: Final = {

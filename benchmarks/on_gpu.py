@@ -23,22 +23,22 @@ import numpy as np
 import warp as wp
 
 from benchmarks.success import HANDS
-from service.model.cores import available_cores
-from service.model.fidelity import FIDELITIES
-from service.model.version import PACKAGE_VERSION
-from worker.engines.devices import Device
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import object_from_path
-from worker.planners.fast_graspd import planner
-from worker.planners.port import Wanted
-from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.judge import judge
-from worker.quality.table import measure
-from worker.run import Run
-from worker.studies.bench import device_name
-from worker.studies.timing import kernel_shares
+from graspd.service.model.cores import available_cores
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.studies.bench import device_name
+from graspd.studies.timing import kernel_shares
+from graspd.worker.engines.devices import Device
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners.fast_graspd import planner
+from graspd.worker.planners.port import Wanted
+from graspd.worker.quality.table import measure
+from graspd.worker.run import Run
+from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.validator import judge
 
 T = TypeVar("T")
 OBJECTS: Final = ("025_mug", "006_mustard_bottle", "003_cracker_box", "024_bowl", "077_rubiks_cube", "048_hammer")

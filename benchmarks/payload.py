@@ -21,24 +21,24 @@ from numpy.typing import NDArray
 
 from benchmarks.cells import HANDS
 from benchmarks.masses import arguments, masses
-from service.model.domain import JobOptions
-from service.model.fidelity import FIDELITIES
-from service.model.scene_spec import parse_scene
-from worker.certified import Certified, certified_grasps
-from worker.grasps import GraspSet, joined
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import object_from_path
-from worker.quality.postures import squeeze
-from worker.quality.referee.compiled import scene_of
-from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.lift import LiftOutcome
-from worker.quality.referee.model import MujocoOptions
-from worker.quality.referee.payload import LIFTING, LiftPayload, PushPayload, limit_of
-from worker.quality.referee.protocol import DIRECTIONS, Outcome, Trial
-from worker.scenes.beside import scenes_of
-from worker.simulation.surroundings import Placed
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.scene_spec import parse_scene
+from graspd.worker.certified import Certified, certified_grasps
+from graspd.worker.control.postures import squeeze
+from graspd.worker.grasps import GraspSet, joined
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.scenes.beside import scenes_of
+from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.validation.compiled import scene_of
+from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.lift import LiftOutcome
+from graspd.worker.validation.model import MujocoOptions
+from graspd.worker.validation.payload import LIFTING, LiftPayload, PushPayload, limit_of
+from graspd.worker.validation.protocol import DIRECTIONS, Outcome, Trial
 
 SEED: Final = 1500
 #: Sums of normal forces [N].

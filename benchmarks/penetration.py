@@ -13,16 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
-from service.model.fidelity import FIDELITIES
-from service.model.transforms import apply
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.hands.surface import sample_surface
-from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
-from worker.planners.port import Wanted
-from worker.quality.table import measure
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.transforms import apply
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import synthesize
+from graspd.worker.planners.port import Wanted
+from graspd.worker.quality.table import measure
 
 COMPACT = ("061_foam_brick", "005_tomato_soup_can", "006_mustard_bottle", "011_banana", "056_tennis_ball")
 SHELLS = ("025_mug", "024_bowl")

@@ -24,16 +24,16 @@ from benchmarks.chain import environment_of
 CHILD: Final = """
 import json, sys, time
 import numpy as np
-from worker.objects.prepare import object_from_path
-from worker.scenes import drop
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.scenes import drop
 
 obj = object_from_path(sys.argv[1], face_error_m=5e-4)
 poses = drop(obj, count=2, seed=1)["scene/object_pose"]
 spent = []
 for _ in range(4):
     began = time.process_time()
-    from worker.rendering import render
-    from worker.run import Run
+    from graspd.worker.rendering import render
+    from graspd.worker.run import Run
     made = render(
         obj, poses, views=int(sys.argv[2]), stereo=False, width=320, height=240, seed=0, run=Run(threads=1)
     )

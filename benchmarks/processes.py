@@ -24,16 +24,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from service.model.domain import BATCH_SIZE
-from service.model.fidelity import FIDELITIES
-from worker.grasps import GraspSet, joined
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.planners import Run, Wanted, synthesize
-from worker.pool.pool import MODULES, Pool
-from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.judge import judge
-from worker.quality.table import measure
+from graspd.service.model.domain import BATCH_SIZE
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.grasps import GraspSet, joined
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import Run, Wanted, synthesize
+from graspd.worker.pool.pool import MODULES, Pool
+from graspd.worker.quality.table import measure
+from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.validator import judge
 
 #: Clock ticks and bytes as /proc tells them.
 _TICK_S: Final = 1 / os.sysconf("SC_CLK_TCK")

@@ -21,19 +21,19 @@ from typing import Any
 import numpy as np
 
 from benchmarks.gallery import HANDS, Entry
-from service.model.domain import JobOptions
-from service.model.errors import GraspdError
-from service.model.scene_spec import SceneSpec
-from service.model.version import STAGE_REVISIONS
-from worker.certified import certified_grasps
-from worker.hands.jaws import jaws_of
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.hands.oppositions import oppositions_of
-from worker.objects.prepare import object_from_path
-from worker.planners.fast_graspd.across import crossings_of
-from worker.scenes.beside import scenes_of
-from worker.stages.hand_self_test import TABLE_READY, tried_softly
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import GraspdError
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.version import STAGE_REVISIONS
+from graspd.worker.certified import certified_grasps
+from graspd.worker.hands.jaws import jaws_of
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.oppositions import oppositions_of
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners.fast_graspd.across import crossings_of
+from graspd.worker.scenes.beside import scenes_of
+from graspd.worker.stages.hand_self_test import TABLE_READY, tried_softly
 
 #: Beside those of the gallery; LEAP stands in DIR as MuJoCo Menagerie has it.
 _SKILL, _MATE = "mani_skill/assets/robots", "dexmate_urdf/robots/hands/f5d6_hand"

@@ -27,22 +27,22 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from benchmarks.cells import write_json
-from service.model.digests import digest_json
-from service.model.transforms import quat_rotate
-from worker.engines.mujoco_warnings import void
-from worker.files.cases import Case, load_case
-from worker.grasps import GraspSet, Posture
-from worker.quality.intervals import wilson
-from worker.quality.postures import TOTAL_NORMAL_FORCE, squeeze
-from worker.quality.referee.decomposition import ConvexPieces, decompose
-from worker.quality.referee.judge import judge
-from worker.quality.referee.lift import Lift, LiftOutcome
-from worker.quality.referee.lifting import judge_lifts
-from worker.quality.referee.model import MujocoOptions, build
-from worker.quality.referee.protocol import STAGE_S, Outcome, Trial
-from worker.quality.table import measure
-from worker.scenes.way import plan_way
-from worker.simulation.surroundings import RISE_M, Obstacle, Placed
+from graspd.exchange.cases import Case, load_case
+from graspd.service.model.digests import digest_json
+from graspd.service.model.transforms import quat_rotate
+from graspd.worker.control.postures import TOTAL_NORMAL_FORCE, squeeze
+from graspd.worker.engines.mujoco_warnings import void
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.quality.intervals import wilson
+from graspd.worker.quality.table import measure
+from graspd.worker.scenes.way import plan_way
+from graspd.worker.simulation.surroundings import RISE_M, Obstacle, Placed
+from graspd.worker.validation.decomposition import ConvexPieces, decompose
+from graspd.worker.validation.lift import Lift, LiftOutcome
+from graspd.worker.validation.lifting import judge_lifts
+from graspd.worker.validation.model import MujocoOptions, build
+from graspd.worker.validation.protocol import STAGE_S, Outcome, Trial
+from graspd.worker.validation.validator import judge
 
 Floats = NDArray[np.float64]
 

@@ -12,17 +12,17 @@ import time
 
 import numpy as np
 
-from service.model.cores import available_cores
-from service.model.fidelity import FIDELITIES
-from worker.grasps import Posture
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
-from worker.planners.port import Wanted
-from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
-from worker.quality.table import DEFAULT_THRESHOLDS_M, measure
-from worker.quality.volume import SharedVolume
-from worker.run import Run
+from graspd.service.model.cores import available_cores
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import synthesize
+from graspd.worker.planners.port import Wanted
+from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
+from graspd.worker.quality.table import DEFAULT_THRESHOLDS_M, measure
+from graspd.worker.quality.volume import SharedVolume
+from graspd.worker.run import Run
 
 SAMPLE = 64
 

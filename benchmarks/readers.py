@@ -24,10 +24,10 @@ import h5py
 import numpy as np
 import typer
 
-from service.readers import Grasps, Pictures, ShardCache, Shards, open_shards, prefetched
-from service.readers.grasps import DEFAULT_COLUMNS
-from service.readers.pictures import Place
-from service.store.store import open_store
+from graspd.service.readers import Grasps, Pictures, ShardCache, Shards, open_shards, prefetched
+from graspd.service.readers.grasps import DEFAULT_COLUMNS
+from graspd.service.readers.pictures import Place
+from graspd.service.store.store import open_store
 from tests.servers import S3Server
 
 ROUNDS = 5
@@ -128,7 +128,7 @@ def loaders(shards: Shards) -> dict[str, Way]:
     import torch
     from torch.utils.data import DataLoader
 
-    from service.readers.torch_data import Samples, ShuffledShards, collate
+    from graspd.service.readers.torch_data import Samples, ShuffledShards, collate
 
     torch.set_num_threads(1)  # on a busy machine the threads of one copy wait for one another
     found = {}

@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from service.model.fidelity import FIDELITIES, Fidelity
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
-from worker.planners.port import Wanted
-from worker.quality.referee.judge import judge
+from graspd.service.model.fidelity import FIDELITIES, Fidelity
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import synthesize
+from graspd.worker.planners.port import Wanted
+from graspd.worker.validation.validator import judge
 
 OBJECTS = ("003_cracker_box", "011_banana", "006_mustard_bottle", "048_hammer", "077_rubiks_cube", "035_power_drill")
 SEED = 101

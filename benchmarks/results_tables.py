@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cells import SEED, Cell, cell_parser, cells, write_json
-from service.model.metrics import ROBUST_MODELS
-from service.model.version import PACKAGE_VERSION
-from worker.quality.contact import contact_distance_consistency_mm
-from worker.quality.diversity import explained_variance
-from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
-from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.displacement import simulated_displacement_cm
-from worker.quality.referee.robust import reaches, robust
-from worker.quality.table import measure
+from graspd.service.model.metrics import ROBUST_MODELS
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.worker.quality.contact import contact_distance_consistency_mm
+from graspd.worker.quality.diversity import explained_variance
+from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
+from graspd.worker.quality.table import measure
+from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.displacement import simulated_displacement_cm
+from graspd.worker.validation.robust import reaches, robust
 
 FRICTION, THRESHOLD_M, TOP, CORES = 1.0, 0.005, 10, 2
 #: Share of the models that many certified grasps should reach.

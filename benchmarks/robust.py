@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cells import Cell, cell_parser, cells, write_json
-from service.model.metrics import AXIS_MEANINGS, ROBUST_MODELS, Axis
-from worker.quality.intervals import wilson
-from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.model import MujocoOptions
-from worker.quality.referee.refit import fits_of
-from worker.quality.referee.robust import reaches, robust
-from worker.quality.referee.variant import SHAPES, Variant, axes_of, couplings_of, draw, together
-from worker.quality.referee.varied import Models
-from worker.run import Run
+from graspd.service.model.metrics import AXIS_MEANINGS, ROBUST_MODELS, Axis
+from graspd.worker.quality.intervals import wilson
+from graspd.worker.run import Run
+from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.model import MujocoOptions
+from graspd.worker.validation.refit import fits_of
+from graspd.worker.validation.robust import reaches, robust
+from graspd.worker.validation.variant import SHAPES, Variant, axes_of, couplings_of, draw, together
+from graspd.worker.validation.varied import Models
 
 OBJECTS = ["003_cracker_box", "005_tomato_soup_can", "011_banana", "025_mug"]
 #: Of the draws; jobs of these seeds have other models.

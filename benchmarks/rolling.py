@@ -19,13 +19,13 @@ from unittest.mock import patch
 import mujoco
 import numpy as np
 
-from service.model.transforms import Floats, quat_conjugate, quat_multiply, quat_rotate
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import object_from_path
-from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.model import FRICTION, MujocoOptions, add_object
-from worker.scenes import simulate
-from worker.scenes.rest import CHANGE_M, RestingFaces, lay_flat, resting_faces
+from graspd.service.model.transforms import Floats, quat_conjugate, quat_multiply, quat_rotate
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.scenes import simulate
+from graspd.worker.scenes.rest import CHANGE_M, RestingFaces, lay_flat, resting_faces
+from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.model import FRICTION, MujocoOptions, add_object
 
 SEED, DROPS, SECONDS = 5, 64, 0.8
 HEAD: Final = """# Rest poses that roll or topple

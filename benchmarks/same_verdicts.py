@@ -24,26 +24,26 @@ from benchmarks.chain import environment_of
 _COMMON: Final = """
 import sys, time
 import numpy as np
-from service.model.domain import JobOptions
-from worker.grasps import GraspSet, Posture
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.run import Run
+from graspd.service.model.domain import JobOptions
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.run import Run
 
 fidelity, run = JobOptions(fidelity="standard").knobs, Run(threads=1)
 hand = hand_from_path(sys.argv[1])
 obj = object_from_path(sys.argv[2], face_error_m=fidelity.face_error_m)
 """
 PLAN: Final = f"""{_COMMON}
-from worker.planners import Wanted, synthesize
+from graspd.worker.planners import Wanted, synthesize
 grasps = synthesize(hand, obj, Wanted(int(sys.argv[4]), fidelity, seed=100), run)
 parts = dict(grasp=grasps.grasp, pregrasp=grasps.pregrasp, squeeze=grasps.squeeze)
 arrays = {{f"{{n}}_{{k}}": v for n, p in parts.items() for k, v in vars(p).items()}}
 np.savez(sys.argv[3], loss=grasps.stability_loss, **arrays)
 """
 JUDGE: Final = f"""{_COMMON}
-from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.judge import judge
+from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.validator import judge
 kept = np.load(sys.argv[3])
 names = ("grasp", "pregrasp", "squeeze")
 parts = {{n: Posture(kept[n + "_hand_pose"], kept[n + "_joint_positions"]) for n in names}}

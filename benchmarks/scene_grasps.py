@@ -23,25 +23,25 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cells import HANDS, cell_parser
-from service.model.fidelity import FIDELITIES
-from service.model.scene_spec import TOUCH, SceneSpec
-from service.model.version import PACKAGE_VERSION
-from worker.grasps import GraspSet
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.hands.oppositions import oppositions_of
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import object_from_path
-from worker.planners import Run, Wanted, synthesize
-from worker.planners.fast_graspd.across import Openings
-from worker.quality.referee.decomposition import ConvexPieces, decompose
-from worker.quality.referee.judge import judge
-from worker.quality.referee.lifting import judge_lifts
-from worker.scenes.clearance import MARGIN_M
-from worker.scenes.kinds import rest_poses, supports_of
-from worker.scenes.trial import trial_on
-from worker.scenes.way import plan_way
-from worker.simulation.surroundings import Placed, Scenes
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.scene_spec import TOUCH, SceneSpec
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.oppositions import oppositions_of
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import Run, Wanted, synthesize
+from graspd.worker.planners.fast_graspd.across import Openings
+from graspd.worker.scenes.clearance import MARGIN_M
+from graspd.worker.scenes.kinds import rest_poses, supports_of
+from graspd.worker.scenes.trial import trial_on
+from graspd.worker.scenes.way import plan_way
+from graspd.worker.simulation.surroundings import Placed, Scenes
+from graspd.worker.validation.decomposition import ConvexPieces, decompose
+from graspd.worker.validation.lifting import judge_lifts
+from graspd.worker.validation.validator import judge
 
 COMMAND = (
     "python -m benchmarks.scene_grasps DATA --work W --grasps 16 --per-face 2 --filtered 96 "

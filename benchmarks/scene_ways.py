@@ -15,15 +15,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from service.model.fidelity import resolve_fidelity
-from service.model.scene_spec import SceneSpec
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
-from worker.planners.port import Wanted
-from worker.scenes.beside import scenes_of
-from worker.scenes.clearance import MARGIN_M
-from worker.scenes.way import Way, plan_way
+from graspd.service.model.fidelity import resolve_fidelity
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import synthesize
+from graspd.worker.planners.port import Wanted
+from graspd.worker.scenes.beside import scenes_of
+from graspd.worker.scenes.clearance import MARGIN_M
+from graspd.worker.scenes.way import Way, plan_way
 
 HANDS: Final = ("barrett", "allegro", "shadow")
 #: Target, kind of its scene, and what stands beside it.

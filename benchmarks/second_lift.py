@@ -21,12 +21,12 @@ import trimesh
 
 from benchmarks.cells import HANDS
 from benchmarks.masses import arguments, masses
-from service.model.domain import JobOptions
-from service.model.scene_spec import parse_scene
-from service.model.transforms import compose
-from worker.files.synthesis import synthesized
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel, JointType
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.scene_spec import parse_scene
+from graspd.service.model.transforms import compose
+from graspd.worker.files.synthesis import synthesized
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel, JointType
 
 SEED: Final = 1400
 HEAD: Final = """# A second lift of valid grasps

@@ -21,20 +21,20 @@ from typing import Any, Final
 
 import httpx
 
-import worker.process.engine
-import worker.process.main
-from api.access.keys import KeyFile, Scope
-from service.index.index import Index
-from service.model import names
-from service.model.planning import message_of, plan, task_id
-from service.model.records import JobRecord
-from service.model.states import Lane, Stage, State
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.run.supervisor import Supervisor
-from service.settings import Settings
-from service.store.records import read_record
-from service.store.store import open_store
+import graspd.worker.process.engine
+import graspd.worker.process.main
+from graspd.api.access.keys import KeyFile, Scope
+from graspd.service.index.index import Index
+from graspd.service.model import names
+from graspd.service.model.planning import message_of, plan, task_id
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import Lane, Stage, State
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.run.supervisor import Supervisor
+from graspd.service.settings import Settings
+from graspd.service.store.records import read_record
+from graspd.service.store.store import open_store
 from tests.fakes import add_assets, engine_of, fake_stages, make_shard, request
 from tests.memory_queue import MemoryQueue
 

@@ -15,18 +15,18 @@ from typing import Any, Final
 import numpy as np
 
 from benchmarks.cells import HANDS, cell_parser
-from service.model.domain import JobOptions
-from service.model.fidelity import FIDELITIES
-from service.model.scene_spec import SceneSpec
-from worker.certified import certified_grasps
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import object_from_path
-from worker.quality.contact import finger_of_body
-from worker.quality.probe import HAND_POINTS, probe_of
-from worker.quality.referee.judge import judge
-from worker.scenes.beside import scenes_of
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.worker.certified import certified_grasps
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.quality.contact import finger_of_body
+from graspd.worker.quality.probe import HAND_POINTS, probe_of
+from graspd.worker.scenes.beside import scenes_of
+from graspd.worker.validation.validator import judge
 
 #: Not a seed that any setting was chosen with.
 SEED, SCENES = 1500, 4

@@ -1,7 +1,7 @@
 """Success of the planner's grasps in the independent engine and their quality, per hand and object, as Markdown.
 
 usage: python -m benchmarks.success DATA_DIR [GRASPS [HAND ...]]     DATA_DIR holds hands/ and objects/
-The referee is MuJoCo with the DexGraspBench protocol, level `certificate` (see worker/quality/referee).
+The referee is MuJoCo with the DexGraspBench protocol, level `certificate` (see worker/validation).
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cells import planned
-from service.model.fidelity import FIDELITIES
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import object_from_path
-from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.judge import judge
-from worker.quality.table import measure
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.quality.table import measure
+from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.validator import judge
 
 HANDS = {
     "Allegro": "allegro/allegro_hand_right.urdf",

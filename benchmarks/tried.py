@@ -16,17 +16,17 @@ from typing import Any, Final
 import numpy as np
 
 from benchmarks.cells import HANDS, cell_parser, kept_json, write_json
-from service.model.fidelity import FIDELITIES
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
-from worker.planners.port import Wanted
-from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.judge import judge
-from worker.quality.referee.short import push_trial
-from worker.quality.table import measure
-from worker.run import Run
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import synthesize
+from graspd.worker.planners.port import Wanted
+from graspd.worker.quality.table import measure
+from graspd.worker.run import Run
+from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.prescreening import push_trial
+from graspd.worker.validation.validator import judge
 
 #: Neither a seed that any setting was chosen with.
 SEED, WARM_SEED = 2027, 1

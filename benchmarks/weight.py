@@ -30,8 +30,8 @@ import pin  # noqa: E402
 EXTRAS: Final = ("", "api", "worker", "all", "dev")
 LARGEST: Final = 6
 _COMMAND: Final = "import sys; sys.argv = ['graspd', {}]; import graspd.cli; graspd.cli.main()"
-_OURS: Final = "from service.model.libraries import imports, own_process; own_process()\nwith imports(): {}"
-_ENGINE: Final = "import worker.certified, worker.planners.fast_graspd.planner"
+_OURS: Final = "from graspd.service.model.libraries import imports, own_process; own_process()\nwith imports(): {}"
+_ENGINE: Final = "import graspd.worker.certified, graspd.worker.planners.fast_graspd.planner"
 #: What somebody waits for, and what does it.
 STARTS: Final = {
     "Python alone": "pass",
@@ -39,8 +39,8 @@ STARTS: Final = {
     "`graspd --help`": _COMMAND.format("'--help'"),
     "`graspd jobs --help`": _COMMAND.format("'jobs', '--help'"),
     "`graspd api --help`": _COMMAND.format("'api', '--help'"),
-    "the API": "import api.server",
-    "the API, as its command imports it": _OURS.format("import api.server"),
+    "the API": "import graspd.api.server",
+    "the API, as its command imports it": _OURS.format("import graspd.api.server"),
     "the planner": _ENGINE,
     "the planner, as commands import it": _OURS.format(_ENGINE),
 }

@@ -20,13 +20,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from service.model.libraries import imports
+from graspd.service.model.libraries import imports
 
 if TYPE_CHECKING:
     from graspd.grasps import Grasp, Grasps, Postures, open
     from graspd.remote import Client, Job
-    from graspd.synthesis import synthesize
-    from service.model.errors import (
+    from graspd.service.model.errors import (
         BusyError,
         ConflictError,
         DamagedError,
@@ -39,10 +38,11 @@ if TYPE_CHECKING:
         TaskError,
         UnavailableError,
     )
+    from graspd.synthesis import synthesize
 
     __version__: str
 
-_ERRORS: Final = "service.model.errors"
+_ERRORS: Final = "graspd.service.model.errors"
 #: Name, the module it lives in.
 _LIVES_IN: Final = {
     "synthesize": "graspd.synthesis",
@@ -90,7 +90,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        return import_module("service.model.version").PACKAGE_VERSION
+        return import_module("graspd.service.model.version").PACKAGE_VERSION
     if name not in _LIVES_IN:
         raise AttributeError(f"module 'graspd' has no attribute {name!r}")
     with imports():

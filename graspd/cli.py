@@ -13,64 +13,64 @@ import typer
 from pydantic import ValidationError
 from typer.core import TyperCommand, TyperGroup
 
-from service.cli import at_the_door
-from service.model.base import words
-from service.model.errors import did_you_mean
-from service.model.libraries import imports, own_process
-from service.model.version import PACKAGE_VERSION
+from graspd.service.cli import at_the_door
+from graspd.service.model.base import words
+from graspd.service.model.errors import did_you_mean
+from graspd.service.model.libraries import imports, own_process
+from graspd.service.model.version import PACKAGE_VERSION
 
 #: Command, module of its group, panel of the overview, help.
 COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("demo", "graspd.demo", "Make grasps", "Make grasps, scenes and pictures from built-in data, and a page of them."),
-    ("synth", "worker.commands.synth", "Make grasps", "Generate grasps of a hand file on an object file."),
-    ("evaluate", "worker.commands.evaluate", "Make grasps", "Validate grasps in MuJoCo, an independent engine."),
-    ("scene", "worker.commands.scene", "Make grasps", "Drop the object on a table, and keep grasps that fit there."),
-    ("render", "worker.commands.render", "Make grasps", "Render pictures of scenes, with labels."),
-    ("chart", "worker.commands.studies", "Make grasps", "Compare speed and accuracy of methods and fidelities."),
-    ("bench", "worker.commands.studies", "Make grasps", "Measure grasps per second, and where the time goes."),
-    ("stability", "worker.commands.studies", "Make grasps", "Map where integrators and planners fail."),
-    ("pictures", "worker.commands.render", "Use grasps", "Draw the best grasps of a file on one sheet."),
-    ("view", "worker.commands.render", "Use grasps", "Show grasps of a file in 3D in the browser."),
-    ("grasps", "worker.commands.curate", "Use grasps", "Select grasps of files and datasets by their metrics."),
-    ("clouds", "worker.commands.curate", "Use grasps", "Write pictures as point clouds, with their grasps."),
-    ("export", "worker.commands.exchange", "Use grasps", "Export grasps and pictures to other formats."),
-    ("import", "worker.commands.exchange", "Use grasps", "Import grasps from other formats, and validate them."),
-    ("up", "service.run.commands", "Service", "Run the whole service on this machine, until Ctrl-C."),
-    ("submit", "api.client.commands", "Service", "Submit a job: one hand on one object."),
-    ("jobs", "api.client.commands", "Service", "List jobs, the newest first."),
-    ("status", "api.client.commands", "Service", "Show stages, progress and quality of a job."),
-    ("logs", "api.client.commands", "Service", "Show failed attempts of a job, with their reasons."),
-    ("cancel", "api.client.commands", "Service", "Stop a job; finished grasps stay."),
-    ("retry", "api.client.commands", "Service", "Run failed and cancelled tasks of a job again."),
-    ("delete", "api.client.commands", "Service", "Delete an ended job, and grasps that no other job has."),
-    ("restore", "api.client.commands", "Service", "Restore a deleted job."),
-    ("datasets", "api.client.dataset_commands", "Service", "Make datasets of many hands and objects."),
-    ("hands", "api.client.commands", "Service", "Check, add, list and show hands."),
-    ("objects", "api.client.commands", "Service", "Check, add, list and show objects."),
-    ("networks", "api.client.commands", "Service", "Add, list and show networks that propose grasps."),
-    ("tags", "api.client.commands", "Service", "Tag grasps; list and export tagged ones."),
-    ("webhooks", "api.client.commands", "Service", "Notify URLs when jobs and datasets end."),
+    ("synth", "graspd.commands.synth", "Make grasps", "Generate grasps of a hand file on an object file."),
+    ("evaluate", "graspd.commands.evaluate", "Make grasps", "Validate grasps in MuJoCo, an independent engine."),
+    ("scene", "graspd.commands.scene", "Make grasps", "Drop the object on a table, and keep grasps that fit there."),
+    ("render", "graspd.commands.render", "Make grasps", "Render pictures of scenes, with labels."),
+    ("chart", "graspd.commands.studies", "Make grasps", "Compare speed and accuracy of methods and fidelities."),
+    ("bench", "graspd.commands.studies", "Make grasps", "Measure grasps per second, and where the time goes."),
+    ("stability", "graspd.commands.studies", "Make grasps", "Map where integrators and planners fail."),
+    ("pictures", "graspd.commands.render", "Use grasps", "Draw the best grasps of a file on one sheet."),
+    ("view", "graspd.commands.render", "Use grasps", "Show grasps of a file in 3D in the browser."),
+    ("grasps", "graspd.commands.curate", "Use grasps", "Select grasps of files and datasets by their metrics."),
+    ("clouds", "graspd.commands.curate", "Use grasps", "Write pictures as point clouds, with their grasps."),
+    ("export", "graspd.commands.exchange", "Use grasps", "Export grasps and pictures to other formats."),
+    ("import", "graspd.commands.exchange", "Use grasps", "Import grasps from other formats, and validate them."),
+    ("up", "graspd.service.run.commands", "Service", "Run the whole service on this machine, until Ctrl-C."),
+    ("submit", "graspd.client.commands", "Service", "Submit a job: one hand on one object."),
+    ("jobs", "graspd.client.commands", "Service", "List jobs, the newest first."),
+    ("status", "graspd.client.commands", "Service", "Show stages, progress and quality of a job."),
+    ("logs", "graspd.client.commands", "Service", "Show failed attempts of a job, with their reasons."),
+    ("cancel", "graspd.client.commands", "Service", "Stop a job; finished grasps stay."),
+    ("retry", "graspd.client.commands", "Service", "Run failed and cancelled tasks of a job again."),
+    ("delete", "graspd.client.commands", "Service", "Delete an ended job, and grasps that no other job has."),
+    ("restore", "graspd.client.commands", "Service", "Restore a deleted job."),
+    ("datasets", "graspd.client.dataset_commands", "Service", "Make datasets of many hands and objects."),
+    ("hands", "graspd.client.commands", "Service", "Check, add, list and show hands."),
+    ("objects", "graspd.client.commands", "Service", "Check, add, list and show objects."),
+    ("networks", "graspd.client.commands", "Service", "Add, list and show networks that propose grasps."),
+    ("tags", "graspd.client.commands", "Service", "Tag grasps; list and export tagged ones."),
+    ("webhooks", "graspd.client.commands", "Service", "Notify URLs when jobs and datasets end."),
     ("doctor", "graspd.doctor", "Administration", "Check Redis, store, index, GPU and more; suggest fixes."),
-    ("api", "api.server_command", "Administration", "Run the HTTP API and the dashboard."),
-    ("controller", "service.run.commands", "Administration", "Run the controller: retries, lost leases, index."),
-    ("worker", "worker.commands.worker", "Administration", "Run workers, each on one device."),
-    ("keys", "api.client.commands", "Administration", "Make, list and revoke API keys."),
-    ("projects", "api.client.commands", "Administration", "List projects of keys, and limit what each may use."),
+    ("api", "graspd.api.server_command", "Administration", "Run the HTTP API and the dashboard."),
+    ("controller", "graspd.service.run.commands", "Administration", "Run the controller: retries, lost leases, index."),
+    ("worker", "graspd.commands.worker", "Administration", "Run workers, each on one device."),
+    ("keys", "graspd.client.commands", "Administration", "Make, list and revoke API keys."),
+    ("projects", "graspd.client.commands", "Administration", "List projects of keys, and limit what each may use."),
     ("admin", "graspd.admin", "Administration", "Rare tasks: kernels, index, store, pictures."),
 )
 
 #: Group, command in it, module that has it, help.
 JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
-    ("admin", "kernels", "worker.commands.admin", "Compile all kernels ahead of time."),
-    ("admin", "index", "service.run.commands", "Rebuild the index from the store, or export its tables."),
-    ("admin", "store", "service.run.store_commands", "Check the store, and repair it."),
-    ("admin", "bench-render", "worker.commands.admin", "Measure pictures per second, and where the time goes."),
-    ("admin", "gallery", "worker.commands.admin", "Draw hands and objects at rest, as a camera sees them."),
-    ("hands", "check", "worker.commands.hands", "Say whether a hand can be used, and what was guessed about it."),
-    ("objects", "check", "worker.commands.objects", "Say whether a mesh can be used, and what was repaired."),
-    ("datasets", "balance", "worker.commands.curate", "Draw a part in which no kind of grasps is more frequent."),
-    ("datasets", "diff", "worker.commands.curate", "Compare two datasets."),
-    ("datasets", "card", "worker.commands.exchange", "Write a dataset's card: contents, quality, biases, plots."),
+    ("admin", "kernels", "graspd.commands.admin", "Compile all kernels ahead of time."),
+    ("admin", "index", "graspd.service.run.commands", "Rebuild the index from the store, or export its tables."),
+    ("admin", "store", "graspd.service.run.store_commands", "Check the store, and repair it."),
+    ("admin", "bench-render", "graspd.commands.admin", "Measure pictures per second, and where the time goes."),
+    ("admin", "gallery", "graspd.commands.admin", "Draw hands and objects at rest, as a camera sees them."),
+    ("hands", "check", "graspd.commands.hands", "Say whether a hand can be used, and what was guessed about it."),
+    ("objects", "check", "graspd.commands.objects", "Say whether a mesh can be used, and what was repaired."),
+    ("datasets", "balance", "graspd.commands.curate", "Draw a part in which no kind of grasps is more frequent."),
+    ("datasets", "diff", "graspd.commands.curate", "Compare two datasets."),
+    ("datasets", "card", "graspd.commands.exchange", "Write a dataset's card: contents, quality, biases, plots."),
 )
 
 #: What a package cannot work without, and the extra that brings it: an image has only the packages it needs.

@@ -12,20 +12,20 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from api.client.client import Client
-from api.client.job_options import validated
-from api.client.reports import JobDisplay, job_summary, means_of, yield_of
-from api.formatting import count, duration, metric
-from api.models import GraspQuery, JobDetail
-from service.cli import JsonFlag, emit, load_settings, plain_console, reporting_errors, write_output
-from service.index.views import GraspView
-from service.model.domain import JobRequest
-from service.model.errors import TaskError
-from service.model.states import AssetKind, State
-from service.run.supervisor import Supervisor
-from service.store import validity
-from service.store.assets import builtin_files
-from service.store.shards import Shard, read_shard
+from graspd.api.formatting import count, duration, metric
+from graspd.api.models import GraspQuery, JobDetail
+from graspd.client.client import Client
+from graspd.client.job_options import validated
+from graspd.client.reports import JobDisplay, job_summary, means_of, yield_of
+from graspd.service.cli import JsonFlag, emit, load_settings, plain_console, reporting_errors, write_output
+from graspd.service.index.views import GraspView
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import TaskError
+from graspd.service.model.states import AssetKind, State
+from graspd.service.run.supervisor import Supervisor
+from graspd.service.store import validity
+from graspd.service.store.assets import builtin_files
+from graspd.service.store.shards import Shard, read_shard
 
 app = typer.Typer()
 
@@ -141,7 +141,7 @@ def print_results(console: Console, best: list[GraspView], job: JobDetail, paths
 
 def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
     """The contact sheet of the best grasps, the views of the first batch, and an index.html that shows both."""
-    from worker.rendering.sheets import views_page
+    from graspd.worker.rendering.sheets import views_page
 
     pictures = []
     bases = [path for path in shards if path.name.startswith("base")]
@@ -160,11 +160,11 @@ def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
 def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     """PNG of the best grasps of a shard, ranked by ε."""
     # Warp takes seconds to import; a mistake in an option must not wait for it.
-    from worker.engines import backend
-    from worker.hands.load import load_hand
-    from worker.objects.prepare import load_object
-    from worker.rendering.pictures import grasp_pictures
-    from worker.rendering.sheets import best, contact_sheet, figures
+    from graspd.worker.engines import backend
+    from graspd.worker.hands.load import load_hand
+    from graspd.worker.objects.prepare import load_object
+    from graspd.worker.rendering.pictures import grasp_pictures
+    from graspd.worker.rendering.sheets import best, contact_sheet, figures
 
     backend.start()
     hand_files, object_files = (

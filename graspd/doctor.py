@@ -14,11 +14,11 @@ from typing import Annotated, Final
 import typer
 
 from graspd.cli import missing_extra
-from service.cli import JsonFlag, emit, load_settings, reporting_errors
-from service.model.errors import InputError
-from service.run.doctor import backends, fleet, machine
-from service.run.doctor.checks import THREADS, Check, Condition, Finding, run_checks, skipped
-from service.settings import Settings
+from graspd.service.cli import JsonFlag, emit, load_settings, reporting_errors
+from graspd.service.model.errors import InputError
+from graspd.service.run.doctor import backends, fleet, machine
+from graspd.service.run.doctor.checks import THREADS, Check, Condition, Finding, run_checks, skipped
+from graspd.service.settings import Settings
 
 app = typer.Typer(no_args_is_help=False)
 _COLOURS: Final = {
@@ -78,7 +78,7 @@ def all_checks(settings: Settings, *, full: bool = False) -> list[Check]:
 def _of_api(settings: Settings) -> list[Check]:
     if missing_extra("api"):
         return [_absent("keys", "api")]
-    from api.access.doctor import keys
+    from graspd.api.access.doctor import keys
 
     return [Check("keys", lambda: keys(settings))]
 
@@ -86,7 +86,7 @@ def _of_api(settings: Settings) -> list[Check]:
 def _of_worker(settings: Settings) -> list[Check]:
     if missing_extra("worker"):
         return [_absent("gpu", "worker"), _absent("kernels", "worker")]
-    from worker.process.doctor import checks_of as of_worker
+    from graspd.worker.process.doctor import checks_of as of_worker
 
     return of_worker(settings)
 

@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING, Any, Final, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from service.cli import write_output
-from service.model.errors import InputError
-from service.model.metrics import GRASP_METRICS, GraspMetric
-from service.model.transforms import Floats, compose
-from service.readers.files import Shards, open_shards
-from service.store import validity
-from service.store.columns import SCHEMAS, Attribute
-from service.store.manifests import INDEX_THRESHOLD_M
-from service.store.shards import Shard, read_shard, write_shard
+from graspd.service.cli import write_output
+from graspd.service.model.errors import InputError
+from graspd.service.model.metrics import GRASP_METRICS, GraspMetric
+from graspd.service.model.transforms import Floats, compose
+from graspd.service.readers.files import Shards, open_shards
+from graspd.service.store import validity
+from graspd.service.store.columns import SCHEMAS, Attribute
+from graspd.service.store.manifests import INDEX_THRESHOLD_M
+from graspd.service.store.shards import Shard, read_shard, write_shard
 
 if TYPE_CHECKING:
-    from worker.viewing import Viewer
+    from graspd.worker.viewing import Viewer
 
 Array = NDArray[Any]
 #: Rows to keep: a mask (N,), row numbers, or a function that makes either from the grasps.

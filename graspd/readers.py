@@ -2,7 +2,17 @@
 
 from typing import Any
 
-from service.readers import Clouds, DepthNoise, Grasps, Pictures, ShardCache, ShardFile, Shards, open_shards, prefetched
+from graspd.service.readers import (
+    Clouds,
+    DepthNoise,
+    Grasps,
+    Pictures,
+    ShardCache,
+    ShardFile,
+    Shards,
+    open_shards,
+    prefetched,
+)
 
 __all__ = [
     "Clouds",
@@ -26,6 +36,6 @@ def hand_surface(shard: Any, rows: Any) -> Any:
     Raises:
         NotFoundError: the shard's hand is not found.
     """
-    from worker.files.clouds import hand_surface as found  # loads the hands' reader
+    from graspd.worker.files.clouds import hand_surface as found  # loads the hands' reader
 
     return found(shard, rows)

@@ -8,17 +8,17 @@ from typing import Any, Self
 from pydantic import ValidationError
 
 from graspd.grasps import Grasps, joined
-from service.model.base import refusal
-from service.model.domain import JobRequest
-from service.model.errors import InputError, TaskError
-from service.model.states import State
-from service.store.shards import read_shard
+from graspd.service.model.base import refusal
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import InputError, TaskError
+from graspd.service.model.states import State
+from graspd.service.store.shards import read_shard
 
 try:
-    from api.client.client import Client as HttpClient
-    from api.client.client import path_of
-    from api.client.reports import open_client
-    from api.models import JobDetail
+    from graspd.api.models import JobDetail
+    from graspd.client.client import Client as HttpClient
+    from graspd.client.client import path_of
+    from graspd.client.reports import open_client
 except ModuleNotFoundError as error:
     raise ImportError(f"graspd.Client needs {error.name}; run pip install 'graspd[api]'") from error
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from service.model.errors import InputError
-from service.model.transforms import POSE_PARTS
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import POSE_PARTS
 
 if TYPE_CHECKING:
     from graspd.grasps import Grasps
-    from worker.viewing import Viewer
+    from graspd.worker.viewing import Viewer
 
 #: Grasps of a notebook's picture, edge of each [px], and the time after which tracing stops [s].
 PICTURED: Final = 4
@@ -76,8 +76,8 @@ def html_of(grasps: Grasps) -> str:
 def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:
     """A viewer that serves; see `Grasps.view`."""
     try:
-        from worker.files.provenance import hand_of_shard, neighbours_of_shard, object_of_shard
-        from worker.viewing import Shown, Viewer, missing
+        from graspd.worker.files.provenance import hand_of_shard, neighbours_of_shard, object_of_shard
+        from graspd.worker.viewing import Shown, Viewer, missing
     except ModuleNotFoundError as error:
         raise ImportError(f"view needs {error.name}; run pip install 'graspd[worker,view]'") from error
     if said := missing():
@@ -88,10 +88,10 @@ def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:
 
 
 def _picture(grasps: Grasps) -> bytes:
-    from worker.commands.grasp_sheet import GraspSheet
-    from worker.engines.devices import Device
-    from worker.files.provenance import hand_of_shard, object_of_shard
-    from worker.run import Run
+    from graspd.commands.grasp_sheet import GraspSheet
+    from graspd.worker.engines.devices import Device
+    from graspd.worker.files.provenance import hand_of_shard, object_of_shard
+    from graspd.worker.run import Run
 
     shard, until = grasps.shard(), time.monotonic() + PICTURE_S
     rows = _best(grasps)

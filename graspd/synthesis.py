@@ -10,11 +10,11 @@ from typing import Any, Literal
 from pydantic import ValidationError
 
 from graspd.grasps import Grasps
-from service.model.base import refusal
-from service.model.domain import JobOptions
-from service.model.errors import InputError
-from service.model.metrics import MIN_DISTANCE_M
-from service.model.scene_spec import parse_scene
+from graspd.service.model.base import refusal
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import InputError
+from graspd.service.model.metrics import MIN_DISTANCE_M
+from graspd.service.model.scene_spec import parse_scene
 
 
 def synthesize(
@@ -98,9 +98,9 @@ def synthesize(
         ImportError: the engine is not installed (`graspd[worker]`).
     """
     try:
-        from service.store.asset_options import object_options
-        from worker.files.synthesis import chosen_fidelity, synthesized
-        from worker.planners.registry import of_this_machine
+        from graspd.service.store.asset_options import object_options
+        from graspd.worker.files.synthesis import chosen_fidelity, synthesized
+        from graspd.worker.planners.registry import of_this_machine
     except ModuleNotFoundError as error:
         raise ImportError(f"synthesize needs {error.name}; run pip install 'graspd[worker]'") from error
     try:

@@ -19,14 +19,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, ParamSpec, 
 import typer
 from pydantic import BaseModel, ValidationError
 
-from service.model.base import refusal
-from service.model.errors import GraspdError, InputError, without_secrets
+from graspd.service.model.base import refusal
+from graspd.service.model.errors import GraspdError, InputError, without_secrets
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from service.settings import Settings
+    from graspd.service.settings import Settings
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -179,7 +179,7 @@ def emit(value: BaseModel | dict[str, Any]) -> None:
 
 def load_settings(**overrides: Any) -> Settings:
     """Settings of the environment, with those options of a command that were given; InputError for a bad value."""
-    from service.settings import GONE, Settings
+    from graspd.service.settings import GONE, Settings
 
     if gone := [f"{name} is gone: {GONE[name]}" for name in sorted(GONE) if os.environ.get(name)]:
         raise InputError("; ".join(gone))
@@ -209,7 +209,7 @@ def engine_settings() -> EngineSettings:
 
 def log_to_stderr(settings: Settings, process: str = "graspd") -> None:
     """Log lines of this process: JSON, or text on a terminal."""
-    from service import telemetry
+    from graspd.service import telemetry
 
     telemetry.set_up_logs(settings, process)
 

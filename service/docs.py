@@ -1,6 +1,6 @@
 """The parts of the documentation that follow from the code: the tables of shards and settings.
 
-A page holds them between `<!-- NAME -->` and `<!-- /NAME -->`; `python -m service.docs` writes them anew.
+A page holds them between `<!-- NAME -->` and `<!-- /NAME -->`; `python -m graspd.service.docs` writes them anew.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from service.pipeline.metrics import series_table
-from service.settings import Settings
-from service.store.columns import ATTRIBUTES, SCHEMAS, ShardKind
+from graspd.service.pipeline.metrics import series_table
+from graspd.service.settings import Settings
+from graspd.service.store.columns import ATTRIBUTES, SCHEMAS, ShardKind
 
 
 def schema_table(kind: ShardKind) -> str:

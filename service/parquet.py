@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from service.model.errors import InputError
+from graspd.service.model.errors import InputError
 
 #: Most that a file of others may unpack to, by its own account [bytes].
 LARGEST: Final = 2**31

@@ -20,10 +20,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from service.model.errors import without_secrets
+from graspd.service.model.errors import without_secrets
 
 if TYPE_CHECKING:
-    from service.settings import Settings
+    from graspd.service.settings import Settings
 
 #: What a line can be about, in the order in which it is shown.
 SUBJECTS: Final = ("request", "key", "job", "task", "attempt", "worker")

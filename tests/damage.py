@@ -8,7 +8,7 @@ import numpy as np
 import obstore
 from numpy.typing import NDArray
 
-from service.store.store import Store
+from graspd.service.store.store import Store
 
 
 def overwrite(store: Store, key: str, data: bytes) -> None:

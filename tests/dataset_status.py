@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from service.index.index import Index
-from service.index.views import CellView, DatasetView, View
+from graspd.service.index.index import Index
+from graspd.service.index.views import CellView, DatasetView, View
 
 _PAGE = 200
 

@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import graspd.cli
-from service.model.states import State
+from graspd.service.model.states import State
 from tests.docs_files import files_for
 
 REPOSITORY: Final = Path(__file__).resolve().parent.parent
@@ -219,8 +219,8 @@ def _resolved(command: Any, words: list[str]) -> tuple[Any, list[str]]:
 
 def run_page(page: Path, leave: str, keep: Path) -> list[str]:
     """Run the lines of a page; returns what failed."""
-    from service.run.supervisor import Supervisor
-    from service.settings import Settings
+    from graspd.service.run.supervisor import Supervisor
+    from graspd.service.settings import Settings
 
     left = re.compile(leave or r"(?!)")
     lines = [(line, line.reason or ("--leave" if left.search(line.text) else "")) for line in lines_of(page)]

@@ -13,8 +13,8 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
-from service.model.states import AssetKind
-from service.store.assets import builtin_files
+from graspd.service.model.states import AssetKind
+from graspd.service.store.assets import builtin_files
 
 _PROGRAM: Final = (sys.executable, "-m", "graspd")
 REPOSITORY: Final = Path(__file__).resolve().parent.parent
@@ -83,8 +83,8 @@ def _meshes(folder: Path) -> None:
 
 
 def _hands(folder: Path) -> None:
+    from tests.exchange.robots.arms import write_arm
     from tests.worker.hands.my_hand import write_all
-    from tests.worker.robots.arms import write_arm
 
     write_all(folder)
     shutil.copy(folder / "my_hand" / "my_hand.urdf", folder / "my_hand.urdf")
@@ -140,9 +140,9 @@ def _for_scaling(text: str, folder: Path, graspd: Graspd) -> None:
 def _for_planners(text: str, folder: Path, graspd: Graspd) -> None:
     """A network without skill, and maps of scenes."""
     del text, graspd
+    from graspd.baselines.learned.network import save
+    from graspd.worker.hands.load import hand_from_path
     from tests.networks import random_network
-    from worker.hands.load import hand_from_path
-    from worker.planners.learned.network import save
 
     hand = hand_from_path("barrett")
     save(random_network(hand.joint_names, hand=hand.name, digest=hand.digest), folder / "barrett.npz")

@@ -16,25 +16,25 @@ from typing import Any
 
 import numpy as np
 
-from service.model import names
-from service.model.clock import timestamp
-from service.model.domain import JobRequest
-from service.model.messages import TaskMessage
-from service.model.planning import message_of, plan
-from service.model.records import JobRecord
-from service.model.states import AssetKind, Lane, Stage
-from service.model.version import STAGE_REVISIONS
-from service.pipeline.backends import Services
-from service.store.integrity import put_document
-from service.store.library import publish_asset
-from service.store.manifests import ShardManifest, load_shard, publish_shard
-from service.store.store import Store
-from worker.process.engine import Engine
-from worker.process.fitness import Check
-from worker.process.link import Link, Setup, StartEngine, start_engine
-from worker.process.selfcheck import EngineError
-from worker.stages.context import Output, StageFunction, TaskContext, shard_of
-from worker.stages.ranges import base_rows, batches_of, joined
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.planning import message_of, plan
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import AssetKind, Lane, Stage
+from graspd.service.model.version import STAGE_REVISIONS
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.integrity import put_document
+from graspd.service.store.library import publish_asset
+from graspd.service.store.manifests import ShardManifest, load_shard, publish_shard
+from graspd.service.store.store import Store
+from graspd.worker.process.engine import Engine
+from graspd.worker.process.fitness import Check
+from graspd.worker.process.link import Link, Setup, StartEngine, start_engine
+from graspd.worker.process.selfcheck import EngineError
+from graspd.worker.stages.context import Output, StageFunction, TaskContext, shard_of
+from graspd.worker.stages.ranges import base_rows, batches_of, joined
 
 HAND_FILES = {"asset.json": b'{"file": "hand.urdf"}', "hand.urdf": b"<robot name='fake'/>"}
 OBJECT_FILES = {"asset.json": b'{"file": "ball.stl"}', "ball.stl": b"solid ball\nendsolid ball\n"}
@@ -156,7 +156,7 @@ def _pretend_to_work(context: TaskContext) -> None:
 
 def _die_untold(once: Path) -> None:
     """Let this worker be killed when it has put a shard, and before it says so, if no other one was."""
-    from worker.process import runner
+    from graspd.worker.process import runner
 
     def publish(*shard: Any) -> bool:
         is_new = publish_shard(*shard)
@@ -188,10 +188,10 @@ def main() -> None:
     file of that name says so. FAKE_REVISION is the revision of synthesize that worker and engine make. Of the options
     of `graspd worker` it takes `--burst` and `--idle`.
     """
-    from service.cli import log_to_stderr
-    from service.settings import Settings
-    from worker.process import engine
-    from worker.process.main import run_worker
+    from graspd.service.cli import log_to_stderr
+    from graspd.service.settings import Settings
+    from graspd.worker.process import engine
+    from graspd.worker.process.main import run_worker
 
     if revision := os.environ.get("FAKE_REVISION"):
         STAGE_REVISIONS["synthesize"] = int(revision)

@@ -11,8 +11,8 @@ from typing import Final
 
 from sqlalchemy import URL, Connection, create_engine, make_url, text
 
-from service.index.index import Index
-from service.settings import sqlite_url
+from graspd.service.index.index import Index
+from graspd.service.settings import sqlite_url
 from tests.servers import PostgresServer, schema_of
 
 #: Tables of a schema that hold pages, but for the one that names the revision.

@@ -9,9 +9,9 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from service.model.states import Lane, Stage
-from service.model.workers import WorkerBeat
-from service.queue.port import (
+from graspd.service.model.states import Lane, Stage
+from graspd.service.model.workers import WorkerBeat
+from graspd.service.queue.port import (
     Event,
     Lease,
     Message,
@@ -19,7 +19,7 @@ from service.queue.port import (
     Report,
     lane_order,
 )
-from service.queue.rq_queue import RqQueue
+from graspd.service.queue.rq_queue import RqQueue
 
 
 @dataclass

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from service.store.network_file import NETWORK_FILE, ProposalNetwork, numbers, to_bytes, weight_shapes
+from graspd.service.store.network_file import NETWORK_FILE, ProposalNetwork, numbers, to_bytes, weight_shapes
 
 DIGEST = "0" * 32
 #: A small job that sets out from a network, but for its options.

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from service.model import metrics
+from graspd.service.model import metrics
 
 NAME, TITLE, MEANING = "finger_force_n", "Finger force", "largest force of a finger"
 ROW = metrics.GraspMetric(
@@ -27,15 +27,15 @@ def main(folder: Path, older_index: str) -> None:
     from fastapi.testclient import TestClient
     from sqlalchemy import inspect
 
-    from api.app import create_app
-    from service.docs import schema_table
-    from service.index.index import Index
-    from service.model.states import Stage
-    from service.store.columns import SCHEMAS
-    from service.store.manifests import load_manifest
+    from graspd.api.app import create_app
+    from graspd.service.docs import schema_table
+    from graspd.service.index.index import Index
+    from graspd.service.model.states import Stage
+    from graspd.service.store.columns import SCHEMAS
+    from graspd.service.store.manifests import load_manifest
+    from graspd.studies.cards.tables import quality_table
     from tests.api.conftest import BASE_URL
-    from tests.worker.cards.conftest import case
-    from worker.cards.tables import quality_table
+    from tests.studies.cards.conftest import case
 
     def measured(hand: str, obj: str, columns: dict[str, Any]) -> None:
         columns[ROW.path] = np.linspace(0, 20, len(columns["quality/valid"]))

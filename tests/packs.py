@@ -8,15 +8,15 @@ import struct
 from collections.abc import Sequence
 from itertools import accumulate
 
-from service.model.clock import timestamp
-from service.model.digests import digest_bytes, digest_json
-from service.model.domain import JobRequest
-from service.model.messages import TaskMessage
-from service.model.planning import message_of, plan
-from service.model.records import JobRecord
-from service.model.states import Lane, Stage
-from service.store.manifests import ShardManifest
-from service.store.store import Store, open_store
+from graspd.service.model.clock import timestamp
+from graspd.service.model.digests import digest_bytes, digest_json
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.planning import message_of, plan
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import Lane, Stage
+from graspd.service.store.manifests import ShardManifest
+from graspd.service.store.store import Store, open_store
 from tests.fakes import make_shard, request
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from service.pipeline.backends import Services
-from service.pipeline.datasets.rounds import DatasetRounds
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets.rounds import DatasetRounds
 
 
 def plan_all(services: Services) -> None:

@@ -19,33 +19,33 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.domain import JobOptions
-from service.model.errors import TaskCancelled
-from service.model.planning import totals
-from worker.grasps import GraspSet, joined, joined_columns
-from worker.hands.model import HandModel
-from worker.hands.oppositions import require_opposing
-from worker.objects.model import ObjectModel
-from worker.planners import NoPlace, Trial, Wanted, fitting_pairs, method, synthesize
-from worker.planners.fast_graspd.across import why_narrow
-from worker.quality.diversity import POINTS, distinct, hand_points
-from worker.quality.gate import GATES, failed_gate, passes
-from worker.quality.referee.decomposition import ConvexPieces, decompose
-from worker.quality.referee.displacement import simulated_displacement_cm
-from worker.quality.referee.first.screening import first_terms
-from worker.quality.referee.judge import judge
-from worker.quality.referee.key import verdict_key
-from worker.quality.referee.lift import LiftOutcome
-from worker.quality.referee.lifting import judge_lifts, lift_key
-from worker.quality.referee.payload import ENOUGH, Limit, limit_of, payloads, shake_margins
-from worker.quality.referee.protocol import DIRECTIONS, Outcome
-from worker.quality.referee.robust import reaches, robust, robustness
-from worker.quality.table import measure
-from worker.rounds import ROUND_STRIDE, Arrays, Round, enough, lanes_of, next_round, taken
-from worker.run import ALONE, Run
-from worker.scenes.trial import lift_level, scene_verdicts, trial_on
-from worker.side_by_side import side_by_side
-from worker.simulation.surroundings import Placed, Scenes
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import TaskCancelled
+from graspd.service.model.planning import totals
+from graspd.worker.grasps import GraspSet, joined, joined_columns
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.oppositions import require_opposing
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners import NoPlace, Trial, Wanted, fitting_pairs, method, synthesize
+from graspd.worker.planners.fast_graspd.across import why_narrow
+from graspd.worker.quality.diversity import POINTS, distinct, hand_points
+from graspd.worker.quality.gate import GATES, failed_gate, passes
+from graspd.worker.quality.table import measure
+from graspd.worker.rounds import ROUND_STRIDE, Arrays, Round, enough, lanes_of, next_round, taken
+from graspd.worker.run import ALONE, Run
+from graspd.worker.scenes.trial import lift_level, scene_verdicts, trial_on
+from graspd.worker.side_by_side import side_by_side
+from graspd.worker.simulation.surroundings import Placed, Scenes
+from graspd.worker.validation.decomposition import ConvexPieces, decompose
+from graspd.worker.validation.displacement import simulated_displacement_cm
+from graspd.worker.validation.key import verdict_key
+from graspd.worker.validation.lift import LiftOutcome
+from graspd.worker.validation.lifting import judge_lifts, lift_key
+from graspd.worker.validation.payload import ENOUGH, Limit, limit_of, payloads, shake_margins
+from graspd.worker.validation.prefilter.prefilter import first_terms
+from graspd.worker.validation.protocol import DIRECTIONS, Outcome
+from graspd.worker.validation.robust import reaches, robust, robustness
+from graspd.worker.validation.validator import judge
 
 #: Why a grasp is not kept: its hand is no number, something of its scene is in its way, the referee dropped it, it
 #: failed the geometric gate, holds in too few models around the nominal one, lifts too little, or is as good as the

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from service.model.transforms import Floats
+from graspd.service.model.transforms import Floats
 
 Columns = Mapping[str, NDArray[Any]]
 #: The one column of a base shard that is no row for each grasp.

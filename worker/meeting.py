@@ -14,7 +14,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from service.model.errors import TaskCancelled
+from graspd.service.model.errors import TaskCancelled
 
 log = logging.getLogger(__name__)
 #: Work for several at once: a result, or what became of it, for each that was asked for.

@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.domain import BATCH_SIZE
-from worker.grasps import THRESHOLDS, GraspSet, joined, joined_columns
+from graspd.service.model.domain import BATCH_SIZE
+from graspd.worker.grasps import THRESHOLDS, GraspSet, joined, joined_columns
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
-from service.model.cores import available_cores
-from service.model.errors import TaskCancelled
-from worker.meeting import Meeting
-from worker.pool.pool import Pool
+from graspd.service.model.cores import available_cores
+from graspd.service.model.errors import TaskCancelled
+from graspd.worker.meeting import Meeting
+from graspd.worker.pool.pool import Pool
 
 FirstJudge = Literal["auto", "on", "off"]
 Progress = Callable[[float, float, str], None]

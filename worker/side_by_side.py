@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar
 
-from worker.run import Lanes, Progress, Run
+from graspd.worker.run import Lanes, Progress, Run
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -9,19 +9,19 @@ from typing import Final
 
 import numpy as np
 
-from service.model.domain import BATCH_SIZE, JobOptions
-from service.model.errors import TaskCancelled
-from worker.certified import Certified, certified_grasps
-from worker.engines.joins import PER_LAUNCH
-from worker.hands.model import HandModel
-from worker.meeting import Meeting
-from worker.objects.model import ObjectModel
-from worker.quality.diversity import distinct, hand_points
-from worker.quality.referee.decomposition import ConvexPieces, decompose
-from worker.rounds import taken
-from worker.run import ALONE, Run
-from worker.side_by_side import Shares, in_threads
-from worker.simulation.surroundings import Scenes
+from graspd.service.model.domain import BATCH_SIZE, JobOptions
+from graspd.service.model.errors import TaskCancelled
+from graspd.worker.certified import Certified, certified_grasps
+from graspd.worker.engines.joins import PER_LAUNCH
+from graspd.worker.hands.model import HandModel
+from graspd.worker.meeting import Meeting
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.quality.diversity import distinct, hand_points
+from graspd.worker.rounds import taken
+from graspd.worker.run import ALONE, Run
+from graspd.worker.side_by_side import Shares, in_threads
+from graspd.worker.simulation.surroundings import Scenes
+from graspd.worker.validation.decomposition import ConvexPieces, decompose
 
 #: Times that batches are made for grasps that were too like those of another batch.
 _REFILLS: Final = 3

@@ -14,18 +14,18 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError
-from service.model.scene_spec import Box, HalfSpace, SceneSpec, supports_in
-from service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
-from service.readers.ways import Waypoint, point_at, scene_spec_of, stop_places, way_of, wrists_of
-from service.store.shards import Shard
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.quality.probe import Probe, probe_of
-from worker.rendering.hands import drawn_parts, drawn_poses, without_visuals
-from worker.rendering.scenery import seen_share
-from worker.scenes.neighbours import Neighbours
+from graspd.service.model.errors import InputError
+from graspd.service.model.scene_spec import Box, HalfSpace, SceneSpec, supports_in
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
+from graspd.service.readers.ways import Waypoint, point_at, scene_spec_of, stop_places, way_of, wrists_of
+from graspd.service.store.shards import Shard
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.quality.probe import Probe, probe_of
+from graspd.worker.rendering.hands import drawn_parts, drawn_poses, without_visuals
+from graspd.worker.rendering.scenery import seen_share
+from graspd.worker.scenes.neighbours import Neighbours
 
 #: Points of the hand whose distance from the object is shown, where it is less than this [m].
 POINTS: Final = 3000

@@ -26,11 +26,11 @@ from starlette.datastructures import Headers
 from starlette.requests import HTTPConnection
 from starlette.types import Scope as AsgiScope
 
-from api.access.keys import Key, KeyFile, Scope
-from api.problems import ApiError
-from service.model.errors import InputError
-from service.model.projects import EVERYTHING, PATTERN, ProjectScope
-from service.settings import Settings
+from graspd.api.access.keys import Key, KeyFile, Scope
+from graspd.api.problems import ApiError
+from graspd.service.model.errors import InputError
+from graspd.service.model.projects import EVERYTHING, PATTERN, ProjectScope
+from graspd.service.settings import Settings
 
 SESSION_COOKIE: Final = "graspd_session"
 #: Headers that a proxy adds: while the service is open they mean that somebody else's requests arrive here.

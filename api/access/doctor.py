@@ -6,11 +6,11 @@ import stat
 from datetime import UTC, datetime, timedelta
 from typing import Final
 
-from api.access.auth import Proxy
-from api.access.keys import Key, KeyFile, Scope
-from service.model.errors import GraspdError
-from service.run.doctor.checks import Finding, bad, good, warning
-from service.settings import Settings
+from graspd.api.access.auth import Proxy
+from graspd.api.access.keys import Key, KeyFile, Scope
+from graspd.service.model.errors import GraspdError
+from graspd.service.run.doctor.checks import Finding, bad, good, warning
+from graspd.service.settings import Settings
 
 _LOCAL: Final = ("127.0.0.1", "::1", "localhost")
 _SOON: Final = timedelta(days=7)

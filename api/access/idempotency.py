@@ -12,9 +12,9 @@ from typing import Any, Final
 
 from redis.exceptions import RedisError
 
-from service.model.digests import digest_bytes, digest_json
-from service.model.domain import JobRequest
-from service.model.errors import InputError, QueueUnavailable
+from graspd.service.model.digests import digest_bytes, digest_json
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import InputError, QueueUnavailable
 
 KEPT_S: Final = 24 * 3600
 _FREE: Final = "if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('DEL', KEYS[1]) end"

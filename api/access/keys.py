@@ -24,8 +24,8 @@ from typing import Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from service.model.errors import ConflictError, InputError, NotFoundError, UnavailableError
-from service.model.projects import PATTERN, Project
+from graspd.service.model.errors import ConflictError, InputError, NotFoundError, UnavailableError
+from graspd.service.model.projects import PATTERN, Project
 
 PREFIX: Final = "gd_"
 SESSION_S: Final = 12 * 3600

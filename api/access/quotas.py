@@ -17,10 +17,10 @@ from typing import Any, Final
 
 from redis.exceptions import RedisError
 
-from api.access.keys import Key, ProjectLimits
-from service.index.index import Index
-from service.model.errors import QuotaError
-from service.settings import Settings
+from graspd.api.access.keys import Key, ProjectLimits
+from graspd.service.index.index import Index
+from graspd.service.model.errors import QuotaError
+from graspd.service.settings import Settings
 
 log = logging.getLogger(__name__)
 #: A key that submits nothing for this long is forgotten [s].

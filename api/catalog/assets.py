@@ -10,22 +10,22 @@ from collections.abc import Mapping, MutableMapping
 from dataclasses import replace
 from typing import Final
 
-from api.access.auth import caller_id, must_own, project_scope
-from service.index.views import AssetView, Page
-from service.model import names
-from service.model.digests import digest_files
-from service.model.errors import ConflictError, DamagedError, LimitError, NotFoundError
-from service.model.names import MOST, fitted
-from service.model.projects import marks_of
-from service.model.states import AssetKind
-from service.pipeline import deletion
-from service.pipeline.backends import Services
-from service.pipeline.recording import recording
-from service.store import library
-from service.store.assets import ZipFiles, asset_json
-from service.store.descriptions import MAX_BYTES, HandCorrections, HandFacts, corrected, facts_of, json_object
-from service.store.integrity import get_sealed, put_document
-from service.store.network_file import network_report
+from graspd.api.access.auth import caller_id, must_own, project_scope
+from graspd.service.index.views import AssetView, Page
+from graspd.service.model import names
+from graspd.service.model.digests import digest_files
+from graspd.service.model.errors import ConflictError, DamagedError, LimitError, NotFoundError
+from graspd.service.model.names import MOST, fitted
+from graspd.service.model.projects import marks_of
+from graspd.service.model.states import AssetKind
+from graspd.service.pipeline import deletion
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.recording import recording
+from graspd.service.store import library
+from graspd.service.store.assets import ZipFiles, asset_json
+from graspd.service.store.descriptions import MAX_BYTES, HandCorrections, HandFacts, corrected, facts_of, json_object
+from graspd.service.store.integrity import get_sealed, put_document
+from graspd.service.store.network_file import network_report
 
 log = logging.getLogger(__name__)
 _NAMES_TRIED: Final = 100

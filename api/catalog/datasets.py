@@ -10,22 +10,22 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
-from api.access.auth import caller, caller_id, must_own, project_scope
-from api.access.quotas import DATASET_PREFIX, Quotas
-from api.catalog.grasps import MEAN_METRICS
-from service.index.queries.grasps import GraspFilter, Metric
-from service.index.queries.statistics import Distribution
-from service.index.views import CellView, DatasetView, MatrixCell, ObjectSetView, Page, SnapshotView
-from service.model.records import Snapshot
-from service.model.states import State
-from service.pipeline import deletion
-from service.pipeline.backends import Services
-from service.pipeline.datasets import actions
-from service.pipeline.datasets.cost import estimate
-from service.pipeline.datasets.estimate import Estimate
-from service.pipeline.datasets.spec import DatasetRequest, Matrix
-from service.pipeline.fidelity_choice import Resolver
-from service.store.records import load_snapshot
+from graspd.api.access.auth import caller, caller_id, must_own, project_scope
+from graspd.api.access.quotas import DATASET_PREFIX, Quotas
+from graspd.api.catalog.grasps import MEAN_METRICS
+from graspd.service.index.queries.grasps import GraspFilter, Metric
+from graspd.service.index.queries.statistics import Distribution
+from graspd.service.index.views import CellView, DatasetView, MatrixCell, ObjectSetView, Page, SnapshotView
+from graspd.service.model.records import Snapshot
+from graspd.service.model.states import State
+from graspd.service.pipeline import deletion
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.cost import estimate
+from graspd.service.pipeline.datasets.estimate import Estimate
+from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix
+from graspd.service.pipeline.fidelity_choice import Resolver
+from graspd.service.store.records import load_snapshot
 
 log = logging.getLogger(__name__)
 

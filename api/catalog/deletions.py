@@ -7,11 +7,11 @@ from datetime import datetime, timedelta
 
 from pydantic import Field
 
-from api.access.auth import must_own, project_scope
-from service.index.views import View
-from service.pipeline import deletion
-from service.pipeline.backends import Services
-from service.store.records import Deletion, What, deletions
+from graspd.api.access.auth import must_own, project_scope
+from graspd.service.index.views import View
+from graspd.service.pipeline import deletion
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.records import Deletion, What, deletions
 
 log = logging.getLogger(__name__)
 

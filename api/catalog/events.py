@@ -14,19 +14,19 @@ from anyio.to_thread import run_sync
 from fastapi import Request
 from fastapi.sse import ServerSentEvent
 
-from api.access.auth import caller, caller_id, may_change, may_still, must_own, project_scope
-from api.access.keys import Scope
-from api.catalog.jobs import Jobs
-from api.catalog.overview import Overview
-from service.index.views import DeliveryView, EndView, WebhookView
-from service.model import names
-from service.model.clock import timestamp
-from service.model.digests import digest_json
-from service.model.errors import ConflictError, LimitError, UnavailableError
-from service.model.projects import ProjectScope
-from service.model.webhooks import MOST_HOOKS, End, Webhook, check_url, secret_of
-from service.pipeline.backends import Services
-from service.pipeline.recording import recording
+from graspd.api.access.auth import caller, caller_id, may_change, may_still, must_own, project_scope
+from graspd.api.access.keys import Scope
+from graspd.api.catalog.jobs import Jobs
+from graspd.api.catalog.overview import Overview
+from graspd.service.index.views import DeliveryView, EndView, WebhookView
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.digests import digest_json
+from graspd.service.model.errors import ConflictError, LimitError, UnavailableError
+from graspd.service.model.projects import ProjectScope
+from graspd.service.model.webhooks import MOST_HOOKS, End, Webhook, check_url, secret_of
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.recording import recording
 
 POLL_S: Final = 0.5
 #: A client that reconnects waits this long.

@@ -15,15 +15,15 @@ from typing import IO, Any, Final, Literal
 
 import numpy as np
 
-from api.access.auth import project_scope
-from api.catalog.grasps import Grasps
-from api.catalog.tags import Tags
-from service.index.views import GraspView
-from service.model.errors import InputError, LimitError
-from service.model.records import Grasp, by_shard
-from service.pipeline.backends import Services
-from service.store.integrity import read_checked
-from service.store.shards import part_of_shard, place_of, read_shard
+from graspd.api.access.auth import project_scope
+from graspd.api.catalog.grasps import Grasps
+from graspd.api.catalog.tags import Tags
+from graspd.service.index.views import GraspView
+from graspd.service.model.errors import InputError, LimitError
+from graspd.service.model.records import Grasp, by_shard
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.integrity import read_checked
+from graspd.service.store.shards import part_of_shard, place_of, read_shard
 
 Format = Literal["csv", "json", "zip"]
 MEDIA_TYPES: Final[dict[Format, str]] = {"csv": "text/csv", "json": "application/json", "zip": "application/zip"}

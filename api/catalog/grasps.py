@@ -13,8 +13,8 @@ from functools import lru_cache
 from itertools import zip_longest
 from typing import Any, Final, Literal
 
-from api.access.auth import project_scope
-from api.models import (
+from graspd.api.access.auth import project_scope
+from graspd.api.models import (
     Diversity,
     GraspDetail,
     GraspQuery,
@@ -26,19 +26,27 @@ from api.models import (
     Push,
     Waypoint,
 )
-from service.index.queries.grasps import GraspFilter, GraspSort, Metric
-from service.index.queries.statistics import Kinds
-from service.index.views import GraspView, JobView, Page, ShardView
-from service.model.errors import InputError, LimitError, NotFoundError
-from service.model.metrics import DIRECTION_CELLS, GRASP_METRICS, GraspType, Indexed, entropy_bits, evenness, indexed
-from service.model.records import MOST_TAGGED, Grasp
-from service.model.scene_spec import supports_in
-from service.pipeline.backends import Services
-from service.readers.ways import scene_spec_of, stop_places, way_of
-from service.store.columns import SCHEMAS
-from service.store.integrity import read_checked
-from service.store.shards import Shard, read_shard
-from service.store.store import Store
+from graspd.service.index.queries.grasps import GraspFilter, GraspSort, Metric
+from graspd.service.index.queries.statistics import Kinds
+from graspd.service.index.views import GraspView, JobView, Page, ShardView
+from graspd.service.model.errors import InputError, LimitError, NotFoundError
+from graspd.service.model.metrics import (
+    DIRECTION_CELLS,
+    GRASP_METRICS,
+    GraspType,
+    Indexed,
+    entropy_bits,
+    evenness,
+    indexed,
+)
+from graspd.service.model.records import MOST_TAGGED, Grasp
+from graspd.service.model.scene_spec import supports_in
+from graspd.service.pipeline.backends import Services
+from graspd.service.readers.ways import scene_spec_of, stop_places, way_of
+from graspd.service.store.columns import SCHEMAS
+from graspd.service.store.integrity import read_checked
+from graspd.service.store.shards import Shard, read_shard
+from graspd.service.store.store import Store
 
 _KEPT_HISTOGRAMS: Final = 256
 MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(metric.name for metric in indexed(Indexed.OFFERED))

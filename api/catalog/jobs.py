@@ -10,18 +10,18 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from api.access.auth import caller, caller_id, must_own, project_scope
-from api.access.idempotency import Idempotency
-from api.access.quotas import Quotas
-from api.catalog.grasps import MEAN_METRICS, Grasps
-from api.catalog.shards import Shards
-from api.models import Job, JobDetail, LossCurve, MeanMetrics, StageStatus, stage_state
-from service.index.views import JobView, Page, StageProgress, TaskView
-from service.model.domain import JobRequest
-from service.model.states import Stage, State
-from service.pipeline import deletion, job_actions
-from service.pipeline.backends import Services
-from service.telemetry import bind
+from graspd.api.access.auth import caller, caller_id, must_own, project_scope
+from graspd.api.access.idempotency import Idempotency
+from graspd.api.access.quotas import Quotas
+from graspd.api.catalog.grasps import MEAN_METRICS, Grasps
+from graspd.api.catalog.shards import Shards
+from graspd.api.models import Job, JobDetail, LossCurve, MeanMetrics, StageStatus, stage_state
+from graspd.service.index.views import JobView, Page, StageProgress, TaskView
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.states import Stage, State
+from graspd.service.pipeline import deletion, job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.telemetry import bind
 
 log = logging.getLogger(__name__)
 _PAGE: Final = 200

@@ -11,22 +11,29 @@ from collections.abc import Callable, Iterable
 from datetime import UTC, date, datetime, timedelta
 from typing import Final
 
-from api.access.auth import caller, project_scope
-from api.access.keys import KeyFile, ProjectLimits
-from api.catalog.jobs import Jobs
-from api.metrics import Snapshot
-from api.models import Health, Part, Worker
-from service.index.notes import Damage
-from service.index.queries.overview import read_index
-from service.index.views import FailureGroup, Stats, TaskView, UsageDay
-from service.model.digests import digest_json
-from service.model.errors import BusyError, GraspdError, InputError, NotFoundError, StoreUnavailable, UnavailableError
-from service.model.projects import ProjectScope
-from service.model.states import Lane, Stage
-from service.pipeline.backends import Services
-from service.pipeline.identity import check_queue
-from service.pipeline.leading import PART
-from service.queue.port import QueueNow
+from graspd.api.access.auth import caller, project_scope
+from graspd.api.access.keys import KeyFile, ProjectLimits
+from graspd.api.catalog.jobs import Jobs
+from graspd.api.metrics import Snapshot
+from graspd.api.models import Health, Part, Worker
+from graspd.service.index.notes import Damage
+from graspd.service.index.queries.overview import read_index
+from graspd.service.index.views import FailureGroup, Stats, TaskView, UsageDay
+from graspd.service.model.digests import digest_json
+from graspd.service.model.errors import (
+    BusyError,
+    GraspdError,
+    InputError,
+    NotFoundError,
+    StoreUnavailable,
+    UnavailableError,
+)
+from graspd.service.model.projects import ProjectScope
+from graspd.service.model.states import Lane, Stage
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.identity import check_queue
+from graspd.service.pipeline.leading import PART
+from graspd.service.queue.port import QueueNow
 
 _DAMAGE_SHOWN: Final = 5
 _JOBS_WATCHED: Final = 20

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from typing import Literal
 
-from api.access.auth import project_scope
-from api.models import Shard
-from service.index.views import Page, ShardView
-from service.pipeline.backends import Services
-from service.store.integrity import Checked
+from graspd.api.access.auth import project_scope
+from graspd.api.models import Shard
+from graspd.service.index.views import Page, ShardView
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.integrity import Checked
 
 
 class Shards:

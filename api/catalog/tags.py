@@ -5,15 +5,15 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection
 
-from api.access.auth import caller_id, may_change, must_own, project_scope
-from api.catalog.grasps import Grasps
-from api.models import Selection, TagChange
-from service.index.views import TagView
-from service.model.errors import InputError, LimitError, NotFoundError
-from service.model.projects import ProjectScope
-from service.model.records import MOST_TAGS, Grasp, Tag, tag_id
-from service.pipeline import tagging
-from service.pipeline.backends import Services
+from graspd.api.access.auth import caller_id, may_change, must_own, project_scope
+from graspd.api.catalog.grasps import Grasps
+from graspd.api.models import Selection, TagChange
+from graspd.service.index.views import TagView
+from graspd.service.model.errors import InputError, LimitError, NotFoundError
+from graspd.service.model.projects import ProjectScope
+from graspd.service.model.records import MOST_TAGS, Grasp, Tag, tag_id
+from graspd.service.pipeline import tagging
+from graspd.service.pipeline.backends import Services
 
 log = logging.getLogger(__name__)
 

@@ -13,23 +13,23 @@ from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData
 
-from api.access.auth import NotYours
-from api.catalog.assets import Assets
-from api.catalog.datasets import Datasets
-from api.catalog.jobs import Jobs
-from api.dashboard import figures
-from api.dashboard.figures import twins
-from api.dashboard.form_uploads import asset_choices
-from api.dashboard.forms import first_message, listed
-from api.dashboard.grasp_pages import COLUMNS
-from api.dashboard.rendering import render
-from api.routes.dependencies import AssetsOf, ComparisonsOf, DatasetsOf, JobsOf, may_read, may_submit
-from service.index.views import CellView
-from service.model.domain import JobRequest
-from service.model.errors import ConflictError, InputError
-from service.model.fidelity import OFFERED
-from service.model.states import AssetKind, State
-from service.pipeline.datasets.spec import DatasetRequest
+from graspd.api.access.auth import NotYours
+from graspd.api.catalog.assets import Assets
+from graspd.api.catalog.datasets import Datasets
+from graspd.api.catalog.jobs import Jobs
+from graspd.api.dashboard import figures
+from graspd.api.dashboard.figures import twins
+from graspd.api.dashboard.form_uploads import asset_choices
+from graspd.api.dashboard.forms import first_message, listed
+from graspd.api.dashboard.grasp_pages import COLUMNS
+from graspd.api.dashboard.rendering import render
+from graspd.api.routes.dependencies import AssetsOf, ComparisonsOf, DatasetsOf, JobsOf, may_read, may_submit
+from graspd.service.index.views import CellView
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import ConflictError, InputError
+from graspd.service.model.fidelity import OFFERED
+from graspd.service.model.states import AssetKind, State
+from graspd.service.pipeline.datasets.spec import DatasetRequest
 
 PAGE_SIZE: Final = 20
 #: A matrix of more cells is shown as a list, a page at a time: nobody reads a table of ten thousand fields.

@@ -10,14 +10,24 @@ from dataclasses import dataclass
 from typing import Final
 from urllib.parse import urlencode
 
-from api.models import Histogram
-from service.index.queries.statistics import Distribution
-from service.index.views import CellView, DatasetView, MatrixCell
-from service.model.errors import DamagedError
-from service.model.states import State
-from service.model.studies import OUTCOMES, MapCell, Outcome, Stability, StabilityMap, between, counts, from_json, tick
-from service.store.records import STABILITY, latest
-from service.store.store import Store
+from graspd.api.models import Histogram
+from graspd.service.index.queries.statistics import Distribution
+from graspd.service.index.views import CellView, DatasetView, MatrixCell
+from graspd.service.model.errors import DamagedError
+from graspd.service.model.states import State
+from graspd.service.model.studies import (
+    OUTCOMES,
+    MapCell,
+    Outcome,
+    Stability,
+    StabilityMap,
+    between,
+    counts,
+    from_json,
+    tick,
+)
+from graspd.service.store.records import STABILITY, latest
+from graspd.service.store.store import Store
 
 #: Coordinates of a chart's inside; the SVG stretches it to the page.
 WIDTH: Final = 600.0

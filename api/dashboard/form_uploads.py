@@ -16,13 +16,13 @@ from typing import Any, Final
 from fastapi import Request
 from starlette.datastructures import FormData, UploadFile
 
-from api.catalog.assets import Assets
-from api.routes.assets import store_upload
-from service.index.views import AssetView
-from service.model.errors import GraspdError, InputError
-from service.model.states import AssetKind
-from service.store.assets import asset_json
-from service.store.descriptions import json_object
+from graspd.api.catalog.assets import Assets
+from graspd.api.routes.assets import store_upload
+from graspd.service.index.views import AssetView
+from graspd.service.model.errors import GraspdError, InputError
+from graspd.service.model.states import AssetKind
+from graspd.service.store.assets import asset_json
+from graspd.service.store.descriptions import json_object
 
 _CHECK_WAIT_S: Final = 15.0
 UNITS: Final = (("m", "metres"), ("mm", "millimetres"), ("cm", "centimetres"), ("in", "inches"))

@@ -15,22 +15,22 @@ from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData, UploadFile
 
-from api.access.auth import project_scope
-from api.catalog.assets import Assets
-from api.catalog.jobs import Jobs
-from api.dashboard.form_uploads import FILE_FIELDS, UNITS, Chosen, choices, chosen, refusal_of
-from api.dashboard.rendering import render
-from api.routes.dependencies import AssetsOf, JobsOf, may_read, may_submit
-from service.index.index import Index
-from service.index.queries.overview import BatchCost, Costs
-from service.model.base import refusal, words
-from service.model.domain import JobRequest
-from service.model.errors import GraspdError, InputError
-from service.model.fidelity import OFFERED
-from service.model.projects import ProjectScope
-from service.model.states import AssetKind, Stage
-from service.pipeline.datasets.cost import estimate
-from service.pipeline.datasets.spec import Matrix
+from graspd.api.access.auth import project_scope
+from graspd.api.catalog.assets import Assets
+from graspd.api.catalog.jobs import Jobs
+from graspd.api.dashboard.form_uploads import FILE_FIELDS, UNITS, Chosen, choices, chosen, refusal_of
+from graspd.api.dashboard.rendering import render
+from graspd.api.routes.dependencies import AssetsOf, JobsOf, may_read, may_submit
+from graspd.service.index.index import Index
+from graspd.service.index.queries.overview import BatchCost, Costs
+from graspd.service.model.base import refusal, words
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import GraspdError, InputError
+from graspd.service.model.fidelity import OFFERED
+from graspd.service.model.projects import ProjectScope
+from graspd.service.model.states import AssetKind, Stage
+from graspd.service.pipeline.datasets.cost import estimate
+from graspd.service.pipeline.datasets.spec import Matrix
 
 router = APIRouter(include_in_schema=False)
 

@@ -13,20 +13,29 @@ from pydantic import TypeAdapter, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData
 
-from api.catalog.assets import Assets
-from api.catalog.grasp_exports import Format
-from api.catalog.tags import Tags
-from api.dashboard import rendering
-from api.dashboard.forms import first_message
-from api.dashboard.rendering import base_url, render
-from api.models import GraspDetail, GraspName, GraspQuery, Selection
-from api.routes.dependencies import AssetsOf, ExportsOf, GraspsOf, ShardsOf, TagsOf, may_read, may_submit, next_address
-from api.routes.grasps import exported
-from service.index.views import GraspView, TagView
-from service.model.base import TagName
-from service.model.errors import InputError
-from service.model.metrics import AXIS_MEANINGS, GRASP_METRICS, GraspType, Indexed, indexed
-from service.model.states import AssetKind
+from graspd.api.catalog.assets import Assets
+from graspd.api.catalog.grasp_exports import Format
+from graspd.api.catalog.tags import Tags
+from graspd.api.dashboard import rendering
+from graspd.api.dashboard.forms import first_message
+from graspd.api.dashboard.rendering import base_url, render
+from graspd.api.models import GraspDetail, GraspName, GraspQuery, Selection
+from graspd.api.routes.dependencies import (
+    AssetsOf,
+    ExportsOf,
+    GraspsOf,
+    ShardsOf,
+    TagsOf,
+    may_read,
+    may_submit,
+    next_address,
+)
+from graspd.api.routes.grasps import exported
+from graspd.service.index.views import GraspView, TagView
+from graspd.service.model.base import TagName
+from graspd.service.model.errors import InputError
+from graspd.service.model.metrics import AXIS_MEANINGS, GRASP_METRICS, GraspType, Indexed, indexed
+from graspd.service.model.states import AssetKind
 
 PAGE_SIZES: Final = {"cards": 24, "table": 50}
 #: Sort key, label, unit of the metrics that lists of grasps show.

@@ -10,16 +10,16 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from pydantic import ValidationError
 from starlette.datastructures import FormData
 
-from api.catalog.assets import Assets
-from api.dashboard.forms import first_message
-from api.dashboard.rendering import render
-from api.routes.assets import CorrectionRequest, store_correction
-from api.routes.dependencies import AssetsOf, may_read, may_submit
-from service.index.views import AssetView
-from service.model.errors import ConflictError, InputError, NotFoundError
-from service.model.states import AssetKind
-from service.store.asset_summary import hand_line, limit_line, self_test_line
-from service.store.descriptions import MAX_ENTRIES, HandFacts
+from graspd.api.catalog.assets import Assets
+from graspd.api.dashboard.forms import first_message
+from graspd.api.dashboard.rendering import render
+from graspd.api.routes.assets import CorrectionRequest, store_correction
+from graspd.api.routes.dependencies import AssetsOf, may_read, may_submit
+from graspd.service.index.views import AssetView
+from graspd.service.model.errors import ConflictError, InputError, NotFoundError
+from graspd.service.model.states import AssetKind
+from graspd.service.store.asset_summary import hand_line, limit_line, self_test_line
+from graspd.service.store.descriptions import MAX_ENTRIES, HandFacts
 
 PAGE_SIZE: Final = 50
 #: A check takes seconds.

@@ -13,15 +13,15 @@ from fastapi.responses import HTMLResponse
 from numpy.typing import NDArray
 from PIL import Image
 
-from api.dashboard import figures, rendering
-from api.dashboard.grasp_pages import COLUMNS, choice_of, did
-from api.dashboard.rendering import base_url, render
-from api.models import GraspQuery, JobDetail, LossCurve
-from api.routes.dependencies import GraspsOf, JobsOf, ShardsOf, TagsOf, may_read
-from service.model.errors import NotFoundError
-from service.store.integrity import read_checked
-from service.store.shards import open_shard
-from service.store.store import Store
+from graspd.api.dashboard import figures, rendering
+from graspd.api.dashboard.grasp_pages import COLUMNS, choice_of, did
+from graspd.api.dashboard.rendering import base_url, render
+from graspd.api.models import GraspQuery, JobDetail, LossCurve
+from graspd.api.routes.dependencies import GraspsOf, JobsOf, ShardsOf, TagsOf, may_read
+from graspd.service.model.errors import NotFoundError
+from graspd.service.store.integrity import read_checked
+from graspd.service.store.shards import open_shard
+from graspd.service.store.store import Store
 
 _SHOWN_PICTURES: Final = 8
 _SHOWN_GRASPS: Final = 10

@@ -12,16 +12,16 @@ from fastapi import APIRouter, Depends, FastAPI, Form, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
-from api.access.auth import SESSION_COOKIE
-from api.access.keys import SESSION_S, KeyFile
-from api.catalog import events
-from api.dashboard import dataset_pages, forms, grasp_pages, hand_pages, job_pages, service_pages
-from api.dashboard.forms import Expectations
-from api.dashboard.job_pages import Pictures
-from api.dashboard.rendering import environment, render
-from api.routes.dependencies import OverviewOf, may_read
-from service.model.errors import ERRORS
-from service.pipeline.backends import Services
+from graspd.api.access.auth import SESSION_COOKIE
+from graspd.api.access.keys import SESSION_S, KeyFile
+from graspd.api.catalog import events
+from graspd.api.dashboard import dataset_pages, forms, grasp_pages, hand_pages, job_pages, service_pages
+from graspd.api.dashboard.forms import Expectations
+from graspd.api.dashboard.job_pages import Pictures
+from graspd.api.dashboard.rendering import environment, render
+from graspd.api.routes.dependencies import OverviewOf, may_read
+from graspd.service.model.errors import ERRORS
+from graspd.service.pipeline.backends import Services
 
 router = APIRouter(include_in_schema=False)
 

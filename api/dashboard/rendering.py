@@ -9,12 +9,12 @@ from fastapi import Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
-from api import formatting
-from api.access.auth import is_allowed, may_change
-from api.access.keys import Scope
-from api.middleware.request_context import with_prefix
-from api.models import GraspDetail, JobDetail
-from service.model.version import PACKAGE_VERSION
+from graspd.api import formatting
+from graspd.api.access.auth import is_allowed, may_change
+from graspd.api.access.keys import Scope
+from graspd.api.middleware.request_context import with_prefix
+from graspd.api.models import GraspDetail, JobDetail
+from graspd.service.model.version import PACKAGE_VERSION
 
 _HERE: Final = Path(__file__).parent
 STATIC: Final = _HERE / "static"

@@ -10,12 +10,12 @@ from typing import Annotated, Final
 from fastapi import APIRouter, Depends, Form, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 
-from api.catalog.datasets import Datasets
-from api.catalog.overview import Overview
-from api.dashboard import figures, tradeoff
-from api.dashboard.rendering import render
-from api.models import STAGE_LABELS
-from api.routes.dependencies import (
+from graspd.api.catalog.datasets import Datasets
+from graspd.api.catalog.overview import Overview
+from graspd.api.dashboard import figures, tradeoff
+from graspd.api.dashboard.rendering import render
+from graspd.api.models import STAGE_LABELS
+from graspd.api.routes.dependencies import (
     DatasetsOf,
     DeletionsOf,
     JobsOf,
@@ -26,11 +26,11 @@ from api.routes.dependencies import (
     may_read,
     may_submit,
 )
-from api.routes.system import Since, Until
-from service.index.views import DatasetView, WorkerView
-from service.model.errors import InputError, UnavailableError
-from service.model.states import State
-from service.store.records import What
+from graspd.api.routes.system import Since, Until
+from graspd.service.index.views import DatasetView, WorkerView
+from graspd.service.model.errors import InputError, UnavailableError
+from graspd.service.model.states import State
+from graspd.service.store.records import What
 
 PAGE_SIZE: Final = 25
 _LOST_SHOWN: Final = timedelta(minutes=10)

@@ -12,11 +12,11 @@ from typing import Any, Final
 
 from pydantic import BaseModel, ConfigDict
 
-from service.model.errors import DamagedError
-from service.model.scene_spec import SceneSpec
-from service.model.studies import FILTERED
-from service.store.records import CHARTS, latest, scene_kinds
-from service.store.store import Store
+from graspd.service.model.errors import DamagedError
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.studies import FILTERED
+from graspd.service.store.records import CHARTS, latest, scene_kinds
+from graspd.service.store.store import Store
 
 WIDTH: Final = 860
 HEIGHT: Final = 420

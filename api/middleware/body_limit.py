@@ -9,11 +9,11 @@ from typing import Final
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from api.access.auth import authorize
-from api.access.keys import Scope as KeyScope
-from api.middleware.request_context import SAFE_METHODS
-from api.problems import ApiError, answer
-from service.model.errors import LimitError
+from graspd.api.access.auth import authorize
+from graspd.api.access.keys import Scope as KeyScope
+from graspd.api.middleware.request_context import SAFE_METHODS
+from graspd.api.problems import ApiError, answer
+from graspd.service.model.errors import LimitError
 
 #: A JSON body or a form without a file: job requests are a few hundred bytes.
 MAX_BODY_BYTES: Final = 1 << 20

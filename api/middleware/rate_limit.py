@@ -21,12 +21,12 @@ from starlette.datastructures import MutableHeaders
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from api.access.auth import Proxy, identify
-from api.access.auth import caller as present_caller
-from api.access.keys import Key, KeyFile
-from api.problems import ApiError, answer
-from service.settings import Settings
-from service.telemetry import bind
+from graspd.api.access.auth import Proxy, identify
+from graspd.api.access.auth import caller as present_caller
+from graspd.api.access.keys import Key, KeyFile
+from graspd.api.problems import ApiError, answer
+from graspd.service.settings import Settings
+from graspd.service.telemetry import bind
 
 #: What costs nothing and is asked often, by browsers and by whatever watches the service.
 _FREE: Final = ("/static/", "/healthz", "/readyz")

@@ -19,12 +19,12 @@ from starlette.requests import Request
 from starlette.routing import Match
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from api.formatting import host_name
-from api.metrics import Metrics
-from api.problems import ApiError, answer, log_unforeseen
-from service import telemetry
-from service.model.errors import GraspdError
-from service.telemetry import bind
+from graspd.api.formatting import host_name
+from graspd.api.metrics import Metrics
+from graspd.api.problems import ApiError, answer, log_unforeseen
+from graspd.service import telemetry
+from graspd.service.model.errors import GraspdError
+from graspd.service.telemetry import bind
 
 _access = logging.getLogger("graspd.access")
 #: Asked every few seconds by whatever watches the service.

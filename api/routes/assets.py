@@ -13,15 +13,25 @@ from fastapi import APIRouter, Depends, Form, Query, Request, Response, UploadFi
 from pydantic import Field
 from starlette.datastructures import UploadFile as AnyUpload
 
-from api.catalog.assets import Assets
-from api.problems import responses
-from api.routes.dependencies import UPLOADS, AssetsOf, Cursor, Limit, Turns, is_known, link_next, may_read, may_submit
-from api.uploads import files_of_upload, name_of_upload
-from service.index.views import AssetView, Page
-from service.model.domain import Name
-from service.model.errors import InputError, RateError
-from service.model.states import AssetKind
-from service.store.descriptions import HandCorrections
+from graspd.api.catalog.assets import Assets
+from graspd.api.problems import responses
+from graspd.api.routes.dependencies import (
+    UPLOADS,
+    AssetsOf,
+    Cursor,
+    Limit,
+    Turns,
+    is_known,
+    link_next,
+    may_read,
+    may_submit,
+)
+from graspd.api.uploads import files_of_upload, name_of_upload
+from graspd.service.index.views import AssetView, Page
+from graspd.service.model.domain import Name
+from graspd.service.model.errors import InputError, RateError
+from graspd.service.model.states import AssetKind
+from graspd.service.store.descriptions import HandCorrections
 
 _GLB: Final = "model/gltf-binary"
 #: Uploads being unpacked and packed in this process; each may hold one file of its size in memory.

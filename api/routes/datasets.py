@@ -9,14 +9,14 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
-from api.problems import ApiError, responses
-from api.routes.dependencies import Cursor, DatasetsOf, Limit, link_next, may_read, may_submit
-from service.index.views import CellView, DatasetView, ObjectSetView, Page, SnapshotView
-from service.model.domain import Name
-from service.model.records import Snapshot
-from service.model.states import State
-from service.pipeline.datasets.estimate import Estimate
-from service.pipeline.datasets.spec import DatasetRequest, Matrix, Names
+from graspd.api.problems import ApiError, responses
+from graspd.api.routes.dependencies import Cursor, DatasetsOf, Limit, link_next, may_read, may_submit
+from graspd.service.index.views import CellView, DatasetView, ObjectSetView, Page, SnapshotView
+from graspd.service.model.domain import Name
+from graspd.service.model.records import Snapshot
+from graspd.service.model.states import State
+from graspd.service.pipeline.datasets.estimate import Estimate
+from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix, Names
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
 sets_router = APIRouter(prefix="/v1/object-sets", tags=["object sets"])

@@ -13,24 +13,24 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import Depends, FastAPI, Query, Request, Response
 from starlette.datastructures import Headers
 
-from api.access.auth import authorize
-from api.access.idempotency import Idempotency
-from api.access.keys import Scope
-from api.access.quotas import Quotas, unfinished
-from api.catalog.assets import Assets
-from api.catalog.datasets import Comparisons, Datasets
-from api.catalog.deletions import Deletions
-from api.catalog.events import Webhooks
-from api.catalog.grasp_exports import GraspExports
-from api.catalog.grasps import Grasps
-from api.catalog.jobs import Jobs
-from api.catalog.overview import Overview, Usage
-from api.catalog.shards import Shards
-from api.catalog.tags import Tags
-from service.model.errors import UnavailableError
-from service.pipeline.backends import Services
-from service.queue.connection import connect, redis_url
-from service.store.store import Store
+from graspd.api.access.auth import authorize
+from graspd.api.access.idempotency import Idempotency
+from graspd.api.access.keys import Scope
+from graspd.api.access.quotas import Quotas, unfinished
+from graspd.api.catalog.assets import Assets
+from graspd.api.catalog.datasets import Comparisons, Datasets
+from graspd.api.catalog.deletions import Deletions
+from graspd.api.catalog.events import Webhooks
+from graspd.api.catalog.grasp_exports import GraspExports
+from graspd.api.catalog.grasps import Grasps
+from graspd.api.catalog.jobs import Jobs
+from graspd.api.catalog.overview import Overview, Usage
+from graspd.api.catalog.shards import Shards
+from graspd.api.catalog.tags import Tags
+from graspd.service.model.errors import UnavailableError
+from graspd.service.pipeline.backends import Services
+from graspd.service.queue.connection import connect, redis_url
+from graspd.service.store.store import Store
 
 MAX_LIMIT = 200
 

@@ -7,12 +7,20 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from api.catalog.grasp_exports import MEDIA_TYPES, Format, GraspExports
-from api.catalog.tags import Tags
-from api.models import GraspDetail, GraspExportQuery, GraspPageQuery, GraspQuery, Selection, TagChange, TagRequest
-from api.problems import responses
-from api.routes.dependencies import ExportsOf, GraspsOf, TagsOf, link_next, may_read, may_submit
-from service.index.views import GraspView, Page, TagView
+from graspd.api.catalog.grasp_exports import MEDIA_TYPES, Format, GraspExports
+from graspd.api.catalog.tags import Tags
+from graspd.api.models import (
+    GraspDetail,
+    GraspExportQuery,
+    GraspPageQuery,
+    GraspQuery,
+    Selection,
+    TagChange,
+    TagRequest,
+)
+from graspd.api.problems import responses
+from graspd.api.routes.dependencies import ExportsOf, GraspsOf, TagsOf, link_next, may_read, may_submit
+from graspd.service.index.views import GraspView, Page, TagView
 
 router = APIRouter(prefix="/v1/grasps", tags=["grasps"])
 

@@ -8,13 +8,13 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
-from api.catalog import events
-from api.models import Job, JobDetail
-from api.problems import responses
-from api.routes.dependencies import Cursor, JobsOf, Limit, link_next, may_read, may_submit
-from service.index.views import Page
-from service.model.domain import JobRequest
-from service.model.states import State
+from graspd.api.catalog import events
+from graspd.api.models import Job, JobDetail
+from graspd.api.problems import responses
+from graspd.api.routes.dependencies import Cursor, JobsOf, Limit, link_next, may_read, may_submit
+from graspd.service.index.views import Page
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.states import State
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 

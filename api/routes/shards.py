@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import RedirectResponse, StreamingResponse
 
-from api.models import Shard
-from api.problems import ApiError, responses
-from api.routes.dependencies import Cursor, Limit, ShardsOf, is_known, link_next, may_read, range_applies
-from service.index.views import Page
+from graspd.api.models import Shard
+from graspd.api.problems import ApiError, responses
+from graspd.api.routes.dependencies import Cursor, Limit, ShardsOf, is_known, link_next, may_read, range_applies
+from graspd.service.index.views import Page
 
 router = APIRouter(prefix="/v1/shards", tags=["shards"])
 

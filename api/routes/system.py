@@ -9,16 +9,16 @@ from typing import Annotated, Final, get_args
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from pydantic import BeforeValidator
 
-from api.access.auth import is_allowed
-from api.access.keys import Scope
-from api.catalog.deletions import DeletionView
-from api.catalog.overview import as_csv
-from api.metrics import CONTENT_TYPE, Metrics
-from api.models import Health, Worker
-from api.problems import responses
-from api.routes.dependencies import DeletionsOf, OverviewOf, UsageOf, may_read, may_scrape, may_submit
-from service.index.views import Stats, UsageDay
-from service.store.records import What
+from graspd.api.access.auth import is_allowed
+from graspd.api.access.keys import Scope
+from graspd.api.catalog.deletions import DeletionView
+from graspd.api.catalog.overview import as_csv
+from graspd.api.metrics import CONTENT_TYPE, Metrics
+from graspd.api.models import Health, Worker
+from graspd.api.problems import responses
+from graspd.api.routes.dependencies import DeletionsOf, OverviewOf, UsageOf, may_read, may_scrape, may_submit
+from graspd.service.index.views import Stats, UsageDay
+from graspd.service.store.records import What
 
 router = APIRouter(tags=["system"])
 

@@ -9,11 +9,11 @@ from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import BaseModel, ConfigDict, Field
 
-from api.catalog import events
-from api.problems import responses
-from api.routes.dependencies import Limit, WebhooksOf, may_read, may_submit
-from service.index.views import DeliveryView, EndView, WebhookView
-from service.model.webhooks import MAX_URL, End
+from graspd.api.catalog import events
+from graspd.api.problems import responses
+from graspd.api.routes.dependencies import Limit, WebhooksOf, may_read, may_submit
+from graspd.service.index.views import DeliveryView, EndView, WebhookView
+from graspd.service.model.webhooks import MAX_URL, End
 
 router = APIRouter(tags=["events"])
 

@@ -14,19 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-from service.model.fidelity import FIDELITIES
-from worker.grasps import GraspSet
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
-from worker.planners.port import Wanted
-from worker.quality.intervals import wilson
-from worker.quality.referee.decomposition import ConvexPieces, decompose
-from worker.quality.referee.model import Scene
-from worker.quality.referee.protocol import Test
-from worker.run import Run
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import synthesize
+from graspd.worker.planners.port import Wanted
+from graspd.worker.quality.intervals import wilson
+from graspd.worker.run import Run
+from graspd.worker.validation.decomposition import ConvexPieces, decompose
+from graspd.worker.validation.model import Scene
+from graspd.worker.validation.protocol import Test
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

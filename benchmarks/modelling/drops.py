@@ -10,12 +10,12 @@ import mujoco
 import numpy as np
 
 from benchmarks.modelling.common import SEED, Floats, Row, Subject, cpu, share
-from service.model.transforms import compose, quat_rotate
-from worker.objects.model import ObjectModel
-from worker.quality.referee.decomposition import ConvexPieces, decompose
-from worker.scenes import simulate
-from worker.scenes.clearance import transfer
-from worker.scenes.rest import RestingFaces, same_face
+from graspd.service.model.transforms import compose, quat_rotate
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.scenes import simulate
+from graspd.worker.scenes.clearance import transfer
+from graspd.worker.scenes.rest import RestingFaces, same_face
+from graspd.worker.validation.decomposition import ConvexPieces, decompose
 
 #: A forearm: a straight round rod from the palm through the Allegro's flange, which looks along -z of its root [m].
 AWAY: Final = np.array([0.0, 0.0, -1.0])

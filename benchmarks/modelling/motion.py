@@ -15,16 +15,16 @@ from scipy.stats import rankdata
 
 from benchmarks.modelling.common import Bools, Floats, Row, Subject, cpu, ranking, share, verdicts
 from benchmarks.modelling.steps import rollout
-from worker.objects.convex import union_volume
-from worker.planners.fast_graspd.candidates import FRICTION
-from worker.quality.postures import hold_forces
-from worker.quality.probe import probe_of
-from worker.quality.referee.decomposition import ConvexPieces
-from worker.quality.referee.displacement import simulated_displacement_cm
-from worker.quality.referee.model import MujocoOptions, Scene, build
-from worker.quality.table import measure
-from worker.run import Run
-from worker.simulation.reference import World
+from graspd.worker.control.postures import hold_forces
+from graspd.worker.objects.convex import union_volume
+from graspd.worker.planners.fast_graspd.candidates import FRICTION
+from graspd.worker.quality.probe import probe_of
+from graspd.worker.quality.table import measure
+from graspd.worker.run import Run
+from graspd.worker.simulation.reference import World
+from graspd.worker.validation.decomposition import ConvexPieces
+from graspd.worker.validation.displacement import simulated_displacement_cm
+from graspd.worker.validation.model import MujocoOptions, Scene, build
 
 STEPS = (1, 3, 10)
 #: Hand points of the rollouts: between the planner's coarse and fine phase.

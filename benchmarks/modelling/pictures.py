@@ -10,13 +10,13 @@ import numpy as np
 import trimesh
 
 from benchmarks.modelling.common import SEED, Row, cpu, object_of
-from service.model.transforms import apply, invert
-from worker.rendering.cameras import Cameras
-from worker.rendering.scene_setup import CameraPlan, Setting
-from worker.rendering.scenery import Pictures
-from worker.rendering.views import SAMPLES as SAMPLES_DEFAULT
-from worker.run import Run
-from worker.scenes.simulate import drop
+from graspd.service.model.transforms import apply, invert
+from graspd.worker.rendering.cameras import Cameras
+from graspd.worker.rendering.scene_setup import CameraPlan, Setting
+from graspd.worker.rendering.scenery import Pictures
+from graspd.worker.rendering.views import SAMPLES as SAMPLES_DEFAULT
+from graspd.worker.run import Run
+from graspd.worker.scenes.simulate import drop
 
 SCENES, VIEWS = 2, 2
 SAMPLES = (2, 4, 12, 24)

@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 
 from benchmarks.modelling.common import PLAIN, SEED, Bools, Row, Subject, cpu, share
-from service.model.scene_spec import SceneSpec
-from worker.grasps import GraspSet
-from worker.planners import synthesize
-from worker.planners.port import Wanted
-from worker.quality.referee.lift import Lift
-from worker.quality.referee.model import MujocoOptions, Scene, build
-from worker.quality.referee.protocol import Outcome, Trial
-from worker.run import Run
-from worker.scenes.clearance import MARGIN_M
-from worker.scenes.kinds import rest_poses, supports_of
-from worker.scenes.way import Way, plan_way
-from worker.simulation.surroundings import Obstacle, Placed, Scenes
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.worker.grasps import GraspSet
+from graspd.worker.planners import synthesize
+from graspd.worker.planners.port import Wanted
+from graspd.worker.run import Run
+from graspd.worker.scenes.clearance import MARGIN_M
+from graspd.worker.scenes.kinds import rest_poses, supports_of
+from graspd.worker.scenes.way import Way, plan_way
+from graspd.worker.simulation.surroundings import Obstacle, Placed, Scenes
+from graspd.worker.validation.lift import Lift
+from graspd.worker.validation.model import MujocoOptions, Scene, build
+from graspd.worker.validation.protocol import Outcome, Trial
 
 #: A table of 1.2 x 0.9 m, 30 mm thick.
 SLAB = Obstacle.box([0, 0, -0.015, 1, 0, 0, 0], [1.2, 0.9, 0.03])

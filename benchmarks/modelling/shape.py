@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from benchmarks.modelling.common import SEED, Row, cpu, hand_of, mean, object_of, share, verdicts
-from service.model.fidelity import FIDELITIES
-from worker.planners import synthesize
-from worker.planners.port import Wanted
-from worker.quality.overlap import penetration_depth
-from worker.quality.probe import probe_of
-from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.model import MujocoOptions, build
-from worker.run import Run
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.planners import synthesize
+from graspd.worker.planners.port import Wanted
+from graspd.worker.quality.overlap import penetration_depth
+from graspd.worker.quality.probe import probe_of
+from graspd.worker.run import Run
+from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.model import MujocoOptions, build
 
 STANDARD = FIDELITIES["standard"]
 SETTINGS: dict[str, dict[str, Any]] = {

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.results.studies import BY_NAME, STUDIES, Study, files_of, is_raw
-from service.model.version import STAGE_REVISIONS
+from graspd.service.model.version import STAGE_REVISIONS
 
 REPOSITORY: Final = Path(__file__).resolve().parents[2]
 DOCS: Final = REPOSITORY / "docs"

@@ -24,11 +24,11 @@ from PIL import Image, ImageChops, ImageStat
 
 from benchmarks.results.manifest import REPOSITORY, digests, load, revision_of_today, save, staleness, write
 from benchmarks.results.studies import BROWSER, FIRST_JUDGE, GPU, SERVICE, TORCH, Study, files_of, is_raw
-from service.model.cores import available_cores
-from service.model.version import STAGE_REVISIONS
-from service.run.supervisor import Supervisor
-from service.settings import Settings
-from worker.rendering.sheets import png
+from graspd.service.model.cores import available_cores
+from graspd.service.model.version import STAGE_REVISIONS
+from graspd.service.run.supervisor import Supervisor
+from graspd.service.settings import Settings
+from graspd.worker.rendering.sheets import png
 
 #: Mean difference of a channel, of 255, from which on a palette shows steps in what fades, a depth image say.
 STEPS: Final = 0.45

@@ -23,12 +23,12 @@ from examples.train_grasp_predictor.sheet import page
 from examples.train_grasp_predictor.table import markdown
 from examples.train_grasp_predictor.training import SHOWN, Lessons, Trained, train
 from examples.train_grasp_predictor.without_network import SQUEEZE, Nearest, across
-from service.readers import Shards, open_shards
-from worker.engines import backend
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.objects.prepare import object_from_path
-from worker.planners.learned.network import ProposalNetwork, Proposals, propose, save
+from graspd.baselines.learned.network import ProposalNetwork, Proposals, propose, save
+from graspd.service.readers import Shards, open_shards
+from graspd.worker.engines import backend
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.prepare import object_from_path
 
 FREE, PEER = "free, filtered", "graspit, filtered"
 ACROSS, NEAREST = "no network: across", "no network: nearest"

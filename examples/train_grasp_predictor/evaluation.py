@@ -11,11 +11,11 @@ import numpy as np
 
 from examples.train_grasp_predictor.execution import Lifted, Ready, carried_out, chosen, made_ready, taken
 from examples.train_grasp_predictor.samples import Sight
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.planners.learned.network import Proposals
-from worker.quality.referee.decomposition import ConvexPieces, decompose
-from worker.quality.referee.lift import LiftOutcome
+from graspd.baselines.learned.network import Proposals
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.validation.decomposition import ConvexPieces, decompose
+from graspd.worker.validation.lift import LiftOutcome
 
 Row = dict[str, Any]
 #: From a picture, a number and a generator to so many proposals, the best first where there is one.

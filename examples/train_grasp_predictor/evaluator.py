@@ -18,11 +18,11 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from examples.train_grasp_predictor.network import UNIT_M
 from examples.train_grasp_predictor.samples import Floats, Sight
-from service.model.transforms import apply, quat_rotate, quat_to_matrix
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
-from worker.hands.surface import sample_surface
-from worker.planners.learned.network import Proposals
+from graspd.baselines.learned.network import Proposals
+from graspd.service.model.transforms import apply, quat_rotate, quat_to_matrix
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.surface import sample_surface
 
 #: Points of the hand, and of the object in one look at it.
 HAND_POINTS: Final = 96

@@ -15,19 +15,19 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from examples.train_grasp_predictor.samples import Floats, Sight
-from service.model.transforms import apply, compose, invert
-from worker.grasps import GraspSet, Posture
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
-from worker.hands.surface import sample_surface
-from worker.objects.model import ObjectModel
-from worker.planners.learned.network import Proposals
-from worker.quality.referee.decomposition import ConvexPieces
-from worker.quality.referee.lift import LiftOutcome
-from worker.quality.referee.lifting import judge_lifts
-from worker.quality.table import measure
-from worker.simulation.obstacles import obstacle_room
-from worker.simulation.surroundings import CLEAR_M, RISE_M, STANDOFF_M, UP, Obstacle, Placed, Surroundings
+from graspd.baselines.learned.network import Proposals
+from graspd.service.model.transforms import apply, compose, invert
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.quality.table import measure
+from graspd.worker.simulation.obstacles import obstacle_room
+from graspd.worker.simulation.surroundings import CLEAR_M, RISE_M, STANDOFF_M, UP, Obstacle, Placed, Surroundings
+from graspd.worker.validation.decomposition import ConvexPieces
+from graspd.worker.validation.lift import LiftOutcome
+from graspd.worker.validation.lifting import judge_lifts
 
 #: Fingers open by the first of these shares of their range, beyond the proposed pregrasp, for which there is room.
 OPENED: Final = (0.15, 0.1, 0.05, 0.0)

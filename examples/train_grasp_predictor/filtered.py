@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from examples.train_grasp_predictor.execution import table
 from examples.train_grasp_predictor.samples import Floats, Scene, Taught, rows_of
-from service.readers import Shards
-from service.store.shards import read_shard
-from worker.grasps import GraspSet, joined
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.scenes.way import plan_way
-from worker.simulation.obstacles import MARGIN_M, obstacle_room
-from worker.simulation.surroundings import Placed
+from graspd.service.readers import Shards
+from graspd.service.store.shards import read_shard
+from graspd.worker.grasps import GraspSet, joined
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.scenes.way import plan_way
+from graspd.worker.simulation.obstacles import MARGIN_M, obstacle_room
+from graspd.worker.simulation.surroundings import Placed
 
 #: Grasps whose way is planned at a time.
 _TOGETHER: Final = 32

@@ -1,4 +1,4 @@
-"""The proposal network in PyTorch: what `worker.planners.learned.network` reads and runs without it.
+"""The proposal network in PyTorch: what `baselines.learned.network` reads and runs without it.
 
 Points of an object seen by one camera become one feature; a flow carries noise to grasps that go with it, so a cloud
 gets as many different proposals as one likes (conditional flow matching, Lipman et al. 2023).

@@ -19,10 +19,10 @@ from examples.train_grasp_predictor.evaluator import Tries, learned
 from examples.train_grasp_predictor.execution import carried_out, made_ready
 from examples.train_grasp_predictor.refinement import Refined, joined, moved
 from examples.train_grasp_predictor.samples import Floats, Sight, Taught, each_scene
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.planners.learned.network import Proposals, decode
-from worker.quality.referee.decomposition import decompose
+from graspd.baselines.learned.network import Proposals, decode
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.validation.decomposition import decompose
 
 #: Pictures of each object that are practised with at first; proposals, and grasps of the data, for each of them.
 PICTURES: Final = 32

@@ -13,9 +13,9 @@ from examples.train_grasp_predictor.evaluation import Proposer
 from examples.train_grasp_predictor.evaluator import scores
 from examples.train_grasp_predictor.execution import made_ready, part_of
 from examples.train_grasp_predictor.samples import Floats, Sight
-from service.model.transforms import quat_from_axis_angle, quat_multiply, quat_rotate
-from worker.hands.model import HandModel
-from worker.planners.learned.network import Proposals
+from graspd.baselines.learned.network import Proposals
+from graspd.service.model.transforms import quat_from_axis_angle, quat_multiply, quat_rotate
+from graspd.worker.hands.model import HandModel
 
 #: Moves of size 1, standard deviations: of the place [m], the attitude [rad] and the joints [rad or m], each by itself,
 #: all closing ones together, and these at the squeeze alone: too little and too much of it both lose what is held.

@@ -1,6 +1,6 @@
 """What cameras saw of objects on a table, and the grasps of each scene as rows of numbers that a network learns.
 
-A row has the 12 + 3 J numbers of `worker.planners.learned.network`, in the frame of the table, z up, counted from its
+A row has the 12 + 3 J numbers of `baselines.learned.network`, in the frame of the table, z up, counted from its
 origin.
 """
 
@@ -13,11 +13,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import compose, quat_rotate
-from service.readers import Pictures, Shards
-from service.store.shards import Shard, read_shard
-from worker.grasps import GraspSet
-from worker.planners.learned.network import Proposals, encode
+from graspd.baselines.learned.network import Proposals, encode
+from graspd.service.model.transforms import compose, quat_rotate
+from graspd.service.readers import Pictures, Shards
+from graspd.service.store.shards import Shard, read_shard
+from graspd.worker.grasps import GraspSet
 
 Floats = NDArray[np.float64]
 

@@ -12,11 +12,11 @@ from PIL import Image, ImageDraw
 from examples.train_grasp_predictor.evaluation import TAKEN, Exam
 from examples.train_grasp_predictor.execution import Lifted, Ready
 from examples.train_grasp_predictor.samples import Floats
-from service.model.transforms import apply, quat_rotate
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.rendering.pictures import grasp_pictures
-from worker.rendering.sheets import label_page
+from graspd.service.model.transforms import apply, quat_rotate
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.rendering.pictures import grasp_pictures
+from graspd.worker.rendering.sheets import label_page
 
 SIDE: Final = 200
 #: Pictures of each object whose first proposal is drawn.

@@ -10,12 +10,12 @@ import numpy as np
 
 from examples.train_grasp_predictor.filtered import filtered, nothing, valid_grasps
 from examples.train_grasp_predictor.samples import Floats, Scene, Taught, apart, each_scene, poses_of, taught
-from service.model.transforms import quat_conjugate, quat_rotate
-from service.readers import Shards
-from service.store.shards import read_shard
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.simulation.surroundings import UP
+from graspd.service.model.transforms import quat_conjugate, quat_rotate
+from graspd.service.readers import Shards
+from graspd.service.store.shards import read_shard
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.simulation.surroundings import UP
 
 #: Sizes of the ablation beside the usual one, and other quarters than the first.
 QUARTER, SIXTEENTH = "scenes, a quarter", "scenes, a sixteenth"

@@ -10,11 +10,11 @@ from scipy.spatial import cKDTree
 
 from examples.train_grasp_predictor.execution import tighter, wider
 from examples.train_grasp_predictor.samples import Floats, Sight, Taught, each_scene
-from service.model.transforms import quat_from_matrix, quat_rotate
-from worker.hands.model import HandModel
-from worker.hands.oppositions import oppositions_of
-from worker.planners.learned.network import Proposals, decode
-from worker.simulation.surroundings import UP
+from graspd.baselines.learned.network import Proposals, decode
+from graspd.service.model.transforms import quat_from_matrix, quat_rotate
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.oppositions import oppositions_of
+from graspd.worker.simulation.surroundings import UP
 
 #: Draws for each hand that is kept, and the farthest that a hand leans from straight down [rad].
 DRAWS: Final = 8

@@ -21,9 +21,9 @@ from typing import Any, Final, TypeVar
 from sqlalchemy import URL, Connection, Engine, MetaData, create_engine, event, inspect, make_url, text
 from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlchemyError
 
-from service.index.tables import grasps, metadata
-from service.model.errors import IndexDamaged, IndexUnavailable, InputError
-from service.model.metrics import indexed
+from graspd.service.index.tables import grasps, metadata
+from graspd.service.model.errors import IndexDamaged, IndexUnavailable, InputError
+from graspd.service.model.metrics import indexed
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")

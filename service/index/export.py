@@ -9,9 +9,9 @@ from typing import Any, Final
 
 from sqlalchemy import JSON, BigInteger, Boolean, Column, Connection, Float, Integer, Table, select
 
-from service.index.database import Database
-from service.index.tables import assets, attempts, dataset_cells, datasets, grasps, jobs, shards, spent, tasks
-from service.parquet import schema_of, write
+from graspd.service.index.database import Database
+from graspd.service.index.tables import assets, attempts, dataset_cells, datasets, grasps, jobs, shards, spent, tasks
+from graspd.service.parquet import schema_of, write
 
 #: What is exported. The rest is of the moment (workers, notes) or for the service alone.
 TABLES: Final[Mapping[str, Table]] = {

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from sqlalchemy import URL
 
-from service.index.changes.live import Live
-from service.index.changes.records import Changes, DatasetChanges
-from service.index.changes.removals import Removals
-from service.index.database import Database
-from service.index.notes import KnownDamage, Notes
-from service.index.outbox import Outbox
-from service.index.queries.assets import Assets, ObjectSets
-from service.index.queries.datasets import Datasets
-from service.index.queries.feed import DatasetFeed, Feed
-from service.index.queries.grasps import Grasps
-from service.index.queries.jobs import Jobs, Shards
-from service.index.queries.overview import Costs, Overview, Usage
-from service.index.queries.statistics import Statistics
-from service.index.tags import Tags
+from graspd.service.index.changes.live import Live
+from graspd.service.index.changes.records import Changes, DatasetChanges
+from graspd.service.index.changes.removals import Removals
+from graspd.service.index.database import Database
+from graspd.service.index.notes import KnownDamage, Notes
+from graspd.service.index.outbox import Outbox
+from graspd.service.index.queries.assets import Assets, ObjectSets
+from graspd.service.index.queries.datasets import Datasets
+from graspd.service.index.queries.feed import DatasetFeed, Feed
+from graspd.service.index.queries.grasps import Grasps
+from graspd.service.index.queries.jobs import Jobs, Shards
+from graspd.service.index.queries.overview import Costs, Overview, Usage
+from graspd.service.index.queries.statistics import Statistics
+from graspd.service.index.tags import Tags
 
 
 class Index:

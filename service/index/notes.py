@@ -9,10 +9,10 @@ from typing import Any, Final
 
 from sqlalchemy import Connection, delete, func, select
 
-from service.index.bulk import upsert
-from service.index.database import Database
-from service.index.tables import damage, notes
-from service.model.clock import timestamp
+from graspd.service.index.bulk import upsert
+from graspd.service.index.database import Database
+from graspd.service.index.tables import damage, notes
+from graspd.service.model.clock import timestamp
 
 _REBUILT: Final = "rebuilt"
 _SCAN: Final = "integrity scan"

@@ -24,14 +24,14 @@ from sqlalchemy import (
     update,
 )
 
-from service.index.bulk import upsert
-from service.index.database import Database
-from service.index.tables import datasets, metadata
-from service.index.views import DeliveryView, EndView, WebhookView
-from service.model.clock import timestamp
-from service.model.errors import NotFoundError
-from service.model.projects import EVERYTHING, ProjectScope
-from service.model.webhooks import MOST_WAITING, WAITS_S, Webhook
+from graspd.service.index.bulk import upsert
+from graspd.service.index.database import Database
+from graspd.service.index.tables import datasets, metadata
+from graspd.service.index.views import DeliveryView, EndView, WebhookView
+from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import NotFoundError
+from graspd.service.model.projects import EVERYTHING, ProjectScope
+from graspd.service.model.webhooks import MOST_WAITING, WAITS_S, Webhook
 
 #: Ends and deliveries older than this are forgotten [s].
 KEPT_S: Final = 30 * 86400.0

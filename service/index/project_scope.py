@@ -9,9 +9,9 @@ from typing import Any, Final
 from pydantic_core import from_json
 from sqlalchemy import ColumnElement, Select, case, exists, or_, select
 
-from service.index.tables import assets, attempts, datasets, jobs, object_sets, tags, tasks
-from service.model.errors import InputError
-from service.model.projects import ProjectScope
+from graspd.service.index.tables import assets, attempts, datasets, jobs, object_sets, tags, tasks
+from graspd.service.model.errors import InputError
+from graspd.service.model.projects import ProjectScope
 
 Tests = tuple[ColumnElement[bool], ...]
 

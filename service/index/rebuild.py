@@ -13,13 +13,13 @@ from typing import Any, Final, TypeVar
 from sqlalchemy import Connection, Table, delete, select
 from sqlalchemy.exc import DataError
 
-from service.index.changes.rows import QUIET
-from service.index.index import Index
-from service.index.notes import Marked
-from service.index.tables import LIVE_COLUMNS, LIVE_TABLES, metadata
-from service.model import names
-from service.model.errors import DamagedError, InputError, NotFoundError
-from service.model.records import (
+from graspd.service.index.changes.rows import QUIET
+from graspd.service.index.index import Index
+from graspd.service.index.notes import Marked
+from graspd.service.index.tables import LIVE_COLUMNS, LIVE_TABLES, metadata
+from graspd.service.model import names
+from graspd.service.model.errors import DamagedError, InputError, NotFoundError
+from graspd.service.model.records import (
     AttemptRecord,
     DatasetEvent,
     DatasetRecord,
@@ -30,13 +30,13 @@ from service.model.records import (
     Snapshot,
     Tag,
 )
-from service.model.states import State
-from service.model.webhooks import Webhook
-from service.settings import sqlite_url
-from service.store.library import load_asset, load_check, stored_assets
-from service.store.manifests import ShardManifest
-from service.store.records import newest_mark, parse_record, pending
-from service.store.store import Store
+from graspd.service.model.states import State
+from graspd.service.model.webhooks import Webhook
+from graspd.service.settings import sqlite_url
+from graspd.service.store.library import load_asset, load_check, stored_assets
+from graspd.service.store.manifests import ShardManifest
+from graspd.service.store.records import newest_mark, parse_record, pending
+from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
 EventT = TypeVar("EventT", bound=Record)

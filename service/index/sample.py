@@ -15,16 +15,24 @@ from typing import Any, Final
 
 from sqlalchemy import URL, Column, Table, make_url, select, text
 
-from service.index.database import REVISION, REVISION_TABLE, UNUSABLE, connect_postgres, mapped, revision_of, unusable
-from service.index.index import Index
-from service.index.tables import jobs, shards
-from service.model import names
-from service.model.errors import DamagedError, IndexDamaged, IndexUnavailable, NotFoundError
-from service.model.records import JobRecord
-from service.model.states import Stage
-from service.store.manifests import load_manifest
-from service.store.records import pending, read_record
-from service.store.store import Store
+from graspd.service.index.database import (
+    REVISION,
+    REVISION_TABLE,
+    UNUSABLE,
+    connect_postgres,
+    mapped,
+    revision_of,
+    unusable,
+)
+from graspd.service.index.index import Index
+from graspd.service.index.tables import jobs, shards
+from graspd.service.model import names
+from graspd.service.model.errors import DamagedError, IndexDamaged, IndexUnavailable, NotFoundError
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import Stage
+from graspd.service.store.manifests import load_manifest
+from graspd.service.store.records import pending, read_record
+from graspd.service.store.store import Store
 
 #: Rows of a kind from each side.
 _SIZE: Final = 100

@@ -23,7 +23,7 @@ from sqlalchemy import (
     false,
 )
 
-from service.model.metrics import Indexed, indexed
+from graspd.service.model.metrics import Indexed, indexed
 
 metadata: Final = MetaData()
 jobs: Final = Table(

@@ -8,14 +8,14 @@ from typing import Final
 
 from sqlalchemy import Connection, case, delete, func, select, tuple_
 
-from service.index.bulk import upsert
-from service.index.database import Database, chunks
-from service.index.project_scope import seen_shards, seen_tags
-from service.index.tables import grasps, tagged, tags
-from service.index.views import TagView
-from service.model.errors import NotFoundError
-from service.model.projects import EVERYTHING, ProjectScope
-from service.model.records import Grasp, Tag
+from graspd.service.index.bulk import upsert
+from graspd.service.index.database import Database, chunks
+from graspd.service.index.project_scope import seen_shards, seen_tags
+from graspd.service.index.tables import grasps, tagged, tags
+from graspd.service.index.views import TagView
+from graspd.service.model.errors import NotFoundError
+from graspd.service.model.projects import EVERYTHING, ProjectScope
+from graspd.service.model.records import Grasp, Tag
 
 #: Grasps that one statement names: two parameters each.
 _AT_ONCE: Final = 400

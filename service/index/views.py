@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, computed_field
 
-from service.model.domain import JobOptions, JobRequest
-from service.model.metric_fields import values, with_fields
-from service.model.planning import shortfall
-from service.model.records import Choice
-from service.model.states import AssetKind, Lane, Stage, State
+from graspd.service.model.domain import JobOptions, JobRequest
+from graspd.service.model.metric_fields import values, with_fields
+from graspd.service.model.planning import shortfall
+from graspd.service.model.records import Choice
+from graspd.service.model.states import AssetKind, Lane, Stage, State
 
 T = TypeVar("T")
 

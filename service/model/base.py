@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 from pydantic.fields import FieldInfo
 
-from service.model.errors import one_of
+from graspd.service.model.errors import one_of
 
 
 class Model(BaseModel):

@@ -9,10 +9,10 @@ from collections.abc import Iterable, Mapping, MutableMapping
 from contextlib import AbstractContextManager
 from typing import IO, Final
 
-from service.model.domain import JobRequest, batches_of
-from service.model.metrics import MIN_DISTANCE_M
-from service.model.states import AssetKind, Stage
-from service.model.version import STAGE_REVISIONS
+from graspd.service.model.domain import JobRequest, batches_of
+from graspd.service.model.metrics import MIN_DISTANCE_M
+from graspd.service.model.states import AssetKind, Stage
+from graspd.service.model.version import STAGE_REVISIONS
 
 #: Raise when payloads come out otherwise and the grasps do not.
 _PAYLOAD_REVISION: Final = 2

@@ -12,15 +12,15 @@ from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
-from service.model.base import DIGEST, Model
-from service.model.base import Digest as Digest
-from service.model.base import Name as Name
-from service.model.base import Word as Word
-from service.model.fidelity import AUTO, Fidelity, resolve_fidelity
-from service.model.matter import FRICTION, MASS_KG, MOST_KG, Density, Friction, Mass
-from service.model.metrics import MIN_DISTANCE_M, MOST_ROBUST_MODELS, ROBUST_MODELS
-from service.model.projects import Project
-from service.model.scene_spec import (
+from graspd.service.model.base import DIGEST, Model
+from graspd.service.model.base import Digest as Digest
+from graspd.service.model.base import Name as Name
+from graspd.service.model.base import Word as Word
+from graspd.service.model.fidelity import AUTO, Fidelity, resolve_fidelity
+from graspd.service.model.matter import FRICTION, MASS_KG, MOST_KG, Density, Friction, Mass
+from graspd.service.model.metrics import MIN_DISTANCE_M, MOST_ROBUST_MODELS, ROBUST_MODELS
+from graspd.service.model.projects import Project
+from graspd.service.model.scene_spec import (
     LEAST_TOUCH,
     MOST_NEIGHBOURS,
     MOST_TOUCH,
@@ -33,7 +33,7 @@ from service.model.scene_spec import (
     has_table,
     scene_of,
 )
-from service.model.states import AssetKind
+from graspd.service.model.states import AssetKind
 
 #: Grasps of a batch: the unit of seeds and of the planner's launches.
 BATCH_SIZE: Final = 32

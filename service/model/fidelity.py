@@ -6,8 +6,8 @@ from typing import Final, Literal
 
 from pydantic import Field
 
-from service.model.base import Model
-from service.model.errors import did_you_mean
+from graspd.service.model.base import Model
+from graspd.service.model.errors import did_you_mean
 
 
 class Fidelity(Model):

@@ -6,9 +6,9 @@ from typing import Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
-from service.model.base import Digest, Model, Name, Word
-from service.model.domain import JobRequest, check_known
-from service.model.states import AssetKind, Stage
+from graspd.service.model.base import Digest, Model, Name, Word
+from graspd.service.model.domain import JobRequest, check_known
+from graspd.service.model.states import AssetKind, Stage
 
 
 class Origin(Model):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
 from pydantic import BaseModel, Field, create_model
 
-from service.model.metrics import Indexed, indexed
+from graspd.service.model.metrics import Indexed, indexed
 
 M = TypeVar("M", bound=BaseModel)
 

@@ -7,8 +7,8 @@ import logging
 from functools import lru_cache
 from typing import Final
 
-from service.model.errors import InputError
-from service.model.states import AssetKind, Stage
+from graspd.service.model.errors import InputError
+from graspd.service.model.states import AssetKind, Stage
 
 ASSETS: Final = "assets"
 JOBS: Final = "jobs"

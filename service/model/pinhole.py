@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats
+from graspd.service.model.transforms import Floats
 
 #: Depths of neighbouring pixels that differ by more than this share are of two surfaces.
 EDGE: Final = 0.02

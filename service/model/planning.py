@@ -14,12 +14,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
-from service.model.digests import digest_json, shard_id
-from service.model.domain import BATCH_SIZE, JobOptions, JobRequest, batches_of
-from service.model.messages import IngestMessage, TaskMessage
-from service.model.records import JobRecord
-from service.model.states import AssetKind, Lane, Stage, State
-from service.model.version import (
+from graspd.service.model.digests import digest_json, shard_id
+from graspd.service.model.domain import BATCH_SIZE, JobOptions, JobRequest, batches_of
+from graspd.service.model.messages import IngestMessage, TaskMessage
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import AssetKind, Lane, Stage, State
+from graspd.service.model.version import (
     OLDEST_TASK_SCHEMA,
     SCHEMA_OF_FIELD,
     SCHEMA_OF_NETWORKS,

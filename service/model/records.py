@@ -12,16 +12,16 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
-from service.model import names
-from service.model.base import TagName
-from service.model.clock import timestamp
-from service.model.digests import digest_json
-from service.model.domain import Digest, JobOptions, JobRequest, Name, check_known
-from service.model.fidelity import AUTO
-from service.model.messages import Origin
-from service.model.projects import Project
-from service.model.states import AssetKind, Lane, Stage
-from service.model.version import STAGE_REVISIONS
+from graspd.service.model import names
+from graspd.service.model.base import TagName
+from graspd.service.model.clock import timestamp
+from graspd.service.model.digests import digest_json
+from graspd.service.model.domain import Digest, JobOptions, JobRequest, Name, check_known
+from graspd.service.model.fidelity import AUTO
+from graspd.service.model.messages import Origin
+from graspd.service.model.projects import Project
+from graspd.service.model.states import AssetKind, Lane, Stage
+from graspd.service.model.version import STAGE_REVISIONS
 
 #: Most batches of a task.
 MOST_BATCHES: Final = 64

@@ -13,8 +13,8 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
-from service.model.base import Digest, Name, refusal, why
-from service.model.errors import InputError, did_you_mean
+from graspd.service.model.base import Digest, Name, refusal, why
+from graspd.service.model.errors import InputError, did_you_mean
 
 #: Kinds of scenes; `free` is an object that floats, `file` one whose supports are given.
 SceneKind = Literal["free", "table", "bin", "shelf", "file"]

@@ -9,10 +9,10 @@ from urllib.parse import urlsplit
 
 from pydantic import Field
 
-from service.model.domain import Digest
-from service.model.errors import InputError
-from service.model.projects import Project
-from service.model.records import Record
+from graspd.service.model.domain import Digest
+from graspd.service.model.errors import InputError
+from graspd.service.model.projects import Project
+from graspd.service.model.records import Record
 
 End = Literal["succeeded", "failed", "cancelled"]
 MAX_URL: Final = 500

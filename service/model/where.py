@@ -18,8 +18,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from service.model.errors import InputError, one_of
-from service.model.metrics import GRASP_METRICS, GraspType
+from graspd.service.model.errors import InputError, one_of
+from graspd.service.model.metrics import GRASP_METRICS, GraspType
 
 #: Longest expression, and deepest nesting of one.
 LONGEST: Final = 1000

@@ -12,10 +12,10 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from service.model.domain import Word
-from service.model.messages import IngestMessage, TaskMessage
-from service.model.states import Stage
-from service.model.version import OLDEST_TASK_SCHEMA, STAGE_REVISIONS, TASK_SCHEMA
+from graspd.service.model.domain import Word
+from graspd.service.model.messages import IngestMessage, TaskMessage
+from graspd.service.model.states import Stage
+from graspd.service.model.version import OLDEST_TASK_SCHEMA, STAGE_REVISIONS, TASK_SCHEMA
 
 #: Anybody who writes to Redis may say anything: what is read from there is as long and as large as ours can be.
 HostWord = Annotated[str, Field(max_length=300)]

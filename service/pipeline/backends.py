@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
-from service.settings import Settings
-from service.store.store import Store, open_store
+from graspd.service.settings import Settings
+from graspd.service.store.store import Store, open_store
 
 if TYPE_CHECKING:
-    from service.index.index import Index
-    from service.queue.rq_queue import RqQueue
+    from graspd.service.index.index import Index
+    from graspd.service.queue.rq_queue import RqQueue
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class Services:
             NotFoundError: there is no store, and none is to be made.
             StoreUnavailable, IndexUnavailable: where they cannot be opened.
         """
-        from service.index.index import Index
-        from service.queue.rq_queue import open_queue
+        from graspd.service.index.index import Index
+        from graspd.service.queue.rq_queue import open_queue
 
         store = open_store(settings.resolved_store_url, public_endpoint=settings.store_public_endpoint, make=make)
         index = Index(settings.resolved_index_url, anew=anew)

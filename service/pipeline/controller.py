@@ -14,32 +14,32 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from service.index.notes import Marked
-from service.index.queries.feed import ReadyTask
-from service.index.rebuild import complete_if_new, rebuild
-from service.model import names
-from service.model.clock import timestamp
-from service.model.errors import BusyError, DamagedError, NotFoundError, StoreUnavailable, UnavailableError
-from service.model.planning import Turns, ingest_id, ingest_message
-from service.model.records import JobRecord
-from service.model.states import Lane
-from service.model.workers import WorkerBeat, need_of
-from service.pipeline.backends import Services
-from service.pipeline.datasets.rounds import DatasetRounds
-from service.pipeline.garbage_collector import GarbageCollector
-from service.pipeline.identity import identify
-from service.pipeline.indexer import Indexer
-from service.pipeline.integrity_scan import IntegrityScan
-from service.pipeline.job_actions import HELD_S, queue_tasks
-from service.pipeline.leading import PART
-from service.pipeline.lease_reaper import LeaseReaper
-from service.pipeline.routes import Routes
-from service.pipeline.webhook_dispatcher import WebhookDispatcher
-from service.queue.port import Event, EventKind, Report
-from service.store.library import publish_builtins, stored_assets
-from service.store.packs import take_apart
-from service.store.records import newest_mark, next_mark, read_record, set_mark
-from service.telemetry import HeartbeatFile
+from graspd.service.index.notes import Marked
+from graspd.service.index.queries.feed import ReadyTask
+from graspd.service.index.rebuild import complete_if_new, rebuild
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import BusyError, DamagedError, NotFoundError, StoreUnavailable, UnavailableError
+from graspd.service.model.planning import Turns, ingest_id, ingest_message
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import Lane
+from graspd.service.model.workers import WorkerBeat, need_of
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets.rounds import DatasetRounds
+from graspd.service.pipeline.garbage_collector import GarbageCollector
+from graspd.service.pipeline.identity import identify
+from graspd.service.pipeline.indexer import Indexer
+from graspd.service.pipeline.integrity_scan import IntegrityScan
+from graspd.service.pipeline.job_actions import HELD_S, queue_tasks
+from graspd.service.pipeline.leading import PART
+from graspd.service.pipeline.lease_reaper import LeaseReaper
+from graspd.service.pipeline.routes import Routes
+from graspd.service.pipeline.webhook_dispatcher import WebhookDispatcher
+from graspd.service.queue.port import Event, EventKind, Report
+from graspd.service.store.library import publish_builtins, stored_assets
+from graspd.service.store.packs import take_apart
+from graspd.service.store.records import newest_mark, next_mark, read_record, set_mark
+from graspd.service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
 #: Events of one round: a second's work. Those behind them wait for the next round, which follows at once.

@@ -13,18 +13,18 @@ from collections.abc import Callable, Collection, Iterable
 
 from sqlalchemy import Connection
 
-from service.index.changes.rows import QUIET
-from service.model import names
-from service.model.clock import timestamp
-from service.model.errors import ConflictError, DamagedError, NotFoundError
-from service.model.projects import EVERYTHING, ProjectScope
-from service.model.records import AttemptRecord, JobRecord, Snapshot, Tag
-from service.model.states import AssetKind
-from service.pipeline import tagging
-from service.pipeline.backends import Services
-from service.pipeline.recording import recording
-from service.store.library import load_asset, load_check
-from service.store.records import (
+from graspd.service.index.changes.rows import QUIET
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import ConflictError, DamagedError, NotFoundError
+from graspd.service.model.projects import EVERYTHING, ProjectScope
+from graspd.service.model.records import AttemptRecord, JobRecord, Snapshot, Tag
+from graspd.service.model.states import AssetKind
+from graspd.service.pipeline import tagging
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.recording import recording
+from graspd.service.store.library import load_asset, load_check
+from graspd.service.store.records import (
     Deletion,
     Put,
     Released,
@@ -38,7 +38,7 @@ from service.store.records import (
     released_key,
     removed_folder,
 )
-from service.store.store import Store
+from graspd.service.store.store import Store
 
 
 def delete_asset(

@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final, Literal, NamedTuple
 
-from service.model.domain import JobRequest
-from service.model.errors import InputError
-from service.model.fidelity import AUTO, OFFERED
-from service.model.records import Choice
-from service.model.studies import FREE, IN_SCENE, IN_SCENES, SPEEDS
-from service.store.integrity import get_document
-from service.store.records import charts_of, latest_key
-from service.store.store import Store
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import InputError
+from graspd.service.model.fidelity import AUTO, OFFERED
+from graspd.service.model.records import Choice
+from graspd.service.model.studies import FREE, IN_SCENE, IN_SCENES, SPEEDS
+from graspd.service.store.integrity import get_document
+from graspd.service.store.records import charts_of, latest_key
+from graspd.service.store.store import Store
 
 Row = Mapping[str, Any]
 Near = Literal["hand and object", "hand", "all"]

@@ -11,15 +11,15 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from service.model import names
-from service.model.clock import timestamp
-from service.model.errors import ConflictError, DamagedError, NotFoundError
-from service.model.planning import plan
-from service.model.states import AssetKind, Stage
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.deletion import delete_job, put_away
-from service.store.records import Deletion, Released, load_dataset, read_record, removed_before
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import ConflictError, DamagedError, NotFoundError
+from graspd.service.model.planning import plan
+from graspd.service.model.states import AssetKind, Stage
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.deletion import delete_job, put_away
+from graspd.service.store.records import Deletion, Released, load_dataset, read_record, removed_before
 
 log = logging.getLogger(__name__)
 #: Time for deletions in one round of the controller [s].

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from service.model.errors import InputError
+from graspd.service.model.errors import InputError
 
 #: For the whole exchange [s].
 PATIENCE_S: Final = 10.0

@@ -14,16 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from service.model import names
-from service.model.clock import timestamp
-from service.model.errors import BusyError, QueueUnavailable
-from service.model.records import Record
-from service.store.records import put_record, read_record
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import BusyError, QueueUnavailable
+from graspd.service.model.records import Record
+from graspd.service.store.records import put_record, read_record
 
 if TYPE_CHECKING:
-    from service.pipeline.backends import Services
-    from service.queue.rq_queue import RqQueue
-    from service.store.store import Store
+    from graspd.service.pipeline.backends import Services
+    from graspd.service.queue.rq_queue import RqQueue
+    from graspd.service.store.store import Store
 
 _FILE: Final = "service.id"
 _BYTES: Final = 16

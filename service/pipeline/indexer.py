@@ -10,18 +10,18 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Final
 
-from service.model.clock import timestamp
-from service.model.errors import InputError, StoreUnavailable, UnavailableError
-from service.model.names import attempt as attempt_key
-from service.model.planning import backoff
-from service.model.records import AttemptRecord
-from service.model.states import AssetKind, Stage, State
-from service.pipeline.backends import Services
-from service.pipeline.metrics import Tally
-from service.queue.port import Event, EventKind
-from service.store.library import load_asset, load_check
-from service.store.manifests import ShardManifest, load_manifest
-from service.store.records import read_record
+from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import InputError, StoreUnavailable, UnavailableError
+from graspd.service.model.names import attempt as attempt_key
+from graspd.service.model.planning import backoff
+from graspd.service.model.records import AttemptRecord
+from graspd.service.model.states import AssetKind, Stage, State
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.metrics import Tally
+from graspd.service.queue.port import Event, EventKind
+from graspd.service.store.library import load_asset, load_check
+from graspd.service.store.manifests import ShardManifest, load_manifest
+from graspd.service.store.records import read_record
 
 log = logging.getLogger(__name__)
 _REMEMBERED_JOBS: Final = 10_000

@@ -8,13 +8,13 @@ import tempfile
 from collections.abc import Callable, Iterator
 from typing import Any, Final
 
-from service.index.notes import Damage
-from service.model import names
-from service.model.clock import age_of
-from service.model.digests import digest_files
-from service.model.domain import Asset
-from service.model.errors import DamagedError, InputError, NotFoundError
-from service.model.records import (
+from graspd.service.index.notes import Damage
+from graspd.service.model import names
+from graspd.service.model.clock import age_of
+from graspd.service.model.digests import digest_files
+from graspd.service.model.domain import Asset
+from graspd.service.model.errors import DamagedError, InputError, NotFoundError
+from graspd.service.model.records import (
     AttemptRecord,
     DatasetEvent,
     DatasetRecord,
@@ -24,14 +24,14 @@ from service.model.records import (
     Snapshot,
     Tag,
 )
-from service.model.states import AssetKind, Stage
-from service.model.webhooks import Webhook
-from service.store.assets import ZipFiles
-from service.store.integrity import is_sealed
-from service.store.library import UNPACKED_LIMIT_BYTES, load_check
-from service.store.manifests import ShardManifest
-from service.store.records import CHARTS, IN_SCENES, STABILITY, Deletion, Released, parse_record
-from service.store.store import Store
+from graspd.service.model.states import AssetKind, Stage
+from graspd.service.model.webhooks import Webhook
+from graspd.service.store.assets import ZipFiles
+from graspd.service.store.integrity import is_sealed
+from graspd.service.store.library import UNPACKED_LIMIT_BYTES, load_check
+from graspd.service.store.manifests import ShardManifest
+from graspd.service.store.records import CHARTS, IN_SCENES, STABILITY, Deletion, Released, parse_record
+from graspd.service.store.store import Store
 
 #: What the key of a record looks like, and what it must hold.
 _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (

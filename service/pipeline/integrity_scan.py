@@ -12,11 +12,11 @@ from dataclasses import replace
 from typing import Final
 from uuid import uuid4
 
-from service.index.notes import Damage, ScanNote
-from service.model.clock import age_of, timestamp
-from service.model.errors import GraspdError
-from service.pipeline.backends import Services
-from service.pipeline.integrity import FOLDERS, examine, is_checked, is_on_its_way
+from graspd.service.index.notes import Damage, ScanNote
+from graspd.service.model.clock import age_of, timestamp
+from graspd.service.model.errors import GraspdError
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.integrity import FOLDERS, examine, is_checked, is_on_its_way
 
 log = logging.getLogger(__name__)
 #: A small store is not read more often than this [s].

@@ -11,30 +11,30 @@ from typing import Final, Literal
 
 import numpy as np
 
-from service.index.queries.feed import ReadyTask
-from service.index.views import AssetView, JobView
-from service.model import names
-from service.model.clock import timestamp
-from service.model.digests import job_id
-from service.model.domain import JobOptions, JobRequest
-from service.model.errors import ConflictError, NotFoundError, SceneError, UnavailableError
-from service.model.messages import Origin, TaskMessage
-from service.model.planning import lane_of, message_of
-from service.model.projects import EVERYTHING, ProjectScope
-from service.model.records import JobRecord
-from service.model.scene_spec import HalfSpace, Pose, Supports
-from service.model.states import AssetKind, Lane, State
-from service.model.transforms import quat_conjugate, quat_rotate
-from service.model.workers import need_of
-from service.pipeline.backends import Services
-from service.pipeline.fidelity_choice import Resolver
-from service.pipeline.ranges import TaskRanges
-from service.pipeline.recording import recording
-from service.pipeline.routes import Routes
-from service.pipeline.usable import usable, with_neighbours, with_network
-from service.queue.port import Event, EventKind
-from service.store.records import add_job_event, job_events, put_record, read_record, refuse_pending
-from service.telemetry import bound
+from graspd.service.index.queries.feed import ReadyTask
+from graspd.service.index.views import AssetView, JobView
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.digests import job_id
+from graspd.service.model.domain import JobOptions, JobRequest
+from graspd.service.model.errors import ConflictError, NotFoundError, SceneError, UnavailableError
+from graspd.service.model.messages import Origin, TaskMessage
+from graspd.service.model.planning import lane_of, message_of
+from graspd.service.model.projects import EVERYTHING, ProjectScope
+from graspd.service.model.records import JobRecord
+from graspd.service.model.scene_spec import HalfSpace, Pose, Supports
+from graspd.service.model.states import AssetKind, Lane, State
+from graspd.service.model.transforms import quat_conjugate, quat_rotate
+from graspd.service.model.workers import need_of
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.fidelity_choice import Resolver
+from graspd.service.pipeline.ranges import TaskRanges
+from graspd.service.pipeline.recording import recording
+from graspd.service.pipeline.routes import Routes
+from graspd.service.pipeline.usable import usable, with_neighbours, with_network
+from graspd.service.queue.port import Event, EventKind
+from graspd.service.store.records import add_job_event, job_events, put_record, read_record, refuse_pending
+from graspd.service.telemetry import bound
 
 log = logging.getLogger(__name__)
 #: Wait before it is looked again whether a worker can do what was held back [s].

@@ -17,11 +17,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
-from service.model.errors import QueueUnavailable
-from service.telemetry import HeartbeatFile
+from graspd.service.model.errors import QueueUnavailable
+from graspd.service.telemetry import HeartbeatFile
 
 if TYPE_CHECKING:
-    from service.queue.rq_queue import RqQueue
+    from graspd.service.queue.rq_queue import RqQueue
 
 log = logging.getLogger(__name__)
 #: As what the controller that leads announces itself; an API of graspd 0.2 looks for the same name.

@@ -7,20 +7,20 @@ import time
 from collections.abc import Callable, Collection
 from typing import Any, Final
 
-from service.model import names
-from service.model.clock import timestamp
-from service.model.errors import DamagedError, NotFoundError, UnavailableError
-from service.model.messages import IngestMessage, TaskMessage
-from service.model.planning import ingest_id
-from service.model.records import AttemptRecord
-from service.model.states import AssetKind, Stage
-from service.pipeline.backends import Services
-from service.pipeline.indexer import Indexer
-from service.queue.port import Lease
-from service.store.integrity import put_document
-from service.store.manifests import load_manifest
-from service.store.packs import take_apart
-from service.store.records import put_record, read_record, task_attempts
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import DamagedError, NotFoundError, UnavailableError
+from graspd.service.model.messages import IngestMessage, TaskMessage
+from graspd.service.model.planning import ingest_id
+from graspd.service.model.records import AttemptRecord
+from graspd.service.model.states import AssetKind, Stage
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.indexer import Indexer
+from graspd.service.queue.port import Lease
+from graspd.service.store.integrity import put_document
+from graspd.service.store.manifests import load_manifest
+from graspd.service.store.packs import take_apart
+from graspd.service.store.records import put_record, read_record, task_attempts
 
 log = logging.getLogger(__name__)
 #: A task on its way between queue, worker and stream is in none of them for a moment [s].

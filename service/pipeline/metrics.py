@@ -15,8 +15,8 @@ from typing import Final, Literal
 
 from pydantic_core import from_json
 
-from service.model.states import State
-from service.store.manifests import ShardManifest
+from graspd.service.model.states import State
+from graspd.service.store.manifests import ShardManifest
 
 #: Upper bounds of the histogram of stage times [s].
 STAGE_BUCKETS_S: Final = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)

@@ -7,15 +7,15 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from service.index.queries.overview import BatchCost
-from service.model.domain import JobRequest, batches_of
-from service.model.projects import EVERYTHING, ProjectScope
-from service.model.records import MOST_BATCHES, JobRecord
-from service.model.states import Lane, Stage
-from service.model.version import SCHEMA_OF_RANGES
-from service.model.workers import WorkerBeat
-from service.pipeline.backends import Services
-from service.pipeline.rates import Rates, tries
+from graspd.service.index.queries.overview import BatchCost
+from graspd.service.model.domain import JobRequest, batches_of
+from graspd.service.model.projects import EVERYTHING, ProjectScope
+from graspd.service.model.records import MOST_BATCHES, JobRecord
+from graspd.service.model.states import Lane, Stage
+from graspd.service.model.version import SCHEMA_OF_RANGES
+from graspd.service.model.workers import WorkerBeat
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.rates import Rates, tries
 
 #: Finished tasks that tell how long a batch takes.
 _LOOKED_AT: Final = 64

@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 from statistics import median, quantiles
 from typing import Final
 
-from service.index.queries.overview import BatchCost
-from service.model.domain import BATCH_SIZE, JobOptions
-from service.model.scene_spec import TOUCH
+from graspd.service.index.queries.overview import BatchCost
+from graspd.service.model.domain import BATCH_SIZE, JobOptions
+from graspd.service.model.scene_spec import TOUCH
 
 
 @dataclass(frozen=True)

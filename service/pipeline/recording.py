@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from pydantic import BaseModel
 from sqlalchemy import Connection
 
-from service.model.errors import StoreUnavailable
-from service.pipeline.backends import Services
-from service.store.records import Put, put_record
+from graspd.service.model.errors import StoreUnavailable
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.records import Put, put_record
 
 log = logging.getLogger(__name__)
 

@@ -8,17 +8,17 @@ import re
 from collections.abc import Sequence
 from typing import Final
 
-from service.index.notes import Damage
-from service.model import names
-from service.model.errors import DamagedError, NotFoundError
-from service.model.planning import PlannedTask, message_of, plan
-from service.model.records import JobRecord
-from service.model.states import AssetKind, Lane, Stage
-from service.model.version import STAGE_REVISIONS
-from service.pipeline.backends import Services
-from service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, STAGES, is_on_its_way
-from service.store.library import builtin_assets, load_asset, publish_builtins
-from service.store.records import read_record, task_attempts
+from graspd.service.index.notes import Damage
+from graspd.service.model import names
+from graspd.service.model.errors import DamagedError, NotFoundError
+from graspd.service.model.planning import PlannedTask, message_of, plan
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import AssetKind, Lane, Stage
+from graspd.service.model.version import STAGE_REVISIONS
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, STAGES, is_on_its_way
+from graspd.service.store.library import builtin_assets, load_asset, publish_builtins
+from graspd.service.store.records import read_record, task_attempts
 
 _OF_ASSET: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(.+)")
 

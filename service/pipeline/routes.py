@@ -6,8 +6,8 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from service.model.states import Stage
-from service.model.workers import Ability, Need, WorkerBeat, own_ability
+from graspd.service.model.states import Stage
+from graspd.service.model.workers import Ability, Need, WorkerBeat, own_ability
 
 
 @dataclass(frozen=True)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 
-from service.model import names
-from service.model.clock import timestamp
-from service.model.errors import ConflictError, LimitError, NotFoundError
-from service.model.records import MOST_TAGGED, Grasp, Tag, by_shard, tag_id
-from service.pipeline.backends import Services
-from service.pipeline.recording import recording
-from service.store.records import Deletion, drop_older, newest_version, put_record, put_version, removed_folder
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import ConflictError, LimitError, NotFoundError
+from graspd.service.model.records import MOST_TAGGED, Grasp, Tag, by_shard, tag_id
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.recording import recording
+from graspd.service.store.records import Deletion, drop_older, newest_version, put_record, put_version, removed_folder
 
 #: Asked with what is to be changed, None if it is to be made; raises where that is not allowed.
 Permit = Callable[[Tag | None], None]

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TypeVar
 
-from service.index.views import AssetView
-from service.model.domain import JobOptions
-from service.model.errors import ConflictError, InputError
-from service.model.projects import EVERYTHING, ProjectScope
-from service.model.records import Member
-from service.model.states import AssetKind
-from service.pipeline.backends import Services
+from graspd.service.index.views import AssetView
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import ConflictError, InputError
+from graspd.service.model.projects import EVERYTHING, ProjectScope
+from graspd.service.model.records import Member
+from graspd.service.model.states import AssetKind
+from graspd.service.pipeline.backends import Services
 
 Options = TypeVar("Options", bound=JobOptions)
 

@@ -17,12 +17,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import zip_longest
 from typing import Final
 
-from service.index.outbox import Due
-from service.index.views import EndView
-from service.model.errors import UnavailableError
-from service.model.webhooks import SIGNATURE, secret_of, signature
-from service.pipeline.backends import Services
-from service.pipeline.http_client import Answer, Networks, networks, post
+from graspd.service.index.outbox import Due
+from graspd.service.index.views import EndView
+from graspd.service.model.errors import UnavailableError
+from graspd.service.model.webhooks import SIGNATURE, secret_of, signature
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.http_client import Answer, Networks, networks, post
 
 log = logging.getLogger(__name__)
 #: Deliveries under way at once, and of them those to addresses that failed last.

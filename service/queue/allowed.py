@@ -15,8 +15,8 @@ from rq.exceptions import DeserializationError
 from rq.job import Job
 from rq.serializers import JSONSerializer
 
-from service.model.errors import TaskRefused
-from service.queue.entries import is_wrong_type
+from graspd.service.model.errors import TaskRefused
+from graspd.service.queue.entries import is_wrong_type
 
 #: The one function name a job may carry.
 TASK_FUNCTION: Final = "graspd.task"

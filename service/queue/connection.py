@@ -13,8 +13,8 @@ from redis import Redis
 from redis.backoff import ExponentialBackoff
 from redis.retry import Retry
 
-from service.model.errors import QueueUnavailable
-from service.settings import Settings
+from graspd.service.model.errors import QueueUnavailable
+from graspd.service.settings import Settings
 
 _SOCKET_TIMEOUT_S: Final = 10.0
 _NETWORK: Final = {"socket_connect_timeout": 3.0, "socket_keepalive": True}

@@ -14,10 +14,10 @@ from typing import Any, Final, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from service.model.messages import IngestMessage, TaskMessage
-from service.model.states import Stage
-from service.model.workers import WorkerBeat
-from service.queue.port import Event, Message, Report
+from graspd.service.model.messages import IngestMessage, TaskMessage
+from graspd.service.model.states import Stage
+from graspd.service.model.workers import WorkerBeat
+from graspd.service.queue.port import Event, Message, Report
 
 Entry = TypeVar("Entry", WorkerBeat, Event, Report)
 _ADAPTERS: Final[dict[type, TypeAdapter[Any]]] = {kind: TypeAdapter(kind) for kind in (WorkerBeat, Event, Report)}

@@ -20,10 +20,10 @@ from rq.job import Job
 from rq.registry import FailedJobRegistry, StartedJobRegistry
 from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
-from service.model.states import Lane, Stage
-from service.model.workers import FIRST_SCHEMA, Ability, Need
-from service.queue import entries
-from service.queue.port import lane_order
+from graspd.service.model.states import Lane, Stage
+from graspd.service.model.workers import FIRST_SCHEMA, Ability, Need
+from graspd.service.queue import entries
+from graspd.service.queue.port import lane_order
 
 #: Names of all lists that a task was ever put into, and of all workers.
 LISTS: Final[str] = Queue.redis_queues_keys

@@ -9,11 +9,11 @@ from typing import Annotated, Any, Final
 
 from pydantic import BeforeValidator, ConfigDict, Field
 
-from service.model.base import Model
-from service.model.domain import Word
-from service.model.messages import IngestMessage, TaskMessage
-from service.model.states import Lane, Stage
-from service.model.workers import Count, HostWord, WorkerBeat
+from graspd.service.model.base import Model
+from graspd.service.model.domain import Word
+from graspd.service.model.messages import IngestMessage, TaskMessage
+from graspd.service.model.states import Lane, Stage
+from graspd.service.model.workers import Count, HostWord, WorkerBeat
 
 Message = TaskMessage | IngestMessage
 

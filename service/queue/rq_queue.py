@@ -22,14 +22,14 @@ from rq.executions import Execution
 from rq.job import Job
 from rq.serializers import JSONSerializer
 
-from service.model.clock import age_of
-from service.model.errors import QueueUnavailable
-from service.model.states import Lane, Stage
-from service.model.workers import WorkerBeat, need_of
-from service.queue import entries
-from service.queue.allowed import TASK_FUNCTION, new_job
-from service.queue.connection import connect, redis_url
-from service.queue.lists import (
+from graspd.service.model.clock import age_of
+from graspd.service.model.errors import QueueUnavailable
+from graspd.service.model.states import Lane, Stage
+from graspd.service.model.workers import WorkerBeat, need_of
+from graspd.service.queue import entries
+from graspd.service.queue.allowed import TASK_FUNCTION, new_job
+from graspd.service.queue.connection import connect, redis_url
+from graspd.service.queue.lists import (
     LISTS,
     RQ_WORKERS,
     execution_keys,
@@ -45,8 +45,8 @@ from service.queue.lists import (
     without_takers,
     workers_key,
 )
-from service.queue.port import Event, Lease, Message, Place, QueueNow, Report
-from service.settings import Settings
+from graspd.service.queue.port import Event, Lease, Message, Place, QueueNow, Report
+from graspd.service.settings import Settings
 
 EVENTS: Final = "graspd:events"
 #: Events kept, 20 MB at most: a minute of a controller that is away and four hundred tasks a second. Lost ones are

@@ -1,6 +1,6 @@
 """Reading datasets: shards from files, a folder or any store, as arrays or as samples for training.
 
-    from service.readers import Grasps, Pictures, open_shards
+    from graspd.service.readers import Grasps, Pictures, open_shards
 
     shards = open_shards("demo-out/shards")                                # files
     shards = open_shards("s3://bucket/graspd", dataset="kitchen")          # a dataset's newest snapshot, cached here
@@ -19,12 +19,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from service.readers.cache import ShardCache, prefetched
-    from service.readers.clouds import Clouds
-    from service.readers.depth_noise import DepthNoise
-    from service.readers.files import ShardFile, Shards, open_shards
-    from service.readers.grasps import Grasps
-    from service.readers.pictures import Pictures
+    from graspd.service.readers.cache import ShardCache, prefetched
+    from graspd.service.readers.clouds import Clouds
+    from graspd.service.readers.depth_noise import DepthNoise
+    from graspd.service.readers.files import ShardFile, Shards, open_shards
+    from graspd.service.readers.grasps import Grasps
+    from graspd.service.readers.pictures import Pictures
 
 #: Name, the module it lives in.
 _LIVES_IN: Final = {

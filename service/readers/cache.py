@@ -12,10 +12,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
 
-from service.model.errors import DamagedShard, InputError, NotFoundError
-from service.store.integrity import check_content, check_digest, gone
-from service.store.store import Store
-from service.user_cache import make_room
+from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
+from graspd.service.store.integrity import check_content, check_digest, gone
+from graspd.service.store.store import Store
+from graspd.service.user_cache import make_room
 
 DEFAULT_BYTES: Final = 20 << 30
 

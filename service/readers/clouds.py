@@ -11,13 +11,13 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model import transforms
-from service.model.errors import InputError
-from service.model.pinhole import back_project, fitted_normals, surface_normals
-from service.model.transforms import Floats
-from service.readers.depth_noise import DepthNoise, incidence, noise_of
-from service.readers.pictures import Pictures, Place, Scenes
-from service.store.shards import Shard
+from graspd.service.model import transforms
+from graspd.service.model.errors import InputError
+from graspd.service.model.pinhole import back_project, fitted_normals, surface_normals
+from graspd.service.model.transforms import Floats
+from graspd.service.readers.depth_noise import DepthNoise, incidence, noise_of
+from graspd.service.readers.pictures import Pictures, Place, Scenes
+from graspd.service.store.shards import Shard
 
 Array = NDArray[Any]
 

@@ -30,9 +30,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError, one_of
-from service.model.pinhole import EDGE, back_project, surface_normals
-from service.model.transforms import Floats
+from graspd.service.model.errors import InputError, one_of
+from graspd.service.model.pinhole import EDGE, back_project, surface_normals
+from graspd.service.model.transforms import Floats
 
 Bools = NDArray[np.bool_]
 

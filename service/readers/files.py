@@ -11,20 +11,20 @@ from typing import Final
 
 import h5py
 
-from service.model import names
-from service.model.errors import InputError, NotFoundError
-from service.model.planning import plan
-from service.model.records import JobRecord
-from service.readers.cache import DEFAULT_BYTES, ShardCache
-from service.readers.ranges import RangeReader
-from service.store.columns import ShardKind
-from service.store.integrity import check_file
-from service.store.manifests import load_manifest
-from service.store.packs import PACKED, has_packs
-from service.store.records import newest_snapshot, read_record
-from service.store.shards import kind_of, open_shard
-from service.store.store import Store, open_store
-from service.user_cache import folder
+from graspd.service.model import names
+from graspd.service.model.errors import InputError, NotFoundError
+from graspd.service.model.planning import plan
+from graspd.service.model.records import JobRecord
+from graspd.service.readers.cache import DEFAULT_BYTES, ShardCache
+from graspd.service.readers.ranges import RangeReader
+from graspd.service.store.columns import ShardKind
+from graspd.service.store.integrity import check_file
+from graspd.service.store.manifests import load_manifest
+from graspd.service.store.packs import PACKED, has_packs
+from graspd.service.store.records import newest_snapshot, read_record
+from graspd.service.store.shards import kind_of, open_shard
+from graspd.service.store.store import Store, open_store
+from graspd.service.user_cache import folder
 
 _STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
 

@@ -9,11 +9,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError
-from service.readers.files import ShardFile, Shards
-from service.store import validity
-from service.store.columns import SCHEMAS
-from service.store.shards import open_shard, read_column
+from graspd.service.model.errors import InputError
+from graspd.service.readers.files import ShardFile, Shards
+from graspd.service.store import validity
+from graspd.service.store.columns import SCHEMAS
+from graspd.service.store.shards import open_shard, read_column
 
 Array = NDArray[Any]
 #: From the columns of one base shard to a mask (N,) of the grasps to keep.

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model import transforms
-from service.model.errors import InputError
-from service.readers.files import ShardFile, Shards
-from service.readers.ranges import RowTable, read_file
-from service.store import validity
-from service.store.columns import SCHEMAS
-from service.store.shards import read_shard
+from graspd.service.model import transforms
+from graspd.service.model.errors import InputError
+from graspd.service.readers.files import ShardFile, Shards
+from graspd.service.readers.ranges import RowTable, read_file
+from graspd.service.store import validity
+from graspd.service.store.columns import SCHEMAS
+from graspd.service.store.shards import read_shard
 
 if TYPE_CHECKING:
-    from service.readers.clouds import Clouds
+    from graspd.service.readers.clouds import Clouds
 
 Array = NDArray[Any]
 
@@ -151,7 +151,7 @@ class Pictures(Sequence[dict[str, Any]]):
 
     def clouds(self, points: int = 1024, **options: Any) -> Clouds:
         """The pictures as point clouds with the labels of their scenes; for the options see `Clouds`."""
-        from service.readers.clouds import Clouds
+        from graspd.service.readers.clouds import Clouds
 
         return Clouds(self, points, **options)
 

@@ -23,11 +23,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import DamagedShard, GraspdError, NotFoundError
-from service.readers.cache import check_not_forked
-from service.store.integrity import gone
-from service.store.shards import open_shard, read_column
-from service.store.store import Store
+from graspd.service.model.errors import DamagedShard, GraspdError, NotFoundError
+from graspd.service.readers.cache import check_not_forked
+from graspd.service.store.integrity import gone
+from graspd.service.store.shards import open_shard, read_column
+from graspd.service.store.store import Store
 
 Range = tuple[int, int]
 

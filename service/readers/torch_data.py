@@ -1,8 +1,8 @@
 """Shards as PyTorch datasets. Importing this module imports torch: `pip install torch`, in whatever build you need.
 
 from torch.utils.data import DataLoader
-from service.readers import Pictures, open_shards
-from service.readers.torch_data import Samples, ShuffledShards, collate
+from graspd.service.readers import Pictures, open_shards
+from graspd.service.readers.torch_data import Samples, ShuffledShards, collate
 
 shards = open_shards("demo-out/shards")
 DataLoader(Samples(Pictures(shards)), batch_size=16, shuffle=True, num_workers=4, collate_fn=collate)
@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset, IterableDataset, default_collate, get_worker_info
 
-from service.readers.clouds import OF_GRASPS
-from service.readers.files import Shards
-from service.readers.grasps import DEFAULT_COLUMNS, Grasps, Where
+from graspd.service.readers.clouds import OF_GRASPS
+from graspd.service.readers.files import Shards
+from graspd.service.readers.grasps import DEFAULT_COLUMNS, Grasps, Where
 
 Sample = dict[str, Any]
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic_core import from_json
 
-from service.model.errors import InputError
-from service.model.scene_spec import SceneSpec
-from service.model.transforms import Floats, slerp
-from service.store.shards import Shard
+from graspd.service.model.errors import InputError
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.transforms import Floats, slerp
+from graspd.service.store.shards import Shard
 
 #: Names of the postures at which something begins or ends. What lies between them has none.
 STOPS: Final = ("standoff", "pregrasp", "grasp", "squeeze", "lift")

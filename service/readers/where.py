@@ -10,10 +10,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.metrics import GRASP_METRICS, GraspMetric
-from service.model.where import Flag, Joined, Node, Not, OfMetric, OfType, parsed
-from service.store import validity
-from service.store.manifests import INDEX_THRESHOLD_M
+from graspd.service.model.metrics import GRASP_METRICS, GraspMetric
+from graspd.service.model.where import Flag, Joined, Node, Not, OfMetric, OfType, parsed
+from graspd.service.store import validity
+from graspd.service.store.manifests import INDEX_THRESHOLD_M
 
 Array = NDArray[Any]
 Mask = NDArray[np.bool_]

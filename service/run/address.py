@@ -20,9 +20,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from service.model.errors import InputError, UnavailableError
-from service.run.children import start_of
-from service.settings import Settings
+from graspd.service.model.errors import InputError, UnavailableError
+from graspd.service.run.children import start_of
+from graspd.service.settings import Settings
 
 _FILE: Final = "api.json"
 

@@ -59,7 +59,7 @@ class Child:
         token = secrets.token_hex(16)
         with self._output() as output:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "service.run.launch", str(os.getpid()), *self.command],
+                [sys.executable, "-m", "graspd.service.run.launch", str(os.getpid()), *self.command],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT if output is not None else None,

@@ -12,11 +12,19 @@ from typing import Annotated
 
 import typer
 
-from service.cli import JsonFlag, emit, keep_private, load_settings, log_to_stderr, plain_console, reporting_errors
-from service.model import names
-from service.model.errors import IndexDamaged, QueueUnavailable, UnavailableError, without_secrets
-from service.settings import Settings
-from service.telemetry import HeartbeatFile
+from graspd.service.cli import (
+    JsonFlag,
+    emit,
+    keep_private,
+    load_settings,
+    log_to_stderr,
+    plain_console,
+    reporting_errors,
+)
+from graspd.service.model import names
+from graspd.service.model.errors import IndexDamaged, QueueUnavailable, UnavailableError, without_secrets
+from graspd.service.settings import Settings
+from graspd.service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
 
@@ -49,8 +57,8 @@ def up(
 ) -> None:
     """The whole service on this machine, until Ctrl-C."""
     _check_extras(workers)
-    from service.run.address import joining
-    from service.run.supervisor import Supervisor
+    from graspd.service.run.address import joining
+    from graspd.service.run.supervisor import Supervisor
 
     settings = load_settings(host=host, port=port, device=device, data_dir=data_dir)
     log_to_stderr(settings, "up")
@@ -90,10 +98,10 @@ def controller(
 
 def _run_controller(settings: Settings, stop: threading.Event) -> None:
     """Lead, or stand by; from the start again where another led meanwhile."""
-    from service.pipeline.backends import Services
-    from service.pipeline.controller import Controller
-    from service.pipeline.leading import Leadership
-    from service.queue.rq_queue import open_queue
+    from graspd.service.pipeline.backends import Services
+    from graspd.service.pipeline.controller import Controller
+    from graspd.service.pipeline.leading import Leadership
+    from graspd.service.queue.rq_queue import open_queue
 
     alive = HeartbeatFile(settings.heartbeat_file)
     queue = open_queue(settings, patience=0)
@@ -119,8 +127,8 @@ def _identify(settings: Settings, stop: threading.Event, alive: HeartbeatFile) -
     Raises:
         BusyError: one of them is another service's.
     """
-    from service.pipeline.backends import Services
-    from service.pipeline.identity import identify
+    from graspd.service.pipeline.backends import Services
+    from graspd.service.pipeline.identity import identify
 
     services = Services.open(settings, patience=0)
     try:
@@ -149,12 +157,12 @@ def rebuild(
 
     With --check exit code 1: they differ, or a shard is damaged.
     """
-    from service.index.rebuild import differences
-    from service.index.rebuild import rebuild as fill
-    from service.pipeline.backends import Services
-    from service.pipeline.identity import identify_if_redis_answers
-    from service.pipeline.integrity import scan
-    from service.store.packs import take_apart
+    from graspd.service.index.rebuild import differences
+    from graspd.service.index.rebuild import rebuild as fill
+    from graspd.service.pipeline.backends import Services
+    from graspd.service.pipeline.identity import identify_if_redis_answers
+    from graspd.service.pipeline.integrity import scan
+    from graspd.service.store.packs import take_apart
 
     services = Services.open(load_settings(data_dir=data_dir), patience=0, make=False, anew=not check)
     store, index = services.store, services.index
@@ -194,8 +202,8 @@ def export(
     json: JsonFlag = False,
 ) -> None:
     """Write grasps, shards, jobs, tasks, assets, datasets and usage as Parquet files, for DuckDB or pandas."""
-    from service.index.export import export as write
-    from service.index.index import Index
+    from graspd.service.index.export import export as write
+    from graspd.service.index.index import Index
 
     index = Index(load_settings(data_dir=data_dir).resolved_index_url)
     try:
@@ -228,8 +236,8 @@ def _check_extras(workers: int) -> None:
 
 def check_controller(settings: Settings) -> None:
     """UnavailableError if no controller gave a sign of life lately."""
-    from service.pipeline.leading import PART
-    from service.queue.rq_queue import open_queue
+    from graspd.service.pipeline.leading import PART
+    from graspd.service.queue.rq_queue import open_queue
 
     queue = open_queue(settings, patience=0)
     try:

@@ -15,10 +15,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Final
 
-from service.model.errors import BusyError, QueueUnavailable
-from service.queue.connection import password_file, socket_path
-from service.run.address import Joining
-from service.settings import Settings
+from graspd.service.model.errors import BusyError, QueueUnavailable
+from graspd.service.queue.connection import password_file, socket_path
+from graspd.service.run.address import Joining
+from graspd.service.settings import Settings
 
 log = logging.getLogger(__name__)
 #: What an append-only Redis keeps, of version 7 on and before.

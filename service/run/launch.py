@@ -1,4 +1,4 @@
-"""Runs a program that ends when its parent does: `python -m service.run.launch PARENT_PID PROGRAM ARGUMENTS...`.
+"""Runs a program that ends when its parent does: `python -m graspd.service.run.launch PARENT_PID PROGRAM ARGUMENTS...`.
 
 Linux tells the child itself (prctl survives the exec). Elsewhere the next `graspd up` ends what the pid files name.
 """

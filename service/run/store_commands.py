@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from service.cli import JsonFlag, emit, load_settings, reporting_errors
-from service.model import names
-from service.model.errors import ConflictError
+from graspd.service.cli import JsonFlag, emit, load_settings, reporting_errors
+from graspd.service.model import names
+from graspd.service.model.errors import ConflictError
 
 app = typer.Typer(no_args_is_help=True)
 store_app = typer.Typer(no_args_is_help=True, help="Check the store, and mend it.")
@@ -34,11 +34,11 @@ def verify(
 
     The controller's integrity scan pauses meanwhile; a second call is refused.
     """
-    from service.pipeline.backends import Services
-    from service.pipeline.identity import identify_if_redis_answers
-    from service.pipeline.integrity import MISSING, scan
-    from service.pipeline.integrity_scan import Turn
-    from service.pipeline.repair import repair as mend
+    from graspd.service.pipeline.backends import Services
+    from graspd.service.pipeline.identity import identify_if_redis_answers
+    from graspd.service.pipeline.integrity import MISSING, scan
+    from graspd.service.pipeline.integrity_scan import Turn
+    from graspd.service.pipeline.repair import repair as mend
 
     services = Services.open(load_settings(data_dir=data_dir), make=False)
     if repair:
@@ -87,8 +87,8 @@ def upgrade(
     json: JsonFlag = False,
 ) -> None:
     """Give every shard that graspd 0.2 put into a pack a file of its own; a controller does the same when it starts."""
-    from service.store.packs import take_apart
-    from service.store.store import open_store
+    from graspd.service.store.packs import take_apart
+    from graspd.service.store.store import open_store
 
     store = open_store(load_settings(data_dir=data_dir).resolved_store_url, make=False)
     shards = sum(1 for _ in take_apart(store))

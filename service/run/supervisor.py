@@ -18,17 +18,17 @@ from typing import IO, Final, Self
 import httpx
 from pydantic import SecretStr
 
-from service.model.errors import BusyError, GraspdError, InputError, UnavailableError
-from service.pipeline.backends import Services
-from service.pipeline.identity import identify_if_redis_answers, recorded
-from service.pipeline.leading import PART
-from service.queue.connection import redis_url
-from service.queue.rq_queue import RqQueue, open_queue
-from service.run.address import Joining, forget_address, record_address
-from service.run.children import Child, end_leftovers, keep_alive, stop_children
-from service.run.embedded import find_server, give_up_log, lock_file, own_redis, server_command, set_log_aside
-from service.settings import Settings
-from service.store.store import open_store
+from graspd.service.model.errors import BusyError, GraspdError, InputError, UnavailableError
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.identity import identify_if_redis_answers, recorded
+from graspd.service.pipeline.leading import PART
+from graspd.service.queue.connection import redis_url
+from graspd.service.queue.rq_queue import RqQueue, open_queue
+from graspd.service.run.address import Joining, forget_address, record_address
+from graspd.service.run.children import Child, end_leftovers, keep_alive, stop_children
+from graspd.service.run.embedded import find_server, give_up_log, lock_file, own_redis, server_command, set_log_aside
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
 
 log = logging.getLogger(__name__)
 _PROBE_S: Final = 0.1

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Final, Literal
 
 import typer
 
-from service.model.errors import InputError
-from service.model.matter import FRICTION, MASS_KG, MOST_KG
+from graspd.service.model.errors import InputError
+from graspd.service.model.matter import FRICTION, MASS_KG, MOST_KG
 
 PalmOption = Annotated[str | None, typer.Option("--palm", help="Link that is the palm.")]
 ApproachOption = Annotated[

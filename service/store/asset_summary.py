@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-from service.model.states import AssetKind
+from graspd.service.model.states import AssetKind
 
 #: Rounding moves a surface so far; it is no news [m].
 _NOTHING_M = 1e-7

@@ -16,11 +16,11 @@ from importlib import resources
 from pathlib import Path, PurePosixPath
 from typing import IO, Final, Self, TypeVar
 
-from service.model.digests import StreamedFiles, digest_bytes, digest_files
-from service.model.domain import Asset
-from service.model.errors import InputError, LimitError, NotFoundError
-from service.model.states import AssetKind
-from service.store.descriptions import MAX_BYTES, parse_description
+from graspd.service.model.digests import StreamedFiles, digest_bytes, digest_files
+from graspd.service.model.domain import Asset
+from graspd.service.model.errors import InputError, LimitError, NotFoundError
+from graspd.service.model.states import AssetKind
+from graspd.service.store.descriptions import MAX_BYTES, parse_description
 
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
 #: The built-in assets carry the release's date, so that publishing them twice writes the same manifest.
@@ -78,7 +78,7 @@ def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
 
 def unpack_file(path: Path) -> dict[str, bytes]:
     """`unpack` of a file, as large as an upload may be; its errors name the file."""
-    from service.settings import Settings
+    from graspd.service.settings import Settings
 
     try:
         return unpack(path.read_bytes(), limit_bytes=UNPACK_FACTOR * Settings().max_upload_bytes)
@@ -234,7 +234,7 @@ def builtin_files(kind: AssetKind, name: str) -> dict[str, bytes]:
 
 
 def builtin_model(kind: AssetKind, name: str) -> bytes:
-    """Binary glTF of a built-in hand or object, as `python -m worker.stages.models` wrote it."""
+    """Binary glTF of a built-in hand or object, as `python -m graspd.worker.stages.models` wrote it."""
     return (Path(str(resources.files("service"))) / "builtin" / "models" / f"{kind.value}-{name}.glb").read_bytes()
 
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from service.model.errors import InputError
-from service.model.metrics import AXIS_MEANINGS, GRASP_METRICS
+from graspd.service.model.errors import InputError
+from graspd.service.model.metrics import AXIS_MEANINGS, GRASP_METRICS
 
 ShardKind = Literal["base", "scene", "views"]
 

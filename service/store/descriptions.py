@@ -12,8 +12,8 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 from pydantic_core import from_json, to_json
 
-from service.model.base import refusal
-from service.model.errors import ConflictError, InputError
+from graspd.service.model.base import refusal
+from graspd.service.model.errors import ConflictError, InputError
 
 #: The built-in hands need 2 KB; the facts stand in every list of hands or objects.
 MAX_BYTES: Final = 64 << 10

@@ -10,10 +10,10 @@ from html import unescape
 from pathlib import Path, PurePosixPath
 from typing import Final, Literal
 
-from service.model.digests import StreamedFiles
-from service.model.errors import InputError, LimitError
-from service.store.assets import MAX_FILES
-from service.store.mesh_files import HEAD_BYTES, MESHES, beside, named_by, one_like, read_reference
+from graspd.service.model.digests import StreamedFiles
+from graspd.service.model.errors import InputError, LimitError
+from graspd.service.store.assets import MAX_FILES
+from graspd.service.store.mesh_files import HEAD_BYTES, MESHES, beside, named_by, one_like, read_reference
 
 #: What says more of a hand than its URDF does; the first goes over the second.
 DESCRIPTIONS: Final = ("asset.json", "hand.json")

@@ -22,8 +22,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
-from service.model.errors import DamagedError, DamagedShard, NotFoundError
-from service.store.store import STREAM_BYTES, Stamp, Store
+from graspd.service.model.errors import DamagedError, DamagedShard, NotFoundError
+from graspd.service.store.store import STREAM_BYTES, Stamp, Store
 
 #: Lists of checksums that exports and cards write, looked for in the folder of a shard and in the two above it.
 CHECKSUM_LISTS: Final = ("SHA256SUMS", "checksums.sha256")

@@ -8,16 +8,16 @@ import tempfile
 from collections.abc import Mapping
 from typing import Final
 
-from service.model import names
-from service.model.clock import timestamp
-from service.model.digests import digest_files
-from service.model.domain import Asset
-from service.model.errors import ConflictError, DamagedError, InputError
-from service.model.states import AssetKind
-from service.store.assets import builtin_asset, builtin_model, builtin_names, describe, pack_into, unpack
-from service.store.integrity import get_document, is_sealed, seal_archive, sealed
-from service.store.records import Put, put_record, read_record
-from service.store.store import Store
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.digests import digest_files
+from graspd.service.model.domain import Asset
+from graspd.service.model.errors import ConflictError, DamagedError, InputError
+from graspd.service.model.states import AssetKind
+from graspd.service.store.assets import builtin_asset, builtin_model, builtin_names, describe, pack_into, unpack
+from graspd.service.store.integrity import get_document, is_sealed, seal_archive, sealed
+from graspd.service.store.records import Put, put_record, read_record
+from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
 #: An archive the service packed itself is bounded by the upload limit; this only stops a store that was tampered with.

@@ -11,20 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from service.model import names
-from service.model.clock import timestamp
-from service.model.domain import Digest, JobRequest, batches_of
-from service.model.messages import TaskMessage
-from service.model.metric_fields import values, with_fields
-from service.model.metrics import axis_word, indexed
-from service.model.states import Stage
-from service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
-from service.store import validity
-from service.store.columns import SCHEMAS, ShardKind
-from service.store.integrity import read_checked
-from service.store.records import put_record, read_record
-from service.store.shards import Shard, read_shard
-from service.store.store import Store
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.domain import Digest, JobRequest, batches_of
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.metric_fields import values, with_fields
+from graspd.service.model.metrics import axis_word, indexed
+from graspd.service.model.states import Stage
+from graspd.service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
+from graspd.service.store import validity
+from graspd.service.store.columns import SCHEMAS, ShardKind
+from graspd.service.store.integrity import read_checked
+from graspd.service.store.records import put_record, read_record
+from graspd.service.store.shards import Shard, read_shard
+from graspd.service.store.store import Store
 
 #: Contact threshold at which the sweep's metrics enter the index [m]: the widest that the literature reports.
 INDEX_THRESHOLD_M: Final = 0.005

@@ -11,8 +11,8 @@ from pathlib import PurePosixPath
 from typing import Final
 from urllib.parse import unquote
 
-from service.model.errors import InputError
-from service.store.assets import check_path
+from graspd.service.model.errors import InputError
+from graspd.service.store.assets import check_path
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(/*)")
 #: Of them the rest is a path; what comes first in it, a package or folders of another machine, may be left out.

@@ -1,7 +1,7 @@
 """Files of proposal networks: `.npz` of the schema `graspd/proposals@1`, arrays and one JSON text, nothing that runs.
 
 The architecture is fixed, so a file is checked whole against the shapes that its joints imply; what a network computes
-is in `worker.planners.learned.network`.
+is in `baselines.learned.network`.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from service.model.base import Digest, Name, refusal
-from service.model.digests import digest_bytes
-from service.model.errors import InputError, LimitError
-from service.store.assets import asset_json
-from service.store.descriptions import json_object, parse_description
+from graspd.service.model.base import Digest, Name, refusal
+from graspd.service.model.digests import digest_bytes
+from graspd.service.model.errors import InputError, LimitError
+from graspd.service.store.assets import asset_json
+from graspd.service.store.descriptions import json_object, parse_description
 
 SCHEMA: Final = "graspd/proposals@1"
 #: Most that a file may hold, packed or not; a network of 22 joints takes 5.4 MB [bytes].

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Final
 
-from service.cli import load_settings
-from service.model.errors import InputError, LimitError
-from service.model.names import fitted
-from service.store.assets import MAX_FILES, UNPACK_FACTOR, unpack
+from graspd.service.cli import load_settings
+from graspd.service.model.errors import InputError, LimitError
+from graspd.service.model.names import fitted
+from graspd.service.store.assets import MAX_FILES, UNPACK_FACTOR, unpack
 
 #: Meshes by their file names.
 SUFFIXES: Final = (".stl", ".obj", ".ply", ".off", ".glb")

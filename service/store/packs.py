@@ -16,14 +16,14 @@ from typing import Final
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from service.model import names
-from service.model.base import Digest
-from service.model.digests import digest_bytes
-from service.model.errors import DamagedError, NotFoundError
-from service.model.states import Stage
-from service.store.manifests import ShardManifest, load_manifest, publish_shard
-from service.store.records import parse_record, put_record
-from service.store.store import Store
+from graspd.service.model import names
+from graspd.service.model.base import Digest
+from graspd.service.model.digests import digest_bytes
+from graspd.service.model.errors import DamagedError, NotFoundError
+from graspd.service.model.states import Stage
+from graspd.service.store.manifests import ShardManifest, load_manifest, publish_shard
+from graspd.service.store.records import parse_record, put_record
+from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
 #: What is told of a store that has some.

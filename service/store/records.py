@@ -17,15 +17,24 @@ from typing import Any, Final, Literal, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError
 
-from service.model import names
-from service.model.base import refusal
-from service.model.clock import timestamp
-from service.model.digests import digest_json
-from service.model.errors import ConflictError, DamagedError, NotFoundError
-from service.model.records import AttemptRecord, DatasetEvent, DatasetRecord, JobEvent, JobRecord, Record, Snapshot, Tag
-from service.model.scene_spec import SceneSpec
-from service.store.integrity import get_document, is_sealed, put_document, put_sealed
-from service.store.store import Store
+from graspd.service.model import names
+from graspd.service.model.base import refusal
+from graspd.service.model.clock import timestamp
+from graspd.service.model.digests import digest_json
+from graspd.service.model.errors import ConflictError, DamagedError, NotFoundError
+from graspd.service.model.records import (
+    AttemptRecord,
+    DatasetEvent,
+    DatasetRecord,
+    JobEvent,
+    JobRecord,
+    Record,
+    Snapshot,
+    Tag,
+)
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.store.integrity import get_document, is_sealed, put_document, put_sealed
+from graspd.service.store.store import Store
 
 RecordT = TypeVar("RecordT", bound=BaseModel)
 #: Writes a record under a key if there is none; whether there was none.

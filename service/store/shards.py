@@ -16,12 +16,12 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.clock import timestamp
-from service.model.digests import digest_json
-from service.model.errors import DamagedShard, InputError, NotFoundError
-from service.model.version import PACKAGE_VERSION
-from service.store.columns import SCHEMAS, Attribute, ShardKind, check_attributes
-from service.store.integrity import check_file
+from graspd.service.model.clock import timestamp
+from graspd.service.model.digests import digest_json
+from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.service.store.columns import SCHEMAS, Attribute, ShardKind, check_attributes
+from graspd.service.store.integrity import check_file
 
 Arrays = Mapping[str, NDArray[np.generic]]
 #: Attribute of each dataset: SHA-256 of its values, so that a file that left the store still shows damage.

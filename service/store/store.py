@@ -24,7 +24,7 @@ import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import LocalStore, MemoryStore, from_url
 
-from service.model.errors import InputError, NotFoundError, StoreUnavailable
+from graspd.service.model.errors import InputError, NotFoundError, StoreUnavailable
 
 _KEY: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]*(/[A-Za-z0-9][A-Za-z0-9._=-]*)*")
 _PROBE: Final = "health/probe"

@@ -11,11 +11,11 @@ import pytest
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
-from api.app import create_app
-from service.index.index import Index
-from service.pipeline.backends import Services
-from service.settings import Settings
-from service.store.store import open_store
+from graspd.api.app import create_app
+from graspd.service.index.index import Index
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
 from tests.api.factories import add_builtins
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
@@ -49,7 +49,7 @@ class _Noon(datetime):
 @pytest.fixture
 def noon(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is noon (UTC) of `TODAY` to quotas: their day does not end while a test runs."""
-    monkeypatch.setattr("api.access.quotas.datetime", _Noon)
+    monkeypatch.setattr("graspd.api.access.quotas.datetime", _Noon)
 
 
 @pytest.fixture

@@ -7,22 +7,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model import names
-from service.model.clock import timestamp
-from service.model.digests import job_id
-from service.model.domain import JobRequest
-from service.model.metrics import Axis
-from service.model.planning import PlannedTask, message_of, plan
-from service.model.records import AttemptRecord, JobRecord
-from service.model.states import AssetKind, Lane, Stage
-from service.model.transforms import pose_to_matrix
-from service.model.workers import WorkerBeat
-from service.pipeline.backends import Services
-from service.store.columns import Attribute
-from service.store.library import publish_builtins
-from service.store.manifests import ShardManifest, manifest_of, publish_shard
-from service.store.records import put_record
-from service.store.shards import check_columns, read_shard, write_shard
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.digests import job_id
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.metrics import Axis
+from graspd.service.model.planning import PlannedTask, message_of, plan
+from graspd.service.model.records import AttemptRecord, JobRecord
+from graspd.service.model.states import AssetKind, Lane, Stage
+from graspd.service.model.transforms import pose_to_matrix
+from graspd.service.model.workers import WorkerBeat
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.columns import Attribute
+from graspd.service.store.library import publish_builtins
+from graspd.service.store.manifests import ShardManifest, manifest_of, publish_shard
+from graspd.service.store.records import put_record
+from graspd.service.store.shards import check_columns, read_shard, write_shard
 
 JOINTS = 16
 Arrays = dict[str, NDArray[np.generic]]

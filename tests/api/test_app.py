@@ -8,9 +8,9 @@ import pytest
 from pydantic import TypeAdapter
 from starlette.testclient import TestClient
 
-from api.app import create_app
-from service.pipeline.backends import Services
-from service.settings import Settings
+from graspd.api.app import create_app
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
 
 
 @pytest.mark.parametrize("path", ["/v1/jobs", "/v1/datasets", "/", "/healthz"])

@@ -9,15 +9,15 @@ import pytest
 import trimesh
 from starlette.testclient import TestClient
 
-from api.uploads import files_of_upload
-from service.model.messages import IngestMessage
-from service.model.states import AssetKind
-from service.pipeline.backends import Services
-from service.store.asset_options import hand_options, object_options
-from service.store.assets import builtin_files
-from service.store.library import load_asset, load_asset_files, load_check
-from worker.stages import ingest
-from worker.stages.context import TaskContext
+from graspd.api.uploads import files_of_upload
+from graspd.service.model.messages import IngestMessage
+from graspd.service.model.states import AssetKind
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.asset_options import hand_options, object_options
+from graspd.service.store.assets import builtin_files
+from graspd.service.store.library import load_asset, load_asset_files, load_check
+from graspd.worker.stages import ingest
+from graspd.worker.stages.context import TaskContext
 
 
 def check(

@@ -14,12 +14,12 @@ import pytest
 import uvicorn
 from fastapi import FastAPI, Request
 
-from api.access.keys import KeyFile, Scope
-from api.app import create_app
-from api.catalog import events
-from api.server import TimedProtocol, bind, configuration
-from service.pipeline.backends import Services
-from service.settings import Settings
+from graspd.api.access.keys import KeyFile, Scope
+from graspd.api.app import create_app
+from graspd.api.catalog import events
+from graspd.api.server import TimedProtocol, bind, configuration
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
 from tests.api.factories import add_job
 from tests.waiting import PATIENCE_S, until
 

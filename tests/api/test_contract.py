@@ -28,12 +28,12 @@ from schemathesis.specs.openapi.checks import (
     unsupported_method,
 )
 
-from api.app import create_app
-from service.pipeline.backends import Services
-from service.queue.connection import connect
-from service.queue.rq_queue import RqQueue
-from service.settings import Settings
-from service.store.store import open_store
+from graspd.api.app import create_app
+from graspd.service.pipeline.backends import Services
+from graspd.service.queue.connection import connect
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
 from tests.api.factories import add_builtins, add_job, add_worker, fail, finish_all
 from tests.indexes import empty_index
 

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from service.run.supervisor import Supervisor
-from service.settings import Settings
-from service.store.shards import read_shard
+from graspd.service.run.supervisor import Supervisor
+from graspd.service.settings import Settings
+from graspd.service.store.shards import read_shard
 
 #: The least that passes all stages; the first run on a machine compiles kernels as well.
 SMALL = ("--grasps", "4", "--scenes", "1", "--views", "1", "--fidelity", "draft")

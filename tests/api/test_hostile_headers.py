@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from api.access.keys import KeyFile, Scope
-from api.app import create_app
-from service.pipeline.backends import Services
-from service.settings import Settings
+from graspd.api.access.keys import KeyFile, Scope
+from graspd.api.app import create_app
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
 from tests.api.factories import add_job, finish_all
 
 _NAMES = [

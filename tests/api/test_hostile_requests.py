@@ -16,12 +16,12 @@ import pytest
 import uvicorn
 from pydantic import SecretStr
 
-from api.access.keys import KeyFile, Scope
-from api.app import create_app
-from api.server import bind, configuration
-from service.pipeline.backends import Services
-from service.queue.rq_queue import RqQueue
-from service.settings import Settings
+from graspd.api.access.keys import KeyFile, Scope
+from graspd.api.app import create_app
+from graspd.api.server import bind, configuration
+from graspd.service.pipeline.backends import Services
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.settings import Settings
 from tests.api.factories import add_job, finish_all
 from tests.waiting import PATIENCE_S
 

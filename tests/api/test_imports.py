@@ -18,19 +18,21 @@ def modules_after(statement: str) -> frozenset[str]:
     return frozenset(done.stdout.split())
 
 
-@pytest.mark.parametrize("statement", ["import api.app", "import api.client.commands", "import api.client.client"])
+@pytest.mark.parametrize(
+    "statement", ["import graspd.api.app", "import graspd.client.commands", "import graspd.client.client"]
+)
 def test_the_front_door_imports_no_engine(statement: str) -> None:
     assert modules_after(statement).isdisjoint(HEAVY)
 
 
-@pytest.mark.parametrize("statement", ["import api.client.commands", "import api.client.dataset_commands"])
+@pytest.mark.parametrize("statement", ["import graspd.client.commands", "import graspd.client.dataset_commands"])
 def test_a_command_line_needs_no_templates_and_no_server(statement: str) -> None:
     assert modules_after(statement).isdisjoint({"jinja2", "uvicorn", "worker"})
 
 
 def test_commands_that_talk_http_need_no_web_framework_and_no_database() -> None:
     modules = ("client", "commands", "add_commands", "dataset_commands", "access_commands", "tag_commands")
-    statement = "import " + ", ".join(f"api.client.{module}" for module in modules)
+    statement = "import " + ", ".join(f"graspd.client.{module}" for module in modules)
     assert modules_after(statement).isdisjoint({"fastapi", "starlette", "sqlalchemy", "redis"})
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from api.metrics import Metrics, Snapshot
-from service.model.states import Stage
-from service.model.workers import WorkerBeat
-from service.pipeline.metrics import SERIES
-from service.queue.port import QueueNow
+from graspd.api.metrics import Metrics, Snapshot
+from graspd.service.model.states import Stage
+from graspd.service.model.workers import WorkerBeat
+from graspd.service.pipeline.metrics import SERIES
+from graspd.service.queue.port import QueueNow
 
 STATES = ("checking", "idle", "busy", "stopping", "quarantined")
 

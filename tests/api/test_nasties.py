@@ -15,15 +15,15 @@ import pytest
 from redis.exceptions import ConnectionError as RedisAway
 from starlette.testclient import TestClient
 
-from api.access.keys import Key, Scope
-from api.access.quotas import Quotas
-from api.middleware.body_limit import MAX_BODY_BYTES
-from service.index import project_scope
-from service.model.errors import QuotaError
-from service.model.states import AssetKind
-from service.pipeline.backends import Services
-from service.settings import Settings
-from service.store.library import load_asset, load_check
+from graspd.api.access.keys import Key, Scope
+from graspd.api.access.quotas import Quotas
+from graspd.api.middleware.body_limit import MAX_BODY_BYTES
+from graspd.service.index import project_scope
+from graspd.service.model.errors import QuotaError
+from graspd.service.model.states import AssetKind
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
+from graspd.service.store.library import load_asset, load_check
 from tests.api.factories import add_job, finish_all
 
 STL = b"solid box\nendsolid box\n"
@@ -186,9 +186,9 @@ def test_a_full_disk_is_said_and_the_upload_may_come_again(
         if where == "the body":
             patch.setattr(tempfile.SpooledTemporaryFile, "write", full)
         elif where == "the archive":
-            patch.setattr("service.store.library.pack_into", full)
+            patch.setattr("graspd.service.store.library.pack_into", full)
         else:
-            patch.setattr("service.store.store.os.link", full)
+            patch.setattr("graspd.service.store.store.os.link", full)
         answer = http.post("/v1/objects", files={"file": ("box.stl", STL)})
     assert answer.status_code == 503, answer.text
     assert answer.json()["type"] == "/problems/store-unavailable"

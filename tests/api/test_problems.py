@@ -9,8 +9,8 @@ import pytest
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
-from service.model.errors import IndexUnavailable, QueueUnavailable, StoreUnavailable
-from service.pipeline.backends import Services
+from graspd.service.model.errors import IndexUnavailable, QueueUnavailable, StoreUnavailable
+from graspd.service.pipeline.backends import Services
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
 

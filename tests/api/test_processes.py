@@ -14,13 +14,13 @@ from typing import Any
 import httpx
 import pytest
 
-from api.access.keys import KeyFile, KeyLimits, Scope
-from service.pipeline.backends import Services
-from service.queue.connection import connect, redis_url
-from service.queue.rq_queue import RqQueue
-from service.run.embedded import server_command
-from service.run.supervisor import Supervisor
-from service.settings import Settings
+from graspd.api.access.keys import KeyFile, KeyLimits, Scope
+from graspd.service.pipeline.backends import Services
+from graspd.service.queue.connection import connect, redis_url
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.run.embedded import server_command
+from graspd.service.run.supervisor import Supervisor
+from graspd.service.settings import Settings
 from tests.api.factories import add_builtins
 from tests.fakes import add_assets
 from tests.service.conftest import wait_for_redis

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 
-from api.server import bind
+from graspd.api.server import bind
 
 
 def test_answers_are_sent_without_delay() -> None:

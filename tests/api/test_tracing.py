@@ -10,16 +10,16 @@ import pytest
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from starlette.testclient import TestClient
 
-from service import telemetry
-from service.model import names
-from service.model.planning import message_of, plan
-from service.model.records import JobRecord
-from service.model.states import Stage
-from service.pipeline.backends import Services
-from service.store.records import read_record
+from graspd.service import telemetry
+from graspd.service.model import names
+from graspd.service.model.planning import message_of, plan
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import Stage
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.records import read_record
+from graspd.worker.process.runner import Runner
+from graspd.worker.stages.context import TaskContext
 from tests.fakes import fake_stages
-from worker.process.runner import Runner
-from worker.stages.context import TaskContext
 
 _PARENT = "00-" + "a" * 32 + "-" + "b" * 16 + "-01"
 

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from api.uploads import files_of_upload
-from service.model.digests import digest_files
-from service.model.errors import InputError
-from service.model.states import AssetKind
-from service.pipeline.backends import Services
-from service.store.assets import pack
-from service.store.library import load_asset_files, publish_asset
+from graspd.api.uploads import files_of_upload
+from graspd.service.model.digests import digest_files
+from graspd.service.model.errors import InputError
+from graspd.service.model.states import AssetKind
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.assets import pack
+from graspd.service.store.library import load_asset_files, publish_asset
 
 MIB = 1 << 20
 

@@ -14,9 +14,9 @@ import pytest
 import uvicorn
 from fastapi import FastAPI
 
-from api.server import bind
-from service.run.supervisor import Supervisor
-from service.settings import Settings
+from graspd.api.server import bind
+from graspd.service.run.supervisor import Supervisor
+from graspd.service.settings import Settings
 from tests.api.conftest import app, furnished, services, settings
 from tests.waiting import PATIENCE_S, until_a_worker_is_idle
 

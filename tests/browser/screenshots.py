@@ -24,8 +24,8 @@ from typing import Any, Final
 import httpx
 from PIL import Image
 
-from service.run.supervisor import Supervisor
-from service.settings import Settings
+from graspd.service.run.supervisor import Supervisor
+from graspd.service.settings import Settings
 from tests.browser.conftest import ARGUMENTS
 
 REPOSITORY: Final = Path(__file__).resolve().parents[2]

@@ -13,15 +13,15 @@ import pytest
 import trimesh
 from PIL import Image
 
-from service.model.states import AssetKind
-from service.model.transforms import apply
-from service.store.assets import builtin_files
+from graspd.service.model.states import AssetKind
+from graspd.service.model.transforms import apply
+from graspd.service.store.assets import builtin_files
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.stages.models import SURFACE_POINTS
 from tests.waiting import until
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
-from worker.hands.surface import sample_surface
-from worker.objects.prepare import object_from_path
-from worker.stages.models import SURFACE_POINTS
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
 

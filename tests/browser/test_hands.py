@@ -8,15 +8,15 @@ from typing import Any
 import httpx
 import pytest
 
-from service.model.messages import IngestMessage
-from service.model.states import AssetKind
-from service.pipeline.backends import Services
-from service.store import library
+from graspd.service.model.messages import IngestMessage
+from graspd.service.model.states import AssetKind
+from graspd.service.pipeline.backends import Services
+from graspd.service.store import library
+from graspd.worker.hands.load import load_hand
+from graspd.worker.stages import ingest
+from graspd.worker.stages.context import TaskContext
 from tests.browser.test_flows import colours
 from tests.worker.hands.urdfs import joint, link, robot
-from worker.hands.load import load_hand
-from worker.stages import ingest
-from worker.stages.context import TaskContext
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
 

@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from service.model import names
-from service.model.planning import plan
-from service.model.records import JobRecord
-from service.pipeline import deletion, tagging
-from service.pipeline.backends import Services
-from service.pipeline.datasets import actions
-from service.pipeline.datasets.spec import DatasetRequest
-from service.store.records import publish, read_record
+from graspd.service.model import names
+from graspd.service.model.planning import plan
+from graspd.service.model.records import JobRecord
+from graspd.service.pipeline import deletion, tagging
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.spec import DatasetRequest
+from graspd.service.store.records import publish, read_record
 from tests.api.dashboard.test_stability_page import a_record
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
 from tests.planning import plan_all

@@ -12,12 +12,12 @@ import pytest
 import uvicorn
 from fastapi import FastAPI
 
-from api.app import create_app
-from api.server import bind
-from service.model.states import AssetKind
-from service.pipeline.backends import Services
-from service.settings import Settings
-from service.store.assets import builtin_files
+from graspd.api.app import create_app
+from graspd.api.server import bind
+from graspd.service.model.states import AssetKind
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
+from graspd.service.store.assets import builtin_files
 from tests.api.factories import add_job, finish_all
 from tests.waiting import until
 

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from service.pipeline.backends import Services
+from graspd.commands.synth import app as synth
+from graspd.service.pipeline.backends import Services
 from tests.api.factories import finish_with
 from tests.waiting import until
-from worker.commands.synth import app as synth
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
 

@@ -11,10 +11,10 @@ import httpx
 import pytest
 from starlette.testclient import TestClient
 
-from api.app import create_app
-from service.pipeline.backends import Services
-from service.settings import Settings
-from service.store.store import open_store
+from graspd.api.app import create_app
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
 from tests.api.factories import add_builtins, add_job, finish_all
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 import graspd.cli
-from service.settings import Settings
+from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.deploy.slurm import directives
 

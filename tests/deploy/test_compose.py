@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from service.settings import Settings
+from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.deploy import composition
 
@@ -143,7 +143,7 @@ def test_the_example_enables_profiles_that_exist() -> None:
 
 
 def test_the_version_is_that_of_the_package() -> None:
-    from service.model.version import PACKAGE_VERSION
+    from graspd.service.model.version import PACKAGE_VERSION
 
     assert composition.example()["GRASPD_VERSION"] == PACKAGE_VERSION
     assert all(SERVICES[name]["image"].endswith(f":{PACKAGE_VERSION}") for name in OURS)

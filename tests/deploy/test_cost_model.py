@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from benchmarks.cost_model import Measured, Prices, Work, estimate, main, sizes, table
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.store.store import open_store
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.store import open_store
 from tests.conftest import REPOSITORY
 from tests.fakes import request
 from tests.service.conftest import services  # noqa: F401

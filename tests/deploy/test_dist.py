@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from service.model.version import PACKAGE_VERSION
+from graspd.service.model.version import PACKAGE_VERSION
 from tests.conftest import REPOSITORY
 
 pytestmark = [
@@ -26,7 +26,7 @@ import pathlib, graspd, service.index.index, api.dashboard.rendering, service.st
 assert str(pathlib.Path(graspd.__file__)).startswith({place!r}), graspd.__file__
 index = service.index.index.Index("sqlite:///" + {place!r} + "/index.sqlite")
 index.close()
-from service.store.store import open_store
+from graspd.service.store.store import open_store
 store = open_store("memory://")
 service.store.library.publish_builtins(store)
 assert len(list(service.store.library.stored_assets(store))) >= 6

@@ -24,7 +24,7 @@ SOUND = Kernel("simulation.kernels.surface", "gather", 90, 71, 0, 0)
 
 
 def test_registers_stack_and_spills_of_each_kernel_are_read() -> None:
-    found = list(gpu_check._told(SAID, "worker.simulation.kernels.surface", 90))
+    found = list(gpu_check._told(SAID, "graspd.worker.simulation.kernels.surface", 90))
     assert [(k.name, k.registers, k.stack_bytes, k.spilled_bytes) for k in found] == [
         ("gather_object", 71, 16, 12),
         ("small", 12, 0, 0),
@@ -45,4 +45,4 @@ def test_a_kernel_that_runs_once_may_take_more_registers() -> None:
 
 
 def test_every_kernel_of_the_planner_s_iteration_is_looked_for() -> None:
-    assert {"worker.simulation.kernels.contact", "worker.planners.dfc.kernels"} <= set(gpu_check.modules())
+    assert {"graspd.worker.simulation.kernels.contact", "graspd.baselines.dfc.kernels"} <= set(gpu_check.modules())

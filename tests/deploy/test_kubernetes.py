@@ -14,10 +14,10 @@ import pytest
 import yaml
 
 import graspd.cli
-from service.model.states import Lane, Stage
-from service.model.version import PACKAGE_VERSION
-from service.queue.lists import queue_name
-from service.settings import Settings
+from graspd.service.model.states import Lane, Stage
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.service.queue.lists import queue_name
+from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.deploy import keda
 from tests.deploy.composition import SERVICES, seconds
@@ -217,7 +217,7 @@ def test_containers_run_commands_that_exist() -> None:
 
 
 def test_the_probes_are_routes_and_checks_that_exist() -> None:
-    from api.routes.system import router
+    from graspd.api.routes.system import router
 
     routes = {route.path for route in router.routes}
     for _, container in containers():

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from service.index.index import Index
-from service.index.rebuild import differences, rebuild
-from service.model.states import State
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.identity import identify
-from service.settings import Settings
-from service.store.library import publish_builtins
-from service.store.store import open_store
+from graspd.service.index.index import Index
+from graspd.service.index.rebuild import differences, rebuild
+from graspd.service.model.states import State
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.identity import identify
+from graspd.service.settings import Settings
+from graspd.service.store.library import publish_builtins
+from graspd.service.store.store import open_store
 from tests.conftest import REPOSITORY
 from tests.deploy import composition, page
 from tests.fakes import add_assets, request

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import httpx
 import pytest
 
-from api.access.keys import KeyFile, Scope
+from graspd.api.access.keys import KeyFile, Scope
 from tests.conftest import REPOSITORY
 from tests.servers import free_ports
 

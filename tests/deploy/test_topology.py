@@ -13,10 +13,10 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.index.index import Index
-from service.index.rebuild import differences
-from service.run.embedded import find_server
-from service.store.store import open_store
+from graspd.service.index.index import Index
+from graspd.service.index.rebuild import differences
+from graspd.service.run.embedded import find_server
+from graspd.service.store.store import open_store
 from tests.conftest import REPOSITORY
 from tests.deploy import composition
 from tests.servers import PostgresServer, S3Server, free_ports

@@ -14,15 +14,15 @@ from examples.train_grasp_predictor.evaluation import FACE, OBJECT, Exam, examin
 from examples.train_grasp_predictor.samples import Scene, Sight, Taught, apart, each_scene, rows_of, sights, taught
 from examples.train_grasp_predictor.table import markdown
 from examples.train_grasp_predictor.without_network import SQUEEZE, Nearest, across
-from service.model.transforms import apply, compose, invert, quat_from_axis_angle, quat_rotate, quat_to_matrix
-from service.readers import open_shards
+from graspd.baselines.learned.network import Proposals, decode
+from graspd.service.model.transforms import apply, compose, invert, quat_from_axis_angle, quat_rotate, quat_to_matrix
+from graspd.service.readers import open_shards
+from graspd.worker.engines import backend
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.prepare import object_from_path
 from tests.service.readers import box_scenes
-from worker.engines import backend
-from worker.grasps import GraspSet, Posture
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.objects.prepare import object_from_path
-from worker.planners.learned.network import Proposals, decode
 
 JOINTS = 3
 Floats = np.ndarray[Any, np.dtype[np.float64]]

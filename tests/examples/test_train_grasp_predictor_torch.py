@@ -18,15 +18,15 @@ from examples.train_grasp_predictor.refinement import BEGUN, Refined, moved  # n
 from examples.train_grasp_predictor.samples import Scene, Sight, Taught, sights, taught  # noqa: E402
 from examples.train_grasp_predictor.training import Lessons, train, turned  # noqa: E402
 from examples.train_grasp_predictor.without_network import SQUEEZE, across  # noqa: E402
-from service.model import transforms  # noqa: E402
-from service.readers import open_shards  # noqa: E402
-from service.store.network_file import ProposalNetwork  # noqa: E402
+from graspd.baselines.learned import network as net  # noqa: E402
+from graspd.service.model import transforms  # noqa: E402
+from graspd.service.readers import open_shards  # noqa: E402
+from graspd.service.store.network_file import ProposalNetwork  # noqa: E402
+from graspd.worker.engines import backend  # noqa: E402
+from graspd.worker.hands.load import hand_from_path  # noqa: E402
+from graspd.worker.hands.model import HandModel  # noqa: E402
+from graspd.worker.objects.prepare import object_from_path  # noqa: E402
 from tests.service.readers import box_scenes  # noqa: E402
-from worker.engines import backend  # noqa: E402
-from worker.hands.load import hand_from_path  # noqa: E402
-from worker.hands.model import HandModel  # noqa: E402
-from worker.objects.prepare import object_from_path  # noqa: E402
-from worker.planners.learned import network as net  # noqa: E402
 
 
 def test_what_torch_learns_is_what_the_planner_runs() -> None:

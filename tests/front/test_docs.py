@@ -17,8 +17,8 @@ import httpx
 import pytest
 
 import graspd
-from service.run.supervisor import Supervisor
-from service.settings import Settings
+from graspd.service.run.supervisor import Supervisor
+from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.waiting import PATIENCE_S, until_a_worker_is_idle
 from tests.worker.hands.my_hand import write_my_hand

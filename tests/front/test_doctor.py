@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from graspd.doctor import all_checks, app
-from service.settings import Settings
+from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.servers import free_ports
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.cli import at_the_door
+from graspd.service.cli import at_the_door
 
 GRASPD = f"'{sys.executable}' -m graspd"
 
@@ -38,7 +38,7 @@ def test_a_closed_output_is_no_fault() -> None:
 
 def test_a_file_that_is_opened_does_not_take_the_place_of_a_closed_output(tmp_path: Path) -> None:
     code = (
-        "import os, sys; from service.cli import at_the_door; "
+        "import os, sys; from graspd.service.cli import at_the_door; "
         "at_the_door(lambda: (os.write(1, b'noise'), open(sys.argv[1], 'w').close(), os.write(1, b'noise')))"
     )
     done = run(f"'{sys.executable}' -c \"{code}\" {tmp_path}/file >&- 2>&-")
@@ -70,7 +70,7 @@ def test_a_refusal_of_the_system_names_the_thing_and_the_fix(
         raise error
 
     with capsys.disabled(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr("service.cli._silence", lambda stream: None)
+        patch.setattr("graspd.service.cli._silence", lambda stream: None)
         patch.setattr("typer.echo", lambda text, err: told.append(text))
         told: list[str] = []
         with pytest.raises(SystemExit) as ended:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import graspd
-from service.model.metrics import GRASP_METRICS
-from service.model.transforms import compose
-from service.store.shards import write_shard
+from graspd.service.model.metrics import GRASP_METRICS
+from graspd.service.model.transforms import compose
+from graspd.service.store.shards import write_shard
 
 THRESHOLDS = np.array([0.001, 0.005, 0.01])
 

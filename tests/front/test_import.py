@@ -13,7 +13,7 @@ from tests.conftest import REPOSITORY
 
 HEAVY = ("numpy", "pydantic", "warp", "newton", "trimesh", "mujoco", "h5py", "httpx", "service", "worker", "api")
 #: What imports the others without the garbage collector.
-LIGHT = {"service", "service.model", "service.model.libraries"}
+LIGHT = {"service", "graspd.service.model", "graspd.service.model.libraries"}
 
 
 def python(code: str, cwd: Path) -> subprocess.CompletedProcess[str]:

@@ -13,7 +13,7 @@ import yaml
 from click.testing import CliRunner
 from packaging.specifiers import SpecifierSet
 
-from service.model.version import PACKAGE_VERSION
+from graspd.service.model.version import PACKAGE_VERSION
 from tests.conftest import REPOSITORY
 from tests.docs_commands import Line
 

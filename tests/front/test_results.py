@@ -16,7 +16,7 @@ from benchmarks.results.__main__ import main
 from benchmarks.results.manifest import DOCS, INDEX, digests, faults, load, staleness, there
 from benchmarks.results.running import Runner, slim
 from benchmarks.results.studies import BY_NAME, STUDIES, Study, is_raw
-from service.model.version import STAGE_REVISIONS
+from graspd.service.model.version import STAGE_REVISIONS
 from tests.conftest import REPOSITORY
 from tests.docs_commands import Line
 

@@ -9,8 +9,8 @@ import numpy as np
 from typer.testing import CliRunner
 
 import graspd
-from worker.commands.evaluate import app as evaluate
-from worker.commands.synth import app as synth
+from graspd.commands.evaluate import app as evaluate
+from graspd.commands.synth import app as synth
 
 
 def test_a_file_of_robust_grasps_says_so_to_every_reader(tmp_path: Path) -> None:

@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.model.fidelity import FIDELITIES
-from worker.hands.jaws import MAX_DOFS
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.planners.fast_graspd import scene_starts
-from worker.planners.fast_graspd.across import crossings_of
-from worker.planners.fast_graspd.pairs import pair_of
-from worker.planners.fast_graspd.reaching import size_to_pads
-from worker.simulation.obstacles import DeviceObstacles
-from worker.simulation.surroundings import Obstacle, Surroundings
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.hands.jaws import MAX_DOFS
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners.fast_graspd import scene_starts
+from graspd.worker.planners.fast_graspd.across import crossings_of
+from graspd.worker.planners.fast_graspd.pairs import pair_of
+from graspd.worker.planners.fast_graspd.reaching import size_to_pads
+from graspd.worker.simulation.obstacles import DeviceObstacles
+from graspd.worker.simulation.surroundings import Obstacle, Surroundings
 
 HANDS = ("allegro/allegro_hand_right.urdf", "barrett_bh280/bh280.urdf", "shadow/shadow_hand_right.urdf")
 

@@ -16,10 +16,10 @@ from PIL import Image
 
 import graspd
 from graspd import showing
-from service.store.shards import write_shard
+from graspd.service.store.shards import write_shard
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
 from tests.front.test_grasps import columns, shard
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
 
 KEY = "a-key-that-nobody-sees"
 

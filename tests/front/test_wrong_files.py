@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from graspd.cli import build
-from worker.commands.exchange import EXPORTS, IMPORTS
+from graspd.commands.exchange import EXPORTS, IMPORTS
 
 #: Words of the libraries that read files, and of pydantic and click.
 FOREIGN = (

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from service.model.errors import QueueUnavailable
-from service.pipeline.backends import Services
-from service.queue.connection import connect, redis_url
-from service.queue.rq_queue import RqQueue
-from service.run.embedded import server_command
-from service.settings import Settings
-from service.store.store import open_store
+from graspd.service.model.errors import QueueUnavailable
+from graspd.service.pipeline.backends import Services
+from graspd.service.queue.connection import connect, redis_url
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.run.embedded import server_command
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
 from tests.fakes import add_assets
 from tests.indexes import EmptySchemas, empty_index
 from tests.memory_queue import MemoryQueue

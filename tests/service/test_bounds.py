@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from benchmarks.large_index import fill
-from service.model.clock import timestamp
-from service.model.states import Lane
-from service.queue.port import Event, EventKind, Report
-from service.queue.rq_queue import EVENTS, EVENTS_KEPT, RqQueue, cancel_key
-from service.store.store import open_store
+from graspd.service.model.clock import timestamp
+from graspd.service.model.states import Lane
+from graspd.service.queue.port import Event, EventKind, Report
+from graspd.service.queue.rq_queue import EVENTS, EVENTS_KEPT, RqQueue, cancel_key
+from graspd.service.store.store import open_store
 from tests.fakes import message_for
 from tests.indexes import empty_index
 

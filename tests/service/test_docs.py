@@ -6,8 +6,8 @@ import re
 
 import pytest
 
-from service.docs import PAGES, PARTS, renewed
-from service.settings import GONE, Settings
+from graspd.service.docs import PAGES, PARTS, renewed
+from graspd.service.settings import GONE, Settings
 from tests.conftest import REPOSITORY
 
 

@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from service.cli import EngineSettings, engine_settings, load_settings
-from service.model.errors import InputError
+from graspd.service.cli import EngineSettings, engine_settings, load_settings
+from graspd.service.model.errors import InputError
 
 
 @pytest.fixture(autouse=True)
@@ -36,6 +36,6 @@ def test_a_bad_value_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_nothing_is_loaded_for_settings_that_nobody_made() -> None:
-    code = "import sys; from service.cli import engine_settings; engine_settings(); print(*sys.modules)"
+    code = "import sys; from graspd.service.cli import engine_settings; engine_settings(); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "pydantic_settings" not in done.stdout.split()

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from service.model.errors import QueueUnavailable
-from service.pipeline.backends import Services
-from service.pipeline.controller import Controller
-from service.telemetry import HeartbeatFile
+from graspd.service.model.errors import QueueUnavailable
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.controller import Controller
+from graspd.service.telemetry import HeartbeatFile
 from tests.deploy.test_kubernetes import AGE_OF_THE_FILE
 from tests.waiting import until
 

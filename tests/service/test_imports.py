@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import service
+import graspd.service
 
 MODULES = sorted(
     "service."

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from service import telemetry
-from service.settings import Settings
+from graspd.service import telemetry
+from graspd.service.settings import Settings
 
 log = logging.getLogger("graspd.test")
 

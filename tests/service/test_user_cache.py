@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from service import user_cache
+from graspd.service import user_cache
 
 
 @pytest.fixture(autouse=True)

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-from service.index.views import JobView
-from service.model.domain import JobRequest
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.run.supervisor import Supervisor
-from service.settings import Settings
+from graspd.service.index.views import JobView
+from graspd.service.model.domain import JobRequest
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.run.supervisor import Supervisor
+from graspd.service.settings import Settings
 from tests.fakes import add_assets
 from tests.indexes import empty_index
 from tests.waiting import PATIENCE_S, until

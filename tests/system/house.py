@@ -10,12 +10,12 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from service.model.states import State
-from service.pipeline.backends import Services
-from service.queue.connection import redis_url
-from service.queue.rq_queue import RqQueue
-from service.run.embedded import server_command
-from service.settings import Settings
+from graspd.service.model.states import State
+from graspd.service.pipeline.backends import Services
+from graspd.service.queue.connection import redis_url
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.run.embedded import server_command
+from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.fakes import add_assets
 from tests.indexes import empty_index

@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 import trimesh
 
-from service.index.index import Index
-from service.index.rebuild import differences
-from service.run.supervisor import Supervisor
-from service.settings import Settings
-from service.store.store import open_store
+from graspd.service.index.index import Index
+from graspd.service.index.rebuild import differences
+from graspd.service.run.supervisor import Supervisor
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
 from tests.waiting import PATIENCE_S, until_a_worker_is_idle
 
 GRIPPER = """\

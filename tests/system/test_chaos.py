@@ -17,22 +17,22 @@ import pytest
 from rq import Queue
 from rq.serializers import JSONSerializer
 
-from service.index.queries.grasps import GraspFilter
-from service.index.rebuild import differences, rebuild
-from service.model import names
-from service.model.errors import BusyError
-from service.model.states import State
-from service.pipeline import job_actions
-from service.queue.allowed import TASK_FUNCTION
-from service.queue.rq_queue import RqQueue
-from service.run.supervisor import Supervisor
-from service.settings import Settings
-from service.store.shards import read_shard
+from graspd.service.index.queries.grasps import GraspFilter
+from graspd.service.index.rebuild import differences, rebuild
+from graspd.service.model import names
+from graspd.service.model.errors import BusyError
+from graspd.service.model.states import State
+from graspd.service.pipeline import job_actions
+from graspd.service.queue.allowed import TASK_FUNCTION
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.run.supervisor import Supervisor
+from graspd.service.settings import Settings
+from graspd.service.store.shards import read_shard
+from graspd.worker.stages.context import TaskContext
 from tests.fakes import fake_synthesize, message_for
 from tests.fakes import request as wanted
 from tests.system.conftest import System, alive, starting
 from tests.waiting import PATIENCE_S, until
-from worker.stages.context import TaskContext
 
 pytestmark = pytest.mark.chaos
 Start = Callable[..., System]
@@ -195,9 +195,9 @@ def test_any_child_that_is_killed_is_started_again(system: System) -> None:
 _UP_IN_A_PROCESS = """
 import json, sys, time
 from pathlib import Path
-from service.settings import Settings
-from service.store.shards import read_shard
-from service.run.supervisor import Supervisor
+from graspd.service.settings import Settings
+from graspd.service.store.shards import read_shard
+from graspd.service.run.supervisor import Supervisor
 up = Supervisor(Settings(data_dir=Path(sys.argv[1]), port=0, device="cpu"), api=False,
                 worker_command=(sys.executable, "-m", "tests.fakes"))
 up.start()

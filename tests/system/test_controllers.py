@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from service.index.rebuild import differences
-from service.model.states import State
-from service.pipeline import job_actions
+from graspd.service.index.rebuild import differences
+from graspd.service.model.states import State
+from graspd.service.pipeline import job_actions
 from tests.fakes import request
 from tests.system.house import House
 

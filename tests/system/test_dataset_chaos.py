@@ -9,13 +9,13 @@ from collections.abc import Callable
 
 import pytest
 
-from service.index.rebuild import differences
-from service.model import names
-from service.model.errors import QueueUnavailable
-from service.model.states import State
-from service.pipeline.datasets import actions
-from service.store.manifests import ShardManifest
-from service.store.records import read_record
+from graspd.service.index.rebuild import differences
+from graspd.service.model import names
+from graspd.service.model.errors import QueueUnavailable
+from graspd.service.model.states import State
+from graspd.service.pipeline.datasets import actions
+from graspd.service.store.manifests import ShardManifest
+from graspd.service.store.records import read_record
 from tests.dataset_status import status
 from tests.service.pipeline.datasets.makers import add_asset, wanted
 from tests.system.conftest import System

@@ -10,9 +10,9 @@ from collections.abc import Callable
 
 import pytest
 
-from service.model.clock import timestamp
-from service.model.states import Lane, State
-from service.pipeline import job_actions
+from graspd.service.model.clock import timestamp
+from graspd.service.model.states import Lane, State
+from graspd.service.pipeline import job_actions
 from tests.fakes import request
 from tests.system.conftest import System
 

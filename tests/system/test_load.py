@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from service.model.states import State
+from graspd.service.model.states import State
 from tests.fakes import request
 from tests.system.conftest import System
 
@@ -26,7 +26,7 @@ _BUSY = f"import time\nend = time.monotonic() + {_LONGEST_S}\nwhile time.monoton
 def load() -> Iterator[None]:
     """Busy processes: 15 on two cores."""
     count = round(BUSY * len(os.sched_getaffinity(0)))
-    command = [sys.executable, "-m", "service.run.launch", str(os.getpid()), sys.executable, "-c", _BUSY]
+    command = [sys.executable, "-m", "graspd.service.run.launch", str(os.getpid()), sys.executable, "-c", _BUSY]
     busy = [subprocess.Popen(command) for _ in range(count)]
     try:
         yield

@@ -9,16 +9,16 @@ import httpx
 import numpy as np
 import pytest
 
-from service.index.rebuild import differences
-from service.model.domain import JobOptions
-from service.model.states import State
-from service.store.network_file import to_bytes
-from service.store.shards import read_shard
+from graspd.service.index.rebuild import differences
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.states import State
+from graspd.service.store.network_file import to_bytes
+from graspd.service.store.shards import read_shard
+from graspd.worker.files.synthesis import synthesized
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.planners.registry import of_this_machine
 from tests.networks import LEARNED, random_network
 from tests.system.conftest import System
-from worker.files.synthesis import synthesized
-from worker.hands.load import hand_from_path
-from worker.planners.registry import of_this_machine
 
 pytestmark = pytest.mark.chaos
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from service.index.rebuild import differences
-from service.model.states import State
+from graspd.service.index.rebuild import differences
+from graspd.service.model.states import State
 from tests.fakes import request
 from tests.servers import PostgresServer, S3Server
 from tests.system.conftest import System

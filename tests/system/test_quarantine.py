@@ -8,7 +8,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.model.states import State
+from graspd.service.model.states import State
 from tests.fakes import request
 from tests.system.conftest import System
 

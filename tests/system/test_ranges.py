@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.model import names
-from service.model.planning import plan
-from service.model.records import JobRecord
-from service.model.states import Lane, Stage, State
-from service.pipeline import job_actions
-from service.store.manifests import load_shard
-from service.store.records import read_record
+from graspd.service.model import names
+from graspd.service.model.planning import plan
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import Lane, Stage, State
+from graspd.service.pipeline import job_actions
+from graspd.service.store.manifests import load_shard
+from graspd.service.store.records import read_record
 from tests.fakes import request as wanted
 from tests.system.conftest import System, alive
 

@@ -7,15 +7,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from service.index.rebuild import differences
-from service.model.domain import JobRequest
-from service.model.states import AssetKind, Stage, State
-from service.store.shards import read_shard
+from graspd.service.index.rebuild import differences
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.states import AssetKind, Stage, State
+from graspd.service.store.shards import read_shard
+from graspd.worker.certified import certified_grasps
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.scenes.beside import scenes_of
 from tests.system.conftest import System
-from worker.certified import certified_grasps
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.scenes.beside import scenes_of
 
 pytestmark = pytest.mark.chaos
 

@@ -13,13 +13,13 @@ import pytest
 from redis import Redis
 from redis.exceptions import AuthenticationError
 
-from service.model.states import State
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.queue.connection import redis_url
-from service.run.address import joining
-from service.run.supervisor import Supervisor
-from service.settings import Settings
+from graspd.service.model.states import State
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.queue.connection import redis_url
+from graspd.service.run.address import joining
+from graspd.service.run.supervisor import Supervisor
+from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.deploy.slurm import FakeSlurm
 from tests.fakes import add_assets, request

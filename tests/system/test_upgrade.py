@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from service.model.states import State
-from service.model.version import STAGE_REVISIONS
-from service.pipeline import job_actions
+from graspd.service.model.states import State
+from graspd.service.model.version import STAGE_REVISIONS
+from graspd.service.pipeline import job_actions
 from tests.conftest import REPOSITORY
 from tests.fakes import request
 from tests.system.house import House
@@ -22,7 +22,7 @@ from tests.system.house import House
 PREVIOUS = "55f607e"
 #: Revisions of synthesize that it and the next version make.
 OLD, NEW = 23, 24
-MAKES = "from service.model.version import STAGE_REVISIONS; STAGE_REVISIONS['synthesize'] = {};"
+MAKES = "from graspd.service.model.version import STAGE_REVISIONS; STAGE_REVISIONS['synthesize'] = {};"
 
 
 @pytest.fixture

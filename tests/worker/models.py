@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from worker.hands.model import ConvexPiece, HandModel, PalmFrame
-from worker.objects.model import ObjectModel
+from graspd.worker.hands.model import ConvexPiece, HandModel, PalmFrame
+from graspd.worker.objects.model import ObjectModel
 
 CREASE_RAD = 0.6
 

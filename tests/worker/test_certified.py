@@ -10,22 +10,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.model.domain import JobRequest
-from service.model.errors import InputError, TaskCancelled
-from service.model.metrics import MIN_DISTANCE_M, Axis
-from worker import certified
-from worker.certified import Certified, certified_grasps
-from worker.grasps import GraspSet, Posture
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import object_from_path
-from worker.planners import Wanted
-from worker.quality.diversity import distances, hand_points
-from worker.quality.referee.protocol import Outcome
-from worker.quality.referee.robust import Robustness
-from worker.rounds import next_round, taken
-from worker.run import Run
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import InputError, TaskCancelled
+from graspd.service.model.metrics import MIN_DISTANCE_M, Axis
+from graspd.worker import certified
+from graspd.worker.certified import Certified, certified_grasps
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import Wanted
+from graspd.worker.quality.diversity import distances, hand_points
+from graspd.worker.rounds import next_round, taken
+from graspd.worker.run import Run
+from graspd.worker.validation.protocol import Outcome
+from graspd.worker.validation.robust import Robustness
 
 COUNT = 6
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.domain import JobOptions
-from service.model.errors import InputError
-from service.store.columns import ATTRIBUTES, SCHEMAS, check_attributes
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import InputError
+from graspd.service.store.columns import ATTRIBUTES, SCHEMAS, check_attributes
+from graspd.worker.files.provenance import base_attributes
+from graspd.worker.grasps import GraspSet, Posture
 from tests.worker.models import object_from_mesh, two_finger_hand
-from worker.files.provenance import base_attributes
-from worker.grasps import GraspSet, Posture
 
 COUNT, JOINTS = 3, 2
 

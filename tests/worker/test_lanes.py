@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.model.domain import JobOptions
-from service.model.errors import TaskCancelled
-from service.model.fidelity import resolve_fidelity
-from service.model.scene_spec import SceneSpec
-from worker import certified
-from worker.certified import Certified, certified_grasps
-from worker.grasps import GraspSet
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.planners import NoPlace, Wanted, synthesize
-from worker.rounds import LANE, lanes_of
-from worker.run import Lanes, Run
-from worker.scenes.kinds import rest_poses, supports_of
-from worker.side_by_side import side_by_side
-from worker.simulation.surroundings import Scenes
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import TaskCancelled
+from graspd.service.model.fidelity import resolve_fidelity
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.worker import certified
+from graspd.worker.certified import Certified, certified_grasps
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import NoPlace, Wanted, synthesize
+from graspd.worker.rounds import LANE, lanes_of
+from graspd.worker.run import Lanes, Run
+from graspd.worker.scenes.kinds import rest_poses, supports_of
+from graspd.worker.side_by_side import side_by_side
+from graspd.worker.simulation.surroundings import Scenes
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), audits=2, seed=3)
 COUNT = 2 * LANE
@@ -182,7 +182,7 @@ def test_a_lane_that_ends_leaves_its_cores_to_the_others() -> None:
         return [shared, run.cores]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("worker.side_by_side.Lanes", Watched)
+        patch.setattr("graspd.worker.side_by_side.Lanes", Watched)
         assert side_by_side([0, 1], work, Run(threads=4), size=lambda _: 1)[1] == [2, 4]
 
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from service.model.errors import TaskCancelled
+from graspd.service.model.errors import TaskCancelled
+from graspd.worker.meeting import Meeting
+from graspd.worker.run import Run
 from tests.waiting import PATIENCE_S
-from worker.meeting import Meeting
-from worker.run import Run
 
 #: Long enough that no test sees its end.
 NEVER_S = 1000.0
@@ -39,7 +39,7 @@ def asked(
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("worker.meeting.FIRST_WAIT_S", NEVER_S)
+    monkeypatch.setattr("graspd.worker.meeting.FIRST_WAIT_S", NEVER_S)
 
 
 def test_all_members_who_wait_are_served_at_once() -> None:

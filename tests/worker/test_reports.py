@@ -11,10 +11,10 @@ import pytest
 import trimesh
 import yaml
 
-from tests.worker.robots.shards import run
-from worker.commands.hands import report_hand
-from worker.commands.objects import report_object
-from worker.objects.prepare import object_from_path
+from graspd.commands.hands import report_hand
+from graspd.commands.objects import report_object
+from graspd.worker.objects.prepare import object_from_path
+from tests.exchange.robots.shards import run
 
 Report = dict[str, Any]
 

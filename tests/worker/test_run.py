@@ -2,9 +2,9 @@
 
 import pytest
 
-from service.model.cores import available_cores
-from service.model.errors import TaskCancelled
-from worker.run import Run
+from graspd.service.model.cores import available_cores
+from graspd.service.model.errors import TaskCancelled
+from graspd.worker.run import Run
 
 
 def test_a_part_of_a_part_fills_its_share_of_the_whole() -> None:

@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.model.domain import JobOptions
-from service.model.errors import InputError, MeshError, TaskCancelled
-from service.model.fidelity import resolve_fidelity
-from worker import together
-from worker.certified import Certified, certified_grasps
-from worker.engines.joins import batches_at_once, fitting, parse_join
-from worker.files.synthesis import synthesized
-from worker.hands.load import hand_from_path
-from worker.meeting import Meeting
-from worker.objects.prepare import object_from_path
-from worker.pool.pool import MODULES, Pool
-from worker.run import Run
-from worker.together import certified_batches, distinct_batches
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import InputError, MeshError, TaskCancelled
+from graspd.service.model.fidelity import resolve_fidelity
+from graspd.worker import together
+from graspd.worker.certified import Certified, certified_grasps
+from graspd.worker.engines.joins import batches_at_once, fitting, parse_join
+from graspd.worker.files.synthesis import synthesized
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.meeting import Meeting
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.pool.pool import MODULES, Pool
+from graspd.worker.run import Run
+from graspd.worker.together import certified_batches, distinct_batches
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), audits=0, grasps=6)
 

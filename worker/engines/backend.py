@@ -24,7 +24,7 @@ from typing import Any, Final
 
 import warp as wp
 
-from service import user_cache
+from graspd.service import user_cache
 
 _HARMLESS = b"Could not find or load the NVIDIA CUDA driver"
 _lock = threading.Lock()

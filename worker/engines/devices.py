@@ -21,8 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Final
 
-from service import user_cache
-from service.model.errors import GraspdError, InputError
+from graspd.service import user_cache
+from graspd.service.model.errors import GraspdError, InputError
 
 log = logging.getLogger(__name__)
 #: Processes on one GPU that are counted; more make no difference.
@@ -92,7 +92,7 @@ def visible_gpus() -> list[Gpu]:
     """The GPUs that CUDA shows to this process."""
     import warp as wp
 
-    from worker.engines import backend
+    from graspd.worker.engines import backend
 
     backend.start()
     return [Gpu(str(device), str(device.uuid), str(device.name)) for device in wp.get_cuda_devices()]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from typing import Final
 
-from service.model.domain import BATCH_SIZE
-from service.model.errors import InputError
+from graspd.service.model.domain import BATCH_SIZE
+from graspd.service.model.errors import InputError
 
 #: Grasps for each multiprocessor of a GPU: their 7 simulations for each of 2 finalists are four warps, one for each of
 #: its schedulers. The kernels of a hand's points fill it long before.

@@ -12,15 +12,15 @@ import numpy as np
 from cachetools import LRUCache, cached
 from numpy.typing import NDArray
 
-from service.model.errors import ConflictError
-from service.model.transforms import Floats, apply
-from service.readers import Clouds
-from service.readers.clouds import OF_GRASPS
-from service.store.shards import Shard
-from worker.files.provenance import hand_of_shard
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
-from worker.hands.surface import sample_surface
+from graspd.service.model.errors import ConflictError
+from graspd.service.model.transforms import Floats, apply
+from graspd.service.readers import Clouds
+from graspd.service.readers.clouds import OF_GRASPS
+from graspd.service.store.shards import Shard
+from graspd.worker.files.provenance import hand_of_shard
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.surface import sample_surface
 
 #: What of a sample says where it comes from.
 _WORDS = ("hand", "object", "shard_id", "base_id")

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic_core import from_json
 
-from service.model.errors import InputError, one_of
-from service.model.transforms import quat_conjugate, quat_rotate
-from service.readers import Shards
-from service.store import validity
-from service.store.shards import Shard
-from worker.files.provenance import hand_of_shard
-from worker.files.subsets import base_shards
-from worker.grasps import Posture
-from worker.quality.diversity import distinct, hand_points
+from graspd.service.model.errors import InputError, one_of
+from graspd.service.model.transforms import quat_conjugate, quat_rotate
+from graspd.service.readers import Shards
+from graspd.service.store import validity
+from graspd.service.store.shards import Shard
+from graspd.worker.files.provenance import hand_of_shard
+from graspd.worker.files.subsets import base_shards
+from graspd.worker.grasps import Posture
+from graspd.worker.quality.diversity import distinct, hand_points
 
 #: What grasps can be shared out by.
 KINDS: Final = ("type", "direction", "face")

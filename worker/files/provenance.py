@@ -16,29 +16,29 @@ from typing import Any, Final
 import numpy as np
 from pydantic_core import from_json
 
-from service.model.digests import digest_files, digest_variant
-from service.model.domain import JobOptions
-from service.model.errors import ConflictError, GraspdError, InputError, NotFoundError
-from service.model.matter import FRICTION, MASS_KG
-from service.model.states import AssetKind
-from service.readers.ways import scene_spec_of
-from service.store.assets import builtin_files, builtin_names
-from service.store.columns import Attribute
-from service.store.library import load_asset_files
-from service.store.shards import Shard, json_attribute
-from service.store.store import open_store
-from worker.grasps import Columns
-from worker.hands.load import files_from_path, hand_from_path, load_hand
-from worker.hands.load import files_from_path as hand_files
-from worker.hands.model import HandModel
-from worker.objects.formats import READERS
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import files_from_path as object_files
-from worker.objects.prepare import load_object, object_from_path
-from worker.scenes.beside import neighbour_of
-from worker.scenes.kinds import supports_of
-from worker.scenes.neighbours import Neighbours
-from worker.simulation.surroundings import Placed, Scenes
+from graspd.service.model.digests import digest_files, digest_variant
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import ConflictError, GraspdError, InputError, NotFoundError
+from graspd.service.model.matter import FRICTION, MASS_KG
+from graspd.service.model.states import AssetKind
+from graspd.service.readers.ways import scene_spec_of
+from graspd.service.store.assets import builtin_files, builtin_names
+from graspd.service.store.columns import Attribute
+from graspd.service.store.library import load_asset_files
+from graspd.service.store.shards import Shard, json_attribute
+from graspd.service.store.store import open_store
+from graspd.worker.grasps import Columns
+from graspd.worker.hands.load import files_from_path, hand_from_path, load_hand
+from graspd.worker.hands.load import files_from_path as hand_files
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.formats import READERS
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import files_from_path as object_files
+from graspd.worker.objects.prepare import load_object, object_from_path
+from graspd.worker.scenes.beside import neighbour_of
+from graspd.worker.scenes.kinds import supports_of
+from graspd.worker.scenes.neighbours import Neighbours
+from graspd.worker.simulation.surroundings import Placed, Scenes
 
 #: What a file may be called that describes a hand or an object.
 SUFFIXES: Final = {AssetKind.HAND: (".urdf", ".xml", ".zip"), AssetKind.OBJECT: (*READERS, ".zip")}
@@ -114,7 +114,7 @@ def _paths(sought: Sought, looked: list[str]) -> Iterator[Path]:
 
 
 def _stored(sought: Sought, looked: list[str]) -> Found | None:
-    from service.settings import Settings
+    from graspd.service.settings import Settings
 
     url = Settings().resolved_store_url
     looked.append(f"in the store {url}")

@@ -12,12 +12,12 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from service.cli import load_settings
-from service.model.errors import InputError, NotFoundError
-from service.readers import Shards, open_shards
-from service.store import validity
-from service.store.shards import Shard, part_of_shard, place_of, read_shard
-from service.store.store import open_store
+from graspd.service.cli import load_settings
+from graspd.service.model.errors import InputError, NotFoundError
+from graspd.service.readers import Shards, open_shards
+from graspd.service.store import validity
+from graspd.service.store.shards import Shard, part_of_shard, place_of, read_shard
+from graspd.service.store.store import open_store
 
 #: From the base shards of one hand on one object to the mask (N,) of each.
 Chooser = Callable[[list[Shard]], list[NDArray[np.bool_]]]

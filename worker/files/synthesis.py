@@ -11,37 +11,37 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.domain import BATCH_SIZE, SHAKE_NEEDS_A_SCENE, JobOptions
-from service.model.errors import InputError, TaskCancelled, did_you_mean, one_of
-from service.model.fidelity import FIDELITIES, Fidelity
-from service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits
-from service.model.planning import shortfall, totals
-from service.model.scene_spec import MOST_SCENES, SceneSpec
-from service.store.columns import Attribute
-from service.store.shards import json_attribute
-from worker.certified import Certified, certified_grasps
-from worker.engines.devices import Device
-from worker.engines.joins import batches_at_once, parse_join
-from worker.files.provenance import (
+from graspd.service.model.domain import BATCH_SIZE, SHAKE_NEEDS_A_SCENE, JobOptions
+from graspd.service.model.errors import InputError, TaskCancelled, did_you_mean, one_of
+from graspd.service.model.fidelity import FIDELITIES, Fidelity
+from graspd.service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits
+from graspd.service.model.planning import shortfall, totals
+from graspd.service.model.scene_spec import MOST_SCENES, SceneSpec
+from graspd.service.store.columns import Attribute
+from graspd.service.store.shards import json_attribute
+from graspd.worker.certified import Certified, certified_grasps
+from graspd.worker.engines.devices import Device
+from graspd.worker.engines.joins import batches_at_once, parse_join
+from graspd.worker.files.provenance import (
     NEIGHBOUR_FACE_ERROR_M,
     base_attributes,
     beside_attributes,
     remembered,
     wrist_attributes,
 )
-from worker.grasps import joined_columns
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.objects.options import as_asked
-from worker.objects.prepare import object_from_path
-from worker.planners import planner
-from worker.pool.pool import MODULES, Pool, processes_at_once
-from worker.quality.referee.payload import Limit
-from worker.run import FirstJudge, Progress, Run
-from worker.scenes.beside import scenes_of
-from worker.scenes.rest import rolling_poses
-from worker.together import certified_batches, distinct_batches
+from graspd.worker.grasps import joined_columns
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.options import as_asked
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import planner
+from graspd.worker.pool.pool import MODULES, Pool, processes_at_once
+from graspd.worker.run import FirstJudge, Progress, Run
+from graspd.worker.scenes.beside import scenes_of
+from graspd.worker.scenes.rest import rolling_poses
+from graspd.worker.together import certified_batches, distinct_batches
+from graspd.worker.validation.payload import Limit
 
 Arrays = dict[str, NDArray[Any]]
 #: Threshold of the metrics that a summary tells [m].

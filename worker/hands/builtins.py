@@ -1,6 +1,6 @@
 """The built-in hands, written from published kinematic facts as URDFs of primitives.
 
-``python -m worker.hands.builtins`` writes them into `service/builtin/hands/`. Frames and numbers follow the makers'
+``python -m graspd.worker.hands.builtins`` writes them into `service/builtin/hands/`. Frames and numbers follow the makers'
 data: Wonik Allegro Hand (right), Barrett BH8-280, Shadow Dexterous Hand E (right, without forearm and wrist).
 """
 

@@ -7,19 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from service.model.errors import AssetError, InputError
-from worker.hands.closing import chains_of
-from worker.hands.guess import approach_is_tied
-from worker.hands.jaws import jaws_of
-from worker.hands.load import assemble, assumed_efforts, main_file, mounting_of
-from worker.hands.model import HandModel
-from worker.hands.oppositions import require_opposing
-from worker.hands.options import HandOptions, parse_options
-from worker.hands.robot import Robot, chain_to
-from worker.hands.surface import sample_surface
-from worker.hands.tree import build_tree, cut_drives, joints_above, passed_limits
-from worker.hands.xacro import read_robot
-from worker.run import ALONE, Run
+from graspd.service.model.errors import AssetError, InputError
+from graspd.worker.hands.closing import chains_of
+from graspd.worker.hands.guess import approach_is_tied
+from graspd.worker.hands.jaws import jaws_of
+from graspd.worker.hands.load import assemble, assumed_efforts, main_file, mounting_of
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.oppositions import require_opposing
+from graspd.worker.hands.options import HandOptions, parse_options
+from graspd.worker.hands.robot import Robot, chain_to
+from graspd.worker.hands.surface import sample_surface
+from graspd.worker.hands.tree import build_tree, cut_drives, joints_above, passed_limits
+from graspd.worker.hands.xacro import read_robot
+from graspd.worker.run import ALONE, Run
 
 #: Points with which the outer surface is measured.
 _SURFACE_POINTS = 512

@@ -6,9 +6,9 @@ from typing import Final
 
 import numpy as np
 
-from service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
 
 #: A finger bends so many times as far one way as the other: twice, whatever the last digits of its limits are.
 FAR: Final = 1.99

@@ -6,10 +6,10 @@ import itertools
 
 import numpy as np
 
-from service.model.transforms import IDENTITY_POSE, Floats, apply
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
-from worker.objects.disk_cache import recalled
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.disk_cache import recalled
 
 #: Pieces closer than this [m] at rest count as touching.
 TOUCH_M = 1e-4

@@ -8,15 +8,15 @@ from functools import partial
 
 import numpy as np
 
-from service.model.errors import HandError, did_you_mean
-from service.model.transforms import IDENTITY_POSE, Floats, apply, compose, quat_rotate
-from worker.hands.closing import carriers, closing_by_limits, closing_by_tips, posture, tips
-from worker.hands.jaws import MAX_DOFS, Jaws, closing_by_geometry, find_jaws, sign_of, slides
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel, PalmFrame
-from worker.hands.options import HandOptions
-from worker.hands.tree import Tree
-from worker.objects.disk_cache import recalled
+from graspd.service.model.errors import HandError, did_you_mean
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, compose, quat_rotate
+from graspd.worker.hands.closing import carriers, closing_by_limits, closing_by_tips, posture, tips
+from graspd.worker.hands.jaws import MAX_DOFS, Jaws, closing_by_geometry, find_jaws, sign_of, slides
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel, PalmFrame
+from graspd.worker.hands.options import HandOptions
+from graspd.worker.hands.tree import Tree
+from graspd.worker.objects.disk_cache import recalled
 
 #: Share of the way from open to closed at which the hand approaches.
 PRESHAPE_SHARE = 0.25

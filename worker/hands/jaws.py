@@ -16,10 +16,10 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, Floats, apply, quat_conjugate, quat_rotate, spread_directions
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel, JointType, SurfacePoints
-from worker.hands.surface import sample_surface
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_conjugate, quat_rotate, spread_directions
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel, JointType, SurfacePoints
+from graspd.worker.hands.surface import sample_surface
 
 Ints = NDArray[np.intp]
 

@@ -7,8 +7,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats, compose, cross, quat_from_axis_angle, quat_rotate
-from worker.hands.model import HandModel, JointType
+from graspd.service.model.transforms import Floats, compose, cross, quat_from_axis_angle, quat_rotate
+from graspd.worker.hands.model import HandModel, JointType
 
 
 def body_poses(hand: HandModel, hand_pose: Floats, joint_positions: Floats) -> Floats:

@@ -10,19 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from service.model.digests import digest_files, digest_variant
-from service.model.errors import HandError, InputError, NotFoundError, did_you_mean
-from service.model.states import AssetKind
-from service.model.transforms import Floats, compose
-from service.store.assets import builtin_files, builtin_names, unpack_file, without_common_folder
-from service.store.hand_files import files_of_hand, hand_name, main_of
-from worker.hands import collisions, guess, primitives, shapes
-from worker.hands.collisions import resting_neighbours
-from worker.hands.guess import complete
-from worker.hands.jaws import jaws_of, slides
-from worker.hands.model import ConvexPiece, Drag, HandModel, PalmFrame
-from worker.hands.mounting import mounting_tree
-from worker.hands.options import (
+from graspd.service.model.digests import digest_files, digest_variant
+from graspd.service.model.errors import HandError, InputError, NotFoundError, did_you_mean
+from graspd.service.model.states import AssetKind
+from graspd.service.model.transforms import Floats, compose
+from graspd.service.store.assets import builtin_files, builtin_names, unpack_file, without_common_folder
+from graspd.service.store.hand_files import files_of_hand, hand_name, main_of
+from graspd.worker.hands import collisions, guess, primitives, shapes
+from graspd.worker.hands.collisions import resting_neighbours
+from graspd.worker.hands.guess import complete
+from graspd.worker.hands.jaws import jaws_of, slides
+from graspd.worker.hands.model import ConvexPiece, Drag, HandModel, PalmFrame
+from graspd.worker.hands.mounting import mounting_tree
+from graspd.worker.hands.options import (
     DEFAULT_EFFORT,
     DEFAULT_FORCE,
     DEFAULT_LINEAR_STIFFNESS,
@@ -30,15 +30,15 @@ from worker.hands.options import (
     HandOptions,
     parse_options,
 )
-from worker.hands.primitives import volume
-from worker.hands.robot import Robot, chain_to
-from worker.hands.shapes import Hulls, make_pieces
-from worker.hands.tendons import tendons_of
-from worker.hands.tree import Tree, build_tree, joint_type
-from worker.hands.visuals import PlacedShape, Visuals
-from worker.hands.xacro import read_robot
-from worker.objects.disk_cache import recalling
-from worker.run import ALONE, Run
+from graspd.worker.hands.primitives import volume
+from graspd.worker.hands.robot import Robot, chain_to
+from graspd.worker.hands.shapes import Hulls, make_pieces
+from graspd.worker.hands.tendons import tendons_of
+from graspd.worker.hands.tree import Tree, build_tree, joint_type
+from graspd.worker.hands.visuals import PlacedShape, Visuals
+from graspd.worker.hands.xacro import read_robot
+from graspd.worker.objects.disk_cache import recalling
+from graspd.worker.run import ALONE, Run
 
 log = logging.getLogger(__name__)
 

@@ -14,13 +14,13 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
-from service.model.errors import HandError
-from service.model.transforms import IDENTITY_POSE, Floats, compose, invert, quat_from_axis_angle
-from worker.hands.mjcf_couplings import couplings
-from worker.hands.mjcf_servos import Servo, commanded, servos
-from worker.hands.mjcf_source import self_contained
-from worker.hands.primitives import hull
-from worker.hands.robot import UNLIMITED_M, Joint, Link, Robot, Shape, build_robot
+from graspd.service.model.errors import HandError
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert, quat_from_axis_angle
+from graspd.worker.hands.mjcf_couplings import couplings
+from graspd.worker.hands.mjcf_servos import Servo, commanded, servos
+from graspd.worker.hands.mjcf_source import self_contained
+from graspd.worker.hands.primitives import hull
+from graspd.worker.hands.robot import UNLIMITED_M, Joint, Link, Robot, Shape, build_robot
 
 _FREE, _HINGE, _SLIDE = (
     int(kind) for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)

@@ -14,10 +14,10 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
-from service.model.errors import HandError
-from service.model.transforms import Floats
-from worker.hands.mjcf_servos import driven, joints_on_tendon
-from worker.hands.robot import Mimic
+from graspd.service.model.errors import HandError
+from graspd.service.model.transforms import Floats
+from graspd.worker.hands.mjcf_servos import driven, joints_on_tendon
+from graspd.worker.hands.robot import Mimic
 
 _RANGE_POINTS: Final = 41
 #: Coefficients of the joints that a tendon pulls, by the name of its drive.

@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from worker.hands.robot import Mimic
+from graspd.worker.hands.robot import Mimic
 
 
 @dataclass(frozen=True)

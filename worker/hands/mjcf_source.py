@@ -13,10 +13,10 @@ from collections.abc import Mapping
 from pathlib import PurePosixPath
 from typing import Final
 
-from service.model.errors import HandError, LimitError
-from service.store.mesh_files import one_like
-from worker.hands.urdf import parse_xml
-from worker.objects.stand_ins import refuse_stand_in
+from graspd.service.model.errors import HandError, LimitError
+from graspd.service.store.mesh_files import one_like
+from graspd.worker.hands.urdf import parse_xml
+from graspd.worker.objects.stand_ins import refuse_stand_in
 
 MAX_BYTES: Final = 8 * 2**20
 _MAX_INCLUDES: Final = 64

@@ -14,12 +14,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats
-from worker.hands.primitives import HandFeatures
-from worker.hands.robot import Ints, Joint
-from worker.hands.tendons import Tendon
-from worker.hands.visuals import NO_VISUALS, Visuals
-from worker.objects.disk_cache import TOLD_IF_SET, content_of
+from graspd.service.model.transforms import Floats
+from graspd.worker.hands.primitives import HandFeatures
+from graspd.worker.hands.robot import Ints, Joint
+from graspd.worker.hands.tendons import Tendon
+from graspd.worker.hands.visuals import NO_VISUALS, Visuals
+from graspd.worker.objects.disk_cache import TOLD_IF_SET, content_of
 
 
 class JointType(IntEnum):

@@ -14,11 +14,11 @@ from typing import Final
 
 import numpy as np
 
-from service.model.transforms import IDENTITY_POSE, Floats, compose, invert
-from worker.hands.model import HandModel
-from worker.hands.options import HandOptions
-from worker.hands.robot import Joint, Robot, chain_to
-from worker.hands.tree import LEAST_RANGE, Drive, Tree, joint_motion
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.options import HandOptions
+from graspd.worker.hands.robot import Joint, Robot, chain_to
+from graspd.worker.hands.tree import LEAST_RANGE, Drive, Tree, joint_motion
 
 #: Most joints of a wrist, largest range of one [rad], and its largest distance from the root along the joints [m]. The
 #: last joint of an arm usually turns farther.

@@ -18,17 +18,17 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model import transforms
-from service.model.errors import HandError
-from service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
-from worker.hands import closing, guess, jaws, kinematics, primitives, surface
-from worker.hands import jaws as pads_code
-from worker.hands.closing import posture
-from worker.hands.jaws import Pad, fingertip_pad
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
-from worker.hands.surface import sample_surface
-from worker.objects.disk_cache import arrays_kept_or_made
+from graspd.service.model import transforms
+from graspd.service.model.errors import HandError
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
+from graspd.worker.hands import closing, guess, jaws, kinematics, primitives, surface
+from graspd.worker.hands import jaws as pads_code
+from graspd.worker.hands.closing import posture
+from graspd.worker.hands.jaws import Pad, fingertip_pad
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects.disk_cache import arrays_kept_or_made
 
 #: Postures that are wanted, from so many times as many, and random steps that make them better.
 POSTURES: Final = 160

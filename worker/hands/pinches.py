@@ -15,14 +15,14 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model import transforms
-from service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
-from worker.hands import closing, kinematics, oppositions, primitives, surface
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel, SurfacePoints
-from worker.hands.oppositions import Oppositions, climbed, opposed_finger, random_postures
-from worker.hands.surface import farthest_points, sample_surface
-from worker.objects.disk_cache import arrays_kept_or_made
+from graspd.service.model import transforms
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
+from graspd.worker.hands import closing, kinematics, oppositions, primitives, surface
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel, SurfacePoints
+from graspd.worker.hands.oppositions import Oppositions, climbed, opposed_finger, random_postures
+from graspd.worker.hands.surface import farthest_points, sample_surface
+from graspd.worker.objects.disk_cache import arrays_kept_or_made
 
 #: Heights of objects that have postures of their own [m]; what is higher reaches the pads.
 HEIGHTS_M: Final = (0.005, 0.008, 0.012, 0.018)

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import HandError
-from service.model.transforms import Floats, quat_rotate
-from worker.hands.robot import Ints
-from worker.objects.disk_cache import recalled
+from graspd.service.model.errors import HandError
+from graspd.service.model.transforms import Floats, quat_rotate
+from graspd.worker.hands.robot import Ints
+from graspd.worker.objects.disk_cache import recalled
 
 if TYPE_CHECKING:
-    from worker.hands.model import ConvexPiece
+    from graspd.worker.hands.model import ConvexPiece
 
 #: Corners of a circle in tessellations: the chord stays within 0.5 % of the radius.
 SEGMENTS = 32

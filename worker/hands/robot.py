@@ -12,9 +12,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import HandError, LimitError
-from service.model.transforms import Floats
-from worker.objects.disk_cache import TOLD_IF_SET
+from graspd.service.model.errors import HandError, LimitError
+from graspd.service.model.transforms import Floats
+from graspd.worker.objects.disk_cache import TOLD_IF_SET
 
 Ints = NDArray[np.int32]
 

@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError
-from service.model.transforms import (
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import (
     IDENTITY_POSE,
     Floats,
     apply,
@@ -20,8 +20,8 @@ from service.model.transforms import (
     quat_from_axis_angle,
     quat_from_matrix,
 )
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
 
 #: Random postures in which two models are compared.
 POSTURES: Final = 200

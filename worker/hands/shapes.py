@@ -14,17 +14,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.digests import digest_json
-from service.model.errors import HandError, MeshError
-from service.model.libraries import version_of
-from service.model.transforms import IDENTITY_POSE, Floats, apply, quat_to_matrix
-from worker.hands.model import ConvexPiece
-from worker.hands.primitives import hull, new_hull, signed_distance, tessellate, triangle_areas, volume
-from worker.hands.robot import Ints, Shape
-from worker.hands.visuals import find_mesh
-from worker.objects.convex import TooMuchWork, coacd_parts, default_cache, keep_parts, load_parts
-from worker.objects.disk_cache import recalled
-from worker.objects.formats import read_mesh
+from graspd.service.model.digests import digest_json
+from graspd.service.model.errors import HandError, MeshError
+from graspd.service.model.libraries import version_of
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_to_matrix
+from graspd.worker.hands.model import ConvexPiece
+from graspd.worker.hands.primitives import hull, new_hull, signed_distance, tessellate, triangle_areas, volume
+from graspd.worker.hands.robot import Ints, Shape
+from graspd.worker.hands.visuals import find_mesh
+from graspd.worker.objects.convex import TooMuchWork, coacd_parts, default_cache, keep_parts, load_parts
+from graspd.worker.objects.disk_cache import recalled
+from graspd.worker.objects.formats import read_mesh
 
 #: A hull of V corners has at most 2 V - 4 triangles: 96 here. Every plane costs time in each distance query.
 MAX_HULL_VERTICES: Final = 50

@@ -17,14 +17,14 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model import transforms
-from service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
-from worker.hands import kinematics, oppositions, primitives, surface
-from worker.hands.kinematics import body_poses, generalized_forces
-from worker.hands.model import HandModel, SurfacePoints
-from worker.hands.oppositions import Oppositions, oppositions_of
-from worker.hands.surface import sample_surface
-from worker.objects.disk_cache import arrays_kept_or_made
+from graspd.service.model import transforms
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
+from graspd.worker.hands import kinematics, oppositions, primitives, surface
+from graspd.worker.hands.kinematics import body_poses, generalized_forces
+from graspd.worker.hands.model import HandModel, SurfacePoints
+from graspd.worker.hands.oppositions import Oppositions, oppositions_of
+from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects.disk_cache import arrays_kept_or_made
 
 Ints = NDArray[np.intp]
 Size = Literal["small", "wide"]

@@ -11,13 +11,13 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model import transforms
-from service.model.errors import HandError
-from service.model.transforms import IDENTITY_POSE, Floats, apply, invert, quat_rotate
-from worker.hands import kinematics, primitives
-from worker.hands.kinematics import body_poses
-from worker.hands.model import ConvexPiece, HandModel, SurfacePoints
-from worker.objects.disk_cache import arrays_kept_or_made, content_of
+from graspd.service.model import transforms
+from graspd.service.model.errors import HandError
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, invert, quat_rotate
+from graspd.worker.hands import kinematics, primitives
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import ConvexPiece, HandModel, SurfacePoints
+from graspd.worker.objects.disk_cache import arrays_kept_or_made, content_of
 
 #: Candidates per wanted point; thinning keeps the one in five that spreads most evenly.
 OVERSAMPLING: Final = 5

@@ -9,9 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from service.model.errors import HandError
-from service.model.transforms import Floats
-from worker.hands.robot import Robot
+from graspd.service.model.errors import HandError
+from graspd.service.model.transforms import Floats
+from graspd.worker.hands.robot import Robot
 
 #: Coefficients smaller than this pull nothing.
 LEAST_PULL: Final = 1e-6

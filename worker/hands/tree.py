@@ -11,12 +11,12 @@ from typing import Final
 
 import numpy as np
 
-from service.model.errors import HandError, did_you_mean
-from service.model.transforms import IDENTITY_POSE, Floats, compose, quat_from_axis_angle
-from worker.hands.model import JointType
-from worker.hands.options import HandOptions
-from worker.hands.robot import MAX_LENGTH_M, UNLIMITED_M, Joint, Mimic, Robot, chain_to
-from worker.hands.tendons import check_tendons
+from graspd.service.model.errors import HandError, did_you_mean
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, quat_from_axis_angle
+from graspd.worker.hands.model import JointType
+from graspd.worker.hands.options import HandOptions
+from graspd.worker.hands.robot import MAX_LENGTH_M, UNLIMITED_M, Joint, Mimic, Robot, chain_to
+from graspd.worker.hands.tendons import check_tendons
 
 #: Share of its range that a drive may lose without a word.
 _TOLD_CUT: Final = 0.01

@@ -17,10 +17,10 @@ import numpy as np
 from defusedxml import ElementTree as SafeTree
 from defusedxml.common import DefusedXmlException
 
-from service.model.errors import HandError, LimitError
-from service.model.transforms import Floats, quat_from_axis_angle, quat_multiply
-from service.store.hand_files import text_of
-from worker.hands.robot import MAX_LENGTH_M, MOVING, UNLIMITED_M, Joint, Link, Mimic, Robot, Shape, build_robot
+from graspd.service.model.errors import HandError, LimitError
+from graspd.service.model.transforms import Floats, quat_from_axis_angle, quat_multiply
+from graspd.service.store.hand_files import text_of
+from graspd.worker.hands.robot import MAX_LENGTH_M, MOVING, UNLIMITED_M, Joint, Link, Mimic, Robot, Shape, build_robot
 
 MAX_BYTES: Final = 4 * 2**20
 #: Visual elements beyond this many are not drawn.

@@ -13,12 +13,12 @@ from typing import Final
 
 import numpy as np
 
-from service.model.errors import HandError, InputError
-from service.model.transforms import Floats, apply
-from service.store.mesh_files import MAX_NAMES, beside, looks_of, one_like, read_reference
-from worker.hands.primitives import tessellate
-from worker.hands.robot import Ints, Shape
-from worker.objects.formats import Nearby, Soup, read_mesh
+from graspd.service.model.errors import HandError, InputError
+from graspd.service.model.transforms import Floats, apply
+from graspd.service.store.mesh_files import MAX_NAMES, beside, looks_of, one_like, read_reference
+from graspd.worker.hands.primitives import tessellate
+from graspd.worker.hands.robot import Ints, Shape
+from graspd.worker.objects.formats import Nearby, Soup, read_mesh
 
 #: A hand's visual meshes together [faces]: beyond that a picture shows no more.
 MAX_FACES: Final = 400_000

@@ -16,11 +16,11 @@ from importlib.util import find_spec
 from pathlib import PurePosixPath
 from typing import Final
 
-from service.model.errors import HandError
-from service.store.hand_files import format_of, text_of
-from worker.hands.robot import Robot
-from worker.hands.urdf import MAX_BYTES, read_urdf
-from worker.objects.stand_ins import refuse_stand_in
+from graspd.service.model.errors import HandError
+from graspd.service.store.hand_files import format_of, text_of
+from graspd.worker.hands.robot import Robot
+from graspd.worker.hands.urdf import MAX_BYTES, read_urdf
+from graspd.worker.objects.stand_ins import refuse_stand_in
 
 #: Largest hands on arms take a tenth of it [s].
 CPU_LIMIT_S: Final = 10
@@ -55,7 +55,7 @@ def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) 
         "texts": {name: text_of(files[name]) for name in sorted(files) if PurePosixPath(name).suffix.lower() in _READ},
     }
     passed_on = {name: os.environ[name] for name in ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH") if name in os.environ}
-    command = [sys.executable, "-m", "worker.hands.xacro_child"]
+    command = [sys.executable, "-m", "graspd.worker.hands.xacro_child"]
     try:
         done = subprocess.run(
             command,
@@ -97,7 +97,7 @@ def read_robot(files: Mapping[str, bytes], main: str, arguments: Mapping[str, st
     refuse_stand_in(main, files[main], HandError)
     match format_of(main, files[main]):
         case "mjcf":
-            from worker.hands.mjcf import read_mjcf
+            from graspd.worker.hands.mjcf import read_mjcf
 
             return read_mjcf(files, main)
         case "xacro":

@@ -1,4 +1,4 @@
-"""Xacro in a process of its own: `python -m worker.hands.xacro_child` reads a JSON object and writes one.
+"""Xacro in a process of its own: `python -m graspd.worker.hands.xacro_child` reads a JSON object and writes one.
 
 Three fences, because expressions in xacro are Python and what guards them in the library can be climbed: names that
 lead out of an expression are refused; an audit hook refuses whatever would touch files, processes or the network; and
@@ -64,7 +64,7 @@ def _expand(given: dict[str, Any]) -> str:
     from defusedxml import minidom as safe
     from xacro import substitution_args
 
-    from service.store.mesh_files import one_like
+    from graspd.service.store.mesh_files import one_like
 
     texts: dict[str, str] = given["texts"]
     names: list[str] = given["names"]

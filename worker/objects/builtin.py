@@ -1,6 +1,6 @@
 """The built-in objects: parametric solids, written as binary STL in metres, z up, standing on z = 0.
 
-``python -m worker.objects.builtin`` writes them into `service/builtin/objects/`.
+``python -m graspd.worker.objects.builtin`` writes them into `service/builtin/objects/`.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import manifold3d
 import numpy as np
 from manifold3d import CrossSection, Manifold
 
-from worker.objects.mesh_geometry import from_manifold
-from worker.objects.topology import merge_vertices
+from graspd.worker.objects.mesh_geometry import from_manifold
+from graspd.worker.objects.topology import merge_vertices
 
 #: Corners of a full circle: the chord of the mug's outer wall stays within 0.05 mm.
 SEGMENTS: Final = 64

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from service.model.errors import AssetError, InputError
-from worker.objects.options import ObjectOptions, parse_options
-from worker.objects.prepare import build, main_file, repaired_mesh, weighed
-from worker.objects.repair import Repaired
+from graspd.service.model.errors import AssetError, InputError
+from graspd.worker.objects.options import ObjectOptions, parse_options
+from graspd.worker.objects.prepare import build, main_file, repaired_mesh, weighed
+from graspd.worker.objects.repair import Repaired
 
 #: Bound with which the prepared mesh of the report is simplified [m]: that of the standard fidelity.
 REPORT_ERROR_M = 3e-4

@@ -1,4 +1,4 @@
-"""CoACD in a process of its own: `python -m worker.objects.coacd_child SECONDS` reads an npz and writes one.
+"""CoACD in a process of its own: `python -m graspd.worker.objects.coacd_child SECONDS` reads an npz and writes one.
 
 It ends by a signal where it computes for longer than so many seconds. In: arrays `vertices`, `faces`, and `options`
 (JSON). Out: one array of corners per piece.

@@ -18,8 +18,8 @@ import manifold3d as m3d
 import numpy as np
 from numpy.typing import NDArray
 
-from service import user_cache
-from service.model.transforms import Floats
+from graspd.service import user_cache
+from graspd.service.model.transforms import Floats
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +46,7 @@ def coacd_parts(vertices: Floats, faces: NDArray[Any], options: Mapping[str, Any
     """
     given = io.BytesIO()
     np.savez(given, vertices=vertices, faces=faces, options=np.array(json.dumps(dict(options))))
-    command = [sys.executable, "-m", "worker.objects.coacd_child", str(cpu_s)]
+    command = [sys.executable, "-m", "graspd.worker.objects.coacd_child", str(cpu_s)]
     try:
         done = subprocess.run(command, input=given.getvalue(), capture_output=True, check=True)
     except subprocess.CalledProcessError as error:

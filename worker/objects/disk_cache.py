@@ -18,9 +18,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service import user_cache
-from service.model.digests import digest_json
-from service.model.libraries import version_of
+from graspd.service import user_cache
+from graspd.service.model.digests import digest_json
+from graspd.service.model.libraries import version_of
 
 #: Libraries that go into the arrays.
 _LIBRARIES: Final = ("numpy", "scipy")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats
-from worker.objects.topology import Indices
+from graspd.service.model.transforms import Floats
+from graspd.worker.objects.topology import Indices
 
 #: Pieces into which a mesh is cut at least, so that a piece is small against the mesh.
 _PIECES = 10_000

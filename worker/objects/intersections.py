@@ -8,11 +8,11 @@ import manifold3d
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats
-from worker.objects import mesh_geometry, topology
-from worker.objects.distance import MeshDistance, cut, surface_points
-from worker.objects.mesh_geometry import signed_volume
-from worker.objects.topology import Indices
+from graspd.service.model.transforms import Floats
+from graspd.worker.objects import mesh_geometry, topology
+from graspd.worker.objects.distance import MeshDistance, cut, surface_points
+from graspd.worker.objects.mesh_geometry import signed_volume
+from graspd.worker.objects.topology import Indices
 
 Mesh = tuple[Floats, Indices]
 

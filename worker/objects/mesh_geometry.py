@@ -15,10 +15,10 @@ import manifold3d
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from service.model.transforms import Floats, quat_rotate
-from worker.grasps import moved
-from worker.objects.model import Ints
-from worker.objects.topology import Indices, parts_of_graph
+from graspd.service.model.transforms import Floats, quat_rotate
+from graspd.worker.grasps import moved
+from graspd.worker.objects.model import Ints
+from graspd.worker.objects.topology import Indices, parts_of_graph
 
 FaceIndices = NDArray[np.int32] | NDArray[np.int64]
 

@@ -12,10 +12,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import MeshError
-from service.model.matter import FRICTION, MASS_KG, MOST_KG
-from service.model.transforms import Floats
-from worker.objects.disk_cache import TOLD_IF_SET, content_of
+from graspd.service.model.errors import MeshError
+from graspd.service.model.matter import FRICTION, MASS_KG, MOST_KG
+from graspd.service.model.transforms import Floats
+from graspd.worker.objects.disk_cache import TOLD_IF_SET, content_of
 
 Ints = NDArray[np.int32]
 

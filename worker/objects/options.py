@@ -8,11 +8,11 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from service.model.base import refusal
-from service.model.domain import JobOptions
-from service.model.errors import MeshError
-from service.model.matter import Density, Friction, Mass
-from worker.objects.model import ObjectModel
+from graspd.service.model.base import refusal
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import MeshError
+from graspd.service.model.matter import Density, Friction, Mass
+from graspd.worker.objects.model import ObjectModel
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 #: Keys that decide how heavy and how slippery the object is, and not its shape.

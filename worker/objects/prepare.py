@@ -20,21 +20,21 @@ from typing import Any, Final
 
 import numpy as np
 
-from service import user_cache
-from service.model.digests import digest_files, digest_json, digest_variant
-from service.model.errors import MeshError, NotFoundError, did_you_mean
-from service.model.libraries import version_of
-from service.model.states import AssetKind
-from service.model.transforms import Floats
-from service.store.assets import builtin_files, builtin_names, unpack_file
-from worker.objects import mesh_geometry, topology
-from worker.objects.distance import MeshDistance, deviation, surface_points
-from worker.objects.formats import READERS, read_mesh
-from worker.objects.mesh_geometry import corner_normals, mass_properties, signed_volume
-from worker.objects.model import Ints, ObjectModel
-from worker.objects.options import OF_MATTER, ObjectOptions, parse_options
-from worker.objects.repair import Repaired, repair
-from worker.objects.topology import Indices
+from graspd.service import user_cache
+from graspd.service.model.digests import digest_files, digest_json, digest_variant
+from graspd.service.model.errors import MeshError, NotFoundError, did_you_mean
+from graspd.service.model.libraries import version_of
+from graspd.service.model.states import AssetKind
+from graspd.service.model.transforms import Floats
+from graspd.service.store.assets import builtin_files, builtin_names, unpack_file
+from graspd.worker.objects import mesh_geometry, topology
+from graspd.worker.objects.distance import MeshDistance, deviation, surface_points
+from graspd.worker.objects.formats import READERS, read_mesh
+from graspd.worker.objects.mesh_geometry import corner_normals, mass_properties, signed_volume
+from graspd.worker.objects.model import Ints, ObjectModel
+from graspd.worker.objects.options import OF_MATTER, ObjectOptions, parse_options
+from graspd.worker.objects.repair import Repaired, repair
+from graspd.worker.objects.topology import Indices
 
 #: Names of files that say nothing of what is in them: the objects of such a set differ by their folders.
 PLAIN_STEMS: Final = ("clean", "mesh", "model", "textured", "nontextured", "simplified")

@@ -11,16 +11,16 @@ from typing import Final
 
 import numpy as np
 
-from service.model.errors import MeshError
-from service.model.transforms import Floats
-from worker.grasps import on_grid
-from worker.objects import mesh_geometry, topology
-from worker.objects.distance import MeshDistance, surface_points
-from worker.objects.formats import Soup
-from worker.objects.intersections import crossings, untangle
-from worker.objects.mesh_geometry import Centred, centred, signed_volume
-from worker.objects.options import UNITS, ObjectOptions
-from worker.objects.topology import Indices
+from graspd.service.model.errors import MeshError
+from graspd.service.model.transforms import Floats
+from graspd.worker.grasps import on_grid
+from graspd.worker.objects import mesh_geometry, topology
+from graspd.worker.objects.distance import MeshDistance, surface_points
+from graspd.worker.objects.formats import Soup
+from graspd.worker.objects.intersections import crossings, untangle
+from graspd.worker.objects.mesh_geometry import Centred, centred, signed_volume
+from graspd.worker.objects.options import UNITS, ObjectOptions
+from graspd.worker.objects.topology import Indices
 
 MAX_EXTENT_M: Final = 3.0
 MIN_EXTENT_M: Final = 1e-3

@@ -8,7 +8,7 @@ import zipfile
 from pathlib import PurePosixPath
 from typing import Final
 
-from service.model.errors import InputError
+from graspd.service.model.errors import InputError
 
 _XML: Final = rb"(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*"
 _MESH: Final = "export a mesh: STL, OBJ, PLY, OFF or GLB"

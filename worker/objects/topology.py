@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats
+from graspd.service.model.transforms import Floats
 
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]

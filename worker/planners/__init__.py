@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from worker.engines.devices import check_device
-from worker.grasps import GraspSet
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.planners.fitting import fitting_pairs
-from worker.planners.port import Asked, Joined, Method, NoPlace, Options, Planner, Trial, Wanted
-from worker.planners.registry import GROUP, PLANNERS, joined, method, method_names, planner
-from worker.run import ALONE, Run
+from graspd.worker.engines.devices import check_device
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fitting import fitting_pairs
+from graspd.worker.planners.port import Asked, Joined, Method, NoPlace, Options, Planner, Trial, Wanted
+from graspd.worker.planners.registry import GROUP, PLANNERS, joined, method, method_names, planner
+from graspd.worker.run import ALONE, Run
 
 __all__ = [
     "GROUP",

@@ -13,11 +13,11 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.errors import InputError
-from service.model.transforms import Floats
-from worker.hands.jaws import jaws_of
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import Floats
+from graspd.worker.hands.jaws import jaws_of
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
 
 #: What must be left of the opening on each side of the object [m].
 FIT_M: Final = 0.001

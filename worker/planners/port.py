@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from service.model.errors import InputError
-from service.model.fidelity import Fidelity
-from worker.grasps import GraspSet
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.run import Run
-from worker.simulation.surroundings import Placed
+from graspd.service.model.errors import InputError
+from graspd.service.model.fidelity import Fidelity
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.run import Run
+from graspd.worker.simulation.surroundings import Placed
 
 #: Scores (N,) of N grasps, in their scenes or around a free object (None): the smaller the better, below 1 good enough
 #: to look at no other candidate, from 2 on so bad that others are worth their time. The third argument has the score of

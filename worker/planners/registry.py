@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 from pydantic import ValidationError
 
-from service.model.base import refusal
-from service.model.errors import InputError, known_names
-from service.model.libraries import imports
-from worker.planners.port import Joined, Method, Options, Planner
+from graspd.service.model.base import refusal
+from graspd.service.model.errors import InputError, known_names
+from graspd.service.model.libraries import imports
+from graspd.worker.planners.port import Joined, Method, Options, Planner
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint, EntryPoints
@@ -22,12 +22,12 @@ GROUP: Final = "graspd.planners"
 
 #: Method name -> module and attribute of its `Method`. Modules are imported when used.
 PLANNERS: Final[dict[str, tuple[str, str]]] = {
-    "fast_graspd": ("worker.planners.fast_graspd.planner", "METHOD"),
-    "graspit": ("worker.planners.graspit.method", "METHOD"),
-    "graspd2022": ("worker.planners.graspd2022.method", "METHOD"),
-    "dfc": ("worker.planners.dfc.method", "METHOD"),
-    "learned": ("worker.planners.learned.method", "METHOD"),
-    "autograsp": ("worker.planners.autograsp.method", "METHOD"),
+    "fast_graspd": ("graspd.worker.planners.fast_graspd.planner", "METHOD"),
+    "graspit": ("graspd.baselines.graspit.method", "METHOD"),
+    "graspd2022": ("graspd.baselines.graspd2022.method", "METHOD"),
+    "dfc": ("graspd.baselines.dfc.method", "METHOD"),
+    "learned": ("graspd.baselines.learned.method", "METHOD"),
+    "autograsp": ("graspd.baselines.autograsp.method", "METHOD"),
 }
 
 
@@ -55,7 +55,7 @@ def method(name: str) -> Method:
     except Exception as error:
         raise InputError(f"method {name!r} cannot be loaded from {offered[name].value}: {error}") from error
     if not isinstance(found, Method):
-        raise InputError(f"method {name!r}: {offered[name].value} is no worker.planners.Method")
+        raise InputError(f"method {name!r}: {offered[name].value} is no graspd.worker.planners.Method")
     return found
 
 

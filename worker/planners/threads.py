@@ -17,8 +17,8 @@ from typing import TypeVar
 import numpy as np
 import warp as wp
 
-from worker.engines.devices import is_out_of_memory
-from worker.run import Run
+from graspd.worker.engines.devices import is_out_of_memory
+from graspd.worker.run import Run
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")

@@ -1,4 +1,4 @@
-"""A process of a `worker.pool.pool.Pool`: `python -m worker.pool.child [MODULE ...] FD`.
+"""A process of a `worker.pool.pool.Pool`: `python -m graspd.worker.pool.child [MODULE ...] FD`.
 
 It takes work from the socket with that file descriptor until the other side is gone. What several pieces of work share
 is kept by its key; the pool tells which of it to forget. The modules are imported before the first piece comes.
@@ -18,7 +18,7 @@ from importlib import import_module
 from multiprocessing.connection import Connection
 from typing import Any
 
-from service.model.libraries import imports, own_process
+from graspd.service.model.libraries import imports, own_process
 
 
 @dataclass(frozen=True)
@@ -86,4 +86,4 @@ def _portable(error: Exception) -> Exception:
 
 if __name__ == "__main__":
     # By its full name: what is pickled names its module, and `__main__` is another one.
-    import_module("worker.pool.child").serve(Connection(int(sys.argv[-1])), sys.argv[1:-1])
+    import_module("graspd.worker.pool.child").serve(Connection(int(sys.argv[-1])), sys.argv[1:-1])

@@ -27,13 +27,13 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
-from service.model.cores import ROOT, available_cores, available_memory
-from service.model.errors import GraspdError, TaskCancelled
-from worker.pool.child import Order
+from graspd.service.model.cores import ROOT, available_cores, available_memory
+from graspd.service.model.errors import GraspdError, TaskCancelled
+from graspd.worker.pool.child import Order
 
 log = logging.getLogger(__name__)
 #: Modules whose work the processes do for a worker; named and not imported: a worker is there before its engine is.
-MODULES: Final = ("worker.quality.referee.judge", "worker.quality.table")
+MODULES: Final = ("graspd.worker.validation.validator", "graspd.worker.quality.table")
 #: What each process keeps of things that pieces of work share: two for a pair that is judged and measured.
 KEPT: Final = 8
 #: Memory that a process takes at the most, with the models of the pairs that it keeps [bytes]; see
@@ -182,7 +182,7 @@ class _Place:
         """A fresh process. Raises OSError."""
         self._kept.clear()
         self._connection, self.process = start_child(
-            [sys.executable, "-m", "worker.pool.child", *self._modules],
+            [sys.executable, "-m", "graspd.worker.pool.child", *self._modules],
             stdout=subprocess.DEVNULL,
             env={**os.environ, **_NO_GPU},
         )

@@ -11,11 +11,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from service.model.states import Stage
-from service.run.doctor.checks import Check, Finding, bad, good, warning
-from service.settings import Settings
+from graspd.service.model.states import Stage
+from graspd.service.run.doctor.checks import Check, Finding, bad, good, warning
+from graspd.service.settings import Settings
 
-_MODULE: Final = "worker.process.doctor"
+_MODULE: Final = "graspd.worker.process.doctor"
 _GPU_S: Final = 120.0
 #: All kernels compiled from nothing on a slow machine.
 _KERNELS_S: Final = 900.0
@@ -124,7 +124,7 @@ def _has_driver() -> bool:
 def _tell_gpus() -> dict[str, Any]:
     import warp as wp
 
-    from worker.engines import backend
+    from graspd.worker.engines import backend
 
     backend.start()
     found = [
@@ -137,9 +137,9 @@ def _tell_gpus() -> dict[str, Any]:
 def _tell_kernels(wanted: str) -> dict[str, Any]:
     import warp as wp
 
-    from worker.engines import backend
-    from worker.engines.devices import Device
-    from worker.process.selfcheck import EngineError, check_engine
+    from graspd.worker.engines import backend
+    from graspd.worker.engines.devices import Device
+    from graspd.worker.process.selfcheck import EngineError, check_engine
 
     backend.start()
     device, error = Device(wanted), ""

@@ -23,27 +23,27 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service import telemetry
-from service.model.cores import available_memory
-from service.model.errors import BusyError, InputError, TaskRefused, UnavailableError
-from service.model.libraries import own_process
-from service.model.states import Stage
-from service.pipeline.identity import check_service
-from service.queue.port import Report
-from service.store.store import Store, open_store
-from worker.engines.devices import Device
-from worker.engines.joins import batches_at_once, parse_join
-from worker.pool.pool import MODULES, Pool, processes_at_once
-from worker.process.fitness import Check, Fitness
-from worker.process.link import Condition, Setup
-from worker.process.runner import Runner
-from worker.process.selfcheck import check_engine
-from worker.run import Run
-from worker.stages import stage_table
-from worker.stages.context import StageFunction, StopReason, TaskContext
+from graspd.service import telemetry
+from graspd.service.model.cores import available_memory
+from graspd.service.model.errors import BusyError, InputError, TaskRefused, UnavailableError
+from graspd.service.model.libraries import own_process
+from graspd.service.model.states import Stage
+from graspd.service.pipeline.identity import check_service
+from graspd.service.queue.port import Report
+from graspd.service.store.store import Store, open_store
+from graspd.worker.engines.devices import Device
+from graspd.worker.engines.joins import batches_at_once, parse_join
+from graspd.worker.pool.pool import MODULES, Pool, processes_at_once
+from graspd.worker.process.fitness import Check, Fitness
+from graspd.worker.process.link import Condition, Setup
+from graspd.worker.process.runner import Runner
+from graspd.worker.process.selfcheck import check_engine
+from graspd.worker.run import Run
+from graspd.worker.stages import stage_table
+from graspd.worker.stages.context import StageFunction, StopReason, TaskContext
 
 if TYPE_CHECKING:
-    from service.settings import Settings
+    from graspd.service.settings import Settings
 
 log = logging.getLogger(__name__)
 

@@ -18,14 +18,14 @@ import time
 from collections.abc import Callable, Collection
 from typing import Final
 
-from service import user_cache
-from service.model.errors import DamagedError, InputError, TaskRefused, UnavailableError
-from service.model.messages import IngestMessage
-from service.model.states import Stage
-from service.queue.port import Message
-from service.store.manifests import shard_exists
-from service.store.store import Store
-from worker.process.selfcheck import EngineError
+from graspd.service import user_cache
+from graspd.service.model.errors import DamagedError, InputError, TaskRefused, UnavailableError
+from graspd.service.model.messages import IngestMessage
+from graspd.service.model.states import Stage
+from graspd.service.queue.port import Message
+from graspd.service.store.manifests import shard_exists
+from graspd.service.store.store import Store
+from graspd.worker.process.selfcheck import EngineError
 
 log = logging.getLogger(__name__)
 #: Check of the engine for some stages; raises EngineError.

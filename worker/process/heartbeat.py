@@ -11,12 +11,12 @@ from typing import Any, Final
 
 from redis.exceptions import RedisError
 
-from service.model.clock import timestamp
-from service.model.workers import WorkerBeat
-from service.queue.connection import connect
-from service.queue.port import Event, EventKind
-from service.queue.rq_queue import list_worker, unlist_worker
-from service.telemetry import HeartbeatFile
+from graspd.service.model.clock import timestamp
+from graspd.service.model.workers import WorkerBeat
+from graspd.service.queue.connection import connect
+from graspd.service.queue.port import Event, EventKind
+from graspd.service.queue.rq_queue import list_worker, unlist_worker
+from graspd.service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
 #: Time between two signs of life, where three of them fit a lease [s]: a cancelled task must stop within two seconds,

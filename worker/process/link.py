@@ -13,12 +13,12 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from service.model.states import Stage
-from worker.pool.pool import end_child, start_child
-from worker.stages.context import StopReason
+from graspd.service.model.states import Stage
+from graspd.worker.pool.pool import end_child, start_child
+from graspd.worker.stages.context import StopReason
 
 if TYPE_CHECKING:
-    from service.settings import Settings
+    from graspd.service.settings import Settings
 
 #: What an engine may take to end by itself [s].
 _END_S: Final = 3.0
@@ -84,12 +84,12 @@ StartEngine = Callable[[Setup], Link]
 Condition = Literal["fit", "unfit", "outgrown"]
 
 
-def start_engine(setup: Setup, program: Sequence[str] = (sys.executable, "-m", "worker.process.engine")) -> Link:
+def start_engine(setup: Setup, program: Sequence[str] = (sys.executable, "-m", "graspd.worker.process.engine")) -> Link:
     """An engine in a fresh process, which ends with this one: a CUDA context and an engine's threads outlive no fork.
 
     Call it from the main thread: the kernel ties a child to the thread that starts it.
     """
-    ours, process = start_child([sys.executable, "-m", "service.run.launch", str(os.getpid()), *program])
+    ours, process = start_child([sys.executable, "-m", "graspd.service.run.launch", str(os.getpid()), *program])
     link = Link(ours, process)
     # The values alone: the library that reads settings takes 8 MiB of a process.
     values: Any = SimpleNamespace(**dict(setup.settings), resolved_store_url=setup.settings.resolved_store_url)

@@ -27,20 +27,20 @@ from rq.job import JobStatus
 from rq.serializers import JSONSerializer
 from rq.worker import WorkerStatus
 
-from service.model.clock import timestamp
-from service.model.errors import QueueUnavailable, TaskRefused
-from service.model.states import Stage
-from service.model.version import PACKAGE_VERSION
-from service.model.workers import WorkerBeat, own_ability
-from service.queue import allowed
-from service.queue.connection import redis_url
-from service.queue.lists import queue_names
-from service.queue.port import Event
-from service.queue.rq_queue import RqQueue, lease_state, open_queue, renew_lease
-from service.settings import Settings
-from worker.process.heartbeat import Heartbeat
-from worker.process.link import Condition, EngineLost, Link, Setup, StartEngine, start_engine
-from worker.stages.context import StopReason
+from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import QueueUnavailable, TaskRefused
+from graspd.service.model.states import Stage
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.service.model.workers import WorkerBeat, own_ability
+from graspd.service.queue import allowed
+from graspd.service.queue.connection import redis_url
+from graspd.service.queue.lists import queue_names
+from graspd.service.queue.port import Event
+from graspd.service.queue.rq_queue import RqQueue, lease_state, open_queue, renew_lease
+from graspd.service.settings import Settings
+from graspd.worker.process.heartbeat import Heartbeat
+from graspd.worker.process.link import Condition, EngineLost, Link, Setup, StartEngine, start_engine
+from graspd.worker.stages.context import StopReason
 
 log = logging.getLogger(__name__)
 #: Reconnection attempts of a worker, about a minute's worth: longer than a Redis takes to come back.

@@ -12,10 +12,10 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from service import telemetry
-from service.model import names
-from service.model.clock import timestamp
-from service.model.errors import (
+from graspd.service import telemetry
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import (
     DamagedError,
     DamagedShard,
     InputError,
@@ -24,17 +24,17 @@ from service.model.errors import (
     TaskRefused,
     UnavailableError,
 )
-from service.model.messages import IngestMessage, Origin, TaskMessage
-from service.model.records import AttemptRecord
-from service.model.states import Stage
-from service.model.workers import need_of, own_ability
-from service.queue.port import Event, EventKind, Message
-from service.store.manifests import ShardManifest, load_manifest, publish_shard, shard_exists
-from service.store.records import put_record
-from worker.engines.devices import DeviceLost, check_device
-from worker.pool.pool import ProcessLost
-from worker.process.fitness import Fitness, first_loss
-from worker.stages.context import StageFunction, StopReason, TaskContext, shard_of
+from graspd.service.model.messages import IngestMessage, Origin, TaskMessage
+from graspd.service.model.records import AttemptRecord
+from graspd.service.model.states import Stage
+from graspd.service.model.workers import need_of, own_ability
+from graspd.service.queue.port import Event, EventKind, Message
+from graspd.service.store.manifests import ShardManifest, load_manifest, publish_shard, shard_exists
+from graspd.service.store.records import put_record
+from graspd.worker.engines.devices import DeviceLost, check_device
+from graspd.worker.pool.pool import ProcessLost
+from graspd.worker.process.fitness import Fitness, first_loss
+from graspd.worker.stages.context import StageFunction, StopReason, TaskContext, shard_of
 
 log = logging.getLogger(__name__)
 

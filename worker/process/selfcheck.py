@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from service.model.domain import JobRequest
-from service.model.errors import GraspdError
-from service.model.libraries import imports
-from service.model.states import Stage
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import GraspdError
+from graspd.service.model.libraries import imports
+from graspd.service.model.states import Stage
 
 if TYPE_CHECKING:
-    from worker.objects.model import ObjectModel
+    from graspd.worker.objects.model import ObjectModel
 
-from worker.run import Run
+from graspd.worker.run import Run
 
 log = logging.getLogger(__name__)
 _RADIUS_M: Final = 0.03
@@ -51,7 +51,7 @@ def check_engine(device: Callable[[], str], stages: Collection[Stage], *, thread
         for stage in stages:
             name = stage.value
             with imports():
-                importlib.import_module(f"worker.stages.{name}")
+                importlib.import_module(f"graspd.worker.stages.{name}")
             if stage in _CHECKS:
                 _CHECKS[stage](Run(of_device, threads))
     except Exception as error:
@@ -60,8 +60,8 @@ def check_engine(device: Callable[[], str], stages: Collection[Stage], *, thread
 
 
 def _check_synthesis(run: Run) -> None:
-    from worker.certified import certified_grasps
-    from worker.hands.load import hand_from_path
+    from graspd.worker.certified import certified_grasps
+    from graspd.worker.hands.load import hand_from_path
 
     request = JobRequest(hand=_HAND, object="ball", grasps=1, fidelity="draft", want="raw")
     found = certified_grasps(hand_from_path(_HAND), _ball(), request, count=1, run=run)
@@ -71,7 +71,7 @@ def _check_synthesis(run: Run) -> None:
 
 
 def _check_scene(run: Run) -> None:
-    from worker.scenes import drop
+    from graspd.worker.scenes import drop
 
     height = drop(_ball(), count=1, seed=0)["scene/object_pose"][0, 2]
     # The pose is that of the ball's frame, whose origin is its centre: it lies on the table, facets aside.
@@ -79,7 +79,7 @@ def _check_scene(run: Run) -> None:
 
 
 def _check_pictures(run: Run) -> None:
-    from worker.rendering import render
+    from graspd.worker.rendering import render
 
     pose = np.array([[0.0, 0.0, _RADIUS_M, 1.0, 0.0, 0.0, 0.0]])
     made = render(_ball(), pose, views=1, stereo=False, width=32, height=24, seed=0, run=run)
@@ -97,9 +97,9 @@ def _ball() -> ObjectModel:
     """Of flat faces, so that it comes to rest."""
     from manifold3d import Manifold
 
-    from worker.objects.builtin import stl_bytes
-    from worker.objects.mesh_geometry import from_manifold
-    from worker.objects.prepare import load_object
+    from graspd.worker.objects.builtin import stl_bytes
+    from graspd.worker.objects.mesh_geometry import from_manifold
+    from graspd.worker.objects.prepare import load_object
 
     mesh = stl_bytes(*from_manifold(Manifold.sphere(_RADIUS_M, 12)))
     return load_object({"ball.stl": mesh}, name="ball", digest="", face_error_m=0.0)

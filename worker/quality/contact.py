@@ -7,9 +7,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats
-from worker.hands.model import HandModel
-from worker.hands.surface import farthest_points
+from graspd.service.model.transforms import Floats
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.surface import farthest_points
 
 #: A body nearer than this is in contact [m] (DexGraspBench).
 LINK_CONTACT_M: Final = 0.002

@@ -8,12 +8,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.metrics import BANDS, SECTORS
-from service.model.transforms import Floats, apply, quat_rotate
-from worker.grasps import Posture
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
-from worker.hands.surface import sample_surface
+from graspd.service.model.metrics import BANDS, SECTORS
+from graspd.service.model.transforms import Floats, apply, quat_rotate
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.surface import sample_surface
 
 #: Points of the hand's surface by which two postures are compared, spread evenly over it.
 POINTS: Final = 64

@@ -8,12 +8,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats, apply
-from worker.hands.model import ConvexPiece, HandModel
-from worker.quality.probe import Distances, Probe
-from worker.simulation.device import to_xyzw
-from worker.simulation.kernels import crossing as kernels
-from worker.simulation.launches import launch
+from graspd.service.model.transforms import Floats, apply
+from graspd.worker.hands.model import ConvexPiece, HandModel
+from graspd.worker.quality.probe import Distances, Probe
+from graspd.worker.simulation.device import to_xyzw
+from graspd.worker.simulation.kernels import crossing as kernels
+from graspd.worker.simulation.launches import launch
 
 #: Planes are told apart by so many digits [m, and of unit normals].
 _DIGITS: Final = 7

@@ -11,16 +11,16 @@ import warp as wp
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.integers import distinct_values
-from service.model.transforms import Floats
-from worker.grasps import Posture
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.quality.contact import LINK_CONTACT_M, contact_links, finger_of_body
-from worker.quality.probe import Probe, probe_of
-from worker.simulation.device import PosedBodies, chain_of, room_for_bodies, to_xyzw
-from worker.simulation.kernels import balance, jamming, opening, optimizers, touching
-from worker.simulation.launches import launch
+from graspd.service.model.integers import distinct_values
+from graspd.service.model.transforms import Floats
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.quality.contact import LINK_CONTACT_M, contact_links, finger_of_body
+from graspd.worker.quality.probe import Probe, probe_of
+from graspd.worker.simulation.device import PosedBodies, chain_of, room_for_bodies, to_xyzw
+from graspd.worker.simulation.kernels import balance, jamming, opening, optimizers, touching
+from graspd.worker.simulation.launches import launch
 
 #: Points that one thread of the CPU works on, and hands that are worked on at a time: what they take fits the cache.
 CPU_LANE: Final = 64

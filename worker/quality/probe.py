@@ -14,18 +14,18 @@ import warp as wp
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats, compose, quat_to_matrix
-from worker.engines.backend import binary_name
-from worker.grasps import Posture
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel, SurfacePoints
-from worker.hands.surface import sample_surface
-from worker.objects.disk_cache import arrays_kept_or_made
-from worker.objects.model import ObjectModel
-from worker.simulation.device import DeviceHand, PosedBodies, to_xyzw
-from worker.simulation.kernels import distance as kernels
-from worker.simulation.launches import launch
-from worker.simulation.sampling import object_samples
+from graspd.service.model.transforms import Floats, compose, quat_to_matrix
+from graspd.worker.engines.backend import binary_name
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel, SurfacePoints
+from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects.disk_cache import arrays_kept_or_made
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.simulation.device import DeviceHand, PosedBodies, to_xyzw
+from graspd.worker.simulation.kernels import distance as kernels
+from graspd.worker.simulation.launches import launch
+from graspd.worker.simulation.sampling import object_samples
 
 #: Hand points that contact area and penetration are measured with; the optimiser's own points use other seeds.
 HAND_POINTS: Final = 2000

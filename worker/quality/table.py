@@ -28,16 +28,16 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.errors import InputError
-from service.model.integers import distinct_values
-from service.model.metrics import GRASP_METRICS, GraspType
-from service.model.transforms import Floats
-from service.store.manifests import INDEX_THRESHOLD_M
-from worker.grasps import GraspSet, Posture
-from worker.hands.model import HandModel, JointType
-from worker.objects.disk_cache import content_of
-from worker.objects.model import ObjectModel
-from worker.quality.contact import (
+from graspd.service.model.errors import InputError
+from graspd.service.model.integers import distinct_values
+from graspd.service.model.metrics import GRASP_METRICS, GraspType
+from graspd.service.model.transforms import Floats
+from graspd.service.store.manifests import INDEX_THRESHOLD_M
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.model import HandModel, JointType
+from graspd.worker.objects.disk_cache import content_of
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.quality.contact import (
     LINK_CONTACT_M,
     MAX_CONTACTS,
     contact_area_cm2,
@@ -45,12 +45,12 @@ from worker.quality.contact import (
     finger_of_body,
     spread_contacts,
 )
-from worker.quality.diversity import approach_cells
-from worker.quality.overlap import Overlap, penetration_depth
-from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, Probe, probe_of
-from worker.quality.volume import SharedVolume
-from worker.quality.wrench_space import Norm, measure_spaces, wrenches
-from worker.run import ALONE, Count, Run
+from graspd.worker.quality.diversity import approach_cells
+from graspd.worker.quality.overlap import Overlap, penetration_depth
+from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, Probe, probe_of
+from graspd.worker.quality.volume import SharedVolume
+from graspd.worker.quality.wrench_space import Norm, measure_spaces, wrenches
+from graspd.worker.run import ALONE, Count, Run
 
 Columns = dict[str, NDArray[np.generic]]
 

@@ -9,11 +9,11 @@ import manifold3d as m3d
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats, pose_to_matrix
-from worker.hands.model import ConvexPiece, HandModel
-from worker.hands.surface import piece_distance
-from worker.objects.model import ObjectModel
-from worker.quality.probe import Probe
+from graspd.service.model.transforms import Floats, pose_to_matrix
+from graspd.worker.hands.model import ConvexPiece, HandModel
+from graspd.worker.hands.surface import piece_distance
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.quality.probe import Probe
 
 #: Edge of a voxel in the fallback [m]: the volume is off by at most half an edge times the shared volume's surface.
 VOXEL_M: Final = 5e-4

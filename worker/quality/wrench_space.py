@@ -18,10 +18,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.model.errors import InputError
-from service.model.transforms import Floats, cross
-from worker.simulation.kernels import hull as kernels
-from worker.simulation.launches import launch
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import Floats, cross
+from graspd.worker.simulation.kernels import hull as kernels
+from graspd.worker.simulation.launches import launch
 
 Norm = Literal["l1", "linf"]
 

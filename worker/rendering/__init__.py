@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from worker.rendering.views import Extras, render
+from graspd.worker.rendering.views import Extras, render
 
 __all__ = ["Extras", "render"]

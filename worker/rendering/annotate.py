@@ -8,11 +8,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.domain import EXTRA_CHANNELS
-from service.model.errors import InputError, did_you_mean
-from service.model.pinhole import pixel_rays
-from service.model.transforms import Floats
-from worker.rendering.cameras import Cameras
+from graspd.service.model.domain import EXTRA_CHANNELS
+from graspd.service.model.errors import InputError, did_you_mean
+from graspd.service.model.pinhole import pixel_rays
+from graspd.service.model.transforms import Floats
+from graspd.worker.rendering.cameras import Cameras
 
 BACKGROUND, TABLE, OBJECT = 0, 1, 2
 

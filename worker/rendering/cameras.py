@@ -13,10 +13,10 @@ from typing import Annotated, Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
-from service.model.base import refusal
-from service.model.errors import InputError
-from service.model.pinhole import pixel_rays
-from service.model.transforms import Floats
+from graspd.service.model.base import refusal
+from graspd.service.model.errors import InputError
+from graspd.service.model.pinhole import pixel_rays
+from graspd.service.model.transforms import Floats
 
 FIELD_OF_VIEW: Final = np.radians(40.0)
 BASELINE_M: Final = 0.06

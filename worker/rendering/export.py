@@ -12,9 +12,9 @@ import OpenEXR
 from numpy.typing import NDArray
 from PIL import Image
 
-from service.model.errors import InputError
-from service.store.shards import Shard
-from worker.rendering.annotate import BACKGROUND, OBJECT, TABLE
+from graspd.service.model.errors import InputError
+from graspd.service.store.shards import Shard
+from graspd.worker.rendering.annotate import BACKGROUND, OBJECT, TABLE
 
 DepthFormat = Literal["exr", "png"]
 #: One step of a 16-bit depth PNG [m]: reaches 6.5 m; 0 is nothing.

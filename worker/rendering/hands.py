@@ -11,14 +11,14 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.colours import hexadecimal, linear
-from service.model.transforms import Floats
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
-from worker.hands.robot import Ints
-from worker.hands.visuals import NO_VISUALS, VisualMesh
-from worker.objects.mesh_geometry import corner_normals
-from worker.rendering.scenery import Look, Solid
+from graspd.service.model.colours import hexadecimal, linear
+from graspd.service.model.transforms import Floats
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.robot import Ints
+from graspd.worker.hands.visuals import NO_VISUALS, VisualMesh
+from graspd.worker.objects.mesh_geometry import corner_normals
+from graspd.worker.rendering.scenery import Look, Solid
 
 _HAND: Final = Look(hexadecimal("#59636e"), roughness=0.42, metalness=0.35)
 _PALM: Final = Look(hexadecimal("#434b54"), roughness=0.48, metalness=0.35)

@@ -8,20 +8,20 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.colours import hexadecimal
-from service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
-from worker.grasps import moved
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.rendering.cameras import Cameras, intrinsics, look_at
-from worker.rendering.hands import drawn_bodies, hand_looks, hand_solids
-from worker.rendering.kernels.shading import CATCHER
-from worker.rendering.scenery import Box, Lamp, Look, Shot, Solid
-from worker.rendering.tracer import Tracer
+from graspd.service.model.colours import hexadecimal
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
+from graspd.worker.grasps import moved
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.rendering.cameras import Cameras, intrinsics, look_at
+from graspd.worker.rendering.hands import drawn_bodies, hand_looks, hand_solids
+from graspd.worker.rendering.kernels.shading import CATCHER
+from graspd.worker.rendering.scenery import Box, Lamp, Look, Shot, Solid
+from graspd.worker.rendering.tracer import Tracer
 
 #: Sides 120 degrees apart, measured from the side view of the hand [rad].
-from worker.run import ALONE, Run
+from graspd.worker.run import ALONE, Run
 
 THREE_SIDES: Final = tuple(np.radians([-35.0, 85.0, 205.0]).tolist())
 ELEVATION: Final = np.radians(20.0)

@@ -11,21 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from service.model.colours import hexadecimal
-from service.model.errors import InputError
-from service.model.transforms import IDENTITY_POSE, Floats, apply, compose, quat_from_matrix
-from worker.hands.closing import posture
-from worker.hands.jaws import pads_of
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
-from worker.objects.mesh_geometry import corner_normals, from_manifold
-from worker.objects.model import ObjectModel
-from worker.rendering import sheets
-from worker.rendering.cameras import intrinsics
-from worker.rendering.hands import drawn_bodies, hand_looks, hand_solids, without_visuals
-from worker.rendering.pictures import FIELD_OF_VIEW, FLOOR, FLOOR_SIZE, OBJECT_LOOK, STUDIO, TOWARD_LAMP, fit_camera
-from worker.rendering.scenery import Box, Look, Shot, Solid
-from worker.rendering.tracer import Tracer
+from graspd.service.model.colours import hexadecimal
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, compose, quat_from_matrix
+from graspd.worker.hands.closing import posture
+from graspd.worker.hands.jaws import pads_of
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.mesh_geometry import corner_normals, from_manifold
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.rendering import sheets
+from graspd.worker.rendering.cameras import intrinsics
+from graspd.worker.rendering.hands import drawn_bodies, hand_looks, hand_solids, without_visuals
+from graspd.worker.rendering.pictures import (
+    FIELD_OF_VIEW,
+    FLOOR,
+    FLOOR_SIZE,
+    OBJECT_LOOK,
+    STUDIO,
+    TOWARD_LAMP,
+    fit_camera,
+)
+from graspd.worker.rendering.scenery import Box, Look, Shot, Solid
+from graspd.worker.rendering.tracer import Tracer
 
 #: Size of one picture of a portrait [px].
 SIZE: Final = (340, 360)

@@ -13,15 +13,22 @@ from typing import Final
 import numpy as np
 from cachetools import LRUCache
 
-from service.model.colours import Colour, hexadecimal, linear
-from service.model.scene_spec import Box as BoxSupport
-from service.model.scene_spec import HalfSpace
-from service.model.transforms import Floats, apply
-from worker.objects.model import ObjectModel
-from worker.rendering.cameras import SAMPLED, GivenCameras, intrinsics, narrow_field, sample_hemisphere, stereo_pair
-from worker.rendering.hands import DrawnHand
-from worker.rendering.kernels.shading import GRAIN, PLAIN, SPECKLE, TILES
-from worker.rendering.scenery import (
+from graspd.service.model.colours import Colour, hexadecimal, linear
+from graspd.service.model.scene_spec import Box as BoxSupport
+from graspd.service.model.scene_spec import HalfSpace
+from graspd.service.model.transforms import Floats, apply
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.rendering.cameras import (
+    SAMPLED,
+    GivenCameras,
+    intrinsics,
+    narrow_field,
+    sample_hemisphere,
+    stereo_pair,
+)
+from graspd.worker.rendering.hands import DrawnHand
+from graspd.worker.rendering.kernels.shading import GRAIN, PLAIN, SPECKLE, TILES
+from graspd.worker.rendering.scenery import (
     TABLE,
     Box,
     Lamp,
@@ -34,8 +41,8 @@ from worker.rendering.scenery import (
     slab_poses,
     slabs,
 )
-from worker.rendering.tracer import Tracer
-from worker.run import Run
+from graspd.worker.rendering.tracer import Tracer
+from graspd.worker.run import Run
 
 #: Draws of cameras, of which the first is taken that sees this share of the object past the supports; else the best.
 _DRAWS: Final = 32

@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.scene_spec import Box as BoxSupport
-from service.model.scene_spec import HalfSpace
-from service.model.transforms import Floats, compose, invert, quat_from_axis_angle, quat_rotate
-from worker.rendering.kernels.shading import PLAIN
+from graspd.service.model.scene_spec import Box as BoxSupport
+from graspd.service.model.scene_spec import HalfSpace
+from graspd.service.model.transforms import Floats, compose, invert, quat_from_axis_angle, quat_rotate
+from graspd.worker.rendering.kernels.shading import PLAIN
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from service.model.transforms import Floats
-from worker.rendering.annotate import OBJECT, TABLE
+from graspd.service.model.transforms import Floats
+from graspd.worker.rendering.annotate import OBJECT, TABLE
 
 MARGIN: Final = 40
 GAP: Final = 18

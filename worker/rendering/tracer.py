@@ -16,13 +16,20 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats, apply, pose_from_matrix, quat_from_axis_angle, quat_rotate, quat_to_matrix
-from worker.engines import backend
-from worker.rendering.annotate import box_corners
-from worker.rendering.kernels import exposure, rays
-from worker.rendering.kernels.shading import Light, Material
-from worker.rendering.scenery import Box, Look, Pictures, Shot, Solid
-from worker.run import ALONE, Run
+from graspd.service.model.transforms import (
+    Floats,
+    apply,
+    pose_from_matrix,
+    quat_from_axis_angle,
+    quat_rotate,
+    quat_to_matrix,
+)
+from graspd.worker.engines import backend
+from graspd.worker.rendering.annotate import box_corners
+from graspd.worker.rendering.kernels import exposure, rays
+from graspd.worker.rendering.kernels.shading import Light, Material
+from graspd.worker.rendering.scenery import Box, Look, Pictures, Shot, Solid
+from graspd.worker.run import ALONE, Run
 
 #: Pixels between two looks at whether to stop: what a core traces in a fifth of a second, and what a GPU holds at once.
 PIXELS_OF_A_CORE: Final = 100_000

@@ -9,17 +9,24 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError
-from service.model.transforms import Floats, apply
-from worker.objects.mesh_geometry import to_centre
-from worker.objects.model import ObjectModel
-from worker.rendering.annotate import box_corners, in_camera, loose_boxes, occlusion_ratio, ray_distance, tight_boxes
-from worker.rendering.cameras import BASELINE_M, SAMPLED, Cameras, GivenCameras
-from worker.rendering.hands import DrawnHand
-from worker.rendering.scene_setup import CameraPlan, Setting
-from worker.rendering.scenery import TABLE, TABLE_SIZE, Pictures, Supports
-from worker.run import ALONE, Run
-from worker.scenes.neighbours import Neighbours
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import Floats, apply
+from graspd.worker.objects.mesh_geometry import to_centre
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.rendering.annotate import (
+    box_corners,
+    in_camera,
+    loose_boxes,
+    occlusion_ratio,
+    ray_distance,
+    tight_boxes,
+)
+from graspd.worker.rendering.cameras import BASELINE_M, SAMPLED, Cameras, GivenCameras
+from graspd.worker.rendering.hands import DrawnHand
+from graspd.worker.rendering.scene_setup import CameraPlan, Setting
+from graspd.worker.rendering.scenery import TABLE, TABLE_SIZE, Pictures, Supports
+from graspd.worker.run import ALONE, Run
+from graspd.worker.scenes.neighbours import Neighbours
 
 __all__ = ["SAMPLES", "TABLE_SIZE", "Extras", "render"]
 

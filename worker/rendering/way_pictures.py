@@ -11,19 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from service.model.colours import hexadecimal
-from service.model.errors import InputError
-from service.model.scene_spec import HalfSpace
-from service.model.transforms import IDENTITY_POSE, Floats, apply, compose
-from service.readers.ways import Waypoint
-from worker.grasps import moved
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
-from worker.objects.mesh_geometry import to_centre
-from worker.objects.model import ObjectModel
-from worker.rendering.cameras import intrinsics, look_at
-from worker.rendering.hands import drawn_bodies, drawn_parts, drawn_poses
-from worker.rendering.pictures import (
+from graspd.service.model.colours import hexadecimal
+from graspd.service.model.errors import InputError
+from graspd.service.model.scene_spec import HalfSpace
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, compose
+from graspd.service.readers.ways import Waypoint
+from graspd.worker.grasps import moved
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.mesh_geometry import to_centre
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.rendering.cameras import intrinsics, look_at
+from graspd.worker.rendering.hands import drawn_bodies, drawn_parts, drawn_poses
+from graspd.worker.rendering.pictures import (
     FIELD_OF_VIEW,
     FLOOR,
     FLOOR_SIZE,
@@ -35,10 +35,10 @@ from worker.rendering.pictures import (
     hand_points,
     side_of,
 )
-from worker.rendering.scenery import Box, Look, Shot, Solid, Supports, seen_share, slab_poses, slabs
-from worker.rendering.tracer import Tracer
-from worker.run import ALONE, Run
-from worker.scenes.neighbours import Neighbours
+from graspd.worker.rendering.scenery import Box, Look, Shot, Solid, Supports, seen_share, slab_poses, slabs
+from graspd.worker.rendering.tracer import Tracer
+from graspd.worker.run import ALONE, Run
+from graspd.worker.scenes.neighbours import Neighbours
 
 #: Postures that a strip shows; those that a grasp has.
 STRIP: Final = ("standoff", "pregrasp", "grasp", "lift")

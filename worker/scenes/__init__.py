@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from worker.scenes.clearance import transfer
-from worker.scenes.neighbours import Neighbours, drop_together
-from worker.scenes.simulate import drop
+from graspd.worker.scenes.clearance import transfer
+from graspd.worker.scenes.neighbours import Neighbours, drop_together
+from graspd.worker.scenes.simulate import drop
 
 __all__ = ["Neighbours", "drop", "drop_together", "transfer"]

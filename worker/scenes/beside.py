@@ -12,17 +12,17 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.errors import MeshError, SceneError
-from service.model.scene_spec import SceneSpec
-from service.model.transforms import Floats
-from worker.hands.primitives import convex_edges
-from worker.objects.convex import union_volume
-from worker.objects.mesh_geometry import to_centre, to_file
-from worker.objects.model import ObjectModel
-from worker.quality.referee.decomposition import decompose
-from worker.scenes.kinds import SUNK, check_free, inside, rest_poses, room_in, supports_of
-from worker.scenes.neighbours import drop_together, lay_beside
-from worker.simulation.surroundings import Neighbour, Obstacle, Scenes
+from graspd.service.model.errors import MeshError, SceneError
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.transforms import Floats
+from graspd.worker.hands.primitives import convex_edges
+from graspd.worker.objects.convex import union_volume
+from graspd.worker.objects.mesh_geometry import to_centre, to_file
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.scenes.kinds import SUNK, check_free, inside, rest_poses, room_in, supports_of
+from graspd.worker.scenes.neighbours import drop_together, lay_beside
+from graspd.worker.simulation.surroundings import Neighbour, Obstacle, Scenes
+from graspd.worker.validation.decomposition import decompose
 
 #: Convex pieces of a neighbour at most: no hand is put into a neighbour's hollow, so hollows may be filled.
 MOST_PIECES: Final = 8

@@ -9,14 +9,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError
-from service.model.transforms import Floats, compose
-from worker.grasps import Posture
-from worker.hands.model import HandModel
-from worker.scenes.neighbours import Neighbours, neighbour_clearance
-from worker.simulation.mounting import mounting_room, wrist_room
-from worker.simulation.obstacles import PosedFeatures
-from worker.simulation.surroundings import CLEAR_M, UP, Obstacle, Surroundings
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import Floats, compose
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.model import HandModel
+from graspd.worker.scenes.neighbours import Neighbours, neighbour_clearance
+from graspd.worker.simulation.mounting import mounting_room, wrist_room
+from graspd.worker.simulation.obstacles import PosedFeatures
+from graspd.worker.simulation.surroundings import CLEAR_M, UP, Obstacle, Surroundings
 
 #: A grasp is kept if the hand stays at least this far above the table [m].
 MARGIN_M: Final = CLEAR_M

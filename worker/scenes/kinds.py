@@ -7,14 +7,14 @@ from typing import Final
 
 import numpy as np
 
-from service.model.errors import SceneError
-from service.model.scene_spec import BIN_SIZE, MOST_TOUCH, SHELF_SIZE, Box, SceneSpec, supports_in
-from service.model.transforms import Floats, compose, quat_from_axis_angle, quat_rotate
-from worker.grasps import moved
-from worker.objects.model import ObjectModel
-from worker.scenes.rest import lay_flat, resting_faces
-from worker.scenes.simulate import drop, reference_share, rest_probability
-from worker.simulation.surroundings import Obstacle
+from graspd.service.model.errors import SceneError
+from graspd.service.model.scene_spec import BIN_SIZE, MOST_TOUCH, SHELF_SIZE, Box, SceneSpec, supports_in
+from graspd.service.model.transforms import Floats, compose, quat_from_axis_angle, quat_rotate
+from graspd.worker.grasps import moved
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.scenes.rest import lay_flat, resting_faces
+from graspd.worker.scenes.simulate import drop, reference_share, rest_probability
+from graspd.worker.simulation.surroundings import Obstacle
 
 #: Least gap between an object and a wall [m].
 GAP: Final = 0.01

@@ -16,17 +16,17 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
-from service.model.errors import InputError, MeshError, SceneError
-from service.model.transforms import Floats, compose, quat_from_axis_angle, quat_rotate
-from worker.engines.mujoco_warnings import void
-from worker.grasps import Posture, moved
-from worker.hands.kinematics import body_poses
-from worker.hands.model import ConvexPiece, HandModel
-from worker.objects.mesh_geometry import to_centre, to_file
-from worker.objects.model import ObjectModel
-from worker.scenes.kinds import GAP, SUNK
-from worker.scenes.rest import RestingFaces, lay_flat, resting_faces, settle
-from worker.scenes.simulate import (
+from graspd.service.model.errors import InputError, MeshError, SceneError
+from graspd.service.model.transforms import Floats, compose, quat_from_axis_angle, quat_rotate
+from graspd.worker.engines.mujoco_warnings import void
+from graspd.worker.grasps import Posture, moved
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import ConvexPiece, HandModel
+from graspd.worker.objects.mesh_geometry import to_centre, to_file
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.scenes.kinds import GAP, SUNK
+from graspd.worker.scenes.rest import RestingFaces, lay_flat, resting_faces, settle
+from graspd.worker.scenes.simulate import (
     DENSITY,
     DROP_HEIGHT,
     MAX_ATTEMPTS,
@@ -39,7 +39,7 @@ from worker.scenes.simulate import (
     rest_probability,
     steadied,
 )
-from worker.simulation.surroundings import Obstacle
+from graspd.worker.simulation.surroundings import Obstacle
 
 TIMEOUT_S: Final = 6.0
 #: Neighbours fall at this distance from the object, as a multiple of the sum of both bounding radii.

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from service.model.errors import MeshError
-from service.model.transforms import Floats, quat_from_axis_angle, quat_multiply, quat_rotate
-from worker.objects.model import Ints, ObjectModel
+from graspd.service.model.errors import MeshError
+from graspd.service.model.transforms import Floats, quat_from_axis_angle, quat_multiply, quat_rotate
+from graspd.worker.objects.model import Ints, ObjectModel
 
 if TYPE_CHECKING:
     import trimesh

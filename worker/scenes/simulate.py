@@ -15,16 +15,16 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError, MeshError
-from service.model.libraries import version_of
-from service.model.transforms import Floats, quat_rotate
-from worker.engines.mujoco_warnings import void
-from worker.grasps import moved
-from worker.objects.disk_cache import arrays_kept_or_made
-from worker.objects.mesh_geometry import to_file
-from worker.objects.model import ObjectModel
-from worker.scenes import rest as resting
-from worker.scenes.rest import RestingFaces, lay_flat, resting_faces, same_face, settle
+from graspd.service.model.errors import InputError, MeshError
+from graspd.service.model.libraries import version_of
+from graspd.service.model.transforms import Floats, quat_rotate
+from graspd.worker.engines.mujoco_warnings import void
+from graspd.worker.grasps import moved
+from graspd.worker.objects.disk_cache import arrays_kept_or_made
+from graspd.worker.objects.mesh_geometry import to_file
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.scenes import rest as resting
+from graspd.worker.scenes.rest import RestingFaces, lay_flat, resting_faces, same_face, settle
 
 #: Any density will do: the motion of a free body on a plane does not depend on it [kg/m^3].
 DENSITY: Final = 500.0

@@ -1,5 +1,5 @@
 """Pre-screening of candidates: in a scene clearance and a short lift, around a free object short pushes
-(`worker.quality.referee.short`). What passes goes through the validator's own test."""
+(`worker.validation.prescreening`). What passes goes through the validator's own test."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats
-from worker.grasps import GraspSet
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.quality.referee.decomposition import ConvexPieces
-from worker.quality.referee.judge import KnownTrials, judge
-from worker.quality.referee.key import Level
-from worker.quality.referee.lift import LiftOutcome
-from worker.quality.referee.lifting import KnownLifts, LiftLevel, judge_lifts
-from worker.quality.referee.short import SLIPS, ShortLifts, push_trial
-from worker.run import Run
-from worker.scenes.way import plan_way
-from worker.simulation.surroundings import Placed, Scenes
+from graspd.service.model.transforms import Floats
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.run import Run
+from graspd.worker.scenes.way import plan_way
+from graspd.worker.simulation.surroundings import Placed, Scenes
+from graspd.worker.validation.decomposition import ConvexPieces
+from graspd.worker.validation.key import Level
+from graspd.worker.validation.lift import LiftOutcome
+from graspd.worker.validation.lifting import KnownLifts, LiftLevel, judge_lifts
+from graspd.worker.validation.prescreening import SLIPS, ShortLifts, push_trial
+from graspd.worker.validation.validator import KnownTrials, judge
 
 #: Added to the score of a hand that would lift but cannot come: worse than any that can and lets the object fall, since
 #: most of these come freely, better than what is lost.

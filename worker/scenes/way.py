@@ -19,17 +19,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, Floats, quat_from_axis_angle, quat_rotate
-from worker.grasps import GraspSet, Posture, moved
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.quality.contact import finger_of_body
-from worker.quality.postures import wide_open
-from worker.quality.probe import Probe, probe_of
-from worker.scenes.clearance import MARGIN_M, PATH_POSTURES, approach
-from worker.simulation.mounting import mounting_room, wrist_room
-from worker.simulation.obstacles import obstacle_room
-from worker.simulation.surroundings import RISE_M, STANDOFF_M, Placed, Surroundings
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_from_axis_angle, quat_rotate
+from graspd.worker.control.postures import wide_open
+from graspd.worker.grasps import GraspSet, Posture, moved
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.quality.contact import finger_of_body
+from graspd.worker.quality.probe import Probe, probe_of
+from graspd.worker.scenes.clearance import MARGIN_M, PATH_POSTURES, approach
+from graspd.worker.simulation.mounting import mounting_room, wrist_room
+from graspd.worker.simulation.obstacles import obstacle_room
+from graspd.worker.simulation.surroundings import RISE_M, STANDOFF_M, Placed, Surroundings
 
 _POINTS: Final = 600
 #: Around a free object: tilts of the retreat from the palm's own direction [rad], each to so many sides.

@@ -13,10 +13,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats
-from worker.simulation.device import joint_units, to_wxyz, to_xyzw
-from worker.simulation.kernels import contact, packing, penalties
-from worker.simulation.model import MAX_DILATION, REFERENCE_POINTS, Model
+from graspd.service.model.transforms import Floats
+from graspd.worker.simulation.device import joint_units, to_wxyz, to_xyzw
+from graspd.worker.simulation.kernels import contact, packing, penalties
+from graspd.worker.simulation.model import MAX_DILATION, REFERENCE_POINTS, Model
 
 
 class Tables:

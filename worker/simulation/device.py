@@ -12,13 +12,13 @@ import warp as wp
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats
-from worker.hands.jaws import slides
-from worker.hands.model import ConvexPiece, HandModel, JointType
-from worker.objects.model import ObjectModel
-from worker.simulation.grids import add_grid, faces_of
-from worker.simulation.kernels import chain as kernels
-from worker.simulation.kernels import kinematics, nearest, pieces, surface
+from graspd.service.model.transforms import Floats
+from graspd.worker.hands.jaws import slides
+from graspd.worker.hands.model import ConvexPiece, HandModel, JointType
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.simulation.grids import add_grid, faces_of
+from graspd.worker.simulation.kernels import chain as kernels
+from graspd.worker.simulation.kernels import kinematics, nearest, pieces, surface
 
 #: Kernels' numbers for `ConvexPiece.kind`.
 _KINDS: Final = {"box": 0, "sphere": 1, "cylinder": 2, "capsule": 3, "hull": 4}

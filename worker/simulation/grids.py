@@ -14,11 +14,11 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats
-from worker.engines.backend import binary_name
-from worker.objects.disk_cache import arrays_kept_or_made
-from worker.objects.model import ObjectModel
-from worker.simulation.kernels import nearest, surface
+from graspd.service.model.transforms import Floats
+from graspd.worker.engines.backend import binary_name
+from graspd.worker.objects.disk_cache import arrays_kept_or_made
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.simulation.kernels import nearest, surface
 
 Arrays = Mapping[str, NDArray[Any]]
 

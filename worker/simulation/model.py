@@ -8,12 +8,12 @@ from typing import Any, Final
 import numpy as np
 import warp as wp
 
-from service.model.errors import InputError
-from service.model.transforms import Floats
-from worker.hands.model import SurfacePoints
-from worker.simulation.device import DeviceHand, DeviceObject
-from worker.simulation.kernels import contact, pieces
-from worker.simulation.obstacles import DeviceObstacles
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import Floats
+from graspd.worker.hands.model import SurfacePoints
+from graspd.worker.simulation.device import DeviceHand, DeviceObject
+from graspd.worker.simulation.kernels import contact, pieces
+from graspd.worker.simulation.obstacles import DeviceObstacles
 
 #: Weights of points are areas in units of 1/800 of the hand's surface: the loss does not depend on how many points.
 REFERENCE_POINTS: Final = 800

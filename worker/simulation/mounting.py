@@ -11,14 +11,14 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, Floats, apply, quat_conjugate, quat_rotate, spread_directions
-from worker.grasps import Posture
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
-from worker.hands.mounting import wrist_positions
-from worker.hands.surface import farthest_points
-from worker.simulation.obstacles import MARGIN_M, obstacle_room
-from worker.simulation.surroundings import CLEAR_M, Surroundings
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_conjugate, quat_rotate, spread_directions
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.mounting import wrist_positions
+from graspd.worker.hands.surface import farthest_points
+from graspd.worker.simulation.obstacles import MARGIN_M, obstacle_room
+from graspd.worker.simulation.surroundings import CLEAR_M, Surroundings
 
 #: Points of a mounting: the outermost in so many directions, then so many corners spread over it.
 OUTERMOST: Final = 20

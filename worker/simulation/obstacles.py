@@ -12,17 +12,17 @@ import warp as wp
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats, quat_rotate
-from worker.grasps import Posture
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
-from worker.hands.primitives import HandFeatures
-from worker.simulation.device import DeviceHand, PosedBodies, to_xyzw
-from worker.simulation.kernels import chain as chain_kernels
-from worker.simulation.kernels import obstacles as kernels
-from worker.simulation.kernels import solids as solid_kernels
-from worker.simulation.launches import launch
-from worker.simulation.surroundings import CLEAR_M, Obstacle, Surroundings
+from graspd.service.model.transforms import Floats, quat_rotate
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.primitives import HandFeatures
+from graspd.worker.simulation.device import DeviceHand, PosedBodies, to_xyzw
+from graspd.worker.simulation.kernels import chain as chain_kernels
+from graspd.worker.simulation.kernels import obstacles as kernels
+from graspd.worker.simulation.kernels import solids as solid_kernels
+from graspd.worker.simulation.launches import launch
+from graspd.worker.simulation.surroundings import CLEAR_M, Obstacle, Surroundings
 
 #: Distance that a hand keeps from obstacles [m]: twice what a scene's certificate asks, for the way is swept in steps.
 MARGIN_M: Final = 0.004

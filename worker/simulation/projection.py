@@ -8,14 +8,14 @@ from typing import Any, Final
 import numpy as np
 import warp as wp
 
-from service.model.transforms import Floats
-from worker.simulation.data import Data, HandState, still_schedule
-from worker.simulation.device import to_wxyz, to_xyzw
-from worker.simulation.kernels import obstacles, solids
-from worker.simulation.kernels import projection as kernels
-from worker.simulation.launches import Launches
-from worker.simulation.model import Model
-from worker.simulation.record import record_placement
+from graspd.service.model.transforms import Floats
+from graspd.worker.simulation.data import Data, HandState, still_schedule
+from graspd.worker.simulation.device import to_wxyz, to_xyzw
+from graspd.worker.simulation.kernels import obstacles, solids
+from graspd.worker.simulation.kernels import projection as kernels
+from graspd.worker.simulation.launches import Launches
+from graspd.worker.simulation.model import Model
+from graspd.worker.simulation.record import record_placement
 
 #: Residuals kept per grasp and iteration.
 CAPACITY: Final = 1024

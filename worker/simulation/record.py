@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Final
 
-from service.model.errors import InputError
-from worker.simulation.data import Data, Marked
-from worker.simulation.kernels import (
+from graspd.service.model.errors import InputError
+from graspd.worker.simulation.data import Data, Marked
+from graspd.worker.simulation.kernels import (
     contact,
     kinematics,
     obstacles,
@@ -21,8 +21,8 @@ from worker.simulation.kernels import (
     solids,
     surface,
 )
-from worker.simulation.launches import Launches
-from worker.simulation.model import NEAR_GAP, REFERENCE_SAMPLES, SOLVERS, Model
+from graspd.worker.simulation.launches import Launches
+from graspd.worker.simulation.model import NEAR_GAP, REFERENCE_SAMPLES, SOLVERS, Model
 
 #: Names that `record_iteration` knows.
 OPTIMIZERS: Final = ("adam", "gd")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.model.transforms import Floats
+from graspd.service.model.transforms import Floats
 
 SMOOTH = 1e-5
 

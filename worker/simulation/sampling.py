@@ -6,11 +6,11 @@ import sys
 
 import numpy as np
 
-from service.model.transforms import Floats
-from worker.hands import surface
-from worker.hands.surface import farthest_points
-from worker.objects.disk_cache import arrays_kept_or_made
-from worker.objects.model import ObjectModel
+from graspd.service.model.transforms import Floats
+from graspd.worker.hands import surface
+from graspd.worker.hands.surface import farthest_points
+from graspd.worker.objects.disk_cache import arrays_kept_or_made
+from graspd.worker.objects.model import ObjectModel
 
 #: Edges between faces that turn by more than this carry samples of their own: they enter links between surface samples.
 SHARP_EDGE_COS = np.cos(np.radians(35.0))

@@ -15,10 +15,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError
-from service.model.transforms import Floats, compose, invert, quat_conjugate, quat_rotate, quat_to_matrix
-from worker.objects.mesh_geometry import to_centre
-from worker.objects.model import ObjectModel
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import Floats, compose, invert, quat_conjugate, quat_rotate, quat_to_matrix
+from graspd.worker.objects.mesh_geometry import to_centre
+from graspd.worker.objects.model import ObjectModel
 
 #: Direction against gravity in the scene frame.
 UP: Final = np.array([0.0, 0.0, 1.0])

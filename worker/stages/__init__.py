@@ -6,16 +6,16 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
-from service.model.states import Stage
+from graspd.service.model.states import Stage
 
 if TYPE_CHECKING:
-    from worker.stages.context import Output, StageFunction, TaskContext
+    from graspd.worker.stages.context import Output, StageFunction, TaskContext
 
 _MODULES: Final = {
-    Stage.INGEST: "worker.stages.ingest",
-    Stage.SYNTHESIZE: "worker.stages.synthesize",
-    Stage.SCENE: "worker.stages.scene",
-    Stage.RENDER: "worker.stages.render",
+    Stage.INGEST: "graspd.worker.stages.ingest",
+    Stage.SYNTHESIZE: "graspd.worker.stages.synthesize",
+    Stage.SCENE: "graspd.worker.stages.scene",
+    Stage.RENDER: "graspd.worker.stages.render",
 }
 
 

@@ -13,34 +13,34 @@ from typing import TypeVar, cast
 
 from cachetools import LRUCache
 
-from service.model import names
-from service.model.digests import digest_json
-from service.model.errors import DamagedError, MeshError, NotFoundError
-from service.model.messages import TaskMessage
-from service.model.states import AssetKind, Stage
-from service.model.version import STAGE_REVISIONS
-from service.store.columns import Attribute
-from service.store.hand_files import format_of
-from service.store.integrity import get_document, get_sealed, put_document, put_sealed
-from service.store.library import load_asset_files
-from service.store.manifests import load_shard
-from service.store.network_file import ProposalNetwork, from_bytes, network_bytes
-from service.store.shards import Shard
-from service.store.store import Store
-from service.user_cache import write_whole
-from worker.files.provenance import NEIGHBOUR_FACE_ERROR_M
-from worker.hands.load import load_hand, main_file
-from worker.hands.model import HandModel
-from worker.hands.options import parse_options
-from worker.hands.xacro import expand
-from worker.objects import prepare
-from worker.objects.model import ObjectModel
-from worker.objects.options import as_asked
-from worker.objects.prepare import load_object
-from worker.planners.learned.known import keep
-from worker.quality.referee.decomposition import ConvexPieces, decompose, piece_file
-from worker.stages.context import TaskContext
-from worker.stages.models import SHOWN_ERROR_M, publish_model
+from graspd.service.model import names
+from graspd.service.model.digests import digest_json
+from graspd.service.model.errors import DamagedError, MeshError, NotFoundError
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.states import AssetKind, Stage
+from graspd.service.model.version import STAGE_REVISIONS
+from graspd.service.store.columns import Attribute
+from graspd.service.store.hand_files import format_of
+from graspd.service.store.integrity import get_document, get_sealed, put_document, put_sealed
+from graspd.service.store.library import load_asset_files
+from graspd.service.store.manifests import load_shard
+from graspd.service.store.network_file import ProposalNetwork, from_bytes, network_bytes
+from graspd.service.store.shards import Shard
+from graspd.service.store.store import Store
+from graspd.service.user_cache import write_whole
+from graspd.worker.files.provenance import NEIGHBOUR_FACE_ERROR_M
+from graspd.worker.hands.load import load_hand, main_file
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.options import parse_options
+from graspd.worker.hands.xacro import expand
+from graspd.worker.objects import prepare
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.options import as_asked
+from graspd.worker.objects.prepare import load_object
+from graspd.worker.planners.known_networks import keep
+from graspd.worker.stages.context import TaskContext
+from graspd.worker.stages.models import SHOWN_ERROR_M, publish_model
+from graspd.worker.validation.decomposition import ConvexPieces, decompose, piece_file
 
 T = TypeVar("T")
 #: Loaded assets kept: a worker in a hands x objects dataset alternates between a few.

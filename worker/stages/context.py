@@ -12,19 +12,19 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.clock import timestamp
-from service.model.digests import digest_json
-from service.model.errors import TaskCancelled
-from service.model.messages import TaskMessage
-from service.model.names import SHARD_KINDS
-from service.model.version import PACKAGE_VERSION
-from service.store.columns import Attribute
-from service.store.manifests import ShardManifest, manifest_of
-from service.store.shards import check_columns, json_attribute, write_shard
-from worker.run import ALONE, Run
+from graspd.service.model.clock import timestamp
+from graspd.service.model.digests import digest_json
+from graspd.service.model.errors import TaskCancelled
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.names import SHARD_KINDS
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.service.store.columns import Attribute
+from graspd.service.store.manifests import ShardManifest, manifest_of
+from graspd.service.store.shards import check_columns, json_attribute, write_shard
+from graspd.worker.run import ALONE, Run
 
 if TYPE_CHECKING:
-    from service.store.store import Store
+    from graspd.service.store.store import Store
 
 #: Least time between two reports [s]: enough for a bar that moves.
 REPORT_EVERY_S: Final = 1.0

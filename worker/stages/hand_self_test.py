@@ -13,24 +13,24 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from service.model.domain import BATCH_SIZE, JobOptions
-from service.model.errors import InputError
-from service.model.scene_spec import SceneSpec
-from service.model.transforms import Floats, apply
-from worker.certified import Certified, certified_grasps
-from worker.grasps import Posture, joined
-from worker.hands.jaws import fingertip_pad, jaws_of
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
-from worker.hands.oppositions import oppositions_of
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import load_object
-from worker.quality.postures import squeeze
-from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.payload import Limit, limit_of
-from worker.quality.referee.protocol import Outcome
-from worker.run import ALONE, Run
-from worker.scenes.beside import scenes_of
+from graspd.service.model.domain import BATCH_SIZE, JobOptions
+from graspd.service.model.errors import InputError
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.transforms import Floats, apply
+from graspd.worker.certified import Certified, certified_grasps
+from graspd.worker.control.postures import squeeze
+from graspd.worker.grasps import Posture, joined
+from graspd.worker.hands.jaws import fingertip_pad, jaws_of
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.oppositions import oppositions_of
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import load_object
+from graspd.worker.run import ALONE, Run
+from graspd.worker.scenes.beside import scenes_of
+from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.payload import Limit, limit_of
+from graspd.worker.validation.protocol import Outcome
 
 #: Free grasps in all, and the share that must hold of a hand that is ready.
 GRASPS: Final = 64

@@ -15,15 +15,15 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
-from service.model import names
-from service.model.errors import HandError
-from service.model.messages import IngestMessage
-from service.model.states import AssetKind
-from service.store.assets import pack, unpack
-from service.store.integrity import put_document, put_sealed
-from service.store.library import UNPACKED_LIMIT_BYTES, load_asset, load_asset_files
-from service.store.network_file import check_network
-from worker.stages.context import TaskContext
+from graspd.service.model import names
+from graspd.service.model.errors import HandError
+from graspd.service.model.messages import IngestMessage
+from graspd.service.model.states import AssetKind
+from graspd.service.store.assets import pack, unpack
+from graspd.service.store.integrity import put_document, put_sealed
+from graspd.service.store.library import UNPACKED_LIMIT_BYTES, load_asset, load_asset_files
+from graspd.service.store.network_file import check_network
+from graspd.worker.stages.context import TaskContext
 
 #: Address space of the child [bytes]: the largest meshes that are taken need about a tenth of it.
 MEMORY_LIMIT_BYTES: Final = 4 * 2**30
@@ -52,7 +52,7 @@ def run(message: IngestMessage, context: TaskContext) -> None:
 
 def _files(message: IngestMessage, context: TaskContext) -> dict[str, bytes]:
     if message.kind is AssetKind.HAND:
-        from worker.stages.assets import load_hand_files
+        from graspd.worker.stages.assets import load_hand_files
 
         # What cannot be expanded is refused by the check, which says why.
         with contextlib.suppress(HandError):
@@ -62,8 +62,8 @@ def _files(message: IngestMessage, context: TaskContext) -> dict[str, bytes]:
 
 def _self_test(message: IngestMessage, files: dict[str, bytes], context: TaskContext) -> dict[str, Any]:
     """How many grasps of plain objects hold. A hand that finds none is no error: that is what it tells."""
-    from worker.hands.load import load_hand
-    from worker.stages.hand_self_test import tried_softly
+    from graspd.worker.hands.load import load_hand
+    from graspd.worker.stages.hand_self_test import tried_softly
 
     return tried_softly(lambda: load_hand(files, name=message.name, digest=message.digest), context.run)
 
@@ -90,7 +90,16 @@ def check_in_child(
         source, target, errors = (Path(folder) / file for file in ("files.zip", "check.json", "errors.txt"))
         source.write_bytes(pack(files))
         limits = [str(memory_bytes), str(cpu_s)]
-        command = [sys.executable, "-m", "worker.stages.ingest", kind.value, name, str(source), str(target), *limits]
+        command = [
+            sys.executable,
+            "-m",
+            "graspd.worker.stages.ingest",
+            kind.value,
+            name,
+            str(source),
+            str(target),
+            *limits,
+        ]
         # A file, whose size is limited: a pipe that nobody empties would stop the child, one that is read has no end.
         with (
             errors.open("wb") as stderr,
@@ -168,19 +177,19 @@ def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cp
         resource.setrlimit(limit, (value, value))
     files = unpack(Path(source).read_bytes(), limit_bytes=UNPACKED_LIMIT_BYTES)
     if AssetKind(kind) is AssetKind.HAND:
-        from worker.hands.check import check_hand
+        from graspd.worker.hands.check import check_hand
 
         found = check_hand(files, name)
     elif AssetKind(kind) is AssetKind.NETWORK:
         # The API checks networks; this one's finding was lost or damaged.
         found = check_network(files, name)
     else:
-        from worker.objects.check import check_object
+        from graspd.worker.objects.check import check_object
 
         found = check_object(files, name)
     Path(target).write_text(json.dumps(found))
     if found["verdict"] != "refuse" and kind != AssetKind.NETWORK and time.process_time() < _MODEL_CPU_S:
-        from worker.stages.models import model_of
+        from graspd.worker.stages.models import model_of
 
         # The finding stands whatever becomes of its picture.
         with contextlib.suppress(Exception):

@@ -1,6 +1,6 @@
 """Models for viewers: hands and objects as binary glTF, made beside the check of an upload or at first use.
 
-``python -m worker.stages.models`` writes those of the built-in hands and objects into `service/builtin/models/`.
+``python -m graspd.worker.stages.models`` writes those of the built-in hands and objects into `service/builtin/models/`.
 
 The joint tree stands in the `extras` of the nodes, so a viewer poses the hand from the joint positions of a shard:
 a node's pose is parent * rest pose * motion about `axis`. Points of the hand's surface come as POINTS primitives.
@@ -15,25 +15,25 @@ from typing import Any, Final
 
 import numpy as np
 
-from service.model import names
-from service.model.colours import Colour, linear
-from service.model.fidelity import Fidelity
-from service.model.states import AssetKind
-from service.model.transforms import Floats
-from service.store.assets import builtin_files, builtin_names
-from service.store.integrity import put_sealed
-from service.store.store import Store
-from worker.hands.check import model_facts
-from worker.hands.jaws import pads_of
-from worker.hands.load import load_hand
-from worker.hands.model import HandModel, JointType
-from worker.hands.robot import Ints
-from worker.hands.surface import sample_surface
-from worker.hands.visuals import VisualMesh, lighter
-from worker.objects.glb_document import Document, plain
-from worker.objects.mesh_geometry import corner_normals
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import load_object
+from graspd.service.model import names
+from graspd.service.model.colours import Colour, linear
+from graspd.service.model.fidelity import Fidelity
+from graspd.service.model.states import AssetKind
+from graspd.service.model.transforms import Floats
+from graspd.service.store.assets import builtin_files, builtin_names
+from graspd.service.store.integrity import put_sealed
+from graspd.service.store.store import Store
+from graspd.worker.hands.check import model_facts
+from graspd.worker.hands.jaws import pads_of
+from graspd.worker.hands.load import load_hand
+from graspd.worker.hands.model import HandModel, JointType
+from graspd.worker.hands.robot import Ints
+from graspd.worker.hands.surface import sample_surface
+from graspd.worker.hands.visuals import VisualMesh, lighter
+from graspd.worker.objects.glb_document import Document, plain
+from graspd.worker.objects.mesh_geometry import corner_normals
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import load_object
 
 #: Simplification of a shown object [m]: that of the standard fidelity, so that people see what is grasped.
 SHOWN_ERROR_M: Final = Fidelity().face_error_m

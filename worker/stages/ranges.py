@@ -10,13 +10,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.domain import BATCH_SIZE
-from service.model.errors import DamagedShard
-from service.model.messages import TaskMessage
-from service.model.names import SHARD_KINDS
-from service.store.columns import SCHEMAS
-from service.store.shards import Shard, json_attribute
-from worker.stages.context import Output
+from graspd.service.model.domain import BATCH_SIZE
+from graspd.service.model.errors import DamagedShard
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.names import SHARD_KINDS
+from graspd.service.store.columns import SCHEMAS
+from graspd.service.store.shards import Shard, json_attribute
+from graspd.worker.stages.context import Output
 
 #: Axes whose rows are those of one batch after the other; what has another axis is common to all.
 _ROWS: Final = ("N", "S", "K")

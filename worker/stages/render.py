@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.model.messages import TaskMessage
-from service.model.scene_spec import supports_in
-from service.model.states import Stage
-from service.model.transforms import compose
-from service.readers.ways import wrists_of
-from service.store import validity
-from service.store.columns import Attribute
-from service.store.shards import Shard, json_attribute
-from worker.rendering import Extras, render
-from worker.rendering.hands import DrawnHand
-from worker.rendering.sheets import best_in_scenes
-from worker.scenes.neighbours import Neighbours
-from worker.stages.assets import beside_attributes, hand_of, input_of, neighbours_of, object_of
-from worker.stages.context import Output, TaskContext, batch_seed
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.scene_spec import supports_in
+from graspd.service.model.states import Stage
+from graspd.service.model.transforms import compose
+from graspd.service.readers.ways import wrists_of
+from graspd.service.store import validity
+from graspd.service.store.columns import Attribute
+from graspd.service.store.shards import Shard, json_attribute
+from graspd.worker.rendering import Extras, render
+from graspd.worker.rendering.hands import DrawnHand
+from graspd.worker.rendering.sheets import best_in_scenes
+from graspd.worker.scenes.neighbours import Neighbours
+from graspd.worker.stages.assets import beside_attributes, hand_of, input_of, neighbours_of, object_of
+from graspd.worker.stages.context import Output, TaskContext, batch_seed
 
 
 def run(message: TaskMessage, context: TaskContext) -> Output:

@@ -7,19 +7,19 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import MeshError, SceneError
-from service.model.messages import TaskMessage
-from service.model.states import Stage
-from service.store.columns import Attribute
-from service.store.shards import Shard, json_attribute
-from worker.files.provenance import wrist_attributes
-from worker.grasps import Posture
-from worker.scenes import drop, transfer
-from worker.scenes.beside import scenes_of
-from worker.scenes.clearance import count_rejections
-from worker.stages.assets import beside_attributes, hand_of, input_of, neighbours_of, object_of
-from worker.stages.context import Output, TaskContext, batch_seed
-from worker.stages.ranges import base_rows, batches_of, joined
+from graspd.service.model.errors import MeshError, SceneError
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.states import Stage
+from graspd.service.store.columns import Attribute
+from graspd.service.store.shards import Shard, json_attribute
+from graspd.worker.files.provenance import wrist_attributes
+from graspd.worker.grasps import Posture
+from graspd.worker.scenes import drop, transfer
+from graspd.worker.scenes.beside import scenes_of
+from graspd.worker.scenes.clearance import count_rejections
+from graspd.worker.stages.assets import beside_attributes, hand_of, input_of, neighbours_of, object_of
+from graspd.worker.stages.context import Output, TaskContext, batch_seed
+from graspd.worker.stages.ranges import base_rows, batches_of, joined
 
 #: Columns of carried-over grasps in a shard of scenes that grasps are yet to be planned in.
 _NO_GRASPS: Final[dict[str, NDArray[Any]]] = {

@@ -11,21 +11,29 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError, LoadError, SceneError
-from service.model.messages import TaskMessage
-from service.model.planning import told, totals
-from service.model.states import Stage
-from service.store.columns import Attribute
-from worker.certified import Certified
-from worker.files.provenance import base_attributes
-from worker.planners import NoPlace, planner
-from worker.scenes.beside import neighbour_of
-from worker.scenes.kinds import supports_of
-from worker.simulation.surroundings import Scenes
-from worker.stages.assets import beside_attributes, hand_of, input_of, keep_network, neighbours_of, object_of, pieces_of
-from worker.stages.context import Output, TaskContext
-from worker.stages.ranges import joined, sizes_of
-from worker.together import certified_batches
+from graspd.service.model.errors import InputError, LoadError, SceneError
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.planning import told, totals
+from graspd.service.model.states import Stage
+from graspd.service.store.columns import Attribute
+from graspd.worker.certified import Certified
+from graspd.worker.files.provenance import base_attributes
+from graspd.worker.planners import NoPlace, planner
+from graspd.worker.scenes.beside import neighbour_of
+from graspd.worker.scenes.kinds import supports_of
+from graspd.worker.simulation.surroundings import Scenes
+from graspd.worker.stages.assets import (
+    beside_attributes,
+    hand_of,
+    input_of,
+    keep_network,
+    neighbours_of,
+    object_of,
+    pieces_of,
+)
+from graspd.worker.stages.context import Output, TaskContext
+from graspd.worker.stages.ranges import joined, sizes_of
+from graspd.worker.together import certified_batches
 
 #: Columns of the scene shard that stand in the base shard as well: so it can be used by itself.
 _OF_SCENES: Final = ("scene/object_pose", "scene/rest_probability", "scene/neighbour_pose")

@@ -8,12 +8,12 @@ from typing import Any
 
 from sqlalchemy import Connection, delete, select, update
 
-from service.index.bulk import update_rows, upsert
-from service.index.changes.rows import clean, settle
-from service.index.database import Database, chunks
-from service.index.tables import assets, jobs, tasks, workers
-from service.model.states import State
-from service.model.workers import WorkerBeat
+from graspd.service.index.bulk import update_rows, upsert
+from graspd.service.index.changes.rows import clean, settle
+from graspd.service.index.database import Database, chunks
+from graspd.service.index.tables import assets, jobs, tasks, workers
+from graspd.service.model.states import State
+from graspd.service.model.workers import WorkerBeat
 
 _UNFINISHED = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
 

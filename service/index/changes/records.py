@@ -9,8 +9,8 @@ from typing import Any, Final
 
 from sqlalchemy import Connection, delete, select, update
 
-from service.index.bulk import upsert
-from service.index.changes.rows import (
+from graspd.service.index.bulk import upsert
+from graspd.service.index.changes.rows import (
     ENTERING,
     Row,
     asset_row,
@@ -24,8 +24,8 @@ from service.index.changes.rows import (
     shard_row,
     task_rows,
 )
-from service.index.database import Database, chunks
-from service.index.tables import (
+from graspd.service.index.database import Database, chunks
+from graspd.service.index.tables import (
     assets,
     attempts,
     dataset_cells,
@@ -38,11 +38,19 @@ from service.index.tables import (
     shards,
     tasks,
 )
-from service.model.domain import Asset
-from service.model.planning import ranges_of
-from service.model.records import AttemptRecord, DatasetEvent, DatasetRecord, JobEvent, JobRecord, ObjectSet, Snapshot
-from service.model.states import State
-from service.store.manifests import ShardManifest
+from graspd.service.model.domain import Asset
+from graspd.service.model.planning import ranges_of
+from graspd.service.model.records import (
+    AttemptRecord,
+    DatasetEvent,
+    DatasetRecord,
+    JobEvent,
+    JobRecord,
+    ObjectSet,
+    Snapshot,
+)
+from graspd.service.model.states import State
+from graspd.service.store.manifests import ShardManifest
 
 #: Ranges that are entered in one turn: some tenths of a second, for which others wait.
 RANGES_AT_ONCE: Final = 500

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection, delete, exists, func, insert, or_, select, update
 
-from service.index.database import Database
-from service.index.tables import (
+from graspd.service.index.database import Database
+from graspd.service.index.tables import (
     assets,
     attempts,
     dataset_cells,
@@ -21,9 +21,9 @@ from service.index.tables import (
     spent,
     tasks,
 )
-from service.index.views import AssetView
-from service.model.errors import NotFoundError
-from service.model.states import AssetKind, Lane, State
+from graspd.service.index.views import AssetView
+from graspd.service.model.errors import NotFoundError
+from graspd.service.model.states import AssetKind, Lane, State
 
 
 @dataclass(frozen=True)

@@ -10,15 +10,15 @@ from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Connection, exists, func, literal, select, tuple_, update
 
-from service.index.database import chunks
-from service.index.outbox import note_ends
-from service.index.tables import attempts, jobs, notes, tasks
-from service.model.domain import Asset, JobOptions
-from service.model.errors import LoadError, SceneError
-from service.model.planning import TaskFacts, batch_ready, batch_states, job_state, plan, stages_of
-from service.model.records import AttemptRecord, JobRecord
-from service.model.states import State
-from service.store.manifests import ShardManifest
+from graspd.service.index.database import chunks
+from graspd.service.index.outbox import note_ends
+from graspd.service.index.tables import attempts, jobs, notes, tasks
+from graspd.service.model.domain import Asset, JobOptions
+from graspd.service.model.errors import LoadError, SceneError
+from graspd.service.model.planning import TaskFacts, batch_ready, batch_states, job_state, plan, stages_of
+from graspd.service.model.records import AttemptRecord, JobRecord
+from graspd.service.model.states import State
+from graspd.service.store.manifests import ShardManifest
 
 Row = dict[str, Any]
 #: Facts, repairs and message of a hand or object stand in every list, and follow from files of a stranger's.

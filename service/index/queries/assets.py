@@ -8,14 +8,14 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, and_, case, or_, select, tuple_
 
-from service.index import project_scope
-from service.index.database import Database, chunks
-from service.index.project_scope import nearest_asset, seen_assets, seen_sets
-from service.index.tables import assets, object_sets
-from service.index.views import AssetView, ObjectSetView, Page
-from service.model.errors import SEARCHED, NotFoundError, known_names
-from service.model.projects import EVERYTHING, ProjectScope
-from service.model.states import AssetKind
+from graspd.service.index import project_scope
+from graspd.service.index.database import Database, chunks
+from graspd.service.index.project_scope import nearest_asset, seen_assets, seen_sets
+from graspd.service.index.tables import assets, object_sets
+from graspd.service.index.views import AssetView, ObjectSetView, Page
+from graspd.service.model.errors import SEARCHED, NotFoundError, known_names
+from graspd.service.model.projects import EVERYTHING, ProjectScope
+from graspd.service.model.states import AssetKind
 
 
 @dataclass(frozen=True)

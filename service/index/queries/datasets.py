@@ -9,18 +9,18 @@ from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, literal, select, tuple_
 
-from service.index import project_scope
-from service.index.database import Database
-from service.index.project_scope import seen_datasets
-from service.index.queries.jobs import outcomes_of
-from service.index.tables import attempts, dataset_cells, dataset_snapshots, datasets, jobs, shards, tasks
-from service.index.views import CellView, DatasetView, Page, SnapshotView
-from service.model.domain import JobOptions
-from service.model.errors import SEARCHED, NotFoundError, known_names
-from service.model.planning import job_state, ranges_of, shortfall, stages_of
-from service.model.projects import EVERYTHING, ProjectScope
-from service.model.records import SnapshotShard
-from service.model.states import Stage, State
+from graspd.service.index import project_scope
+from graspd.service.index.database import Database
+from graspd.service.index.project_scope import seen_datasets
+from graspd.service.index.queries.jobs import outcomes_of
+from graspd.service.index.tables import attempts, dataset_cells, dataset_snapshots, datasets, jobs, shards, tasks
+from graspd.service.index.views import CellView, DatasetView, Page, SnapshotView
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import SEARCHED, NotFoundError, known_names
+from graspd.service.model.planning import job_state, ranges_of, shortfall, stages_of
+from graspd.service.model.projects import EVERYTHING, ProjectScope
+from graspd.service.model.records import SnapshotShard
+from graspd.service.model.states import Stage, State
 
 _SHARE: Final[ColumnElement[float]] = case(
     (tasks.c.state == State.SUCCEEDED.value, 1.0),

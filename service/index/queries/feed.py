@@ -9,12 +9,12 @@ from typing import Any
 
 from sqlalchemy import Column, ColumnElement, exists, or_, select
 
-from service.index.database import Database, chunks
-from service.index.tables import assets, dataset_cells, datasets, jobs, tasks
-from service.model.domain import JobOptions
-from service.model.planning import MAX_BACKOFF_S, PlannedTask, Turns, WaitingJob, interleave, share_of
-from service.model.records import Cell, Choice, JobRecord, Member
-from service.model.states import AssetKind, Lane, Stage, State
+from graspd.service.index.database import Database, chunks
+from graspd.service.index.tables import assets, dataset_cells, datasets, jobs, tasks
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.planning import MAX_BACKOFF_S, PlannedTask, Turns, WaitingJob, interleave, share_of
+from graspd.service.model.records import Cell, Choice, JobRecord, Member
+from graspd.service.model.states import AssetKind, Lane, Stage, State
 
 
 @dataclass(frozen=True)

@@ -35,19 +35,19 @@ from sqlalchemy import (
 )
 from sqlalchemy.sql.operators import in_op, is_
 
-from service.index import project_scope
-from service.index.database import Database, chunks
-from service.index.project_scope import seen_shards
-from service.index.tables import dataset_cells, grasps, jobs, shards, tagged, tasks
-from service.index.views import GraspView, Page
-from service.model.base import Model
-from service.model.errors import InputError, NotFoundError
-from service.model.metric_fields import SortedName
-from service.model.metrics import indexed
-from service.model.projects import EVERYTHING, ProjectScope
-from service.model.records import Grasp
-from service.model.states import Stage
-from service.model.where import Flag, Joined, Node, Not, OfMetric, OfType, parsed
+from graspd.service.index import project_scope
+from graspd.service.index.database import Database, chunks
+from graspd.service.index.project_scope import seen_shards
+from graspd.service.index.tables import dataset_cells, grasps, jobs, shards, tagged, tasks
+from graspd.service.index.views import GraspView, Page
+from graspd.service.model.base import Model
+from graspd.service.model.errors import InputError, NotFoundError
+from graspd.service.model.metric_fields import SortedName
+from graspd.service.model.metrics import indexed
+from graspd.service.model.projects import EVERYTHING, ProjectScope
+from graspd.service.model.records import Grasp
+from graspd.service.model.states import Stage
+from graspd.service.model.where import Flag, Joined, Node, Not, OfMetric, OfType, parsed
 
 Metric = SortedName
 

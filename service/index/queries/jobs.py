@@ -9,15 +9,15 @@ from typing import Any, Final, Literal
 
 from sqlalchemy import ColumnElement, Connection, Float, and_, case, cast, func, select, tuple_
 
-from service.index import project_scope
-from service.index.database import Database, chunks
-from service.index.project_scope import seen_jobs, seen_shards, seen_tasks
-from service.index.tables import attempts, jobs, shards, tasks
-from service.index.views import AttemptView, JobView, Page, ShardView, StageProgress, TaskView
-from service.model.errors import NotFoundError
-from service.model.planning import ranges_of, totals
-from service.model.projects import EVERYTHING, ProjectScope
-from service.model.states import Stage, State
+from graspd.service.index import project_scope
+from graspd.service.index.database import Database, chunks
+from graspd.service.index.project_scope import seen_jobs, seen_shards, seen_tasks
+from graspd.service.index.tables import attempts, jobs, shards, tasks
+from graspd.service.index.views import AttemptView, JobView, Page, ShardView, StageProgress, TaskView
+from graspd.service.model.errors import NotFoundError
+from graspd.service.model.planning import ranges_of, totals
+from graspd.service.model.projects import EVERYTHING, ProjectScope
+from graspd.service.model.states import Stage, State
 
 
 @dataclass(frozen=True)

@@ -11,16 +11,16 @@ from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Select, and_, case, func, select
 
-from service.index import project_scope
-from service.index.database import Database
-from service.index.project_scope import seen_attempts, seen_jobs, seen_shards, seen_tasks
-from service.index.tables import attempts, damage, jobs, shards, spent, tasks, workers
-from service.index.views import FailureGroup, MatrixCell, Stats, Throughput, UsageDay, WorkerView
-from service.model.clock import age_of
-from service.model.domain import JobRequest
-from service.model.names import SHARD_KINDS
-from service.model.projects import EVERYTHING, ProjectScope
-from service.model.states import Stage, State
+from graspd.service.index import project_scope
+from graspd.service.index.database import Database
+from graspd.service.index.project_scope import seen_attempts, seen_jobs, seen_shards, seen_tasks
+from graspd.service.index.tables import attempts, damage, jobs, shards, spent, tasks, workers
+from graspd.service.index.views import FailureGroup, MatrixCell, Stats, Throughput, UsageDay, WorkerView
+from graspd.service.model.clock import age_of
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.names import SHARD_KINDS
+from graspd.service.model.projects import EVERYTHING, ProjectScope
+from graspd.service.model.states import Stage, State
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import ColumnElement, Connection, Integer, cast, func, select
 
-from service.index.database import Database
-from service.index.queries.grasps import GraspFilter, Metric, conditions, sql_conditions
-from service.index.tables import dataset_cells, grasps, shards, tasks
+from graspd.service.index.database import Database
+from graspd.service.index.queries.grasps import GraspFilter, Metric, conditions, sql_conditions
+from graspd.service.index.tables import dataset_cells, grasps, shards, tasks
 
 
 @dataclass(frozen=True)

@@ -7,22 +7,22 @@ from typing import Literal
 
 from sqlalchemy import Connection
 
-from service.index.views import DatasetView, ObjectSetView
-from service.model import names
-from service.model.clock import timestamp
-from service.model.digests import digest_json
-from service.model.domain import JobOptions
-from service.model.errors import ConflictError, InputError, LimitError, NotFoundError
-from service.model.projects import EVERYTHING, ProjectScope
-from service.model.records import DatasetRecord, Member, ObjectSet, Snapshot, object_set_of
-from service.model.scene_spec import NamedNeighbour, SceneDocument
-from service.model.states import AssetKind, State
-from service.pipeline.backends import Services
-from service.pipeline.datasets.spec import MAX_CELLS, DatasetRequest, Matrix, describe
-from service.pipeline.fidelity_choice import Resolver
-from service.pipeline.recording import recording
-from service.pipeline.usable import usable, with_neighbours, with_network
-from service.store.records import (
+from graspd.service.index.views import DatasetView, ObjectSetView
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.digests import digest_json
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import ConflictError, InputError, LimitError, NotFoundError
+from graspd.service.model.projects import EVERYTHING, ProjectScope
+from graspd.service.model.records import DatasetRecord, Member, ObjectSet, Snapshot, object_set_of
+from graspd.service.model.scene_spec import NamedNeighbour, SceneDocument
+from graspd.service.model.states import AssetKind, State
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets.spec import MAX_CELLS, DatasetRequest, Matrix, describe
+from graspd.service.pipeline.fidelity_choice import Resolver
+from graspd.service.pipeline.recording import recording
+from graspd.service.pipeline.usable import usable, with_neighbours, with_network
+from graspd.service.store.records import (
     Put,
     add_dataset_event,
     dataset_events,

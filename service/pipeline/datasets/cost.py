@@ -17,17 +17,17 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
-from service.index.index import Index
-from service.index.queries.overview import BatchCost
-from service.model.domain import BATCH_SIZE, JobOptions, JobRequest
-from service.model.errors import LimitError
-from service.model.planning import stages_of
-from service.model.projects import EVERYTHING, ProjectScope
-from service.model.records import request_of
-from service.model.states import AssetKind, Stage
-from service.pipeline.datasets.estimate import Estimate, RateUsed, WorkersPlan
-from service.pipeline.datasets.spec import MAX_CELLS, Matrix
-from service.pipeline.rates import Machine, Rate, Rates, StageRate, picture_rate, scene_rate, tries
+from graspd.service.index.index import Index
+from graspd.service.index.queries.overview import BatchCost
+from graspd.service.model.domain import BATCH_SIZE, JobOptions, JobRequest
+from graspd.service.model.errors import LimitError
+from graspd.service.model.planning import stages_of
+from graspd.service.model.projects import EVERYTHING, ProjectScope
+from graspd.service.model.records import request_of
+from graspd.service.model.states import AssetKind, Stage
+from graspd.service.pipeline.datasets.estimate import Estimate, RateUsed, WorkersPlan
+from graspd.service.pipeline.datasets.spec import MAX_CELLS, Matrix
+from graspd.service.pipeline.rates import Machine, Rate, Rates, StageRate, picture_rate, scene_rate, tries
 
 WORKERS: Final = (1, 8, 64)
 #: A task in the queue and the events it sends back, both ways (docs/explanation/scaling.md) [bytes].

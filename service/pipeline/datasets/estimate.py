@@ -6,8 +6,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from service.index.views import View
-from service.model.states import Stage
+from graspd.service.index.views import View
+from graspd.service.model.states import Stage
 
 
 class WorkersPlan(View):

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
-from service.model.errors import InputError
-from service.model.records import Snapshot, SnapshotShard
-from service.store.integrity import check_digest
+from graspd.service.model.errors import InputError
+from graspd.service.model.records import Snapshot, SnapshotShard
+from graspd.service.store.integrity import check_digest
 
 #: Bytes of a shard, in chunks: from the API or from the store.
 Fetch = Callable[[SnapshotShard], Iterable[bytes]]

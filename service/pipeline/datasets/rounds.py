@@ -11,14 +11,14 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from service.index.queries.feed import DatasetWork
-from service.model.errors import ConflictError
-from service.model.records import job_of
-from service.model.states import State
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.ranges import TaskRanges
-from service.store.records import job_events
+from graspd.service.index.queries.feed import DatasetWork
+from graspd.service.model.errors import ConflictError
+from graspd.service.model.records import job_of
+from graspd.service.model.states import State
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.ranges import TaskRanges
+from graspd.service.store.records import job_events
 
 log = logging.getLogger(__name__)
 #: Time for datasets in one round of the controller [s]: the queue and lost workers must not wait for long.

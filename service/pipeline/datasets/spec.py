@@ -7,12 +7,12 @@ from typing import Annotated, Final, Self
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from service.model.clock import timestamp
-from service.model.digests import digest_json, job_id
-from service.model.domain import JobOptions, JobRequest, Name
-from service.model.fidelity import AUTO
-from service.model.records import Choice, DatasetRecord, Member, request_of
-from service.model.version import STAGE_REVISIONS
+from graspd.service.model.clock import timestamp
+from graspd.service.model.digests import digest_json, job_id
+from graspd.service.model.domain import JobOptions, JobRequest, Name
+from graspd.service.model.fidelity import AUTO
+from graspd.service.model.records import Choice, DatasetRecord, Member, request_of
+from graspd.service.model.version import STAGE_REVISIONS
 
 #: Larger matrices are split by their user: the record of this many cells has 4 MB.
 MAX_CELLS: Final = 100_000

@@ -15,11 +15,11 @@ from redis import Redis
 from redis.exceptions import RedisError
 from sqlalchemy import func, make_url, select
 
-from service.index.index import Index
-from service.index.rebuild import differences
-from service.index.sample import IndexCondition, compare, draw, look
-from service.index.tables import shards
-from service.model.errors import (
+from graspd.service.index.index import Index
+from graspd.service.index.rebuild import differences
+from graspd.service.index.sample import IndexCondition, compare, draw, look
+from graspd.service.index.tables import shards
+from graspd.service.model.errors import (
     GraspdError,
     IndexDamaged,
     InputError,
@@ -27,14 +27,14 @@ from service.model.errors import (
     QueueUnavailable,
     UnavailableError,
 )
-from service.pipeline.identity import Identity, recorded, service_ids
-from service.queue.connection import connect, redis_url, socket_path
-from service.queue.rq_queue import open_queue
-from service.run.doctor.checks import Finding, bad, good, skipped, warning
-from service.run.doctor.machine import existing, local_store
-from service.run.embedded import find_server
-from service.settings import Settings
-from service.store.store import Store, open_store
+from graspd.service.pipeline.identity import Identity, recorded, service_ids
+from graspd.service.queue.connection import connect, redis_url, socket_path
+from graspd.service.queue.rq_queue import open_queue
+from graspd.service.run.doctor.checks import Finding, bad, good, skipped, warning
+from graspd.service.run.doctor.machine import existing, local_store
+from graspd.service.run.embedded import find_server
+from graspd.service.settings import Settings
+from graspd.service.store.store import Store, open_store
 
 #: The oldest that graspd was tried on.
 _OLDEST: Final = (6, 2)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from service.model.errors import GraspdError
+from graspd.service.model.errors import GraspdError
 
 #: How the names of the threads of checks begin.
 THREADS: Final = "doctor-"

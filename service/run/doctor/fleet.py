@@ -21,19 +21,19 @@ from redis.exceptions import RedisError
 from sqlalchemy import URL, make_url, text
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.index.database import connect_postgres
-from service.model.errors import GraspdError, QueueUnavailable
-from service.model.states import Stage
-from service.model.version import PACKAGE_VERSION
-from service.model.workers import WorkerBeat
-from service.pipeline.leading import PART
-from service.queue.rq_queue import RqQueue, open_queue
-from service.run.address import recorded_address
-from service.run.doctor.backends import is_there, redis_connection
-from service.run.doctor.checks import Finding, bad, good, skipped, warning
-from service.run.doctor.machine import local_store
-from service.settings import Settings
-from service.store.store import open_store
+from graspd.service.index.database import connect_postgres
+from graspd.service.model.errors import GraspdError, QueueUnavailable
+from graspd.service.model.states import Stage
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.service.model.workers import WorkerBeat
+from graspd.service.pipeline.leading import PART
+from graspd.service.queue.rq_queue import RqQueue, open_queue
+from graspd.service.run.address import recorded_address
+from graspd.service.run.doctor.backends import is_there, redis_connection
+from graspd.service.run.doctor.checks import Finding, bad, good, skipped, warning
+from graspd.service.run.doctor.machine import local_store
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
 
 _HTTP_S: Final = 5.0
 _IDLE: Final = "no service runs on this data folder"

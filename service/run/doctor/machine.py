@@ -17,12 +17,12 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.version import Version
 
-from service import user_cache
-from service.model.cores import available_cores, available_memory
-from service.model.version import PACKAGE_VERSION
-from service.run.doctor.checks import Finding, bad, good, warning
-from service.settings import Settings
-from service.store.store import local_folder
+from graspd.service import user_cache
+from graspd.service.model.cores import available_cores, available_memory
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.service.run.doctor.checks import Finding, bad, good, warning
+from graspd.service.settings import Settings
+from graspd.service.store.store import local_folder
 
 _GIB: Final = 2**30
 #: Below this a worker's scratch files, a shard and the log of Redis do not fit together with certainty.

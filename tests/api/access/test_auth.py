@@ -11,12 +11,12 @@ import pytest
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
-from api.access.keys import KeyFile, KeyLimits, Scope
-from api.app import create_app
-from api.client.access_commands import duration
-from service.model.errors import ConflictError, InputError, NotFoundError, QueueUnavailable
-from service.pipeline.backends import Services
-from service.settings import Settings
+from graspd.api.access.keys import KeyFile, KeyLimits, Scope
+from graspd.api.app import create_app
+from graspd.client.access_commands import duration
+from graspd.service.model.errors import ConflictError, InputError, NotFoundError, QueueUnavailable
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
 from tests.memory_queue import MemoryQueue
 
 JOB = {"hand": "allegro", "object": "mug"}

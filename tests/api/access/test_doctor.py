@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from api.access.doctor import keys
-from api.access.keys import KeyFile, Scope
-from service.run.doctor.checks import Condition
-from service.settings import Settings
+from graspd.api.access.doctor import keys
+from graspd.api.access.keys import KeyFile, Scope
+from graspd.service.run.doctor.checks import Condition
+from graspd.service.settings import Settings
 
 
 @pytest.fixture

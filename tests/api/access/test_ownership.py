@@ -7,18 +7,18 @@ from collections.abc import Iterator
 import pytest
 from starlette.testclient import TestClient
 
-from api.access.auth import NotYours, caller, must_own
-from api.access.keys import Key, KeyFile, Scope
-from api.app import create_app
-from service.index.index import Index
-from service.index.rebuild import rebuild
-from service.model import names
-from service.model.records import JobRecord
-from service.model.states import AssetKind, State
-from service.pipeline.backends import Services
-from service.settings import Settings
-from service.store.network_file import to_bytes
-from service.store.records import read_record
+from graspd.api.access.auth import NotYours, caller, must_own
+from graspd.api.access.keys import Key, KeyFile, Scope
+from graspd.api.app import create_app
+from graspd.service.index.index import Index
+from graspd.service.index.rebuild import rebuild
+from graspd.service.model import names
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import AssetKind, State
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
+from graspd.service.store.network_file import to_bytes
+from graspd.service.store.records import read_record
 from tests.api.factories import add_job, fail
 from tests.networks import random_network
 from tests.planning import plan_all

@@ -10,15 +10,15 @@ from pydantic import SecretStr
 from sqlalchemy import update
 from starlette.testclient import TestClient
 
-from api.access.keys import KeyFile, ProjectLimits, Scope
-from api.app import create_app
-from service.index.tables import shards
-from service.model import names
-from service.model.records import JobRecord
-from service.pipeline.backends import Services
-from service.queue.rq_queue import RqQueue
-from service.settings import Settings
-from service.store.records import read_record
+from graspd.api.access.keys import KeyFile, ProjectLimits, Scope
+from graspd.api.app import create_app
+from graspd.service.index.tables import shards
+from graspd.service.model import names
+from graspd.service.model.records import JobRecord
+from graspd.service.pipeline.backends import Services
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.settings import Settings
+from graspd.service.store.records import read_record
 from tests.api.conftest import TODAY
 from tests.api.factories import finish_all
 

@@ -17,20 +17,20 @@ from fastapi.routing import APIRoute
 from pydantic import SecretStr
 from starlette.testclient import TestClient
 
-from api.access.keys import Key, KeyFile, Scope
-from api.app import create_app
-from service.index.index import Index
-from service.index.rebuild import differences, rebuild
-from service.model import names
-from service.model.errors import InputError
-from service.model.planning import plan
-from service.model.records import JobRecord
-from service.model.states import AssetKind
-from service.pipeline.backends import Services
-from service.settings import Settings
-from service.store.network_file import to_bytes
-from service.store.records import read_record
-from service.store.store import open_store
+from graspd.api.access.keys import Key, KeyFile, Scope
+from graspd.api.app import create_app
+from graspd.service.index.index import Index
+from graspd.service.index.rebuild import differences, rebuild
+from graspd.service.model import names
+from graspd.service.model.errors import InputError
+from graspd.service.model.planning import plan
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import AssetKind
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
+from graspd.service.store.network_file import to_bytes
+from graspd.service.store.records import read_record
+from graspd.service.store.store import open_store
 from tests.api.factories import add_worker, fail, finish_all
 from tests.memory_queue import MemoryQueue
 from tests.networks import random_network

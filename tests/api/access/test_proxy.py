@@ -11,12 +11,12 @@ import pytest
 from pydantic import SecretStr
 from starlette.testclient import TestClient
 
-from api.access.auth import SESSION_COOKIE, Proxy
-from api.access.keys import KeyFile, Scope
-from api.app import create_app
-from service.model.errors import InputError, UnavailableError
-from service.pipeline.backends import Services
-from service.settings import Settings
+from graspd.api.access.auth import SESSION_COOKIE, Proxy
+from graspd.api.access.keys import KeyFile, Scope
+from graspd.api.app import create_app
+from graspd.service.model.errors import InputError, UnavailableError
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
 
 SECRET = "correct horse battery staple"
 PROXY, STRANGER = ("10.1.2.3", 4000), ("203.0.113.9", 4000)

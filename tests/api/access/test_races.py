@@ -13,21 +13,21 @@ from httpx import Response
 from pydantic import SecretStr
 from starlette.testclient import TestClient
 
-from api.access.keys import Key, KeyFile, KeyLimits, Scope
-from api.access.quotas import Quotas
-from api.app import create_app
-from service.index.rebuild import differences
-from service.model import names
-from service.model.errors import ConflictError, QuotaError
-from service.model.records import JobRecord, ObjectSet, object_set_of
-from service.model.webhooks import MOST_HOOKS
-from service.pipeline.backends import Services
-from service.pipeline.datasets.rounds import DatasetRounds
-from service.queue.rq_queue import RqQueue
-from service.settings import Settings
-from service.store import library
-from service.store.records import read_record
-from service.store.store import Store
+from graspd.api.access.keys import Key, KeyFile, KeyLimits, Scope
+from graspd.api.access.quotas import Quotas
+from graspd.api.app import create_app
+from graspd.service.index.rebuild import differences
+from graspd.service.model import names
+from graspd.service.model.errors import ConflictError, QuotaError
+from graspd.service.model.records import JobRecord, ObjectSet, object_set_of
+from graspd.service.model.webhooks import MOST_HOOKS
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets.rounds import DatasetRounds
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.settings import Settings
+from graspd.service.store import library
+from graspd.service.store.records import read_record
+from graspd.service.store.store import Store
 from tests.api.factories import finish_all
 
 #: Often enough for two requests to meet.
@@ -147,7 +147,7 @@ def test_a_retry_of_fewer_grasps_leaves_the_sum_true(quotas: Callable[[Unfinishe
 def test_a_claim_of_a_process_that_died_ends(
     quotas: Callable[[Unfinished], Quotas], rq_queue: RqQueue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("api.access.quotas._PENDING_S", 0)
+    monkeypatch.setattr("graspd.api.access.quotas._PENDING_S", 0)
     one = quotas(lambda ids: set())
     died = one.claim(KEY, "a", 20)
     died.__enter__()

@@ -5,10 +5,10 @@ from __future__ import annotations
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
-from api.app import create_app
-from service.index.rebuild import rebuild
-from service.pipeline.backends import Services
-from service.settings import Settings
+from graspd.api.app import create_app
+from graspd.service.index.rebuild import rebuild
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
 from tests.api.factories import add_job
 from tests.damage import overwrite
 from tests.indexes import empty_index

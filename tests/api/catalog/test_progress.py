@@ -7,13 +7,13 @@ import io
 import pytest
 from rich.console import Console
 
-from api.catalog.jobs import Paces, eta_of_job, stage_statuses
-from api.client.reports import JobDisplay
-from api.formatting import duration, metric, percent, size
-from api.models import Job
-from service.index.views import JobView, StageProgress, TaskView
-from service.model.domain import JobRequest
-from service.model.states import Lane, Stage, State
+from graspd.api.catalog.jobs import Paces, eta_of_job, stage_statuses
+from graspd.api.formatting import duration, metric, percent, size
+from graspd.api.models import Job
+from graspd.client.reports import JobDisplay
+from graspd.service.index.views import JobView, StageProgress, TaskView
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.states import Lane, Stage, State
 
 
 class Clock:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 from starlette.testclient import TestClient
 
-from service.model import names
-from service.model.records import JobRecord
-from service.pipeline.backends import Services
-from service.pipeline.datasets import actions
-from service.pipeline.datasets.spec import DatasetRequest
-from service.store.records import read_record
+from graspd.service.model import names
+from graspd.service.model.records import JobRecord
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.spec import DatasetRequest
+from graspd.service.store.records import read_record
 from tests.api.factories import add_job, finish_all
 from tests.planning import plan_all
 

@@ -10,14 +10,14 @@ import typer
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from api.client import add_commands
-from api.client.add_commands import add_object
-from api.client.client import Client
-from service.model.errors import InputError
-from service.model.states import AssetKind
-from service.store.asset_options import sizes_of
-from service.store.assets import pack
-from service.store.object_sets import files_of_set
+from graspd.client import add_commands
+from graspd.client.add_commands import add_object
+from graspd.client.client import Client
+from graspd.service.model.errors import InputError
+from graspd.service.model.states import AssetKind
+from graspd.service.store.asset_options import sizes_of
+from graspd.service.store.assets import pack
+from graspd.service.store.object_sets import files_of_set
 
 STL = b"solid box\nendsolid box\n"
 

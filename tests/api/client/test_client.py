@@ -9,10 +9,10 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api.client import client as client_module
-from api.client.client import Client, events_of, path_of
-from api.models import Job, Shard
-from service.model.errors import (
+from graspd.api.models import Job, Shard
+from graspd.client import client as client_module
+from graspd.client.client import Client, events_of, path_of
+from graspd.service.model.errors import (
     ConflictError,
     GraspdError,
     InputError,
@@ -21,7 +21,7 @@ from service.model.errors import (
     QuotaError,
     UnavailableError,
 )
-from service.model.states import AssetKind, Stage, State
+from graspd.service.model.states import AssetKind, Stage, State
 
 Handler = Callable[[httpx.Request], httpx.Response]
 

@@ -17,17 +17,17 @@ import httpx
 import pytest
 from typer.testing import CliRunner
 
-from api.client.reports import job_summary
-from api.models import JobDetail, MeanMetrics
+from graspd.api.models import JobDetail, MeanMetrics
 from graspd.cli import build
-from service.model.domain import JobRequest
-from service.model.states import AssetKind, State
-from service.run.supervisor import Supervisor
-from service.settings import Settings
-from service.store.library import load_asset_files
-from service.store.network_file import to_bytes
-from service.store.records import publish
-from service.store.store import open_store
+from graspd.client.reports import job_summary
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.states import AssetKind, State
+from graspd.service.run.supervisor import Supervisor
+from graspd.service.settings import Settings
+from graspd.service.store.library import load_asset_files
+from graspd.service.store.network_file import to_bytes
+from graspd.service.store.records import publish
+from graspd.service.store.store import open_store
 from tests.networks import random_network
 from tests.service.pipeline.test_fidelity_choice import scene_chart
 from tests.waiting import PATIENCE_S

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from api.client.client import Client
-from service.model.states import State
-from service.run.supervisor import Supervisor
+from graspd.client.client import Client
+from graspd.service.model.states import State
+from graspd.service.run.supervisor import Supervisor
 from tests import waiting
 from tests.api.client.test_commands import Shell, graspd, said, service
 

@@ -7,12 +7,12 @@ import io
 import pytest
 from rich.console import Console
 
-from api.client.reports import print_cells, print_dataset, print_estimate
-from service.model.domain import JobOptions
-from service.pipeline.backends import Services
-from service.pipeline.datasets import actions
-from service.pipeline.datasets.cost import estimate
-from service.pipeline.datasets.spec import DatasetRequest
+from graspd.client.reports import print_cells, print_dataset, print_estimate
+from graspd.service.model.domain import JobOptions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.cost import estimate
+from graspd.service.pipeline.datasets.spec import DatasetRequest
 from tests.api.factories import add_job, finish_all
 from tests.planning import plan_all
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from api.client.job_options import Wanted, read_spec, wanted
-from service.model.errors import InputError
-from service.pipeline.datasets.spec import MAX_CELLS
+from graspd.client.job_options import Wanted, read_spec, wanted
+from graspd.service.model.errors import InputError
+from graspd.service.pipeline.datasets.spec import MAX_CELLS
 
 ROOT = Path(__file__).resolve().parents[3]
 TOML = """

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from api.client.add_commands import upload_of
-from service.model.errors import InputError
-from service.store.assets import unpack
+from graspd.client.add_commands import upload_of
+from graspd.service.model.errors import InputError
+from graspd.service.store.assets import unpack
 
 MESH = '<mesh filename="{}"/>'
 

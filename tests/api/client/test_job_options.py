@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from api.client.job_options import pairs
-from service.model.errors import InputError
+from graspd.client.job_options import pairs
+from graspd.service.model.errors import InputError
 
 
 @pytest.mark.parametrize(

@@ -11,11 +11,11 @@ import pytest
 from rich.progress import Progress
 from typer.testing import CliRunner
 
-from api.client.reports import JobDisplay
 from graspd.cli import build
-from service.cli import plain_console, plain_table
-from service.model.domain import JobOptions
-from service.model.states import State
+from graspd.client.reports import JobDisplay
+from graspd.service.cli import plain_console, plain_table
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.states import State
 
 NAME = "[red]mug[/] :mug: " + "a-very-long-name-of-an-object-that-somebody-gave-to-it"[:46]
 ID = "0123456789ab"
@@ -85,7 +85,7 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
         yield Service()
 
     for module in ("commands", "dataset_commands", "tag_commands", "access_commands"):
-        monkeypatch.setattr(f"api.client.{module}.open_client", opened)
+        monkeypatch.setattr(f"graspd.client.{module}.open_client", opened)
 
     def run(*arguments: str) -> list[str]:
         done = CliRunner().invoke(build(), arguments, env={"COLUMNS": "80"})

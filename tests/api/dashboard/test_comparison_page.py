@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 from starlette.testclient import TestClient
 
-from api.catalog.datasets import Comparisons, Datasets, Pair
-from service.index.queries.grasps import GraspFilter
-from service.pipeline.backends import Services
-from service.pipeline.datasets import actions
-from service.pipeline.datasets.spec import DatasetRequest
+from graspd.api.catalog.datasets import Comparisons, Datasets, Pair
+from graspd.service.index.queries.grasps import GraspFilter
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.spec import DatasetRequest
 from tests.api.factories import add_job, finish_all
 from tests.planning import plan_all
 
@@ -70,7 +70,7 @@ def test_a_cell_that_only_one_has_makes_no_difference() -> None:
 
 def test_more_cells_than_anybody_reads_are_left_out(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
     _two(services)
-    monkeypatch.setattr("api.catalog.datasets.MOST_CELLS", 1)
+    monkeypatch.setattr("graspd.api.catalog.datasets.MOST_CELLS", 1)
     datasets = Datasets(services, None)  # type: ignore[arg-type]
     assert Comparisons(services, datasets).of("rough", "fine").pairs == []
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 from starlette.testclient import TestClient
 
-from api.dashboard.figures import of_service
-from service.index.views import MatrixCell
-from service.model.states import State
-from service.pipeline.backends import Services
-from service.pipeline.datasets import actions
-from service.pipeline.datasets.spec import DatasetRequest
+from graspd.api.dashboard.figures import of_service
+from graspd.service.index.views import MatrixCell
+from graspd.service.model.states import State
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.spec import DatasetRequest
 from tests.api.factories import add_job, fail, finish_all
 from tests.planning import plan_all
 

@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from api.dashboard import form_uploads
-from service.index.views import AssetView
-from service.model import names
-from service.model.states import AssetKind
-from service.pipeline.backends import Services
-from service.store.library import load_asset, load_asset_files
+from graspd.api.dashboard import form_uploads
+from graspd.service.index.views import AssetView
+from graspd.service.model import names
+from graspd.service.model.states import AssetKind
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.library import load_asset, load_asset_files
 from tests.api.dashboard.test_pages import FORM
 
 MESH = ("part.stl", b"solid part\nendsolid\n")

@@ -10,12 +10,12 @@ import pytest
 from PIL import Image
 from starlette.testclient import TestClient
 
-from api.catalog.grasps import OUTCOMES, judged_by
-from service.model.metrics import AXIS_MEANINGS, Axis
-from service.pipeline.backends import Services
-from service.store.shards import Shard, read_shard
+from graspd.api.catalog.grasps import OUTCOMES, judged_by
+from graspd.service.model.metrics import AXIS_MEANINGS, Axis
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.shards import Shard, read_shard
+from graspd.worker.validation.protocol import JudgedBy, Outcome
 from tests.api.factories import JOINTS, add_job, finish_all
-from worker.quality.referee.protocol import JudgedBy, Outcome
 
 
 def test_a_grasp_is_the_row_of_its_shard(http: TestClient, services: Services) -> None:

@@ -9,15 +9,15 @@ import pytest
 from PIL import Image
 from starlette.testclient import TestClient
 
-from service.index.database import Database
-from service.index.notes import Damage
-from service.index.queries.jobs import Jobs
-from service.index.queries.overview import Overview
-from service.model.errors import IndexUnavailable, QueueUnavailable
-from service.model.fidelity import OFFERED
-from service.model.planning import plan
-from service.model.states import State
-from service.pipeline.backends import Services
+from graspd.service.index.database import Database
+from graspd.service.index.notes import Damage
+from graspd.service.index.queries.jobs import Jobs
+from graspd.service.index.queries.overview import Overview
+from graspd.service.model.errors import IndexUnavailable, QueueUnavailable
+from graspd.service.model.fidelity import OFFERED
+from graspd.service.model.planning import plan
+from graspd.service.model.states import State
+from graspd.service.pipeline.backends import Services
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
 from tests.memory_queue import MemoryQueue
 

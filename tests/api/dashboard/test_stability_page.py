@@ -7,10 +7,10 @@ import math
 import pytest
 from starlette.testclient import TestClient
 
-from api.dashboard.figures import PITCH, draw
-from service.model.studies import MapCell, Outcome, Stability, StabilityMap
-from service.pipeline.backends import Services
-from service.store.records import publish
+from graspd.api.dashboard.figures import PITCH, draw
+from graspd.service.model.studies import MapCell, Outcome, Stability, StabilityMap
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.records import publish
 
 
 def a_map(name: str = "stiffness", **changes: object) -> StabilityMap:

@@ -7,7 +7,7 @@ from typing import Final
 import pytest
 from jinja2 import meta, nodes
 
-from api.dashboard.rendering import environment
+from graspd.api.dashboard.rendering import environment
 
 #: Functions that `render` gives to every page; what a macro is called with.
 GIVEN: Final = {"may_change", "caller"}

@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
-from api.dashboard.tradeoff import HEIGHT, WIDTH, Measured, draw, pareto
-from service.model.scene_spec import SceneSpec
-from service.model.studies import FILTERED, IN_SCENE
-from service.pipeline.backends import Services
-from service.store.records import publish
+from graspd.api.dashboard.tradeoff import HEIGHT, WIDTH, Measured, draw, pareto
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.studies import FILTERED, IN_SCENE
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.records import publish
 
 
 def run(fidelity: str, speed: float, gsr: float, **fields: object) -> dict[str, object]:

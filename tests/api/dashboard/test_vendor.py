@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from api.dashboard.rendering import STATIC
+from graspd.api.dashboard.rendering import STATIC
 
 FOLDERS = (STATIC / "vendor", Path(__file__).parents[2] / "browser" / "vendor")
 #: What is bundled comes with the list of its parts.

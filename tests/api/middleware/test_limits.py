@@ -11,16 +11,16 @@ import pytest
 from pydantic import SecretStr
 from starlette.testclient import TestClient
 
-from api.access.keys import KeyFile, KeyLimits, Scope
-from api.app import create_app
-from api.middleware.body_limit import BodyLimit
-from api.middleware.rate_limit import Allowance, Rates
-from service.model import names
-from service.model.records import JobRecord
-from service.pipeline.backends import Services
-from service.queue.rq_queue import RqQueue
-from service.settings import Settings
-from service.store.records import read_record
+from graspd.api.access.keys import KeyFile, KeyLimits, Scope
+from graspd.api.app import create_app
+from graspd.api.middleware.body_limit import BodyLimit
+from graspd.api.middleware.rate_limit import Allowance, Rates
+from graspd.service.model import names
+from graspd.service.model.records import JobRecord
+from graspd.service.pipeline.backends import Services
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.settings import Settings
+from graspd.service.store.records import read_record
 from tests.api.factories import finish_all
 from tests.planning import plan_all
 from tests.waiting import PATIENCE_S
@@ -32,7 +32,7 @@ Twins = Callable[..., tuple[TestClient, TestClient]]
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a busy machine Redis may be slow to answer, and what is not counted is let in."""
-    monkeypatch.setattr("api.middleware.rate_limit._ANSWER_S", PATIENCE_S)
+    monkeypatch.setattr("graspd.api.middleware.rate_limit._ANSWER_S", PATIENCE_S)
 
 
 @pytest.fixture
@@ -266,7 +266,7 @@ def test_a_body_that_trickles_in_is_given_up(monkeypatch: pytest.MonkeyPatch) ->
         sent.append(message)
 
     clock = [0.0]
-    monkeypatch.setattr("api.middleware.body_limit.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("graspd.api.middleware.body_limit.time.monotonic", lambda: clock[0])
     limit = BodyLimit(reads_all, upload_paths=frozenset(), upload_bytes=1)
     scope = {"type": "http", "method": "POST", "path": "/v1/jobs", "headers": [], "query_string": b"", "server": None}
     asyncio.run(limit(scope, trickling, send))

@@ -11,13 +11,13 @@ import pytest
 from pydantic import ValidationError
 from starlette.testclient import TestClient
 
-from api.access.keys import KeyFile, Scope
-from api.app import create_app
-from api.client.client import Client
-from api.middleware.request_context import RootPath, with_prefix
-from service.model.errors import InputError
-from service.pipeline.backends import Services
-from service.settings import Settings
+from graspd.api.access.keys import KeyFile, Scope
+from graspd.api.app import create_app
+from graspd.api.middleware.request_context import RootPath, with_prefix
+from graspd.client.client import Client
+from graspd.service.model.errors import InputError
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
 from tests.api.conftest import BASE_URL
 from tests.api.factories import add_job, finish_all
 

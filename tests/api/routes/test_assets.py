@@ -8,13 +8,13 @@ import zipfile
 import pytest
 from starlette.testclient import TestClient
 
-from api.uploads import files_of_upload, name_of_upload
-from service.model.errors import InputError, LimitError
-from service.model.states import AssetKind
-from service.pipeline.backends import Services
-from service.settings import Settings
-from service.store.asset_summary import summary
-from service.store.library import load_asset, load_asset_files
+from graspd.api.uploads import files_of_upload, name_of_upload
+from graspd.service.model.errors import InputError, LimitError
+from graspd.service.model.states import AssetKind
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
+from graspd.service.store.asset_summary import summary
+from graspd.service.store.library import load_asset, load_asset_files
 
 STL = b"solid box\nendsolid box\n"
 

@@ -7,7 +7,7 @@ from fastapi import FastAPI
 from httpx import Response
 from starlette.testclient import TestClient
 
-from service.pipeline.backends import Services
+from graspd.service.pipeline.backends import Services
 from tests.api.factories import add_job, finish_all
 
 

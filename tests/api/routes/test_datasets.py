@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from service.model import names
-from service.model.records import JobRecord
-from service.pipeline.backends import Services
-from service.store.records import publish, read_record
+from graspd.service.model import names
+from graspd.service.model.records import JobRecord
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.records import publish, read_record
 from tests.api.factories import finish_all
 from tests.planning import plan_all
 from tests.service.pipeline.test_fidelity_choice import CHART, scene_chart

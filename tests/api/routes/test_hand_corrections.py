@@ -9,15 +9,15 @@ import pytest
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
-from api.access.keys import KeyFile, Scope
-from api.app import create_app
-from service.model import names
-from service.model.states import AssetKind
-from service.pipeline.backends import Services
-from service.settings import Settings
-from service.store.assets import builtin_files
-from service.store.descriptions import MAX_ENTRIES
-from service.store.library import load_asset, load_asset_files
+from graspd.api.access.keys import KeyFile, Scope
+from graspd.api.app import create_app
+from graspd.service.model import names
+from graspd.service.model.states import AssetKind
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
+from graspd.service.store.assets import builtin_files
+from graspd.service.store.descriptions import MAX_ENTRIES
+from graspd.service.store.library import load_asset, load_asset_files
 from tests.api.conftest import BASE_URL
 
 FILES = builtin_files(AssetKind.HAND, "barrett")

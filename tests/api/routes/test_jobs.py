@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from api.client.client import events_of
-from service.model.clock import timestamp
-from service.model.metrics import GraspType
-from service.model.planning import plan
-from service.pipeline.backends import Services
-from service.store.records import publish
+from graspd.client.client import events_of
+from graspd.service.model.clock import timestamp
+from graspd.service.model.metrics import GraspType
+from graspd.service.model.planning import plan
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.records import publish
 from tests.api.factories import add_job, fail, finish, finish_all
 from tests.service.pipeline.test_fidelity_choice import scene_chart
 from tests.waiting import until

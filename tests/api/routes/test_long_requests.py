@@ -9,9 +9,9 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from api.routes import assets
-from api.routes.dependencies import Turns
-from service.model.errors import UnavailableError
+from graspd.api.routes import assets
+from graspd.api.routes.dependencies import Turns
+from graspd.service.model.errors import UnavailableError
 from tests.waiting import PATIENCE_S
 
 

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from api.uploads import files_of_upload
-from service.model import names
-from service.model.errors import LimitError
-from service.model.records import JobRecord
-from service.model.states import AssetKind
-from service.pipeline.backends import Services
-from service.store import network_file
-from service.store.library import load_asset_files
-from service.store.network_file import NETWORK_FILE, to_bytes
-from service.store.records import read_record
+from graspd.api.uploads import files_of_upload
+from graspd.service.model import names
+from graspd.service.model.errors import LimitError
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import AssetKind
+from graspd.service.pipeline.backends import Services
+from graspd.service.store import network_file
+from graspd.service.store.library import load_asset_files
+from graspd.service.store.network_file import NETWORK_FILE, to_bytes
+from graspd.service.store.records import read_record
 from tests.networks import random_network
 from tests.service.store.test_network_file import HOSTILE
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from service.pipeline.backends import Services
+from graspd.service.pipeline.backends import Services
 from tests.api.factories import add_job, finish_all
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}

@@ -9,10 +9,10 @@ import h5py
 import pytest
 from starlette.testclient import TestClient
 
-from api.dashboard.job_pages import Pictures
-from api.routes.shards import parse_range
-from service.pipeline.backends import Services
-from service.store.store import Store
+from graspd.api.dashboard.job_pages import Pictures
+from graspd.api.routes.shards import parse_range
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.store import Store
 from tests.api.factories import add_job, finish_all
 from tests.damage import cut, flip, remove
 

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from api.access.keys import KeyFile, Scope
-from api.app import create_app
-from service.index.rebuild import differences, rebuild
-from service.model import names
-from service.model.records import MOST_TAGGED
-from service.pipeline.backends import Services
-from service.readers.where import parse
-from service.store.manifests import ShardManifest
-from service.store.shards import Shard, read_shard
+from graspd.api.access.keys import KeyFile, Scope
+from graspd.api.app import create_app
+from graspd.service.index.rebuild import differences, rebuild
+from graspd.service.model import names
+from graspd.service.model.records import MOST_TAGGED
+from graspd.service.pipeline.backends import Services
+from graspd.service.readers.where import parse
+from graspd.service.store.manifests import ShardManifest
+from graspd.service.store.shards import Shard, read_shard
 from tests.api.factories import add_job, finish_all
 from tests.planning import plan_all
 
@@ -128,7 +128,7 @@ def test_a_tag_is_made_anew_after_its_end_even_if_that_broke_off(
     http: TestClient, made: ShardManifest, services: Services, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     give(http, "good", grasps=named(made.shard_id, 1))
-    monkeypatch.setattr("service.pipeline.tagging.drop_older", lambda *_: None)
+    monkeypatch.setattr("graspd.service.pipeline.tagging.drop_older", lambda *_: None)
     http.delete("/v1/tags/good")
     rebuild(services.index, services.store)
     assert http.get("/v1/tags").json() == []
@@ -149,12 +149,12 @@ def test_what_is_not_there_or_too_much_gets_no_tag(
     assert "no grasp passes" in refused(422, filter={"min_epsilon": 1000})
     refused(422, name="no/name", grasps=named(made.shard_id, 1))
     refused(422, name="x" * 65, grasps=named(made.shard_id, 1))
-    monkeypatch.setattr("service.pipeline.tagging.MOST_TAGGED", 3)
+    monkeypatch.setattr("graspd.service.pipeline.tagging.MOST_TAGGED", 3)
     assert "at most 3" in refused(413, grasps=named(made.shard_id, 1, 2, 3, 4))
-    monkeypatch.setattr("api.catalog.grasps.MOST_TAGGED", 3)
+    monkeypatch.setattr("graspd.api.catalog.grasps.MOST_TAGGED", 3)
     assert "narrow it" in refused(413, filter={})
     assert http.get("/v1/tags").json() == [] and MOST_TAGGED > 3
-    monkeypatch.setattr("api.catalog.tags.MOST_TAGS", 1)
+    monkeypatch.setattr("graspd.api.catalog.tags.MOST_TAGS", 1)
     give(http, "first", grasps=named(made.shard_id, 1))
     assert "the most" in refused(413, grasps=named(made.shard_id, 1))
 
@@ -224,7 +224,7 @@ def test_a_zip_of_nothing_of_too_much_or_of_a_damaged_shard_is_refused(
     (services.settings.data_dir / "store" / made.key).write_bytes(b"other bytes")
     answer = http.get(address)
     assert answer.status_code == 500 and made.key in answer.json()["detail"]
-    monkeypatch.setattr("api.catalog.grasp_exports.MOST_SHARDS", 0)
+    monkeypatch.setattr("graspd.api.catalog.grasp_exports.MOST_SHARDS", 0)
     assert http.get(address).status_code == 413
 
 

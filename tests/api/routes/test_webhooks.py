@@ -15,16 +15,16 @@ import pytest
 from pydantic import SecretStr
 from starlette.testclient import TestClient
 
-from api.access.keys import KeyFile, Scope
-from api.app import create_app
-from service.index.index import Index
-from service.index.outbox import note_ends
-from service.index.rebuild import rebuild
-from service.model.webhooks import MOST_HOOKS, WAITS_S, Webhook
-from service.pipeline.backends import Services
-from service.pipeline.http_client import Answer
-from service.pipeline.webhook_dispatcher import AT_ONCE, SLOW_AT_ONCE, WebhookDispatcher
-from service.settings import Settings
+from graspd.api.access.keys import KeyFile, Scope
+from graspd.api.app import create_app
+from graspd.service.index.index import Index
+from graspd.service.index.outbox import note_ends
+from graspd.service.index.rebuild import rebuild
+from graspd.service.model.webhooks import MOST_HOOKS, WAITS_S, Webhook
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.http_client import Answer
+from graspd.service.pipeline.webhook_dispatcher import AT_ONCE, SLOW_AT_ONCE, WebhookDispatcher
+from graspd.service.settings import Settings
 from tests.api.factories import add_job, finish_all
 from tests.planning import plan_all
 from tests.waiting import PATIENCE_S, until
@@ -278,7 +278,7 @@ def test_silent_addresses_keep_no_other_waiting(services: Services, dead: int, t
 def test_a_burst_of_ends_is_told_without_a_pause_between_them(
     services: Services, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.pipeline.webhook_dispatcher._PAUSE_S", PATIENCE_S)
+    monkeypatch.setattr("graspd.service.pipeline.webhook_dispatcher._PAUSE_S", PATIENCE_S)
     ear, stop = Ear(services), threading.Event()
     ear.dispatcher = WebhookDispatcher(services, stop, send=ear.send)
     hooks(services, 1, "a", "good")

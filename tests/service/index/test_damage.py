@@ -11,21 +11,21 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.index.index import Index
-from service.index.rebuild import differences, rebuild
-from service.model import names
-from service.model.errors import IndexUnavailable
-from service.model.planning import plan
-from service.model.records import AttemptRecord, JobRecord
-from service.model.states import AssetKind, State
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.controller import Controller
-from service.run.commands import app
-from service.settings import Settings
-from service.store.library import stored_assets
-from service.store.records import add_job_event, put_record, read_record
-from service.store.store import open_store
+from graspd.service.index.index import Index
+from graspd.service.index.rebuild import differences, rebuild
+from graspd.service.model import names
+from graspd.service.model.errors import IndexUnavailable
+from graspd.service.model.planning import plan
+from graspd.service.model.records import AttemptRecord, JobRecord
+from graspd.service.model.states import AssetKind, State
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.controller import Controller
+from graspd.service.run.commands import app
+from graspd.service.settings import Settings
+from graspd.service.store.library import stored_assets
+from graspd.service.store.records import add_job_event, put_record, read_record
+from graspd.service.store.store import open_store
 from tests.damage import overwrite
 from tests.fakes import add_assets, make_shard, message_for, request
 from tests.indexes import empty_index

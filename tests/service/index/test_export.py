@@ -8,16 +8,16 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 
-from service.index.export import TABLES, export
-from service.model.errors import InputError
-from service.pipeline.backends import Services
+from graspd.service.index.export import TABLES, export
+from graspd.service.model.errors import InputError
+from graspd.service.pipeline.backends import Services
 from tests.service.index.test_projects import enter, make
 
 pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed; pip install 'graspd[parquet]'")
 
 
 def test_every_row_and_value_of_a_table_is_in_its_file(services: Services, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("service.index.export.GROUP", 7)  # several groups of rows, the last one not full
+    monkeypatch.setattr("graspd.service.index.export.GROUP", 7)  # several groups of rows, the last one not full
     make(services, enter(services, "vision", 1, batches=2))
     counts = export(services.index.database, tmp_path)
     assert counts["grasps"] == 64 and counts["jobs"] == 1 and counts["shards"] == counts["tasks"] > 1

@@ -14,24 +14,24 @@ import pytest
 from pydantic import SecretStr
 from sqlalchemy import delete, update
 
-from service.index import tables
-from service.index.index import Index
-from service.index.queries.grasps import GraspFilter, GraspSort
-from service.index.rebuild import differences, rebuild
-from service.index.views import GraspView
-from service.model import names
-from service.model.clock import timestamp
-from service.model.errors import ConflictError, IndexUnavailable, InputError, NotFoundError, StoreUnavailable
-from service.model.messages import Origin
-from service.model.planning import Turns, message_of, plan
-from service.model.records import AttemptRecord, JobRecord
-from service.model.states import AssetKind, Lane, Stage, State
-from service.model.version import STAGE_REVISIONS
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.settings import Settings
-from service.store.records import put_record, read_record
-from service.store.store import Store, open_store
+from graspd.service.index import tables
+from graspd.service.index.index import Index
+from graspd.service.index.queries.grasps import GraspFilter, GraspSort
+from graspd.service.index.rebuild import differences, rebuild
+from graspd.service.index.views import GraspView
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import ConflictError, IndexUnavailable, InputError, NotFoundError, StoreUnavailable
+from graspd.service.model.messages import Origin
+from graspd.service.model.planning import Turns, message_of, plan
+from graspd.service.model.records import AttemptRecord, JobRecord
+from graspd.service.model.states import AssetKind, Lane, Stage, State
+from graspd.service.model.version import STAGE_REVISIONS
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
+from graspd.service.store.records import put_record, read_record
+from graspd.service.store.store import Store, open_store
 from tests.fakes import add_assets, make_shard, request
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
@@ -400,7 +400,7 @@ def test_a_rebuild_that_breaks_off_leaves_the_old_rows(services: Services, monke
 def test_a_pair_is_found_whichever_way_the_database_goes(
     services: Services, monkeypatch: pytest.MonkeyPatch, sorted_at_once: int
 ) -> None:
-    monkeypatch.setattr("service.index.queries.grasps.SORTED_AT_ONCE", sorted_at_once)
+    monkeypatch.setattr("graspd.service.index.queries.grasps.SORTED_AT_ONCE", sorted_at_once)
     job, _ = job_actions.submit(services, request())
     run_all(services, job.id)
     sort = GraspSort(by="penetration_depth_mm", descending=False)
@@ -433,8 +433,8 @@ def test_every_way_of_searching_finds_the_same(
             and all(getattr(grasp, name) >= bound for name, bound in where.at_least.items())
             and all(getattr(grasp, name) <= bound for name, bound in where.at_most.items())
         ]
-        monkeypatch.setattr("service.index.queries.grasps.SORTED_AT_ONCE", sorted_at_once)
-        monkeypatch.setattr("service.index.queries.grasps.LOOKED_AT", looked_at)
+        monkeypatch.setattr("graspd.service.index.queries.grasps.SORTED_AT_ONCE", sorted_at_once)
+        monkeypatch.setattr("graspd.service.index.queries.grasps.LOOKED_AT", looked_at)
         found: list[GraspView] = []
         cursor = None
         while True:

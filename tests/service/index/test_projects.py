@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from service.index.rebuild import rebuild
-from service.index.views import UsageDay
-from service.model import names
-from service.model.clock import timestamp
-from service.model.messages import Origin
-from service.model.planning import Turns, message_of, plan
-from service.model.projects import ProjectScope
-from service.model.records import JobRecord
-from service.model.states import AssetKind, Lane
-from service.pipeline.backends import Services
-from service.store.records import put_record
+from graspd.service.index.rebuild import rebuild
+from graspd.service.index.views import UsageDay
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.messages import Origin
+from graspd.service.model.planning import Turns, message_of, plan
+from graspd.service.model.projects import ProjectScope
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import AssetKind, Lane
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.records import put_record
 from tests.fakes import make_shard, request
 
 _PAIR = ((AssetKind.HAND, "gripper"), (AssetKind.OBJECT, "ball"))

@@ -11,15 +11,15 @@ from sqlalchemy import Engine, create_engine, inspect, text
 from typer.testing import CliRunner
 
 from benchmarks.large_index import fill
-from service.index import database
-from service.index.index import Index
-from service.index.queries.grasps import GraspSort
-from service.index.tables import metadata
-from service.model.errors import IndexUnavailable
-from service.model.metrics import indexed
-from service.run.commands import app
-from service.settings import Settings
-from service.store.store import open_store
+from graspd.service.index import database
+from graspd.service.index.index import Index
+from graspd.service.index.queries.grasps import GraspSort
+from graspd.service.index.tables import metadata
+from graspd.service.model.errors import IndexUnavailable
+from graspd.service.model.metrics import indexed
+from graspd.service.run.commands import app
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
 from tests.servers import PostgresServer
 from tests.service.conftest import DATABASES
 

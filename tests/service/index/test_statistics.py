@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from sqlalchemy import insert
 
-from service.index.index import Index
-from service.index.queries.grasps import GraspFilter
-from service.index.tables import METRICS, grasps, shards
+from graspd.service.index.index import Index
+from graspd.service.index.queries.grasps import GraspFilter
+from graspd.service.index.tables import METRICS, grasps, shards
 from tests.indexes import empty_index
 
 COUNT = 500

@@ -10,16 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from service.index.rebuild import differences
-from service.model import names
-from service.model.clock import timestamp
-from service.model.planning import message_of, plan
-from service.model.records import JobRecord
-from service.model.states import AssetKind, Lane, State
-from service.pipeline.backends import Services
-from service.settings import Settings
-from service.store.records import put_record
-from service.store.store import open_store
+from graspd.service.index.rebuild import differences
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.planning import message_of, plan
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import AssetKind, Lane, State
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
+from graspd.service.store.records import put_record
+from graspd.service.store.store import open_store
 from tests.fakes import add_assets, make_shard, request
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.model.domain import AUDITS, BATCH_SIZE
+from graspd.service.model.domain import AUDITS, BATCH_SIZE
 from tests.fakes import request
 
 #: The letter takes 6 pushes of 2 s and 0.8 s of closing, 3,200 steps of MuJoCo; a valid grasp has cost some 450 steps

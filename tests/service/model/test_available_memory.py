@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from service.model.cores import available_memory
+from graspd.service.model.cores import available_memory
 
 MACHINE_MB = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**20
 

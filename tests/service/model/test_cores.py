@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from service.model import cores
-from service.model.cores import available_cores
+from graspd.service.model import cores
+from graspd.service.model.cores import available_cores
 
 MACHINE = 16
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.model.errors import ERRORS, GraspdError
+from graspd.service.model.errors import ERRORS, GraspdError
 
 
 @pytest.mark.parametrize("kind", ERRORS.values(), ids=ERRORS.keys())

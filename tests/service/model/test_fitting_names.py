@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from api.uploads import name_of_upload
-from service.model.errors import InputError
-from service.model.names import fitted
-from worker.files.exchange.lots import plain_name
+from graspd.api.uploads import name_of_upload
+from graspd.exchange.lots import plain_name
+from graspd.service.model.errors import InputError
+from graspd.service.model.names import fitted
 
 LONG = "mujoco-Office_Depot_Canon_CL211XL_Remanufactured_Ink_Cartridge_TriColor"
 

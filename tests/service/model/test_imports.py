@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from service.model import libraries as module
-from service.model.libraries import imports, own_process
+from graspd.service.model import libraries as module
+from graspd.service.model.libraries import imports, own_process
 
 
 @pytest.fixture(autouse=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from service.model.libraries import _distributions, version_of
+from graspd.service.model.libraries import _distributions, version_of
 
 
 @pytest.mark.parametrize(

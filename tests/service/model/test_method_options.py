@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
-from service.model.digests import shard_id
-from service.model.domain import JobRequest
-from service.model.states import Stage
+from graspd.service.model.digests import shard_id
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.states import Stage
 from tests.fakes import request
 
 

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from benchmarks.large_index import fill
-from service.index.index import Index
-from service.model.metrics import GRASP_METRICS
-from service.store.columns import SCHEMAS
-from service.store.store import open_store
+from graspd.service.index.index import Index
+from graspd.service.model.metrics import GRASP_METRICS
+from graspd.service.store.columns import SCHEMAS
+from graspd.service.store.store import open_store
 from tests.conftest import REPOSITORY
 from tests.one_more_metric import MEANING, NAME, TITLE
 

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from service.model.digests import job_id, shard_id
-from service.model.domain import JobOptions, JobRequest
-from service.model.metrics import MIN_DISTANCE_M
-from service.model.states import Stage
+from graspd.service.model.digests import job_id, shard_id
+from graspd.service.model.domain import JobOptions, JobRequest
+from graspd.service.model.metrics import MIN_DISTANCE_M
+from graspd.service.model.states import Stage
 
 HAND, OBJECT = "a" * 32, "b" * 32
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from service.model.planning import limit_told, shortfall, totals
+from graspd.service.model.planning import limit_told, shortfall, totals
 
 
 def test_all_that_were_asked_for_need_no_reason() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.model.pinhole import back_project, fitted_normals, pixel_rays, surface_normals
+from graspd.service.model.pinhole import back_project, fitted_normals, pixel_rays, surface_normals
 
 K = np.array([[90.0, 0, 31.5], [0, 80.0, 24.5], [0, 0, 1]])
 WIDTH, HEIGHT = 64, 48

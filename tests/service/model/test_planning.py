@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.model.clock import timestamp
-from service.model.digests import job_id
-from service.model.domain import JobRequest
-from service.model.planning import (
+from graspd.service.model.clock import timestamp
+from graspd.service.model.digests import job_id
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.planning import (
     MAX_BACKOFF_S,
     TaskFacts,
     backoff,
@@ -20,8 +20,8 @@ from service.model.planning import (
     message_of,
     plan,
 )
-from service.model.records import JobRecord
-from service.model.states import Lane, Stage, State
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import Lane, Stage, State
 from tests.fakes import request
 
 HAND, OBJECT = "a" * 32, "b" * 32

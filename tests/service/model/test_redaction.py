@@ -7,14 +7,14 @@ import logging
 import pytest
 from pydantic import ValidationError
 
-from service.index.index import Index
-from service.index.sample import look
-from service.model.errors import GraspdError, InputError, without_secrets
-from service.queue.connection import connect
-from service.run.address import Joining
-from service.settings import Settings
-from service.store.store import open_store
-from service.telemetry import JsonLines, _TextLines
+from graspd.service.index.index import Index
+from graspd.service.index.sample import look
+from graspd.service.model.errors import GraspdError, InputError, without_secrets
+from graspd.service.queue.connection import connect
+from graspd.service.run.address import Joining
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
+from graspd.service.telemetry import JsonLines, _TextLines
 
 SECRET = "s3cr3t"
 QUOTING = [

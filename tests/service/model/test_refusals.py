@@ -7,7 +7,7 @@ from typing import Any, Literal
 import pytest
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from service.model.base import Name, refusal
+from graspd.service.model.base import Name, refusal
 
 
 class Kind(BaseModel):

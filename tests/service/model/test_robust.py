@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
-from service.model.digests import job_id
-from service.model.domain import JobRequest
-from service.model.metrics import AXIS_MEANINGS, ROBUST_MODELS, Axis, axis_word
+from graspd.service.model.digests import job_id
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.metrics import AXIS_MEANINGS, ROBUST_MODELS, Axis, axis_word
 
 
 def request(**options: object) -> JobRequest:

@@ -7,16 +7,16 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from service.model.clock import timestamp
-from service.model.digests import digest_json, job_id, shard_id
-from service.model.domain import SCENES, JobOptions, JobRequest
-from service.model.planning import message_of, plan
-from service.model.records import JobRecord, Member
-from service.model.states import Lane, Stage
-from service.model.version import STAGE_REVISIONS
-from service.pipeline.datasets.spec import describe
+from graspd.service.model.clock import timestamp
+from graspd.service.model.digests import digest_json, job_id, shard_id
+from graspd.service.model.domain import SCENES, JobOptions, JobRequest
+from graspd.service.model.planning import message_of, plan
+from graspd.service.model.records import JobRecord, Member
+from graspd.service.model.states import Lane, Stage
+from graspd.service.model.version import STAGE_REVISIONS
+from graspd.service.pipeline.datasets.spec import describe
+from graspd.worker.planners.registry import PLANNERS, method
 from tests.fakes import request
-from worker.planners.registry import PLANNERS, method
 
 HAND, OBJECT = "a" * 32, "b" * 32
 #: A job as it was written before jobs had scenes.

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from service.model.errors import InputError
-from service.model.scene_spec import MAX_FILE_BYTES, SceneSpec, parse_scene, scene_option
+from graspd.service.model.errors import InputError
+from graspd.service.model.scene_spec import MAX_FILE_BYTES, SceneSpec, parse_scene, scene_option
 
 TABLE = {"supports": [{"kind": "half_space"}]}
 

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.model.studies import MapCell, Stability, StabilityMap, counts, from_json, short, tick
-from service.store.records import publish
-from service.store.store import open_store
+from graspd.service.model.studies import MapCell, Stability, StabilityMap, counts, from_json, short, tick
+from graspd.service.store.records import publish
+from graspd.service.store.store import open_store
 
 
 def a_map(*cells: MapCell) -> StabilityMap:

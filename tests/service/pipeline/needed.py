@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from service.model.errors import ConflictError
-from service.model.states import AssetKind
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.datasets import actions
-from service.pipeline.datasets.spec import DatasetRequest
-from service.pipeline.deletion import delete_asset, delete_dataset, delete_job
+from graspd.service.model.errors import ConflictError
+from graspd.service.model.states import AssetKind
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.spec import DatasetRequest
+from graspd.service.pipeline.deletion import delete_asset, delete_dataset, delete_job
 from tests.planning import plan_all
 
 

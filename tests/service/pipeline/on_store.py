@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from service.pipeline.backends import Services
-from service.settings import Settings
-from service.store.store import open_store
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
 from tests.fakes import add_assets
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue

@@ -8,25 +8,25 @@ from typing import Any
 
 import pytest
 
-from service.index.rebuild import differences
-from service.model import names
-from service.model.clock import timestamp
-from service.model.errors import ConflictError, QueueUnavailable, StoreUnavailable
-from service.model.messages import IngestMessage, TaskMessage
-from service.model.states import AssetKind, Stage, State
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.controller import Controller
-from service.pipeline.lease_reaper import LOST_AFTER_S
-from service.pipeline.routes import Routes
-from service.queue.port import Event, EventKind
-from service.store.library import publish_asset, stored_assets
+from graspd.service.index.rebuild import differences
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import ConflictError, QueueUnavailable, StoreUnavailable
+from graspd.service.model.messages import IngestMessage, TaskMessage
+from graspd.service.model.states import AssetKind, Stage, State
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.controller import Controller
+from graspd.service.pipeline.lease_reaper import LOST_AFTER_S
+from graspd.service.pipeline.routes import Routes
+from graspd.service.queue.port import Event, EventKind
+from graspd.service.store.library import publish_asset, stored_assets
+from graspd.worker.process.runner import Runner
+from graspd.worker.stages.context import StopReason, TaskContext
 from tests.fakes import HAND_FILES, fake_stages, make_shard, request
 from tests.indexes import empty_index
 from tests.memory_queue import Delivery, MemoryQueue
 from tests.waiting import until
-from worker.process.runner import Runner
-from worker.stages.context import StopReason, TaskContext
 
 
 class Clock:

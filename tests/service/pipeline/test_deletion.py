@@ -7,20 +7,20 @@ from typing import Any
 
 import pytest
 
-from service.index.changes.removals import Removals
-from service.index.rebuild import differences
-from service.model import names
-from service.model.errors import ConflictError, NotFoundError
-from service.model.records import tag_id
-from service.model.states import AssetKind, State
-from service.pipeline import job_actions, tagging
-from service.pipeline.backends import Services
-from service.pipeline.datasets import actions
-from service.pipeline.datasets.spec import DatasetRequest
-from service.pipeline.deletion import delete_asset, delete_dataset, delete_job, restore
-from service.pipeline.garbage_collector import GarbageCollector
-from service.store.library import publish_asset
-from service.store.records import deletions, pending
+from graspd.service.index.changes.removals import Removals
+from graspd.service.index.rebuild import differences
+from graspd.service.model import names
+from graspd.service.model.errors import ConflictError, NotFoundError
+from graspd.service.model.records import tag_id
+from graspd.service.model.states import AssetKind, State
+from graspd.service.pipeline import job_actions, tagging
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.spec import DatasetRequest
+from graspd.service.pipeline.deletion import delete_asset, delete_dataset, delete_job, restore
+from graspd.service.pipeline.garbage_collector import GarbageCollector
+from graspd.service.store.library import publish_asset
+from graspd.service.store.records import deletions, pending
 from tests.fakes import OBJECT_FILES, make_shard, request
 from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import fail

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from service.pipeline.controller import Duty
+from graspd.service.pipeline.controller import Duty
 
 
 class Clock:

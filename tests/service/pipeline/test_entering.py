@@ -10,16 +10,16 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from sqlalchemy import func, select
 
-from service.index.changes.records import RANGES_AT_ONCE
-from service.index.rebuild import differences
-from service.index.tables import tasks
-from service.model import names
-from service.model.errors import ConflictError
-from service.model.states import State
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.controller import Controller
-from service.pipeline.deletion import delete_job
+from graspd.service.index.changes.records import RANGES_AT_ONCE
+from graspd.service.index.rebuild import differences
+from graspd.service.index.tables import tasks
+from graspd.service.model import names
+from graspd.service.model.errors import ConflictError
+from graspd.service.model.states import State
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.controller import Controller
+from graspd.service.pipeline.deletion import delete_job
 from tests.fakes import request
 
 WorkOff = Callable[[], list[tuple[str, int]]]

@@ -7,15 +7,15 @@ from typing import Any
 
 import pytest
 
-from service.model import names
-from service.model.errors import InputError
-from service.model.records import Choice, JobRecord
-from service.model.scene_spec import SceneSpec
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.fidelity_choice import cheapest, parse_target
-from service.store.records import charts_of, latest, publish, read_record, scene_kinds
-from service.store.store import open_store
+from graspd.service.model import names
+from graspd.service.model.errors import InputError
+from graspd.service.model.records import Choice, JobRecord
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.fidelity_choice import cheapest, parse_target
+from graspd.service.store.records import charts_of, latest, publish, read_record, scene_kinds
+from graspd.service.store.store import open_store
 from tests.fakes import request
 
 

@@ -10,25 +10,25 @@ from typing import Final
 import numpy as np
 import pytest
 
-from service.index.rebuild import rebuild
-from service.model import names
-from service.model.clock import timestamp
-from service.model.errors import DamagedError
-from service.model.records import AttemptRecord, JobRecord, ObjectSet, Tag
-from service.model.states import AssetKind, Stage
-from service.model.webhooks import Webhook
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.datasets import actions
-from service.pipeline.datasets.spec import DatasetRequest
-from service.pipeline.identity import ServiceRecord
-from service.pipeline.integrity import FOLDERS, examine, scan
-from service.pipeline.repair import repair
-from service.store.assets import pack as pack_files
-from service.store.integrity import put_document, put_sealed
-from service.store.library import builtin_assets, load_check, publish_builtins, store_files
-from service.store.manifests import load_manifest
-from service.store.records import (
+from graspd.service.index.rebuild import rebuild
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import DamagedError
+from graspd.service.model.records import AttemptRecord, JobRecord, ObjectSet, Tag
+from graspd.service.model.states import AssetKind, Stage
+from graspd.service.model.webhooks import Webhook
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.spec import DatasetRequest
+from graspd.service.pipeline.identity import ServiceRecord
+from graspd.service.pipeline.integrity import FOLDERS, examine, scan
+from graspd.service.pipeline.repair import repair
+from graspd.service.store.assets import pack as pack_files
+from graspd.service.store.integrity import put_document, put_sealed
+from graspd.service.store.library import builtin_assets, load_check, publish_builtins, store_files
+from graspd.service.store.manifests import load_manifest
+from graspd.service.store.records import (
     Deletion,
     Released,
     add_job_event,

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from service.model.clock import timestamp
-from service.model.states import Lane, Stage, State
-from service.model.workers import WorkerBeat, own_ability
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.controller import Controller
-from service.queue.port import Event, EventKind, Report
+from graspd.service.model.clock import timestamp
+from graspd.service.model.states import Lane, Stage, State
+from graspd.service.model.workers import WorkerBeat, own_ability
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.controller import Controller
+from graspd.service.queue.port import Event, EventKind, Report
 from tests.fakes import make_shard, request
 from tests.memory_queue import Delivery, MemoryQueue
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from service.model.errors import InputError
-from service.model.webhooks import check_url
-from service.pipeline import http_client
-from service.pipeline.http_client import is_public, networks, post
+from graspd.service.model.errors import InputError
+from graspd.service.model.webhooks import check_url
+from graspd.service.pipeline import http_client
+from graspd.service.pipeline.http_client import is_public, networks, post
 
 LOOPBACK = networks("127.0.0.0/8")
 

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from service.index.index import Index
-from service.model.errors import BusyError
-from service.pipeline.backends import Services
-from service.pipeline.controller import Controller
-from service.pipeline.identity import check_queue, identify, service_ids
-from service.queue.rq_queue import RqQueue
-from service.settings import Settings
-from service.store.store import Store, open_store
+from graspd.service.index.index import Index
+from graspd.service.model.errors import BusyError
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.controller import Controller
+from graspd.service.pipeline.identity import check_queue, identify, service_ids
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.settings import Settings
+from graspd.service.store.store import Store, open_store
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 

@@ -8,23 +8,23 @@ from pathlib import Path
 
 import pytest
 
-from service.index.rebuild import differences
-from service.model import names
-from service.model.errors import DamagedShard
-from service.model.states import State
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.controller import Controller
-from service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, scan
-from service.pipeline.repair import repair
-from service.queue.port import EventKind
-from service.store.manifests import ShardManifest, load_manifest, load_shard
+from graspd.service.index.rebuild import differences
+from graspd.service.model import names
+from graspd.service.model.errors import DamagedShard
+from graspd.service.model.states import State
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.controller import Controller
+from graspd.service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, scan
+from graspd.service.pipeline.repair import repair
+from graspd.service.queue.port import EventKind
+from graspd.service.store.manifests import ShardManifest, load_manifest, load_shard
+from graspd.worker.process.runner import Runner
+from graspd.worker.run import Run
+from graspd.worker.stages.context import TaskContext
 from tests.damage import cut, flip, overwrite, remove
 from tests.fakes import fake_stages, request
 from tests.service.pipeline.on_store import parts_on
-from worker.process.runner import Runner
-from worker.run import Run
-from worker.stages.context import TaskContext
 
 SHARDS = 6
 
@@ -136,7 +136,7 @@ def test_the_command_tells_what_is_damaged_and_exits_with_1(
 ) -> None:
     from typer.testing import CliRunner
 
-    from service.run.store_commands import app
+    from graspd.service.run.store_commands import app
 
     monkeypatch.setenv("GRASPD_STORE_URL", services.store.url)
     command = ["store", "verify", "--json", "--data-dir", str(services.settings.data_dir)]
@@ -156,7 +156,7 @@ def test_a_check_of_the_index_sees_damaged_shards_too(
 ) -> None:
     from typer.testing import CliRunner
 
-    from service.run.commands import app
+    from graspd.service.run.commands import app
 
     monkeypatch.setenv("GRASPD_STORE_URL", services.store.url)
     command = ["index", "rebuild", "--check", "--data-dir", str(services.settings.data_dir)]

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from service.model import names
-from service.pipeline.backends import Services
-from service.pipeline.controller import Controller
-from service.pipeline.integrity import FOLDERS, MISSING, NO_MANIFEST
-from service.pipeline.integrity_scan import IntegrityScan, Interrupted, Turn
-from service.settings import Settings
-from service.store.manifests import ShardManifest
-from service.store.store import open_store
+from graspd.service.model import names
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.controller import Controller
+from graspd.service.pipeline.integrity import FOLDERS, MISSING, NO_MANIFEST
+from graspd.service.pipeline.integrity_scan import IntegrityScan, Interrupted, Turn
+from graspd.service.settings import Settings
+from graspd.service.store.manifests import ShardManifest
+from graspd.service.store.store import open_store
 from tests.damage import flip, overwrite, remove
 from tests.fakes import make_shard, message_for
 from tests.indexes import empty_index
@@ -149,7 +149,7 @@ def test_a_second_verify_is_refused(
 ) -> None:
     from typer.testing import CliRunner
 
-    from service.run.store_commands import app
+    from graspd.service.run.store_commands import app
 
     folder = tmp_path / "one"
     settings = Settings(data_dir=folder)

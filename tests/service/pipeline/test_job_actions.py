@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from service.index.rebuild import differences
-from service.model import names
-from service.model.errors import ConflictError, InputError, NotFoundError, QueueUnavailable
-from service.model.states import AssetKind, Lane, State
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.store.library import publish_asset
-from service.store.records import job_events
+from graspd.service.index.rebuild import differences
+from graspd.service.model import names
+from graspd.service.model.errors import ConflictError, InputError, NotFoundError, QueueUnavailable
+from graspd.service.model.states import AssetKind, Lane, State
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.library import publish_asset
+from graspd.service.store.records import job_events
 from tests.fakes import HAND_FILES, request
 from tests.memory_queue import MemoryQueue
 from tests.service.index.test_index import fail, run_all

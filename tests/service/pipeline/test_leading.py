@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from service.model.errors import QueueUnavailable
-from service.pipeline.leading import Leadership
-from service.telemetry import HeartbeatFile
+from graspd.service.model.errors import QueueUnavailable
+from graspd.service.pipeline.leading import Leadership
+from graspd.service.telemetry import HeartbeatFile
 from tests.memory_queue import MemoryQueue
 from tests.waiting import PATIENCE_S, until
 
@@ -34,7 +34,7 @@ LEASE_S = 600.0
 @pytest.fixture(autouse=True)
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leases are renewed every 10 ms."""
-    monkeypatch.setattr("service.pipeline.leading._RENEWALS", LEASE_S * 100)
+    monkeypatch.setattr("graspd.service.pipeline.leading._RENEWALS", LEASE_S * 100)
 
 
 class Pauses(threading.Event):
@@ -71,7 +71,7 @@ def test_a_lease_is_renewed_for_as_long_as_it_is_held_and_then_given_back() -> N
 def test_who_waits_leads_within_a_lease_and_a_look_after_the_other_fell_silent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("service.pipeline.leading._RENEWALS", 3.0)
+    monkeypatch.setattr("graspd.service.pipeline.leading._RENEWALS", 3.0)
     stop = Pauses()
     stop.queue.lead("silent", LEASE_S)
     assert leadership(stop.queue).wait(stop)

@@ -9,21 +9,21 @@ from pathlib import Path
 
 import pytest
 
-from service.index import rebuild as rebuilding
-from service.index.index import Index
-from service.index.notes import Notes
-from service.index.rebuild import differences
-from service.model import names
-from service.model.clock import timestamp
-from service.model.planning import message_of, plan
-from service.model.records import JobRecord
-from service.pipeline import controller, job_actions
-from service.pipeline.backends import Services
-from service.pipeline.datasets import actions
-from service.queue.port import Event, EventKind
-from service.settings import Settings
-from service.store.records import read_record
-from service.store.store import open_store
+from graspd.service.index import rebuild as rebuilding
+from graspd.service.index.index import Index
+from graspd.service.index.notes import Notes
+from graspd.service.index.rebuild import differences
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.planning import message_of, plan
+from graspd.service.model.records import JobRecord
+from graspd.service.pipeline import controller, job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
+from graspd.service.queue.port import Event, EventKind
+from graspd.service.settings import Settings
+from graspd.service.store.records import read_record
+from graspd.service.store.store import open_store
 from tests.fakes import add_assets, make_shard, request
 from tests.memory_queue import MemoryQueue
 

@@ -11,15 +11,15 @@ from typing import Any
 import pytest
 from sqlalchemy.dialects import sqlite
 
-from api.metrics import Metrics, Snapshot
-from service.index.notes import Damage
-from service.index.queries import overview
-from service.model.messages import TaskMessage
-from service.model.states import Lane, Stage, State
-from service.pipeline.backends import Services
-from service.pipeline.job_actions import submit
-from service.pipeline.metrics import MOST_KINDS, OTHER_KIND, SERIES, Tally, parse_field
-from service.queue.rq_queue import WORKERS, RqQueue, worker_key
+from graspd.api.metrics import Metrics, Snapshot
+from graspd.service.index.notes import Damage
+from graspd.service.index.queries import overview
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.states import Lane, Stage, State
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.job_actions import submit
+from graspd.service.pipeline.metrics import MOST_KINDS, OTHER_KIND, SERIES, Tally, parse_field
+from graspd.service.queue.rq_queue import WORKERS, RqQueue, worker_key
 from tests.conftest import REPOSITORY
 from tests.fakes import make_shard, message_for, request
 from tests.indexes import empty_index

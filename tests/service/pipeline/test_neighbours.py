@@ -8,21 +8,21 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from service.index.queries.grasps import GraspFilter
-from service.index.rebuild import differences
-from service.model import names
-from service.model.errors import ConflictError, InputError, NotFoundError, SceneError
-from service.model.messages import TaskMessage
-from service.model.planning import message_of, plan
-from service.model.records import JobRecord
-from service.model.states import AssetKind, Stage
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.datasets import actions
-from service.pipeline.datasets.spec import DatasetRequest
-from service.pipeline.deletion import delete_asset
-from service.store.library import publish_asset
-from service.store.records import read_record
+from graspd.service.index.queries.grasps import GraspFilter
+from graspd.service.index.rebuild import differences
+from graspd.service.model import names
+from graspd.service.model.errors import ConflictError, InputError, NotFoundError, SceneError
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.planning import message_of, plan
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import AssetKind, Stage
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.spec import DatasetRequest
+from graspd.service.pipeline.deletion import delete_asset
+from graspd.service.store.library import publish_asset
+from graspd.service.store.records import read_record
 from tests.fakes import make_shard, request
 from tests.planning import plan_all
 from tests.service.pipeline.needed import needed_until_its_users_are_deleted

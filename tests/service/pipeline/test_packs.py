@@ -10,20 +10,20 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from service.index.rebuild import differences
-from service.model import names
-from service.model.clock import timestamp
-from service.model.errors import InputError
-from service.model.records import JobRecord, Snapshot
-from service.model.states import Stage, State
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.integrity import scan
-from service.pipeline.repair import repair
-from service.readers import open_shards
-from service.run import commands, store_commands
-from service.store.packs import has_packs
-from service.store.records import put_record, read_record
+from graspd.service.index.rebuild import differences
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import InputError
+from graspd.service.model.records import JobRecord, Snapshot
+from graspd.service.model.states import Stage, State
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.integrity import scan
+from graspd.service.pipeline.repair import repair
+from graspd.service.readers import open_shards
+from graspd.service.run import commands, store_commands
+from graspd.service.store.packs import has_packs
+from graspd.service.store.records import put_record, read_record
 from tests.damage import flipped, overwrite
 from tests.fakes import request
 from tests.packs import pack, tasks_of

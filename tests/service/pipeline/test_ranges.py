@@ -11,26 +11,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from service.index.changes.records import Changes
-from service.index.rebuild import differences
-from service.model.clock import timestamp
-from service.model.planning import message_of, plan
-from service.model.records import JobRecord
-from service.model.states import AssetKind, Lane, Stage, State
-from service.model.version import SCHEMA_OF_RANGES, STAGE_REVISIONS, TASK_SCHEMA
-from service.model.workers import WorkerBeat
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.datasets import actions
-from service.pipeline.datasets.spec import DatasetRequest
-from service.pipeline.ranges import TaskRanges, span_of
-from service.settings import Settings
-from service.store.library import publish_asset
-from service.store.manifests import ShardManifest, publish_shard
+from graspd.service.index.changes.records import Changes
+from graspd.service.index.rebuild import differences
+from graspd.service.model.clock import timestamp
+from graspd.service.model.planning import message_of, plan
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import AssetKind, Lane, Stage, State
+from graspd.service.model.version import SCHEMA_OF_RANGES, STAGE_REVISIONS, TASK_SCHEMA
+from graspd.service.model.workers import WorkerBeat
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.spec import DatasetRequest
+from graspd.service.pipeline.ranges import TaskRanges, span_of
+from graspd.service.settings import Settings
+from graspd.service.store.library import publish_asset
+from graspd.service.store.manifests import ShardManifest, publish_shard
+from graspd.worker.stages.context import TaskContext, shard_of
 from tests.fakes import OBJECT_FILES, fake_stages, request
 from tests.planning import plan_all
 from tests.service.pipeline.test_controller import Bench
-from worker.stages.context import TaskContext, shard_of
 
 
 @pytest.fixture

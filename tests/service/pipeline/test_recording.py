@@ -10,19 +10,19 @@ import pytest
 from sqlalchemy import Connection, make_url
 from sqlalchemy.exc import OperationalError
 
-from service.index import database
-from service.index.index import Index
-from service.index.rebuild import differences
-from service.model import names
-from service.model.errors import IndexUnavailable
-from service.model.records import JobRecord
-from service.model.states import AssetKind
-from service.pipeline import job_actions, tagging
-from service.pipeline.backends import Services
-from service.pipeline.datasets import actions
-from service.pipeline.datasets.spec import DatasetRequest
-from service.pipeline.deletion import delete_asset, delete_job
-from service.store.records import read_record
+from graspd.service.index import database
+from graspd.service.index.index import Index
+from graspd.service.index.rebuild import differences
+from graspd.service.model import names
+from graspd.service.model.errors import IndexUnavailable
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import AssetKind
+from graspd.service.pipeline import job_actions, tagging
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.spec import DatasetRequest
+from graspd.service.pipeline.deletion import delete_asset, delete_job
+from graspd.service.store.records import read_record
 from tests.fakes import make_shard, request
 from tests.packs import tasks_of
 

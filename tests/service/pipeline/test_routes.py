@@ -7,14 +7,14 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from service.model.domain import JobRequest
-from service.model.planning import needed_schema
-from service.model.states import Lane, Stage
-from service.model.workers import FIRST_SCHEMA, Need, WorkerBeat, own_ability
-from service.pipeline.routes import Place, Routes
-from service.queue import entries
-from service.queue.lists import known_lists, queue_name, queue_names
-from service.queue.rq_queue import RqQueue
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.planning import needed_schema
+from graspd.service.model.states import Lane, Stage
+from graspd.service.model.workers import FIRST_SCHEMA, Need, WorkerBeat, own_ability
+from graspd.service.pipeline.routes import Place, Routes
+from graspd.service.queue import entries
+from graspd.service.queue.lists import known_lists, queue_name, queue_names
+from graspd.service.queue.rq_queue import RqQueue
 from tests.fakes import message_for, request
 
 OWN = own_ability()

@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 
-from service.index.views import AssetView
-from service.model import names
-from service.model.errors import SceneError
-from service.model.states import AssetKind
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.job_actions import check_scene
-from service.store.library import load_asset
+from graspd.service.index.views import AssetView
+from graspd.service.model import names
+from graspd.service.model.errors import SceneError
+from graspd.service.model.states import AssetKind
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.job_actions import check_scene
+from graspd.service.store.library import load_asset
 from tests.fakes import request
 
 UPRIGHT = [1.0, 0, 0, 0]

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from service.index.queries.grasps import GraspFilter, GraspSort
-from service.model import names
-from service.model.clock import timestamp
-from service.model.planning import message_of, plan
-from service.model.records import AttemptRecord, JobRecord
-from service.model.states import Stage, State
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.store.records import put_record, read_record
+from graspd.service.index.queries.grasps import GraspFilter, GraspSort
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.planning import message_of, plan
+from graspd.service.model.records import AttemptRecord, JobRecord
+from graspd.service.model.states import Stage, State
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.store.records import put_record, read_record
 from tests.fakes import make_shard, request
 
 

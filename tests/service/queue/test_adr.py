@@ -21,13 +21,13 @@ from rq.serializers import JSONSerializer
 from rq.timeouts import BaseDeathPenalty
 from rq.worker import BaseWorker
 
-from service.model.states import Lane, Stage, State
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.indexer import Indexer
-from service.pipeline.lease_reaper import LeaseReaper
-from service.queue.lists import held_key, queue_name
-from service.queue.rq_queue import RqQueue, cancel_key, rq_id
+from graspd.service.model.states import Lane, Stage, State
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.indexer import Indexer
+from graspd.service.pipeline.lease_reaper import LeaseReaper
+from graspd.service.queue.lists import held_key, queue_name
+from graspd.service.queue.rq_queue import RqQueue, cancel_key, rq_id
 from tests.conftest import REPOSITORY
 from tests.fakes import request
 

@@ -12,9 +12,9 @@ from rq import Callback, Queue, Retry
 from rq.job import Job
 from rq.serializers import DefaultSerializer, JSONSerializer
 
-from service.model.errors import TaskRefused
-from service.queue.allowed import TASK_FUNCTION, allowed_job
-from service.queue.rq_queue import RqQueue
+from graspd.service.model.errors import TaskRefused
+from graspd.service.queue.allowed import TASK_FUNCTION, allowed_job
+from graspd.service.queue.rq_queue import RqQueue
 
 
 def forge(queue: RqQueue, function: str, *args: Any, serializer: Any = JSONSerializer, **options: Any) -> str:
@@ -31,7 +31,7 @@ def fetch(queue: RqQueue, job: str) -> Job:
 
 
 @pytest.mark.parametrize(
-    "function", ["os.system", "subprocess.check_output", "graspd.tasks", "worker.process.main.run_worker"]
+    "function", ["os.system", "subprocess.check_output", "graspd.tasks", "graspd.worker.process.main.run_worker"]
 )
 def test_a_forged_function_name_is_refused(rq_queue: RqQueue, function: str, tmp_path: Path) -> None:
     witness = tmp_path / "witness"

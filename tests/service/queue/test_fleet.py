@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from service.model.clock import timestamp
-from service.model.states import Lane, Stage
-from service.queue.lists import queue_name
-from service.queue.port import Event, EventKind, Report
-from service.queue.rq_queue import REPORTS, RqQueue
+from graspd.service.model.clock import timestamp
+from graspd.service.model.states import Lane, Stage
+from graspd.service.queue.lists import queue_name
+from graspd.service.queue.port import Event, EventKind, Report
+from graspd.service.queue.rq_queue import REPORTS, RqQueue
 from tests.fakes import message_for
 from tests.memory_queue import MemoryQueue
 

@@ -11,18 +11,18 @@ from typing import Any
 
 import pytest
 
-from api.metrics import Metrics, Snapshot
-from service.model.clock import timestamp
-from service.model.errors import UnavailableError
-from service.model.states import Stage, State
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.controller import Controller
-from service.pipeline.leading import PART
-from service.queue.port import Event, EventKind
-from service.queue.rq_queue import EVENTS, METRICS, WORKERS, RqQueue, worker_key
-from service.settings import Settings
-from service.store.store import open_store
+from graspd.api.metrics import Metrics, Snapshot
+from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import UnavailableError
+from graspd.service.model.states import Stage, State
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.controller import Controller
+from graspd.service.pipeline.leading import PART
+from graspd.service.queue.port import Event, EventKind
+from graspd.service.queue.rq_queue import EVENTS, METRICS, WORKERS, RqQueue, worker_key
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
 from tests.fakes import add_assets, request
 from tests.indexes import empty_index
 

@@ -11,18 +11,18 @@ from rq import Queue, SimpleWorker
 from rq.executions import prepare_execution
 from rq.serializers import JSONSerializer
 
-from service.model.clock import timestamp
-from service.model.messages import IngestMessage, TaskMessage
-from service.model.states import Lane, Stage
-from service.model.workers import WorkerBeat
-from service.queue.lists import queue_names
-from service.queue.port import BULK_EVERY, Event, EventKind
-from service.queue.rq_queue import LEAD, RqQueue, lease_state, list_worker, renew_lease, worker_key
+from graspd.service.model.clock import timestamp
+from graspd.service.model.messages import IngestMessage, TaskMessage
+from graspd.service.model.states import Lane, Stage
+from graspd.service.model.workers import WorkerBeat
+from graspd.service.queue.lists import queue_names
+from graspd.service.queue.port import BULK_EVERY, Event, EventKind
+from graspd.service.queue.rq_queue import LEAD, RqQueue, lease_state, list_worker, renew_lease, worker_key
+from graspd.worker.process.heartbeat import Heartbeat
+from graspd.worker.stages.context import StopReason
 from tests.fakes import request
 from tests.memory_queue import MemoryQueue
 from tests.waiting import until
-from worker.process.heartbeat import Heartbeat
-from worker.stages.context import StopReason
 
 DIGEST = "0" * 32
 
@@ -360,7 +360,7 @@ def test_a_worker_is_listed_while_it_gives_signs_of_life(rq_queue: RqQueue, redi
 
 
 def test_the_stream_of_events_is_bounded(rq_queue: RqQueue, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.queue.rq_queue.EVENTS_KEPT", 200)
+    monkeypatch.setattr("graspd.service.queue.rq_queue.EVENTS_KEPT", 200)
     for _ in range(1000):
         rq_queue.publish(Event(kind=EventKind.STARTED, at=timestamp()))
     # Redis trims whole nodes of the stream, of 100 entries each.

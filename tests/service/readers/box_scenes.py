@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model import transforms
-from service.model.pinhole import pixel_rays
-from service.store.shards import write_shard
+from graspd.service.model import transforms
+from graspd.service.model.pinhole import pixel_rays
+from graspd.service.store.shards import write_shard
 
 Floats = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ import h5py
 import numpy as np
 import pytest
 
-from service.model.errors import DamagedShard
-from service.readers import Pictures, open_shards
-from service.readers.ranges import RowTable, read_file
-from service.store.columns import SCHEMAS
+from graspd.service.model.errors import DamagedShard
+from graspd.service.readers import Pictures, open_shards
+from graspd.service.readers.ranges import RowTable, read_file
+from graspd.service.store.columns import SCHEMAS
 from tests.service.readers import box_scenes
 
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.model import transforms
-from service.model.errors import InputError
-from service.readers import Pictures, open_shards
-from service.readers.clouds import Clouds, graspness
-from service.store.shards import read_shard
+from graspd.service.model import transforms
+from graspd.service.model.errors import InputError
+from graspd.service.readers import Pictures, open_shards
+from graspd.service.readers.clouds import Clouds, graspness
+from graspd.service.store.shards import read_shard
 from tests.service.readers import box_scenes
 from tests.service.readers.box_scenes import EYES, POSES, SCENE_OF_GRASP, SIZE, VALID
 
@@ -153,7 +153,7 @@ def test_a_voxel_holds_one_point(pictures: Pictures) -> None:
 
 
 def test_where_nothing_is_seen_the_cloud_is_zero_and_says_so(pictures: Pictures) -> None:
-    from service.readers.depth_noise import DepthNoise
+    from graspd.service.readers.depth_noise import DepthNoise
 
     blind = Clouds(pictures, 16, noise=DepthNoise(400.0, dropout=1.0), hand_surface=lambda *_: np.zeros((3, 1, 3)))
     sample = blind[0]

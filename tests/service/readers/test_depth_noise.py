@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.model.errors import InputError
-from service.model.pinhole import pixel_rays
-from service.readers.depth_noise import NOISES, DepthNoise, noise_of, shadows
+from graspd.service.model.errors import InputError
+from graspd.service.model.pinhole import pixel_rays
+from graspd.service.readers.depth_noise import NOISES, DepthNoise, noise_of, shadows
 
 WIDTH, HEIGHT = 320, 240
 K = np.array([[330.0, 0, 160], [0, 330.0, 120], [0, 0, 1]])

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.model.errors import InputError
-from service.readers import Pictures, open_shards, prefetched
+from graspd.service.model.errors import InputError
+from graspd.service.readers import Pictures, open_shards, prefetched
 from tests.service.readers import box_scenes
 
 

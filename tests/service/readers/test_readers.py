@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.model.errors import DamagedShard, InputError, NotFoundError
-from service.model.names import dataset_snapshot, shard_file
-from service.model.records import JobRecord, Snapshot, SnapshotShard
-from service.model.transforms import compose, pose_from_matrix
-from service.pipeline.backends import Services
-from service.readers import Grasps, Pictures, ShardCache, Shards, open_shards
-from service.store.records import put_record
-from service.store.shards import Shard, read_shard
+from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
+from graspd.service.model.names import dataset_snapshot, shard_file
+from graspd.service.model.records import JobRecord, Snapshot, SnapshotShard
+from graspd.service.model.transforms import compose, pose_from_matrix
+from graspd.service.pipeline.backends import Services
+from graspd.service.readers import Grasps, Pictures, ShardCache, Shards, open_shards
+from graspd.service.store.records import put_record
+from graspd.service.store.shards import Shard, read_shard
 from tests.api import factories
 from tests.damage import flipped, flipped_values
 
@@ -159,7 +159,7 @@ def test_a_wrong_value_in_a_file_is_refused_and_not_handed_out(folder: Path) -> 
 
 
 def test_a_full_cache_drops_what_was_unused_longest(services: Services, tmp_path: Path) -> None:
-    from service.model.states import Stage
+    from graspd.service.model.states import Stage
 
     data = [bytes([number]) * 1000 for number in range(3)]
     keys = [shard_file(Stage.SYNTHESIZE, f"{number:032x}") for number in range(3)]

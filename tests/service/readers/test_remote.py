@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.model.records import JobRecord
-from service.pipeline.backends import Services
-from service.readers import Grasps, Pictures, open_shards
-from service.settings import Settings
-from service.store.store import open_store
+from graspd.service.model.records import JobRecord
+from graspd.service.pipeline.backends import Services
+from graspd.service.readers import Grasps, Pictures, open_shards
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
 from tests.api import factories
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue

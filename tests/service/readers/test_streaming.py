@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from obstore.store import MemoryStore
 
-from service.model.errors import DamagedShard, InputError, StoreUnavailable
-from service.readers import Pictures, ShardCache, ShardFile, Shards, open_shards, prefetched, ranges
-from service.store.store import Store, open_store
+from graspd.service.model.errors import DamagedShard, InputError, StoreUnavailable
+from graspd.service.readers import Pictures, ShardCache, ShardFile, Shards, open_shards, prefetched, ranges
+from graspd.service.store.store import Store, open_store
 from tests.conftest import REPOSITORY
 from tests.service.readers import box_scenes
 from tests.service.readers.box_scenes import VIEWS
@@ -167,9 +167,9 @@ def test_a_store_that_is_away_is_told_and_not_taken_for_damage(
 def test_a_process_that_keeps_the_error_of_a_shard_that_is_none_ends_well() -> None:
     """HDF5 crashes at the end of a process in which something still holds a file that it could not open."""
     code = """
-from service.model.errors import InputError
-from service.readers.ranges import RangeReader
-from service.store.store import open_store
+from graspd.service.model.errors import InputError
+from graspd.service.readers.ranges import RangeReader
+from graspd.service.store.store import open_store
 store = open_store("memory://")
 store.put("shards/views/none.h5", bytes(100_000))
 try:

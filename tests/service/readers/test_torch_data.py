@@ -7,15 +7,15 @@ from typing import Any
 
 import pytest
 
-from service.pipeline.backends import Services
-from service.readers import Grasps, Pictures, Shards, open_shards
+from graspd.service.pipeline.backends import Services
+from graspd.service.readers import Grasps, Pictures, Shards, open_shards
 from tests.api import factories
 from tests.service.readers import box_scenes
 
 torch = pytest.importorskip("torch", reason="torch is not installed; `pip install torch` runs these tests")
 from torch.utils.data import DataLoader  # noqa: E402
 
-from service.readers.torch_data import Samples, ShuffledShards, collate  # noqa: E402
+from graspd.service.readers.torch_data import Samples, ShuffledShards, collate  # noqa: E402
 
 
 @pytest.fixture

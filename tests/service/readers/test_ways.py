@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.model.errors import InputError
-from service.model.scene_spec import SceneSpec
-from service.model.transforms import quat_from_axis_angle
-from service.readers.ways import Waypoint, point_at, scene_spec_of, stop_places, way_of, wrists_of
-from service.store.shards import Shard, json_attribute
+from graspd.service.model.errors import InputError
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.transforms import quat_from_axis_angle
+from graspd.service.readers.ways import Waypoint, point_at, scene_spec_of, stop_places, way_of, wrists_of
+from graspd.service.store.shards import Shard, json_attribute
 
 WAYPOINTS = 4
 

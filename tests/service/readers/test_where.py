@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.model.errors import InputError
-from service.model.where import LONGEST
-from service.readers.where import parse
+from graspd.service.model.errors import InputError
+from graspd.service.model.where import LONGEST
+from graspd.service.readers.where import parse
 
 COLUMNS: dict[str, Any] = {
     "quality/thresholds_m": np.array([0.002, 0.005]),

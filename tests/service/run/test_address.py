@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from api.client.reports import open_client
-from api.server import bind
-from service.run.address import forget_address, record_address, recorded_address
-from service.run.supervisor import Supervisor, _reserve
-from service.settings import Settings
+from graspd.api.server import bind
+from graspd.client.reports import open_client
+from graspd.service.run.address import forget_address, record_address, recorded_address
+from graspd.service.run.supervisor import Supervisor, _reserve
+from graspd.service.settings import Settings
 
 URL = "http://127.0.0.1:45678"
 

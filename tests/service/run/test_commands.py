@@ -17,14 +17,14 @@ from pydantic import BaseModel, Field
 from typer.testing import CliRunner
 
 from graspd import cli as program
-from service.cli import load_settings, reporting_errors
-from service.model.errors import InputError, StoreUnavailable, UnavailableError
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.run.commands import app
-from service.run.supervisor import _SETTLED, Supervisor
-from service.settings import Settings
-from service.store.store import open_store
+from graspd.service.cli import load_settings, reporting_errors
+from graspd.service.model.errors import InputError, StoreUnavailable, UnavailableError
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.run.commands import app
+from graspd.service.run.supervisor import _SETTLED, Supervisor
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
 from tests.fakes import request
 from tests.service.index.test_index import run_all
 
@@ -178,7 +178,7 @@ def test_a_worker_that_never_gets_ready_is_named_with_its_log(tmp_path: Path) ->
 def test_what_is_waited_for_is_told_and_the_wait_can_be_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.run.supervisor._TOLD_EVERY_S", 0.0)
+    monkeypatch.setattr("graspd.service.run.supervisor._TOLD_EVERY_S", 0.0)
     idle, stop, told = (sys.executable, "-c", "import signal; signal.pause()"), threading.Event(), []
 
     def say(line: str) -> None:
@@ -193,7 +193,7 @@ def test_what_is_waited_for_is_told_and_the_wait_can_be_stopped(
 
 def test_the_controller_ends_well_on_sigterm(tmp_path: Path) -> None:
     environment = os.environ | {"GRASPD_DATA_DIR": str(tmp_path), "GRASPD_REDIS_URL": f"unix://{tmp_path}/none.sock"}
-    code = "from service.run.commands import app; app(['controller'])"
+    code = "from graspd.service.run.commands import app; app(['controller'])"
     with subprocess.Popen([sys.executable, "-c", code], env=environment, stderr=subprocess.PIPE) as controller:
         assert controller.stderr is not None
         # It waits for Redis instead of giving up.

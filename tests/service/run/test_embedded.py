@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from service.model.errors import BusyError, QueueUnavailable
-from service.queue.connection import connect, redis_url, socket_path
-from service.queue.rq_queue import RqQueue
-from service.run import embedded
-from service.run.children import Child
-from service.run.embedded import find_server, give_up_log, own_redis, server_command
-from service.settings import Settings
+from graspd.service.model.errors import BusyError, QueueUnavailable
+from graspd.service.queue.connection import connect, redis_url, socket_path
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.run import embedded
+from graspd.service.run.children import Child
+from graspd.service.run.embedded import find_server, give_up_log, own_redis, server_command
+from graspd.service.settings import Settings
 from tests.service.conftest import wait_for_redis
 from tests.waiting import until
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from service.model.errors import GraspdError, InputError, UnavailableError
-from service.run.address import joining
-from service.settings import Settings
+from graspd.service.model.errors import GraspdError, InputError, UnavailableError
+from graspd.service.run.address import joining
+from graspd.service.settings import Settings
 from tests.servers import free_ports
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from service.run.address import record_address, recorded_address
-from service.run.children import Child, end_leftovers, start_of
+from graspd.service.run.address import record_address, recorded_address
+from graspd.service.run.children import Child, end_leftovers, start_of
 from tests.waiting import until
 
 _WAIT = "import signal; signal.pause()"

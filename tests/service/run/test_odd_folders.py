@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from service.index.index import Index
-from service.model.errors import InputError
-from service.pipeline.backends import Services
-from service.run.supervisor import Supervisor
-from service.settings import Settings
-from service.store.store import open_store
+from graspd.service.index.index import Index
+from graspd.service.model.errors import InputError
+from graspd.service.pipeline.backends import Services
+from graspd.service.run.supervisor import Supervisor
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
 from tests.waiting import PATIENCE_S
 
 NAMES = [

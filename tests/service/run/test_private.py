@@ -19,8 +19,8 @@ def test_a_service_keeps_its_data_from_other_users(tmp_path: Path, was_open: boo
         folder.chmod(0o755)
     environment = os.environ | {"GRASPD_DATA_DIR": str(folder), "GRASPD_REDIS_URL": f"unix://{tmp_path}/none.sock"}
     program = (
-        "from service.cli import keep_private, load_settings\n"
-        "from service.pipeline.backends import Services\n"
+        "from graspd.service.cli import keep_private, load_settings\n"
+        "from graspd.service.pipeline.backends import Services\n"
         "settings = load_settings()\n"
         "keep_private(settings)\n"
         "services = Services.open(settings)\n"
@@ -33,7 +33,7 @@ def test_a_service_keeps_its_data_from_other_users(tmp_path: Path, was_open: boo
     assert modes[folder] == 0o700
 
 
-@pytest.mark.parametrize("room", ["api/server_command.py", "service/run/commands.py", "worker/commands/worker.py"])
+@pytest.mark.parametrize("room", ["api/server_command.py", "service/run/commands.py", "graspd/commands/worker.py"])
 def test_every_service_command_is_private(room: str) -> None:
     text = (Path(__file__).parents[3] / room).read_text()
     assert text.count('log_to_stderr(settings, "') == text.count("keep_private(settings)") > 0

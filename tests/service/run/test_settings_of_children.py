@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from pydantic import SecretStr
 
-from service.run.supervisor import _SETTLED, _stated
-from service.settings import Settings
+from graspd.service.run.supervisor import _SETTLED, _stated
+from graspd.service.settings import Settings
 
 #: Values of each setting that its default is none of; texts hold what shells, JSON and URLs give a meaning.
 _ODD = "a b\"c'd%20#e?f,ü{}"

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from service.pipeline.backends import Services
-from service.pipeline.identity import identify
-from service.queue.connection import connect
-from service.queue.rq_queue import RqQueue
-from service.settings import Settings
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.identity import identify
+from graspd.service.queue.connection import connect
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.settings import Settings
 from tests.indexes import empty_index
 
 COMMANDS = [["up", "--workers", "0", "--port", "0"], ["api", "--port", "0"], ["controller"], ["worker"]]

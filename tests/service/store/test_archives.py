@@ -7,7 +7,7 @@ import zlib
 
 import pytest
 
-from service.store.assets import pack, unpack
+from graspd.service.store.assets import pack, unpack
 
 
 def test_a_machine_without_memory_damages_no_archive(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,8 +11,8 @@ import h5py
 import numpy as np
 import pytest
 
-from service.model.errors import InputError, NotFoundError
-from service.store.shards import read_shard
+from graspd.service.model.errors import InputError, NotFoundError
+from graspd.service.store.shards import read_shard
 from tests.worker.files.test_curation import shard as base_shard
 
 

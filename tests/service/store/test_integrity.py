@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from service.model.errors import DamagedShard
-from service.model.states import Stage
-from service.store.integrity import Checked, read_checked
-from service.store.manifests import ShardManifest, load_shard
-from service.store.shards import read_shard
-from service.store.store import Store, open_store
+from graspd.service.model.errors import DamagedShard
+from graspd.service.model.states import Stage
+from graspd.service.store.integrity import Checked, read_checked
+from graspd.service.store.manifests import ShardManifest, load_shard
+from graspd.service.store.shards import read_shard
+from graspd.service.store.store import Store, open_store
 from tests.damage import cut, flip, flipped, flipped_values, overwrite, remove
 from tests.fakes import make_shard, message_for
 
@@ -99,7 +99,7 @@ def test_a_file_that_cannot_be_read_is_refused_in_one_line(tmp_path: Path, store
         try:
             read_shard(path)
         except Exception as error:
-            assert type(error).__module__ == "service.model.errors", (at, error)
+            assert type(error).__module__ == "graspd.service.model.errors", (at, error)
             assert "\n" not in str(error), at
 
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.model.errors import InputError, LimitError
-from service.store import network_file
-from service.store.network_file import ProposalNetwork, from_bytes, to_bytes
+from graspd.service.model.errors import InputError, LimitError
+from graspd.service.store import network_file
+from graspd.service.store.network_file import ProposalNetwork, from_bytes, to_bytes
 from tests.networks import random_network
 
 Arrays = dict[str, Any]

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from service.model.errors import InputError, LimitError
-from service.store.object_sets import object_set, read_set
+from graspd.service.model.errors import InputError, LimitError
+from graspd.service.store.object_sets import object_set, read_set
 
 
 def names(*paths: str) -> dict[str, list[str]]:

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from service.model import names
-from service.model.errors import StoreUnavailable
-from service.model.messages import TaskMessage
-from service.model.states import Stage
-from service.store import packs
-from service.store.integrity import read_checked
-from service.store.manifests import load_manifest, load_shard, publish_shard, shard_exists
-from service.store.packs import has_packs, take_apart
-from service.store.store import Store, open_store
+from graspd.service.model import names
+from graspd.service.model.errors import StoreUnavailable
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.states import Stage
+from graspd.service.store import packs
+from graspd.service.store.integrity import read_checked
+from graspd.service.store.manifests import load_manifest, load_shard, publish_shard, shard_exists
+from graspd.service.store.packs import has_packs, take_apart
+from graspd.service.store.store import Store, open_store
 from tests.damage import flipped, overwrite
 from tests.packs import batches, made_of, pack
 

@@ -9,8 +9,8 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
-from service.model.errors import NotFoundError, StoreUnavailable
-from service.store.store import Store, open_store
+from graspd.service.model.errors import NotFoundError, StoreUnavailable
+from graspd.service.store.store import Store, open_store
 from tests.servers import MissingServer, S3Server, free_ports
 
 pytestmark = pytest.mark.s3

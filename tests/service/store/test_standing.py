@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.store import validity
+from graspd.service.store import validity
 
 FLAGS = np.array([1, 1, 0], np.uint8)
 

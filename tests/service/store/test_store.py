@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from service.model.errors import InputError, NotFoundError, StoreUnavailable
-from service.store.store import Entry, Store, check_key, open_store
+from graspd.service.model.errors import InputError, NotFoundError, StoreUnavailable
+from graspd.service.store.store import Entry, Store, check_key, open_store
 
 
 @pytest.fixture(params=["memory", "file", pytest.param("s3", marks=pytest.mark.s3)])
@@ -158,7 +158,7 @@ def test_a_full_disk_is_one_clear_line_and_leaves_nothing(tmp_path: Path, monkey
 
     store = open_store(tmp_path.as_uri())
     with monkeypatch.context() as patch:
-        patch.setattr("service.store.store.os.fsync", full)
+        patch.setattr("graspd.service.store.store.os.fsync", full)
         with pytest.raises(StoreUnavailable, match=r"No space left on device$"):
             store.put("shards/base/a.h5", b"data")
     assert list((tmp_path / "shards" / "base").iterdir()) == []

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import threading
 
+from graspd.worker.engines import backend
 from tests.waiting import PATIENCE_S
-from worker.engines import backend
 
 
 def test_the_default_device_of_one_thread_is_not_that_of_another() -> None:

@@ -9,18 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from worker.engines import backend
+from graspd.worker.engines import backend
 
-MODULE = "worker.simulation.kernels.optimizers"
+MODULE = "graspd.worker.simulation.kernels.optimizers"
 START = """
 import importlib, warp as wp
-from worker.engines import backend
+from graspd.worker.engines import backend
 backend.start()
 print(wp.config.kernel_cache_dir)
 """
 LOAD = START + f"wp.load_module(importlib.import_module({MODULE!r}), device='cpu')"
 BAKE = f"""
-from worker.engines import backend
+from graspd.worker.engines import backend
 backend.start()
 backend.bake([{MODULE!r}], architectures=[90])
 """

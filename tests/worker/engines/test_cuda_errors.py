@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import warp as wp
 
-from service.model.fidelity import FIDELITIES
-from worker.engines.devices import DeviceLost, check_device, is_out_of_memory
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
-from worker.planners.fast_graspd import planner
-from worker.planners.port import Wanted
-from worker.planners.threads import run_parts
-from worker.run import Run
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.engines.devices import DeviceLost, check_device, is_out_of_memory
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import synthesize
+from graspd.worker.planners.fast_graspd import planner
+from graspd.worker.planners.port import Wanted
+from graspd.worker.planners.threads import run_parts
+from graspd.worker.run import Run
 
 #: As Warp 1.19 says it.
 NO_MEMORY = "Failed to allocate 8589934592 bytes on device 'cuda:0'"

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from service.model.errors import InputError
-from worker.engines import devices
-from worker.engines.devices import Device, Gpu, take
+from graspd.service.model.errors import InputError
+from graspd.worker.engines import devices
+from graspd.worker.engines.devices import Device, Gpu, take
 
 FOUR = [Gpu(f"cuda:{k}", f"GPU-{k:04}", "H200") for k in range(4)]
 
@@ -49,7 +49,7 @@ def test_a_number_decides(tmp_path: Path, number: int, name: str) -> None:
 def test_the_gpu_of_a_killed_process_is_free_again(tmp_path: Path) -> None:
     script = (
         "import sys, time, pathlib\n"
-        "from worker.engines.devices import Gpu, take\n"
+        "from graspd.worker.engines.devices import Gpu, take\n"
         "two = [Gpu('cuda:0', 'a'), Gpu('cuda:1', 'b')]\n"
         "print(take(two, pathlib.Path(sys.argv[1])).name, flush=True)\n"
         "time.sleep(600)\n"

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from service import user_cache
-from worker.engines.backend import kernel_cache
+from graspd.service import user_cache
+from graspd.worker.engines.backend import kernel_cache
 
 
 @pytest.fixture
@@ -42,7 +42,9 @@ def test_warp_starts_where_no_folder_of_the_user_can_be_written(blocked: Path, t
         "WARP_CACHE_PATH": str(blocked),
         "TMPDIR": str(tmp_path / "tmp"),
     }
-    code = "from worker.engines import backend; backend.start(); import warp; print(warp.config.kernel_cache_dir)"
+    code = (
+        "from graspd.worker.engines import backend; backend.start(); import warp; print(warp.config.kernel_cache_dir)"
+    )
     done = subprocess.run(
         [sys.executable, "-c", code], env={**os.environ, **places}, capture_output=True, text=True, check=False
     )

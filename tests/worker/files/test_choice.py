@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.model.errors import InputError
-from service.store.shards import Shard
-from worker.files.subsets import choose
+from graspd.service.model.errors import InputError
+from graspd.service.store.shards import Shard
+from graspd.worker.files.subsets import choose
 
 
 def shard(valid: list[int], sound: list[int], success: list[int] | None) -> Shard:

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from service.readers import Pictures, open_shards
-from service.readers.clouds import OF_GRASPS
+from graspd.commands.curate import app
+from graspd.service.readers import Pictures, open_shards
+from graspd.service.readers.clouds import OF_GRASPS
 from tests.service.readers import box_scenes
-from worker.commands.curate import app
 
 
 @pytest.fixture(scope="module")

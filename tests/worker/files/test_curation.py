@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from service.model.errors import InputError
-from service.readers import Grasps, open_shards
-from service.store.shards import read_shard, write_shard
-from worker.commands.curate import app
-from worker.files.cases import expand
-from worker.files.curation import Balance, faces
+from graspd.commands.curate import app
+from graspd.exchange.cases import expand
+from graspd.service.model.errors import InputError
+from graspd.service.readers import Grasps, open_shards
+from graspd.service.store.shards import read_shard, write_shard
+from graspd.worker.files.curation import Balance, faces
 
 COUNT = 40
 

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from api.client.job_options import read_spec
-from service.model.errors import InputError
-from service.readers.ways import scene_spec_of
-from service.store.shards import Shard
-from worker.cards.contents import Contents, with_provenance
-from worker.commands.studies import _read_maps as read_stability
-from worker.files.curation import _short
-from worker.files.exchange.bench_hand import _read as read_mapping
-from worker.files.exchange.published import friction
-from worker.files.provenance import options_of
+from graspd.client.job_options import read_spec
+from graspd.commands.studies import _read_maps as read_stability
+from graspd.exchange.bench_hand import _read as read_mapping
+from graspd.exchange.published import friction
+from graspd.service.model.errors import InputError
+from graspd.service.readers.ways import scene_spec_of
+from graspd.service.store.shards import Shard
+from graspd.studies.cards.contents import Contents, with_provenance
+from graspd.worker.files.curation import _short
+from graspd.worker.files.provenance import options_of
 
 DEEP = "[" * 100_000 + "]" * 100_000
 

@@ -11,17 +11,17 @@ import trimesh
 from typer.testing import CliRunner
 
 from graspd.cli import build
-from service.model.domain import JobOptions
-from service.model.fidelity import FIDELITIES
-from service.model.scene_spec import SceneSpec, parse_scene
-from service.model.transforms import apply
-from service.store.shards import write_shard
-from worker.files.cases import load_case
-from worker.files.evaluate import evaluate
-from worker.files.synthesis import Synthesized, synthesized
-from worker.objects.prepare import object_from_path
-from worker.rendering.pictures import grasp_pictures
-from worker.stages.models import object_glb
+from graspd.exchange.cases import load_case
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.scene_spec import SceneSpec, parse_scene
+from graspd.service.model.transforms import apply
+from graspd.service.store.shards import write_shard
+from graspd.studies.evaluation import evaluate
+from graspd.worker.files.synthesis import Synthesized, synthesized
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.rendering.pictures import grasp_pictures
+from graspd.worker.stages.models import object_glb
 
 PLACES = {"origin": (0.0, 0.0, 0.0), "6 m": (5.0, -3.0, 2.0), "UTM": (500_000.0, 4_500_000.0, 300.0)}
 AWAY = pytest.mark.parametrize("place", ["6 m", "UTM"])
@@ -108,7 +108,7 @@ def test_pictures_are_the_same(made: Any, boxes: dict[str, Path], tmp_path: Path
 
 @AWAY
 def test_views_of_scenes_are_the_same(made: Any, tmp_path: Path, place: str) -> None:
-    from service.store.shards import read_shard
+    from graspd.service.store.shards import read_shard
 
     seen = []
     for at in ("origin", place):
@@ -133,7 +133,7 @@ def test_a_model_stands_where_its_file_says_in_numbers_about_its_middle(boxes: d
 
 @AWAY
 def test_a_neighbour_may_lie_anywhere_in_its_file_as_well(boxes: dict[str, Path], place: str) -> None:
-    from worker.scenes.beside import scenes_of
+    from graspd.worker.scenes.beside import scenes_of
 
     spec = SceneSpec(kind="bin", neighbours=[{"object": "box"}])
     block, other = object_from_path("block"), object_from_path(boxes["origin"])

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from worker.hands.load import load_hand
-from worker.hands.model import HandModel
+from graspd.worker.hands.load import load_hand
+from graspd.worker.hands.model import HandModel
 
 #: Opening [m], and what is left between the pads when closed.
 OPENING, CLOSED = 0.080, 0.0

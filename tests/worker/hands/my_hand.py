@@ -7,8 +7,8 @@ import zipfile
 from pathlib import Path
 from typing import Final
 
-from service.model.states import AssetKind
-from service.store.assets import builtin_files
+from graspd.service.model.states import AssetKind
+from graspd.service.store.assets import builtin_files
 from tests.worker.hands.grippers import gripper_urdf
 from tests.worker.hands.mjcfs import FOUR_BAR
 from tests.worker.hands.test_packages import package

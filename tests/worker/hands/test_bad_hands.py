@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from service.model.errors import HandError, LimitError
+from graspd.commands.hands import report_hand
+from graspd.service.model.errors import HandError, LimitError
+from graspd.worker.hands.check import check_hand
+from graspd.worker.hands.robot import MAX_LINKS
+from graspd.worker.hands.urdf import MAX_BYTES, read_urdf
 from tests.worker.hands.urdfs import chain, joint, link, robot
-from worker.commands.hands import report_hand
-from worker.hands.check import check_hand
-from worker.hands.robot import MAX_LINKS
-from worker.hands.urdf import MAX_BYTES, read_urdf
 
 
 def test_every_bad_urdf_gets_its_verdict_and_a_message_that_names_the_defect(shared_data: Path) -> None:

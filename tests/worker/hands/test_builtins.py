@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.model.states import AssetKind
-from service.model.transforms import IDENTITY_POSE, compose, invert
-from service.store.assets import builtin_asset, builtin_files, builtin_names
-from worker.hands.builtins import HANDS, files_of
-from worker.hands.collisions import touching_bodies
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
-from worker.hands.surface import piece_distance
+from graspd.service.model.states import AssetKind
+from graspd.service.model.transforms import IDENTITY_POSE, compose, invert
+from graspd.service.store.assets import builtin_asset, builtin_files, builtin_names
+from graspd.worker.hands.builtins import HANDS, files_of
+from graspd.worker.hands.collisions import touching_bodies
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.surface import piece_distance
 
 ALLEGRO = [f"{f}_{j}" for f in ("index", "middle", "ring") for j in ("abduction", "proximal", "middle", "distal")]
 ALLEGRO += ["thumb_rotation", "thumb_proximal", "thumb_middle", "thumb_distal"]

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from graspd.worker.hands.closing import posture
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import load_hand
+from graspd.worker.hands.model import HandModel
 from tests.worker.hands.urdfs import joint, link, robot
-from worker.hands.closing import posture
-from worker.hands.kinematics import body_poses
-from worker.hands.load import load_hand
-from worker.hands.model import HandModel
 
 _PALM = '<collision><geometry><box size="0.09 0.09 0.02"/></geometry></collision>'
 #: A finger that leans in by 30 degrees.

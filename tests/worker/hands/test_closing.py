@@ -8,10 +8,10 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from graspd.cli import build
+from graspd.worker.hands.check import check_hand
+from graspd.worker.hands.load import load_hand
+from graspd.worker.hands.model import HandModel
 from tests.worker.hands.urdfs import joint, link, robot
-from worker.hands.check import check_hand
-from worker.hands.load import load_hand
-from worker.hands.model import HandModel
 
 _PALM = '<collision><geometry><box size="0.09 0.02 0.09"/></geometry></collision>'
 _PHALANX = '<collision><origin xyz="0 0 0.02"/><geometry><box size="0.014 0.014 0.04"/></geometry></collision>'

@@ -10,15 +10,15 @@ import pytest
 from typer.testing import CliRunner
 
 from graspd.cli import build
-from service.model.states import AssetKind
-from service.store.assets import builtin_names
-from service.store.descriptions import HandCorrections, corrected, facts_of
+from graspd.service.model.states import AssetKind
+from graspd.service.store.assets import builtin_names
+from graspd.service.store.descriptions import HandCorrections, corrected, facts_of
+from graspd.worker.hands.jaws import pads_of
+from graspd.worker.hands.load import files_from_path, hand_from_path, load_hand
+from graspd.worker.hands.model import HandModel
+from graspd.worker.stages.models import hand_glb
 from tests.worker.hands.grippers import gripper
 from tests.worker.hands.urdfs import BOX, joint, link, robot
-from worker.hands.jaws import pads_of
-from worker.hands.load import files_from_path, hand_from_path, load_hand
-from worker.hands.model import HandModel
-from worker.stages.models import hand_glb
 
 CLAW = robot(
     link("palm", BOX),

@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from api.client.add_commands import upload_of
-from api.uploads import files_of_upload
-from service.model.errors import HandError
-from service.model.states import AssetKind
+from graspd.api.uploads import files_of_upload
+from graspd.client.add_commands import upload_of
+from graspd.commands.hands import report_hand
+from graspd.service.model.errors import HandError
+from graspd.service.model.states import AssetKind
+from graspd.worker.hands.check import check_hand
+from graspd.worker.hands.load import hand_from_path
 from tests.worker.hands.urdfs import joint, link, robot
-from worker.commands.hands import report_hand
-from worker.hands.check import check_hand
-from worker.hands.load import hand_from_path
 
 NOTES = {
     "urdf": "leap.urdf",

@@ -13,13 +13,13 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from graspd.cli import build
+from graspd.worker.hands.model import HandModel
+from graspd.worker.rendering import portraits
+from graspd.worker.run import Run
+from graspd.worker.stages import hand_self_test
+from graspd.worker.stages.hand_self_test import SelfTest
 from tests.conftest import REPOSITORY
 from tests.worker.hands.my_hand import asset_json_of, write_all
-from worker.hands.model import HandModel
-from worker.rendering import portraits
-from worker.run import Run
-from worker.stages import hand_self_test
-from worker.stages.hand_self_test import SelfTest
 
 PAGE = (REPOSITORY / "docs" / "how-to" / "hands.md").read_text()
 BLOCKS = "".join(re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)).replace("\\\n", " ")

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.model.errors import InputError
-from service.model.states import AssetKind
-from service.store.assets import builtin_files
-from worker.hands.load import load_hand
+from graspd.service.model.errors import InputError
+from graspd.service.model.states import AssetKind
+from graspd.service.store.assets import builtin_files
+from graspd.worker.hands.load import load_hand
 
 SOURCE = builtin_files(AssetKind.HAND, "barrett")
 WORDS = [

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from graspd.worker.hands.load import load_hand
+from graspd.worker.hands.shapes import MAX_ERROR_M, hull_error, parts_of
 from tests.worker.hands.urdfs import joint, link, robot
-from worker.hands.load import load_hand
-from worker.hands.shapes import MAX_ERROR_M, hull_error, parts_of
 
 
 @pytest.fixture(autouse=True)
@@ -68,7 +68,7 @@ def test_an_object_fits_between_the_prongs_of_a_loaded_hand() -> None:
 
 
 def test_a_failed_decomposition_leaves_the_hull_and_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("worker.hands.shapes.coacd_parts", lambda *_: ())
+    monkeypatch.setattr("graspd.worker.hands.shapes.coacd_parts", lambda *_: ())
     mesh = fork(0.05)
     assert measured(mesh)[0] == 1
     monkeypatch.undo()
@@ -76,7 +76,7 @@ def test_a_failed_decomposition_leaves_the_hull_and_is_not_kept(monkeypatch: pyt
 
 
 def test_real_hands_keep_their_hulls_but_for_barretts_palm(shared_data: Path) -> None:
-    from worker.hands.load import hand_from_path
+    from graspd.worker.hands.load import hand_from_path
 
     counts = {"allegro/allegro_hand_right.urdf": 23, "barrett_bh280/bh280.urdf": 14, "barrett/bhand_model.urdf": 33}
     for file, count in counts.items():

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.errors import HandError
+from graspd.service.model.errors import HandError
+from graspd.studies.stability.assets import ring_hand
+from graspd.worker.hands.jaws import jaws_of
+from graspd.worker.hands.load import hand_from_path, load_hand
+from graspd.worker.hands.model import HandModel
+from graspd.worker.simulation.device import joint_units
+from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.model import MujocoOptions, build
 from tests.worker.hands.grippers import OPENING, gripper
 from tests.worker.hands.urdfs import joint, link, robot
 from tests.worker.models import object_from_mesh
-from worker.hands.jaws import jaws_of
-from worker.hands.load import hand_from_path, load_hand
-from worker.hands.model import HandModel
-from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.model import MujocoOptions, build
-from worker.simulation.device import joint_units
-from worker.studies.stability.assets import ring_hand
 
 #: The pads are planes, so points on them tell their distance to rounding.
 PLANE_M = 1e-9

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.errors import HandError
-from service.model.transforms import IDENTITY_POSE, compose, invert, pose_to_matrix
+from graspd.commands.hands import report_hand
+from graspd.service.model.errors import HandError
+from graspd.service.model.transforms import IDENTITY_POSE, compose, invert, pose_to_matrix
+from graspd.worker.hands.check import check_hand
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import files_from_path, hand_from_path, load_hand
+from graspd.worker.hands.model import HandModel
 from tests.worker.hands.mjcfs import CLAW, FOUR_BAR, TENDON_CLAW
-from worker.commands.hands import report_hand
-from worker.hands.check import check_hand
-from worker.hands.kinematics import body_poses
-from worker.hands.load import files_from_path, hand_from_path, load_hand
-from worker.hands.model import HandModel
 
 #: Both sides compute in float64; what is left is rounding over a chain of a dozen rotations [m, and entries of R].
 FK_TOLERANCE = 1e-6

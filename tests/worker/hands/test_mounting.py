@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.model.transforms import IDENTITY_POSE, apply, invert
+from graspd.service.model.transforms import IDENTITY_POSE, apply, invert
+from graspd.worker.hands.check import check_hand
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import load_hand
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.mounting import wrist_positions
 from tests.worker.hands.test_roots import BOX, gripper, humanoid
 from tests.worker.hands.urdfs import joint, link, robot
-from worker.hands.check import check_hand
-from worker.hands.kinematics import body_poses
-from worker.hands.load import load_hand
-from worker.hands.model import HandModel
-from worker.hands.mounting import wrist_positions
 
 FOREARM = '<collision><origin xyz="0.01 0 0.1"/>' + BOX.format(0.05, 0.06, 0.2)[11:]
 

@@ -7,15 +7,15 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from service.model.domain import JobOptions
-from service.model.errors import HandError
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import HandError
+from graspd.worker.certified import certified_grasps
+from graspd.worker.hands import oppositions
+from graspd.worker.hands.load import load_hand
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.oppositions import require_opposing
 from tests.worker.hands.grippers import gripper
 from tests.worker.models import object_from_mesh
-from worker.certified import certified_grasps
-from worker.hands import oppositions
-from worker.hands.load import load_hand
-from worker.hands.model import HandModel
-from worker.hands.oppositions import require_opposing
 
 _LINK = (
     '<link name="{name}"><collision><origin xyz="0 0 0.02"/><geometry><box size="0.01 0.01 0.04"/></geometry>'

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worker.hands import oppositions
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
-from worker.hands.oppositions import oppositions_of
+from graspd.worker.hands import oppositions
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.oppositions import oppositions_of
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import trimesh
 
+from graspd.commands.hands import report_hand
+from graspd.worker.hands.load import files_from_path, hand_from_path
 from tests.worker.hands.urdfs import joint, link, robot
-from worker.commands.hands import report_hand
-from worker.hands.load import files_from_path, hand_from_path
 
 MESH = '<collision><geometry><mesh filename="{}"/></geometry></collision>'
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.model.transforms import IDENTITY_POSE, apply
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
-from worker.hands.pinches import HEIGHTS_M, OVER_M, pinches_of
+from graspd.service.model.transforms import IDENTITY_POSE, apply
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.pinches import HEIGHTS_M, OVER_M, pinches_of
 
 HEIGHT_M = 0.012
 

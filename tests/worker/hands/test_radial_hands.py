@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.model.states import AssetKind
-from service.model.transforms import Floats, quat_from_axis_angle, quat_multiply, quat_rotate
-from service.store.asset_summary import summary
-from service.store.assets import builtin_files
+from graspd.service.model.states import AssetKind
+from graspd.service.model.transforms import Floats, quat_from_axis_angle, quat_multiply, quat_rotate
+from graspd.service.store.asset_summary import summary
+from graspd.service.store.assets import builtin_files
+from graspd.worker.hands.check import check_hand
+from graspd.worker.hands.jaws import fingertip_pad, sign_of
+from graspd.worker.hands.load import load_hand
+from graspd.worker.hands.model import HandModel
 from tests.worker.hands.urdfs import joint, link, robot
-from worker.hands.check import check_hand
-from worker.hands.jaws import fingertip_pad, sign_of
-from worker.hands.load import load_hand
-from worker.hands.model import HandModel
 
 RADIUS = 0.045
 _PLATE = '<geometry><box size="0.16 0.1 0.02"/></geometry>'

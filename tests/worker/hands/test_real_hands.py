@@ -11,11 +11,11 @@ import pytest
 import trimesh
 import yourdfpy
 
-from service.model.transforms import IDENTITY_POSE, pose_to_matrix
-from worker.hands.check import check_hand
-from worker.hands.kinematics import body_poses
-from worker.hands.load import files_from_path, hand_from_path, load_hand
-from worker.hands.model import HandModel
+from graspd.service.model.transforms import IDENTITY_POSE, pose_to_matrix
+from graspd.worker.hands.check import check_hand
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import files_from_path, hand_from_path, load_hand
+from graspd.worker.hands.model import HandModel
 
 URDFS = {
     "allegro": "allegro/allegro_hand_right.urdf",

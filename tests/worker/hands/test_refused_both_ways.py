@@ -8,8 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 from graspd.cli import build
-from service.model.states import AssetKind
-from service.store.store import open_store
+from graspd.service.model.states import AssetKind
+from graspd.service.store.store import open_store
 from tests.worker.hands.mjcfs import CLAW
 from tests.worker.hands.urdfs import joint, link, robot
 from tests.worker.objects.test_dae import BOMB, SCENE, dae

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from graspd.commands.hands import report_hand
+from graspd.worker.hands.check import check_hand
+from graspd.worker.hands.load import load_hand
+from graspd.worker.hands.model import HandModel
 from tests.worker.hands.mjcfs import CLAW, FOUR_BAR
 from tests.worker.hands.urdfs import joint, link, robot
-from worker.commands.hands import report_hand
-from worker.hands.check import check_hand
-from worker.hands.load import load_hand
-from worker.hands.model import HandModel
 
 LIMIT = '<limit lower="0" upper="0.04"/>'
 

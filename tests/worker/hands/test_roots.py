@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from service.model.errors import HandError
+from graspd.service.model.errors import HandError
+from graspd.worker.hands.check import check_hand
+from graspd.worker.hands.load import load_hand
 from tests.worker.hands.urdfs import joint, link, robot
-from worker.hands.check import check_hand
-from worker.hands.load import load_hand
 
 BOX = '<collision><geometry><box size="{} {} {}"/></geometry></collision>'
 

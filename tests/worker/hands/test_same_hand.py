@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.model.errors import InputError
-from service.model.transforms import compose, invert, quat_from_axis_angle
+from graspd.exchange.bench_hand import write_hand
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import compose, invert, quat_from_axis_angle
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.same_hand import same_hand
 from tests.worker.hands.test_mjcf import package_file
-from worker.files.exchange.bench_hand import write_hand
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.hands.same_hand import same_hand
 
 HAND = hand_from_path("shadow")
 #: Where the other model's root link is, as seen from ours.

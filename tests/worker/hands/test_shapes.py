@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.model.errors import HandError
+from graspd.service.model.errors import HandError
+from graspd.worker.hands import primitives
+from graspd.worker.hands.collisions import hull_distance
+from graspd.worker.hands.load import load_hand
+from graspd.worker.hands.shapes import MAX_HULL_VERTICES, find_mesh, reduce_hull
+from graspd.worker.objects.builtin import stl_bytes
 from tests.worker.hands.urdfs import joint, link, robot
-from worker.hands import primitives
-from worker.hands.collisions import hull_distance
-from worker.hands.load import load_hand
-from worker.hands.shapes import MAX_HULL_VERTICES, find_mesh, reduce_hull
-from worker.objects.builtin import stl_bytes
 
 SIZES = {"box": (0.1, 0.06, 0.03), "sphere": (0.04,), "cylinder": (0.02, 0.1), "capsule": (0.02, 0.1)}
 #: Chords of a circle of 32 corners lose up to 0.5 % of the radius, so volumes lose up to 2 %.

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.model.transforms import IDENTITY_POSE, quat_rotate
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
-from worker.hands.oppositions import oppositions_of
-from worker.hands.spans import TURNED_M, Size, _Look, spans_of
-from worker.hands.surface import sample_surface
+from graspd.service.model.transforms import IDENTITY_POSE, quat_rotate
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.oppositions import oppositions_of
+from graspd.worker.hands.spans import TURNED_M, Size, _Look, spans_of
+from graspd.worker.hands.surface import sample_surface
 
 
 @pytest.mark.parametrize("size", ["small", "wide"])

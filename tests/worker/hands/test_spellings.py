@@ -11,13 +11,13 @@ from typing import Any
 import pytest
 import trimesh
 
-from api.uploads import files_of_upload
-from service.model.errors import InputError
-from service.model.states import AssetKind
+from graspd.api.uploads import files_of_upload
+from graspd.commands.hands import report_hand
+from graspd.service.model.errors import InputError
+from graspd.service.model.states import AssetKind
+from graspd.worker.hands.check import check_hand
 from tests.worker.hands.mjcfs import CLAW
 from tests.worker.hands.urdfs import joint, link, robot
-from worker.commands.hands import report_hand
-from worker.hands.check import check_hand
 
 BOX = bytes(trimesh.creation.box((0.01, 0.02, 0.06)).export(file_type="stl"))
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 5\n"

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from worker.hands.jaws import jaws_of
-from worker.hands.load import hand_from_path
+from graspd.worker.hands.jaws import jaws_of
+from graspd.worker.hands.load import hand_from_path
 
 
 def grippers() -> Path:

@@ -8,13 +8,20 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from service.model.transforms import IDENTITY_POSE, apply
+from graspd.service.model.transforms import IDENTITY_POSE, apply
+from graspd.worker.hands import surface
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path, load_hand
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.surface import (
+    BURIED_M,
+    COINCIDENT_M,
+    apportion,
+    farthest_points,
+    piece_distance,
+    sample_surface,
+)
 from tests.worker.hands.urdfs import joint, link, robot
-from worker.hands import surface
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path, load_hand
-from worker.hands.model import HandModel
-from worker.hands.surface import BURIED_M, COINCIDENT_M, apportion, farthest_points, piece_distance, sample_surface
 
 #: Area is measured by at least 30,000 random candidates: the standard error of a share p is sqrt(p (1-p) / 30000), here
 #: below 0.3 %; four of these.

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.errors import HandError
+from graspd.service.model.errors import HandError
+from graspd.worker.hands.check import check_hand
+from graspd.worker.hands.load import files_from_path, hand_from_path, load_hand
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.tendons import Tendon, actuators
+from graspd.worker.objects.disk_cache import TOLD_IF_SET, content_of
 from tests.worker.hands.mjcfs import CLAW
-from worker.hands.check import check_hand
-from worker.hands.load import files_from_path, hand_from_path, load_hand
-from worker.hands.model import HandModel
-from worker.hands.tendons import Tendon, actuators
-from worker.objects.disk_cache import TOLD_IF_SET, content_of
 
 FINGERS = ("FF", "MF", "RF", "LF")
 

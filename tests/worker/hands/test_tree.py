@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.model.errors import HandError
-from service.model.transforms import IDENTITY_POSE
+from graspd.service.model.errors import HandError
+from graspd.service.model.transforms import IDENTITY_POSE
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import load_hand
+from graspd.worker.hands.model import HandModel
 from tests.worker.hands.urdfs import chain, joint, link, robot
-from worker.hands.kinematics import body_poses
-from worker.hands.load import load_hand
-from worker.hands.model import HandModel
 
 
 def load(urdf: bytes, **options: Any) -> HandModel:

@@ -11,16 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from api.uploads import files_of_upload
-from service.model.errors import HandError, InputError
-from service.model.states import AssetKind
-from service.store.library import publish_asset
-from service.store.store import open_store
-from worker.commands.hands import report_hand
-from worker.hands.check import check_hand
-from worker.hands.load import hand_from_path
-from worker.hands.xacro import expand
-from worker.stages.assets import load_hand_files
+from graspd.api.uploads import files_of_upload
+from graspd.commands.hands import report_hand
+from graspd.service.model.errors import HandError, InputError
+from graspd.service.model.states import AssetKind
+from graspd.service.store.library import publish_asset
+from graspd.service.store.store import open_store
+from graspd.worker.hands.check import check_hand
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.xacro import expand
+from graspd.worker.stages.assets import load_hand_files
 
 CLAW = """<?xml version="1.0"?>
 <robot name="claw" xmlns:xacro="http://www.ros.org/wiki/xacro">
@@ -125,7 +125,7 @@ def test_entities_are_refused() -> None:
 
 
 def test_an_expansion_without_end_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("worker.hands.xacro.CPU_LIMIT_S", 1)
+    monkeypatch.setattr("graspd.worker.hands.xacro.CPU_LIMIT_S", 1)
     assert "takes more than" in refusal('<a b="${9**9**9}"/>')
 
 
@@ -136,8 +136,8 @@ def test_an_expansion_that_the_machine_ended_refuses_no_hand(code: str, monkeypa
     def other(command: list[str], **options: object) -> object:
         return run([sys.executable, "-c", f"import os, signal; {code}"], **options)  # type: ignore[call-overload]
 
-    monkeypatch.setattr("worker.hands.xacro.subprocess.run", other)
-    monkeypatch.setattr("worker.hands.xacro._WALL_LIMIT_S", 0.5 if "pause" in code else 60.0)
+    monkeypatch.setattr("graspd.worker.hands.xacro.subprocess.run", other)
+    monkeypatch.setattr("graspd.worker.hands.xacro._WALL_LIMIT_S", 0.5 if "pause" in code else 60.0)
     with pytest.raises(OSError, match=r"x\.xacro"):
         expand({"x.xacro": b"<robot/>"}, "x.xacro", {})
 
@@ -157,7 +157,7 @@ def test_an_expansion_that_the_machine_ended_refuses_no_hand(code: str, monkeypa
 )
 def test_code_that_climbs_out_of_an_expression_finds_the_doors_closed(attempt: str) -> None:
     code = (
-        "import os, socket; from importlib import import_module; from worker.hands import xacro_child as child;"
+        "import os, socket; from importlib import import_module; from graspd.worker.hands import xacro_child as child;"
         f"child._close_doors(5, 2**30)\ntry:\n    {attempt}\nexcept BaseException as error:\n"
         "    os.write(1, type(error).__name__.encode())\nos._exit(0)"
     )
@@ -210,5 +210,5 @@ def test_a_hand_in_the_store_is_expanded_once(monkeypatch: pytest.MonkeyPatch) -
     asset = publish_asset(store, AssetKind.HAND, "claw", {**FILES, "asset.json": b'{"file": "urdf/claw.urdf.xacro"}'})
     first = load_hand_files(store, asset.digest)
     assert first["urdf/claw.urdf.xacro"] == expand(FILES, "urdf/claw.urdf.xacro", {})
-    monkeypatch.setattr("worker.stages.assets.expand", lambda *_: pytest.fail("expanded again"))
+    monkeypatch.setattr("graspd.worker.stages.assets.expand", lambda *_: pytest.fail("expanded again"))
     assert load_hand_files(store, asset.digest) == first

@@ -6,8 +6,8 @@ import numpy as np
 from manifold3d import Manifold
 from numpy.typing import NDArray
 
-from worker.objects.builtin import stl_bytes
-from worker.objects.mesh_geometry import from_manifold
+from graspd.worker.objects.builtin import stl_bytes
+from graspd.worker.objects.mesh_geometry import from_manifold
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 

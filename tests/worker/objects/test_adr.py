@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.errors import MeshError
+from graspd.service.model.errors import MeshError
+from graspd.worker.objects.formats import read_mesh
 from tests.worker.objects.test_formats import pack_glb
 from tests.worker.objects.test_polygons import text
-from worker.objects.formats import read_mesh
 
 FACETS_OF_FOUR = (
     b"solid\n"

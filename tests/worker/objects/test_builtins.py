@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.model.states import AssetKind
-from service.store.assets import builtin_files, builtin_names
-from worker.objects.builtin import OBJECTS, files_of
-from worker.objects.check import check_object
-from worker.objects.distance import deviation
-from worker.objects.prepare import load_object, object_from_path
-from worker.objects.topology import is_closed
+from graspd.service.model.states import AssetKind
+from graspd.service.store.assets import builtin_files, builtin_names
+from graspd.worker.objects.builtin import OBJECTS, files_of
+from graspd.worker.objects.check import check_object
+from graspd.worker.objects.distance import deviation
+from graspd.worker.objects.prepare import load_object, object_from_path
+from graspd.worker.objects.topology import is_closed
 
 
 def test_all_objects_are_there() -> None:

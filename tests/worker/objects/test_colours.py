@@ -11,11 +11,11 @@ import pytest
 import trimesh
 from PIL import Image
 
+from graspd.worker.hands.load import load_hand
+from graspd.worker.objects.formats import read_mesh
+from graspd.worker.objects.formats.glb import material_colour
+from graspd.worker.rendering.hands import hand_parts
 from tests.worker.hands.urdfs import BOX, joint, link, robot
-from worker.hands.load import load_hand
-from worker.objects.formats import read_mesh
-from worker.objects.formats.glb import material_colour
-from worker.rendering.hands import hand_parts
 
 #: sRGB of a byte, rounded twice.
 STEP = 1.5 / 255

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects.disk_cache import content_of
+from graspd.worker.quality.probe import probe_of
+from graspd.worker.rendering.scene_setup import CameraPlan, Setting
+from graspd.worker.scenes.simulate import rest_probability
 from tests.worker.models import object_from_mesh, two_finger_hand
-from worker.hands.surface import sample_surface
-from worker.objects.disk_cache import content_of
-from worker.quality.probe import probe_of
-from worker.rendering.scene_setup import CameraPlan, Setting
-from worker.scenes.simulate import rest_probability
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 HAND = two_finger_hand()

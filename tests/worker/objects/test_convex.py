@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from worker.objects.convex import TooMuchWork, coacd_parts
+from graspd.worker.objects.convex import TooMuchWork, coacd_parts
 
 _CORNERS, _FACES = np.eye(4, 3), np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
 
@@ -20,7 +20,7 @@ def ending(code: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def other(command: list[str], **options: object) -> object:
         return run([sys.executable, "-c", f"import os, signal\n{code}"], **options)  # type: ignore[call-overload]
 
-    monkeypatch.setattr("worker.objects.convex.subprocess.run", other)
+    monkeypatch.setattr("graspd.worker.objects.convex.subprocess.run", other)
 
 
 def test_more_computing_than_it_may_is_too_much_work(monkeypatch: pytest.MonkeyPatch) -> None:

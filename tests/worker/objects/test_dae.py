@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.errors import LimitError, MeshError
-from worker.objects.formats import read_mesh
+from graspd.service.model.errors import LimitError, MeshError
+from graspd.worker.objects.formats import read_mesh
 
 HEAD = '<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">'
 #: A tetrahedron and a square of four corners, each in a colour of its own, in millimetres, moved and turned.

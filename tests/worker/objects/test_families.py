@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from graspd.exchange.training_export import families, signature
+from graspd.worker.objects.model import ObjectModel
 from tests.worker.models import object_from_mesh
-from worker.files.training_export import families, signature
-from worker.objects.model import ObjectModel
 
 
 def box(extents: tuple[float, float, float]) -> trimesh.Trimesh:
@@ -44,7 +44,7 @@ def test_objects_of_the_same_files_are_of_one_family_and_none_are_of_none(bottle
 
 def test_whoever_is_like_two_families_makes_them_one(monkeypatch: pytest.MonkeyPatch, bottle: trimesh.Trimesh) -> None:
     at = {"a": 0.0, "b": 0.009, "c": 0.0045, "d": 1.0}
-    monkeypatch.setattr("worker.files.training_export.signature", lambda obj: np.full(50, at[obj.digest]))
+    monkeypatch.setattr("graspd.exchange.training_export.signature", lambda obj: np.full(50, at[obj.digest]))
     one = object_from_mesh(bottle)
     assert families({name: replace(one, digest=name) for name in at}) == {"a": "a", "b": "a", "c": "a", "d": "d"}
 

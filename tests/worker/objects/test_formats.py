@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.errors import LimitError, MeshError
+from graspd.service.model.errors import LimitError, MeshError
+from graspd.worker.objects.builtin import stl_bytes
+from graspd.worker.objects.check import check_object
+from graspd.worker.objects.formats import read_mesh
+from graspd.worker.objects.formats.soup import MAX_FACES
 from tests.worker.objects.shapes import Mesh, box
-from worker.objects.builtin import stl_bytes
-from worker.objects.check import check_object
-from worker.objects.formats import read_mesh
-from worker.objects.formats.soup import MAX_FACES
 
 VOLUME = 0.06 * 0.05 * 0.04
 

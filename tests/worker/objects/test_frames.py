@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.errors import MeshError
-from worker.grasps import GRID_M, GraspSet, Posture
-from worker.objects.check import check_object
-from worker.objects.mesh_geometry import centred, to_centre, to_file
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import from_bytes, load_object, to_bytes
+from graspd.service.model.errors import MeshError
+from graspd.worker.grasps import GRID_M, GraspSet, Posture
+from graspd.worker.objects.check import check_object
+from graspd.worker.objects.mesh_geometry import centred, to_centre, to_file
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import from_bytes, load_object, to_bytes
 
 SIZE = (0.06, 0.05, 0.1)
 NEAR, FAR, UTM = (0.123456, 0.05, -0.2), (5.0, -3.0, 2.0), (500_000.0, 4_500_000.0, 300.0)

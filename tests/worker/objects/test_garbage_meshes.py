@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from graspd.worker.objects.check import check_object
 from tests.worker.objects.test_formats import FILES
-from worker.objects.check import check_object
 
 WORDS = [
     b"nan",

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graspd.worker.objects.distance import MeshDistance, deviation, point_triangle_distance, sample_faces
+from graspd.worker.objects.mesh_geometry import corner_normals, mass_properties, signed_volume
+from graspd.worker.objects.prepare import load_object, object_from_path, simplify
+from graspd.worker.objects.topology import components, is_closed
 from tests.worker.objects.shapes import box, cylinder, sphere, stl
-from worker.objects.distance import MeshDistance, deviation, point_triangle_distance, sample_faces
-from worker.objects.mesh_geometry import corner_normals, mass_properties, signed_volume
-from worker.objects.prepare import load_object, object_from_path, simplify
-from worker.objects.topology import components, is_closed
 
 
 def test_mass_properties_of_a_box_are_exact_far_from_the_origin() -> None:
@@ -121,7 +121,7 @@ def test_an_error_of_zero_leaves_the_mesh_as_it_is() -> None:
 def test_a_flat_face_collapses_to_few_triangles() -> None:
     from manifold3d import Manifold
 
-    from worker.objects.mesh_geometry import from_manifold
+    from graspd.worker.objects.mesh_geometry import from_manifold
 
     vertices, faces = from_manifold(Manifold.cube((0.06, 0.05, 0.04), True).refine_to_length(0.002))
     assert len(faces) > 5000

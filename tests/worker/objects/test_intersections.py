@@ -7,10 +7,10 @@ import pytest
 from manifold3d import Manifold
 from numpy.typing import NDArray
 
+from graspd.worker.objects.check import check_object
+from graspd.worker.objects.intersections import crossings, untangle
+from graspd.worker.objects.mesh_geometry import from_manifold, signed_volume
 from tests.worker.objects.shapes import Mesh, box, cylinder, join, sphere, stl
-from worker.objects.check import check_object
-from worker.objects.intersections import crossings, untangle
-from worker.objects.mesh_geometry import from_manifold, signed_volume
 
 RADIUS = 0.008
 #: Where two cylinders of one radius cross at right angles they share 16/3 r^3 (Steinmetz).

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service import user_cache
-from service.model.errors import MeshError
+from graspd.service import user_cache
+from graspd.service.model.errors import MeshError
+from graspd.worker.objects import prepare
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import load_object
 from tests.worker.objects.shapes import box, join, sphere, stl
-from worker.objects import prepare
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import load_object
 
 #: Two balls in one another: a repair to remember.
 BALLS = stl(join(sphere(segments=24), sphere(segments=24, at=(0.02, 0.0, 0.0))))
@@ -100,7 +100,7 @@ def test_what_was_refused_is_refused_again_and_not_kept(own_cache: Path) -> None
 
 def test_a_command_that_comes_later_prepares_nothing(own_cache: Path) -> None:
     script = (
-        "import sys; from worker.objects import prepare\n"
+        "import sys; from graspd.worker.objects import prepare\n"
         "prepare.object_from_path('block', 1e-3)\n"
         "prepare.build = None\n"
         "prepare._prepared.cache_clear()\n"

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service import user_cache
+from graspd.service import user_cache
+from graspd.worker.hands import surface
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects import disk_cache
+from graspd.worker.objects.disk_cache import arrays_kept_or_made, recalled, recalling
+from graspd.worker.objects.prepare import load_object
+from graspd.worker.simulation import sampling
 from tests.worker.models import two_finger_hand
 from tests.worker.objects.shapes import sphere, stl
-from worker.hands import surface
-from worker.hands.load import hand_from_path
-from worker.objects import disk_cache
-from worker.objects.disk_cache import arrays_kept_or_made, recalled, recalling
-from worker.objects.prepare import load_object
-from worker.simulation import sampling
 
 
 @pytest.fixture(autouse=True)
@@ -85,7 +85,7 @@ def test_a_hand_is_the_same_from_kept_shapes_and_needs_no_scipy(tmp_path: Path) 
     first, again = hand_from_path("barrett"), hand_from_path("barrett")
     assert first.content == again.content
     code = (
-        "import sys; from worker.hands.load import hand_from_path; import worker.certified; "
+        "import sys; from graspd.worker.hands.load import hand_from_path; import graspd.worker.certified; "
         "print(hand_from_path('barrett').content, *{'scipy', 'trimesh', 'pydantic_settings'} & set(sys.modules))"
     )
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from service.store.hand_files import files_of_hand
-from service.store.mesh_files import MAX_NAMES, beside, looks_of
+from graspd.service.store.hand_files import files_of_hand
+from graspd.service.store.mesh_files import MAX_NAMES, beside, looks_of
+from graspd.worker.hands.load import hand_from_path, load_hand
+from graspd.worker.objects.formats import read_mesh
 from tests.worker.hands.urdfs import BOX, joint, link, robot
 from tests.worker.objects.test_colours import large
 from tests.worker.objects.test_dae import dae
-from worker.hands.load import hand_from_path, load_hand
-from worker.objects.formats import read_mesh
 
 #: Two triangles without a material, a square that is cut into two, and a triangle of a material that nobody describes.
 OBJ = b"""mtllib looks/part.mtl

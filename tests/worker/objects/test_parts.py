@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from worker.objects.check import check_object
+from graspd.worker.objects.check import check_object
 
 
 def boxes(gap: float, upper: tuple[float, float, float] = (0.04, 0.05, 0.03)) -> trimesh.Trimesh:

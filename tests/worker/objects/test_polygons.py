@@ -8,9 +8,9 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.model.errors import LimitError
-from worker.objects.formats import read_mesh
-from worker.objects.formats.soup import triangulate
+from graspd.service.model.errors import LimitError
+from graspd.worker.objects.formats import read_mesh
+from graspd.worker.objects.formats.soup import triangulate
 
 #: A channel, open above: its ends are polygons with two re-entrant corners.
 U = np.array([(0, 0), (80, 0), (80, 50), (70, 50), (70, 10), (10, 10), (10, 50), (0, 50)], float) / 1000

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.model.errors import MeshError
+from graspd.commands.objects import report_object
+from graspd.service.model.errors import MeshError
+from graspd.worker.objects.check import check_object
+from graspd.worker.objects.prepare import load_object
+from graspd.worker.objects.topology import is_closed
 from tests.worker.objects.shapes import Mesh, box, join, sphere, stl
-from worker.commands.objects import report_object
-from worker.objects.check import check_object
-from worker.objects.prepare import load_object
-from worker.objects.topology import is_closed
 
 #: Uploads are float32: seven digits of 0.1 m.
 ROUNDING = 1e-6

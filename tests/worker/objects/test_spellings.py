@@ -10,12 +10,12 @@ import zipfile
 import numpy as np
 import pytest
 
-from service.model.errors import MeshError
+from graspd.service.model.errors import MeshError
+from graspd.worker.objects.builtin import stl_bytes
+from graspd.worker.objects.check import check_object
+from graspd.worker.objects.formats import read_mesh
 from tests.worker.objects.shapes import box
 from tests.worker.objects.test_formats import ascii_stl, obj, off, ply
-from worker.objects.builtin import stl_bytes
-from worker.objects.check import check_object
-from worker.objects.formats import read_mesh
 
 PLAIN = {"m.stl": ascii_stl(box()), "m.obj": obj(box()), "m.off": off(box()), "m.ply": ply(box(), "ascii")}
 

@@ -8,26 +8,34 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.fidelity import resolve_fidelity
-from service.model.transforms import apply, quat_from_matrix, quat_rotate
+from graspd.service.model.fidelity import resolve_fidelity
+from graspd.service.model.transforms import apply, quat_from_matrix, quat_rotate
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.jaws import pads_of
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.oppositions import oppositions_of
+from graspd.worker.hands.pinches import pinches_of
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners.fast_graspd.across import (
+    ACROSS,
+    NEAR_M,
+    Openings,
+    across,
+    crossings_of,
+    outlines_of,
+    promising,
+)
+from graspd.worker.planners.fast_graspd.candidates import posture_of
+from graspd.worker.planners.fast_graspd.pairs import pair_of
+from graspd.worker.planners.fast_graspd.scene_starts import REACHING, clear_scene_starts, free_ways
+from graspd.worker.planners.fast_graspd.starts import CLEAR, start_generator
+from graspd.worker.planners.fast_graspd.withdrawal import hindrance
+from graspd.worker.simulation.data import HandState
+from graspd.worker.simulation.obstacles import MARGIN_M, DeviceObstacles, body_room
+from graspd.worker.simulation.surroundings import Obstacle, Scenes, Surroundings
 from tests.worker.models import object_from_mesh
 from tests.worker.simulation.rigs import ball
-from worker.grasps import Posture
-from worker.hands.jaws import pads_of
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
-from worker.hands.oppositions import oppositions_of
-from worker.hands.pinches import pinches_of
-from worker.objects.prepare import object_from_path
-from worker.planners.fast_graspd.across import ACROSS, NEAR_M, Openings, across, crossings_of, outlines_of, promising
-from worker.planners.fast_graspd.candidates import posture_of
-from worker.planners.fast_graspd.pairs import pair_of
-from worker.planners.fast_graspd.scene_starts import REACHING, clear_scene_starts, free_ways
-from worker.planners.fast_graspd.starts import CLEAR, start_generator
-from worker.planners.fast_graspd.withdrawal import hindrance
-from worker.simulation.data import HandState
-from worker.simulation.obstacles import MARGIN_M, DeviceObstacles, body_room
-from worker.simulation.surroundings import Obstacle, Scenes, Surroundings
 
 UP = np.array([0.0, 0, 1])
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.model.fidelity import FIDELITIES
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.planners.fast_graspd import planner
-from worker.planners.port import Wanted
-from worker.run import Run
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners.fast_graspd import planner
+from graspd.worker.planners.port import Wanted
+from graspd.worker.run import Run
 
 FIDELITY = FIDELITIES["draft"].model_copy(update={"name": "custom", "finalists": 2, "coarse_iterations": 30})
 

@@ -7,27 +7,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.model.fidelity import resolve_fidelity
-from service.model.scene_spec import SceneSpec
+from graspd.service.model.fidelity import resolve_fidelity
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.worker.control.postures import normal_force, squeeze
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import Wanted, synthesize
+from graspd.worker.planners.fast_graspd import candidates, planner
+from graspd.worker.planners.fast_graspd.candidates import GENTLER, Seated
+from graspd.worker.planners.fast_graspd.planner import ATTEMPTS, CLOSER
+from graspd.worker.planners.fast_graspd.schedule import PULL
+from graspd.worker.run import Run
+from graspd.worker.scenes.kinds import rest_poses, supports_of
+from graspd.worker.scenes.trial import lift_trial
+from graspd.worker.simulation.data import Data, HandState
+from graspd.worker.simulation.surroundings import Obstacle, Placed
+from graspd.worker.validation.decomposition import ConvexPieces
+from graspd.worker.validation.prescreening import SLIPS, push_trial
 from tests.worker.models import two_finger_hand
 from tests.worker.quality.helpers import grasp_set, posture
 from tests.worker.simulation.rigs import ball
-from worker.grasps import GraspSet
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.planners import Wanted, synthesize
-from worker.planners.fast_graspd import candidates, planner
-from worker.planners.fast_graspd.candidates import GENTLER, Seated
-from worker.planners.fast_graspd.planner import ATTEMPTS, CLOSER
-from worker.planners.fast_graspd.schedule import PULL
-from worker.quality.postures import normal_force, squeeze
-from worker.quality.referee.decomposition import ConvexPieces
-from worker.quality.referee.short import SLIPS, push_trial
-from worker.run import Run
-from worker.scenes.kinds import rest_poses, supports_of
-from worker.scenes.trial import lift_trial
-from worker.simulation.data import Data, HandState
-from worker.simulation.surroundings import Obstacle, Placed
 
 QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2, "finalists": 2})
 TABLE = (Obstacle.half_space([0, 0, 1], 0.0),)

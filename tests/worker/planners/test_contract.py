@@ -7,14 +7,14 @@ import threading
 import numpy as np
 import pytest
 
-from service.model.errors import TaskCancelled
-from service.model.fidelity import FIDELITIES
-from worker.grasps import GraspSet
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.planners import PLANNERS, method, synthesize
-from worker.planners.port import Wanted
-from worker.run import Run
+from graspd.service.model.errors import TaskCancelled
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import PLANNERS, method, synthesize
+from graspd.worker.planners.port import Wanted
+from graspd.worker.run import Run
 
 #: All methods around free objects but fast_graspd, with the options that make them quick.
 PEERS: dict[str, dict[str, object]] = {

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from service.model.errors import InputError, TaskCancelled
-from service.model.fidelity import FIDELITIES, Fidelity
-from worker.grasps import GraspSet
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
-from worker.planners.fast_graspd import pairs, planner, schedule
-from worker.planners.port import Wanted
-from worker.quality.table import measure
-from worker.run import Run
-from worker.simulation.projection import ProjectionOptions
+from graspd.service.model.errors import InputError, TaskCancelled
+from graspd.service.model.fidelity import FIDELITIES, Fidelity
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import synthesize
+from graspd.worker.planners.fast_graspd import pairs, planner, schedule
+from graspd.worker.planners.port import Wanted
+from graspd.worker.quality.table import measure
+from graspd.worker.run import Run
+from graspd.worker.simulation.projection import ProjectionOptions
 
 DRAFT = FIDELITIES["draft"]
 QUICK = DRAFT.model_copy(update={"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2})

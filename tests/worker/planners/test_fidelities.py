@@ -14,14 +14,14 @@ from typing import Any
 import pytest
 import trimesh
 
-from service.model.digests import digest_bytes
-from service.model.fidelity import FIDELITIES, Fidelity
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import load_object
-from worker.planners import PLANNERS, method, synthesize
-from worker.planners.port import Wanted
-from worker.quality.table import measure
-from worker.run import Run
+from graspd.service.model.digests import digest_bytes
+from graspd.service.model.fidelity import FIDELITIES, Fidelity
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import load_object
+from graspd.worker.planners import PLANNERS, method, synthesize
+from graspd.worker.planners.port import Wanted
+from graspd.worker.quality.table import measure
+from graspd.worker.run import Run
 
 #: Knobs that make a call short; the mesh, which is what the fidelities here differ in, stays theirs.
 SHORT: dict[str, Any] = {

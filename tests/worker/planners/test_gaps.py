@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.domain import JobOptions
-from service.model.fidelity import FIDELITIES
-from service.model.scene_spec import SceneSpec
-from service.model.transforms import IDENTITY_POSE
+from graspd.commands.synth import _said
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.transforms import IDENTITY_POSE
+from graspd.worker.certified import certified_grasps
+from graspd.worker.files.synthesis import synthesized
+from graspd.worker.hands.jaws import thinnest_fingertip
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.oppositions import oppositions_of
+from graspd.worker.planners.fast_graspd.across import Openings, crossings_of, room_beside, why_narrow
+from graspd.worker.run import Run
+from graspd.worker.simulation.surroundings import Obstacle, Scenes, Surroundings
 from tests.worker.models import object_from_mesh
-from worker.certified import certified_grasps
-from worker.commands.synth import _said
-from worker.files.synthesis import synthesized
-from worker.hands.jaws import thinnest_fingertip
-from worker.hands.load import hand_from_path
-from worker.hands.oppositions import oppositions_of
-from worker.planners.fast_graspd.across import Openings, crossings_of, room_beside, why_narrow
-from worker.run import Run
-from worker.simulation.surroundings import Obstacle, Scenes, Surroundings
 
 UP = np.array([0.0, 0, 1])
 SIZE = np.array([0.05, 0.06, 0.08])

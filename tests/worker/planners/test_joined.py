@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.model.errors import InputError, MeshError, TaskCancelled
-from service.model.fidelity import resolve_fidelity
-from service.model.scene_spec import SceneSpec
-from worker.grasps import GraspSet
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.planners import Asked, Wanted, synthesize
-from worker.planners.fast_graspd import planner
-from worker.planners.fast_graspd.planner import plan_joined
-from worker.run import Run
-from worker.scenes.kinds import rest_poses, supports_of
-from worker.simulation.surroundings import Placed
+from graspd.service.model.errors import InputError, MeshError, TaskCancelled
+from graspd.service.model.fidelity import resolve_fidelity
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import Asked, Wanted, synthesize
+from graspd.worker.planners.fast_graspd import planner
+from graspd.worker.planners.fast_graspd.planner import plan_joined
+from graspd.worker.run import Run
+from graspd.worker.scenes.kinds import rest_poses, supports_of
+from graspd.worker.simulation.surroundings import Placed
 
 QUICK = resolve_fidelity("draft").model_copy(
     update={"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2}

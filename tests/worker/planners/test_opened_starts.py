@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.fidelity import FIDELITIES
-from tests.worker.simulation.rigs import object_of
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.planners import Wanted, synthesize
-from worker.planners.fast_graspd.pairs import pair_of
-from worker.planners.fast_graspd.starts import (
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.studies.stability.assets import ring_hand
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners import Wanted, synthesize
+from graspd.worker.planners.fast_graspd.pairs import pair_of
+from graspd.worker.planners.fast_graspd.starts import (
     CLEAR,
     NO_PLACE,
     clear_starts,
     open_further,
     start_generator,
 )
-from worker.run import Run
-from worker.simulation.model import Model
-from worker.studies.stability.assets import ring_hand
+from graspd.worker.run import Run
+from graspd.worker.simulation.model import Model
+from tests.worker.simulation.rigs import object_of
 
 DRAFT = FIDELITIES["draft"]
 

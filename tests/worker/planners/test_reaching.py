@@ -9,18 +9,18 @@ import pytest
 import trimesh
 
 import graspd
-from service.model.fidelity import FIDELITIES
-from service.model.transforms import quat_rotate
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.transforms import quat_rotate
+from graspd.worker.hands.jaws import fingertip_pad
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.planners.fast_graspd.candidates import posture_of
+from graspd.worker.planners.fast_graspd.pairs import pair_of
+from graspd.worker.planners.fast_graspd.reaching import Reaching
+from graspd.worker.planners.fast_graspd.starts import CLEAR, RETREATS, clear_starts, start_generator
+from graspd.worker.simulation.data import HandState
+from graspd.worker.simulation.model import Model
 from tests.worker.simulation.rigs import object_of
-from worker.hands.jaws import fingertip_pad
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
-from worker.planners.fast_graspd.candidates import posture_of
-from worker.planners.fast_graspd.pairs import pair_of
-from worker.planners.fast_graspd.reaching import Reaching
-from worker.planners.fast_graspd.starts import CLEAR, RETREATS, clear_starts, start_generator
-from worker.simulation.data import HandState
-from worker.simulation.model import Model
 
 #: A box that an Allegro hand spans in one direction only, and half of its width there [m].
 SIDES = (0.1, 0.24, 0.24)

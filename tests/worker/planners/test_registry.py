@@ -11,11 +11,11 @@ from pathlib import Path
 import h5py
 import pytest
 
-from service.model.domain import FREE_ONLY_METHODS
-from service.model.errors import InputError
-from worker.planners import PLANNERS, method, method_names, planner, registry
-from worker.planners.port import Method
-from worker.planners.registry import parsed_options
+from graspd.service.model.domain import FREE_ONLY_METHODS
+from graspd.service.model.errors import InputError
+from graspd.worker.planners import PLANNERS, method, method_names, planner, registry
+from graspd.worker.planners.port import Method
+from graspd.worker.planners.registry import parsed_options
 
 
 @pytest.mark.parametrize("name", sorted(PLANNERS))
@@ -53,17 +53,17 @@ def offer(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
 
 
 def test_a_planner_of_another_package_is_found_by_its_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    offer(monkeypatch, "theirs", "worker.planners.autograsp.method:METHOD")
+    offer(monkeypatch, "theirs", "graspd.baselines.autograsp.method:METHOD")
     assert "theirs" in method_names()
     assert isinstance(method("theirs"), Method)
 
 
 def test_another_package_cannot_take_the_name_of_a_method_of_graspds_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    offer(monkeypatch, "fast_graspd", "worker.planners.autograsp.method:METHOD")
+    offer(monkeypatch, "fast_graspd", "graspd.baselines.autograsp.method:METHOD")
     assert "Fast-Grasp'D" in method("fast_graspd").source
 
 
-@pytest.mark.parametrize("value", ["no.such.module:METHOD", "worker.planners:GROUP"])
+@pytest.mark.parametrize("value", ["no.such.module:METHOD", "graspd.worker.planners:GROUP"])
 def test_an_entry_point_that_is_no_method_is_named_in_the_error(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
     offer(monkeypatch, "theirs", value)
     with pytest.raises(InputError, match="theirs"):

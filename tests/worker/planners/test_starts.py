@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.model.transforms import quat_rotate
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.planners.fast_graspd import starts
+from graspd.service.model.transforms import quat_rotate
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners.fast_graspd import starts
 
 
 def drawn_alone(pair: starts._Pair, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

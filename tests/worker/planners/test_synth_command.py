@@ -14,13 +14,13 @@ from typer.testing import CliRunner
 
 import graspd
 from graspd.cli import build
-from service.cli import write_output
-from service.model.errors import ConflictError, NotFoundError
-from service.readers import Grasps, open_shards
-from service.store.shards import Shard, read_shard
-from worker import certified
-from worker.commands import synth as synth_command
-from worker.files.provenance import object_of_shard
+from graspd.commands import synth as synth_command
+from graspd.service.cli import write_output
+from graspd.service.model.errors import ConflictError, NotFoundError
+from graspd.service.readers import Grasps, open_shards
+from graspd.service.store.shards import Shard, read_shard
+from graspd.worker import certified
+from graspd.worker.files.provenance import object_of_shard
 
 
 def run(*words: str | Path) -> Any:

@@ -7,15 +7,15 @@ import resource
 import numpy as np
 import pytest
 
-from service.model.fidelity import FIDELITIES
-from service.model.transforms import apply
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
-from worker.hands.surface import sample_surface
-from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
-from worker.planners.port import Wanted
-from worker.run import Run
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.transforms import apply
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import synthesize
+from graspd.worker.planners.port import Wanted
+from graspd.worker.run import Run
 
 #: Mean distance between the same surface points of two hands [m]. A difference of 5 mm is seen at a glance.
 ALIKE_M = 0.005

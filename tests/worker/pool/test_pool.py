@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from service.model.errors import TaskCancelled
+from graspd.service.model.errors import TaskCancelled
+from graspd.worker.pool.pool import BYTES_PER_PROCESS, KEPT, MEMORY_SHARE, Pool, ProcessLost, processes_at_once
 from tests.waiting import until
 from tests.worker.pool import works
-from worker.pool.pool import BYTES_PER_PROCESS, KEPT, MEMORY_SHARE, Pool, ProcessLost, processes_at_once
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_who_is_cancelled_waits_no_longer_and_others_are_served(tmp_path: Path) 
 
 def test_processes_end_with_the_one_that_started_them(tmp_path: Path) -> None:
     program = (
-        "from pathlib import Path; from worker.pool.pool import Pool; from tests.worker.pool import works; "
+        "from pathlib import Path; from graspd.worker.pool.pool import Pool; from tests.worker.pool import works; "
         f"Pool(2).map(works.hang, 'folder', Path({str(tmp_path)!r}), [0, 1])"
     )
     parent = subprocess.Popen([sys.executable, "-c", program])

@@ -9,21 +9,21 @@ from typing import Any
 
 import pytest
 
-from service.model.messages import TaskMessage
-from service.model.states import Lane, Stage
-from service.queue.port import Event, EventKind
-from service.queue.rq_queue import RqQueue
-from service.settings import Settings
-from service.store.manifests import shard_exists
-from service.store.records import task_attempts
-from service.store.store import Store, open_store
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.states import Lane, Stage
+from graspd.service.queue.port import Event, EventKind
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.settings import Settings
+from graspd.service.store.manifests import shard_exists
+from graspd.service.store.records import task_attempts
+from graspd.service.store.store import Store, open_store
+from graspd.worker.engines.devices import DeviceLost
+from graspd.worker.pool.pool import ProcessLost
+from graspd.worker.process import engine, main
+from graspd.worker.process.runner import Runner
+from graspd.worker.run import Run
+from graspd.worker.stages.context import TaskContext
 from tests.fakes import engine_of, fake_synthesize, message_for
-from worker.engines.devices import DeviceLost
-from worker.pool.pool import ProcessLost
-from worker.process import engine, main
-from worker.process.runner import Runner
-from worker.run import Run
-from worker.stages.context import TaskContext
 
 
 @pytest.fixture(autouse=True)

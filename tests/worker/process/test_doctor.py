@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from service.run.doctor.checks import Condition
-from service.settings import Settings
-from worker.process import doctor
-from worker.process.selfcheck import EngineError
+from graspd.service.run.doctor.checks import Condition
+from graspd.service.settings import Settings
+from graspd.worker.process import doctor
+from graspd.worker.process.selfcheck import EngineError
 
 GIB = 2**30
 H100 = {"name": "cuda:0", "model": "H100", "total": 80 * GIB, "free": 79 * GIB}
@@ -88,7 +88,7 @@ def test_the_child_tells_what_is_wrong_with_the_engine(monkeypatch: pytest.Monke
     def broken(*_: object, **__: object) -> None:
         raise EngineError("synthesize: OSError: no kernels")
 
-    monkeypatch.setattr("worker.process.selfcheck.check_engine", broken)
+    monkeypatch.setattr("graspd.worker.process.selfcheck.check_engine", broken)
     told = doctor._tell_kernels("cpu")
     assert told["error"] == "synthesize: OSError: no kernels"
     assert told["device"].startswith("cpu (")

@@ -13,16 +13,16 @@ from typing import Any
 
 import pytest
 
-from service.model.states import Lane
-from service.queue.port import EventKind
-from service.queue.rq_queue import RqQueue
+from graspd.service.model.states import Lane
+from graspd.service.queue.port import EventKind
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.worker.process import main
+from graspd.worker.process.heartbeat import Heartbeat
+from graspd.worker.process.link import EngineLost, Link, is_stopped
+from graspd.worker.process.main import GraspWorker
+from graspd.worker.stages.context import StopReason, TaskContext
 from tests.fakes import message_for
 from tests.waiting import until
-from worker.process import main
-from worker.process.heartbeat import Heartbeat
-from worker.process.link import EngineLost, Link, is_stopped
-from worker.process.main import GraspWorker
-from worker.stages.context import StopReason, TaskContext
 
 LEASE_S = 2.0
 TASK = message_for()

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from service.model.states import Stage
-from service.settings import Settings
-from service.store.store import open_store
+from graspd.service.model.states import Stage
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
+from graspd.worker.engines.devices import Device
+from graspd.worker.process import engine
+from graspd.worker.process.engine import Surroundings
 from tests.worker.pool import works
-from worker.engines.devices import Device
-from worker.process import engine
-from worker.process.engine import Surroundings
 
 
 def of(folder: Path, processes: int) -> Surroundings:

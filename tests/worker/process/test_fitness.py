@@ -7,18 +7,18 @@ from typing import Any
 
 import pytest
 
-from service.model.errors import DamagedError, MeshError
-from service.model.messages import TaskMessage
-from service.model.states import Stage
-from service.queue.port import Event, EventKind
-from service.store.records import task_attempts
-from service.store.store import Store, open_store
+from graspd.service.model.errors import DamagedError, MeshError
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.states import Stage
+from graspd.service.queue.port import Event, EventKind
+from graspd.service.store.records import task_attempts
+from graspd.service.store.store import Store, open_store
+from graspd.worker.process import fitness as module
+from graspd.worker.process.fitness import Fitness
+from graspd.worker.process.runner import Runner
+from graspd.worker.process.selfcheck import EngineError
+from graspd.worker.stages.context import TaskContext
 from tests.fakes import fake_synthesize, make_shard, message_for
-from worker.process import fitness as module
-from worker.process.fitness import Fitness
-from worker.process.runner import Runner
-from worker.process.selfcheck import EngineError
-from worker.stages.context import TaskContext
 
 
 class Bench:

@@ -10,13 +10,13 @@ import pytest
 from rq import Queue
 from rq.serializers import JSONSerializer
 
-from service.model.states import Lane, Stage
-from service.queue.port import EventKind
-from service.queue.rq_queue import RqQueue
-from service.settings import Settings
+from graspd.service.model.states import Lane, Stage
+from graspd.service.queue.port import EventKind
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.settings import Settings
+from graspd.worker.process.main import run_worker
+from graspd.worker.stages import scene
 from tests.fakes import engine_of, fake_synthesize, message_for
-from worker.process.main import run_worker
-from worker.stages import scene
 
 
 class Forged:
@@ -68,7 +68,7 @@ FORGERIES: dict[str, Callable[[Any, Path], object]] = {
     "a job of no time": lambda redis, _: redis.hset(f"rq:job:{_job(redis, 'os.getcwd')}", "created_at", "yesterday"),
     "a job of no data": lambda redis, _: redis.hset(f"rq:job:{_job(redis, 'os.getcwd')}", "data", b"\xff\xfe"),
     "a command": lambda redis, witness: _job(redis, "os.system", f"touch {witness}"),
-    "another function of ours": lambda redis, _: _job(redis, "service.queue.allowed.run_task", {}),
+    "another function of ours": lambda redis, _: _job(redis, "graspd.service.queue.allowed.run_task", {}),
     "a task without a message": lambda redis, _: _job(redis, "graspd.task", "text"),
     "a message of nothing": lambda redis, _: _job(redis, "graspd.task", {}),
 }

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from service.model.clock import timestamp
-from service.model.states import Stage
-from service.model.workers import WorkerBeat
-from service.queue.port import EventKind
-from service.queue.rq_queue import RqQueue
+from graspd.service.model.clock import timestamp
+from graspd.service.model.states import Stage
+from graspd.service.model.workers import WorkerBeat
+from graspd.service.queue.port import EventKind
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.worker.process.heartbeat import Heartbeat
 from tests.waiting import until
-from worker.process.heartbeat import Heartbeat
 
 LEASE_S = 2.0
 

@@ -9,15 +9,15 @@ from typing import Any
 
 import pytest
 
-from service.model.messages import TaskMessage
-from service.model.states import Lane, Stage
-from service.queue.port import EventKind
-from service.queue.rq_queue import RqQueue
-from service.settings import Settings
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.states import Lane, Stage
+from graspd.service.queue.port import EventKind
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.settings import Settings
+from graspd.worker.process.main import GraspWorker, run_worker
+from graspd.worker.stages.context import TaskContext
 from tests.fakes import engine_of, fake_synthesize, message_for
 from tests.waiting import until
-from worker.process.main import GraspWorker, run_worker
-from worker.stages.context import TaskContext
 
 
 def test_a_task_that_was_taken_away_ends_in_a_line_and_no_traceback(

@@ -7,20 +7,20 @@ from typing import Any
 
 import pytest
 
-from service.model import names
-from service.model.errors import InputError, MeshError, QueueUnavailable, StoreUnavailable, TaskRefused
-from service.model.messages import TaskMessage
-from service.model.states import Stage
-from service.queue.port import Event, EventKind
-from service.store.manifests import load_manifest
-from service.store.records import task_attempts
-from service.store.shards import read_shard
-from service.store.store import Store, open_store
+from graspd.service.model import names
+from graspd.service.model.errors import InputError, MeshError, QueueUnavailable, StoreUnavailable, TaskRefused
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.states import Stage
+from graspd.service.queue.port import Event, EventKind
+from graspd.service.store.manifests import load_manifest
+from graspd.service.store.records import task_attempts
+from graspd.service.store.shards import read_shard
+from graspd.service.store.store import Store, open_store
+from graspd.worker.process.runner import Runner
+from graspd.worker.stages import scene
+from graspd.worker.stages.context import StopReason, TaskContext
 from tests.damage import flip
 from tests.fakes import fake_synthesize, make_shard, message_for
-from worker.process.runner import Runner
-from worker.stages import scene
-from worker.stages.context import StopReason, TaskContext
 
 
 class Bench:
@@ -220,7 +220,7 @@ def test_a_stage_that_is_not_served_here_is_refused(bench: Bench) -> None:
 
 
 def test_progress_is_told_now_and_then_however_often_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("worker.stages.context.REPORT_EVERY_S", 3600.0)
+    monkeypatch.setattr("graspd.worker.stages.context.REPORT_EVERY_S", 3600.0)
     told: list[tuple[float, float, str]] = []
     context = TaskContext(open_store("memory://"), tell=lambda *args: told.append(args))
     for step in range(10_000):

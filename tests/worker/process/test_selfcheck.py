@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from service.model.states import Stage
-from worker import certified
-from worker.process.selfcheck import EngineError, check_engine
+from graspd.service.model.states import Stage
+from graspd.worker import certified
+from graspd.worker.process.selfcheck import EngineError, check_engine
 
 
 @pytest.mark.parametrize("stage", Stage)

@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import trimesh
 
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.model import HandModel, PalmFrame
 from tests.worker.models import piece, two_finger_hand
-from worker.grasps import GraspSet, Posture
-from worker.hands.model import HandModel, PalmFrame
 
 
 def posture(*rows: tuple[tuple[float, float, float], tuple[float, ...]]) -> Posture:

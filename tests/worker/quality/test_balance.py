@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from worker.quality import squeeze
-from worker.quality.squeeze import nonnegative_weights
+from graspd.worker.control import squeeze
+from graspd.worker.control.squeeze import nonnegative_weights
 
 TARGET = np.zeros(23)
 TARGET[6] = 10.0

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from graspd.worker.objects import disk_cache
+from graspd.worker.quality import probe
+from graspd.worker.quality.probe import Probe
 from tests.worker.models import two_finger_hand
 from tests.worker.simulation.rigs import ball
-from worker.objects import disk_cache
-from worker.quality import probe
-from worker.quality.probe import Probe
 
 HAND, BALL = two_finger_hand(), ball(subdivisions=2)
 

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits, evenness
-from service.model.transforms import apply, quat_from_axis_angle
+from graspd.exchange.cases import load_case
+from graspd.service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits, evenness
+from graspd.service.model.transforms import apply, quat_from_axis_angle
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.quality import diversity
+from graspd.worker.quality.diversity import POINTS, approach_cells, cells_of, distances, distinct, hand_points, nearest
+from graspd.worker.quality.table import measure
 from tests.worker.models import object_from_mesh
 from tests.worker.quality.helpers import grasp_set, pad_hand, plate_hand, posture
-from worker.files.cases import load_case
-from worker.grasps import Posture
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.quality import diversity
-from worker.quality.diversity import POINTS, approach_cells, cells_of, distances, distinct, hand_points, nearest
-from worker.quality.table import measure
 
 FIRST, SECOND = np.array([0]), np.array([1])
 
@@ -132,7 +132,7 @@ def test_pads_that_meet_on_a_ball_are_a_precision_grasp() -> None:
 def test_fingers_that_touch_by_their_sides_are_a_lateral_grasp() -> None:
     """A thin card between two straight fingers: what they touch it with looks along their axes of flexion."""
     hand = hand_from_path("allegro")
-    from worker.hands.kinematics import body_poses
+    from graspd.worker.hands.kinematics import body_poses
 
     straight = np.clip(np.zeros(hand.dofs), hand.lower, hand.upper)
     poses = body_poses(hand, np.array([[0.0, 0, 0, 1, 0, 0, 0]]), hand.expand(straight[None]))[0]

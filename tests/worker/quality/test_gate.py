@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from worker.quality.gate import MAX_PENETRATION_MM, MAX_SELF_PENETRATION_MM, MIN_CONTACT_LINKS, passes
+from graspd.worker.quality.gate import MAX_PENETRATION_MM, MAX_SELF_PENETRATION_MM, MIN_CONTACT_LINKS, passes
 
 GOOD = {"penetration_depth_mm": 0.5, "self_penetration_depth_mm": 0.0, "contact_links": 3.0}
 

@@ -10,8 +10,15 @@ import pytest
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from worker.quality import wrench_space
-from worker.quality.wrench_space import MAX_POINTS, measure_hulls, measure_space, radius, radius_and_volume, wrenches
+from graspd.worker.quality import wrench_space
+from graspd.worker.quality.wrench_space import (
+    MAX_POINTS,
+    measure_hulls,
+    measure_space,
+    radius,
+    radius_and_volume,
+    wrenches,
+)
 
 #: Both hulls joggle their points, ours by 1e-8; slivers between nearly coplanar points multiply that.
 JOGGLED = 1e-6
@@ -84,7 +91,7 @@ def test_wrench_space_takes_qhull_where_ours_fails(monkeypatch: pytest.MonkeyPat
     edges = contacts(12).reshape(12, 8, 6)
     wanted = measure_space(edges)
     monkeypatch.setattr(
-        "worker.quality.wrench_space.measure_hulls", lambda clouds, *_: np.full((2, len(clouds)), np.nan)
+        "graspd.worker.quality.wrench_space.measure_hulls", lambda clouds, *_: np.full((2, len(clouds)), np.nan)
     )
     assert measure_space(edges) == pytest.approx(wanted, rel=JOGGLED)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from worker.quality.intervals import wilson, wilson_of_mean
+from graspd.worker.quality.intervals import wilson, wilson_of_mean
 
 
 def test_the_bar_of_a_share_covers_the_truth_and_is_never_empty() -> None:

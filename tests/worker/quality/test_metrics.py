@@ -8,27 +8,27 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.errors import InputError, TaskCancelled
-from service.model.metrics import GRASP_METRICS
-from service.model.transforms import compose
-from service.store.columns import SCHEMAS
-from tests.worker.models import object_from_mesh, two_finger_hand
-from tests.worker.quality.helpers import grasp_set, plate_hand, posture
-from worker.grasps import Posture
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
-from worker.hands.surface import sample_surface
-from worker.quality.contact import (
+from graspd.service.model.errors import InputError, TaskCancelled
+from graspd.service.model.metrics import GRASP_METRICS
+from graspd.service.model.transforms import compose
+from graspd.service.store.columns import SCHEMAS
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.surface import sample_surface
+from graspd.worker.quality.contact import (
     choose_contacts,
     contact_distance_consistency_mm,
     finger_of_body,
     spread_contacts,
 )
-from worker.quality.diversity import explained_variance
-from worker.quality.probe import HAND_POINTS, REACH_M, Probe
-from worker.quality.table import MEASURES, measure
-from worker.quality.volume import SharedVolume, VoxelVolume
-from worker.run import Run
+from graspd.worker.quality.diversity import explained_variance
+from graspd.worker.quality.probe import HAND_POINTS, REACH_M, Probe
+from graspd.worker.quality.table import MEASURES, measure
+from graspd.worker.quality.volume import SharedVolume, VoxelVolume
+from graspd.worker.run import Run
+from tests.worker.models import object_from_mesh, two_finger_hand
+from tests.worker.quality.helpers import grasp_set, plate_hand, posture
 
 #: Single precision of coordinates around 0.1 m.
 SINGLE = 1e-6

@@ -6,13 +6,13 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from graspd.worker.grasps import Posture
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.quality.overlap import Overlap
+from graspd.worker.quality.probe import Probe
+from graspd.worker.quality.volume import SharedVolume
 from tests.worker.models import object_from_mesh
 from tests.worker.quality.helpers import plate_hand
-from worker.grasps import Posture
-from worker.objects.model import ObjectModel
-from worker.quality.overlap import Overlap
-from worker.quality.probe import Probe
-from worker.quality.volume import SharedVolume
 
 HAND = plate_hand((0.05, 0.04, 0.01))
 EVERY = np.ones((1, len(HAND.pieces)), bool)

@@ -12,8 +12,8 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
-from service.model.errors import InputError
-from worker.quality.wrench_space import cone_edges, measure_space, tangents, wrenches
+from graspd.service.model.errors import InputError
+from graspd.worker.quality.wrench_space import cone_edges, measure_space, tangents, wrenches
 
 #: The table of reference values is printed with six digits.
 PRINTED = 1e-5

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence, features
 
-from service.model.errors import InputError
-from service.model.transforms import apply, compose, invert
-from worker.commands.grasp_sheet import waypoints
-from worker.grasps import Posture
-from worker.rendering.way_pictures import KINDS, animation
-from worker.robots.execution import POSTURES, Executions, ToolFrame, straight_paths, timed
+from graspd.commands.grasp_sheet import waypoints
+from graspd.exchange.robots.execution import POSTURES, Executions, ToolFrame, straight_paths, timed
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import apply, compose, invert
+from graspd.worker.grasps import Posture
+from graspd.worker.rendering.way_pictures import KINDS, animation
 
 SECONDS = [0.5, 0.05, 1.2]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.model.pinhole import pixel_rays
-from worker.rendering.cameras import (
+from graspd.service.model.pinhole import pixel_rays
+from graspd.worker.rendering.cameras import (
     ELEVATION,
     FIELD_OF_VIEW,
     NEAREST_M,

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.digests import shard_id
-from service.model.domain import JobRequest
-from service.model.errors import InputError
-from service.model.states import Stage
-from service.store.shards import check_columns
+from graspd.service.model.digests import shard_id
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import InputError
+from graspd.service.model.states import Stage
+from graspd.service.store.shards import check_columns
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.rendering import Extras, render
+from graspd.worker.rendering.annotate import parse_channels
+from graspd.worker.rendering.cameras import GivenCameras, intrinsics, look_at, read_cameras
+from graspd.worker.rendering.hands import DrawnHand
+from graspd.worker.scenes import Neighbours
 from tests.worker.models import object_from_mesh, two_finger_hand
-from worker.objects.model import ObjectModel
-from worker.rendering import Extras, render
-from worker.rendering.annotate import parse_channels
-from worker.rendering.cameras import GivenCameras, intrinsics, look_at, read_cameras
-from worker.rendering.hands import DrawnHand
-from worker.scenes import Neighbours
 
 SIZE = (96, 72)
 RADIUS = 0.04

@@ -8,12 +8,12 @@ import numpy as np
 import trimesh
 
 from graspd.readers import hand_surface
-from service.model.transforms import apply
-from service.readers import Pictures, open_shards
-from service.store.shards import Shard, write_shard
+from graspd.service.model.transforms import apply
+from graspd.service.readers import Pictures, open_shards
+from graspd.service.store.shards import Shard, write_shard
+from graspd.worker.rendering import render
 from tests.service.readers import box_scenes
 from tests.worker.models import object_from_mesh
-from worker.rendering import render
 
 #: What a view promises of its depth [m]: tests/worker/rendering/test_views.py.
 DEPTH_M = 1e-4
@@ -40,8 +40,8 @@ def test_points_of_a_rendered_object_lie_on_its_mesh_and_their_normals_are_its_f
 
 def test_the_surface_of_the_hand_of_a_shard_follows_its_kinematics() -> None:
     """All of a hand moves with its root; the points of a body that no joint carries move with nothing else."""
-    from worker.hands.load import hand_from_path
-    from worker.hands.surface import sample_surface
+    from graspd.worker.hands.load import hand_from_path
+    from graspd.worker.hands.surface import sample_surface
 
     hand = hand_from_path("barrett")
     joints = np.zeros((2, len(hand.joint_names)))

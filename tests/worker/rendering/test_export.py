@@ -10,9 +10,9 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from service.model.errors import InputError
-from service.store.shards import Shard
-from worker.rendering.export import PNG_STEP_M, export_images
+from graspd.service.model.errors import InputError
+from graspd.service.store.shards import Shard
+from graspd.worker.rendering.export import PNG_STEP_M, export_images
 
 H, W = 6, 8
 

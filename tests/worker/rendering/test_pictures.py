@@ -9,10 +9,9 @@ import pytest
 import trimesh
 from PIL import Image
 
-from tests.worker.models import object_from_mesh, two_finger_hand
-from worker.rendering import render
-from worker.rendering.pictures import THREE_SIDES, grasp_pictures
-from worker.rendering.sheets import (
+from graspd.worker.rendering import render
+from graspd.worker.rendering.pictures import THREE_SIDES, grasp_pictures
+from graspd.worker.rendering.sheets import (
     GAP,
     MARGIN,
     PAPER,
@@ -23,6 +22,7 @@ from worker.rendering.sheets import (
     three_sides_sheet,
     views_page,
 )
+from tests.worker.models import object_from_mesh, two_finger_hand
 
 HAND = two_finger_hand()
 POSES = np.array([[0, 0, -0.06, 1.0, 0, 0, 0], [0, 0, 0.06, 0, 1.0, 0, 0]])

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.scene_spec import Box, HalfSpace, SceneSpec, supports_in
-from service.model.transforms import quat_rotate
+from graspd.service.model.scene_spec import Box, HalfSpace, SceneSpec, supports_in
+from graspd.service.model.transforms import quat_rotate
+from graspd.worker.rendering import Extras, render
+from graspd.worker.rendering.scenery import TABLE, TABLE_SIZE, seen_share, slab_poses, slabs
 from tests.worker.models import object_from_mesh
-from worker.rendering import Extras, render
-from worker.rendering.scenery import TABLE, TABLE_SIZE, seen_share, slab_poses, slabs
 
 SPECS = {kind: supports_in(SceneSpec(kind=kind)) for kind in ("table", "bin", "shelf")}
 POSE = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])

@@ -12,11 +12,11 @@ import trimesh
 import warp as wp
 from newton.sensors import SensorCamera
 
-from service.model.transforms import pose_from_matrix, quat_from_axis_angle, quat_rotate
-from worker.rendering.cameras import intrinsics, look_at
-from worker.rendering.kernels import rays, shading
-from worker.rendering.scenery import Box, Lamp, Look, Shot, Solid
-from worker.rendering.tracer import Tracer
+from graspd.service.model.transforms import pose_from_matrix, quat_from_axis_angle, quat_rotate
+from graspd.worker.rendering.cameras import intrinsics, look_at
+from graspd.worker.rendering.kernels import rays, shading
+from graspd.worker.rendering.scenery import Box, Lamp, Look, Shot, Solid
+from graspd.worker.rendering.tracer import Tracer
 
 WIDTH, HEIGHT = 96, 72
 FLOOR, WALL = Box((0.8, 0.6, 0.1)), Box((0.3, 0.02, 0.2))

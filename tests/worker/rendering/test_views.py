@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.errors import InputError, TaskCancelled
-from service.model.transforms import apply, quat_from_axis_angle
-from service.store.shards import check_columns
+from graspd.service.model.errors import InputError, TaskCancelled
+from graspd.service.model.transforms import apply, quat_from_axis_angle
+from graspd.service.store.shards import check_columns
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.rendering import render
+from graspd.worker.rendering.cameras import Cameras
+from graspd.worker.rendering.views import TABLE_SIZE
+from graspd.worker.run import Run
 from tests.worker.models import object_from_mesh
-from worker.objects.model import ObjectModel
-from worker.rendering import render
-from worker.rendering.cameras import Cameras
-from worker.rendering.views import TABLE_SIZE
-from worker.run import Run
 
 #: What a view promises of its depth [m]; float32 rays over half a metre err by less than a tenth of it.
 DEPTH_M = 1e-4
@@ -208,7 +208,7 @@ def test_a_scene_looks_the_same_whatever_other_scenes_are_rendered_with_it(mug, 
 
 
 def test_many_pictures_are_traced_in_parts_that_do_not_show(mug, mug_poses, mug_views, monkeypatch):
-    monkeypatch.setattr("worker.rendering.tracer.PIXELS_OF_A_CORE", SIZE[0] * SIZE[1])
+    monkeypatch.setattr("graspd.worker.rendering.tracer.PIXELS_OF_A_CORE", SIZE[0] * SIZE[1])
     again = shoot(mug, mug_poses)
     np.testing.assert_array_equal(mug_views["image/rgb"], again["image/rgb"])
     np.testing.assert_array_equal(mug_views["image/depth"], again["image/depth"])
@@ -236,7 +236,7 @@ def test_the_object_casts_a_shadow(ball, ball_views):
 
 
 def test_a_cancelled_render_stops_between_launches(ball, monkeypatch):
-    monkeypatch.setattr("worker.rendering.tracer.PIXELS_OF_A_CORE", 1)
+    monkeypatch.setattr("graspd.worker.rendering.tracer.PIXELS_OF_A_CORE", 1)
     answers = iter([False, True])
     with pytest.raises(TaskCancelled):
         shoot(ball, REST, run=Run(cancelled=lambda: next(answers)))
@@ -269,7 +269,7 @@ def test_memory_stays_flat_over_repeated_renders(ball):
 
 @pytest.mark.parametrize("cores", [1, 3])
 def test_pixels_do_not_depend_on_the_number_of_cores(mug, mug_poses, mug_views, monkeypatch, cores):
-    monkeypatch.setattr("worker.run.available_cores", lambda: cores)
+    monkeypatch.setattr("graspd.worker.run.available_cores", lambda: cores)
     again = shoot(mug, mug_poses)
     np.testing.assert_array_equal(mug_views["image/rgb"], again["image/rgb"])
     np.testing.assert_array_equal(mug_views["image/depth"], again["image/depth"])

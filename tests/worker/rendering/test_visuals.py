@@ -12,11 +12,11 @@ import trimesh
 from typer.testing import CliRunner
 
 from graspd.cli import build
+from graspd.worker.hands.load import hand_from_path, load_hand
+from graspd.worker.hands.model import HandModel
+from graspd.worker.rendering.hands import drawn_bodies, hand_parts, without_visuals
+from graspd.worker.stages.models import hand_glb
 from tests.worker.hands.urdfs import joint, link, robot
-from worker.hands.load import hand_from_path, load_hand
-from worker.hands.model import HandModel
-from worker.rendering.hands import drawn_bodies, hand_parts, without_visuals
-from worker.stages.models import hand_glb
 
 BOX = '<collision><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'
 RED = '<material name="red"><color rgba="1 0 0 1"/></material>'

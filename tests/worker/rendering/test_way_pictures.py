@@ -9,12 +9,12 @@ import pytest
 import trimesh
 from PIL import Image
 
-from service.model.scene_spec import Box, HalfSpace
-from service.readers.ways import Waypoint
+from graspd.service.model.scene_spec import Box, HalfSpace
+from graspd.service.readers.ways import Waypoint
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.rendering.hands import DrawnHand, drawn_bodies
+from graspd.worker.rendering.way_pictures import Around, way_pictures
 from tests.worker.models import object_from_mesh, two_finger_hand
-from worker.hands.kinematics import body_poses
-from worker.rendering.hands import DrawnHand, drawn_bodies
-from worker.rendering.way_pictures import Around, way_pictures
 
 HAND = two_finger_hand()
 REST = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])

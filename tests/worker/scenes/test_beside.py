@@ -11,21 +11,21 @@ import trimesh
 from typer.testing import CliRunner
 
 from graspd.cli import build
-from service.model.errors import InputError
-from service.model.fidelity import resolve_fidelity
-from service.model.scene_spec import SceneSpec
-from service.store.shards import read_shard
+from graspd.service.model.errors import InputError
+from graspd.service.model.fidelity import resolve_fidelity
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.store.shards import read_shard
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import synthesize
+from graspd.worker.planners.port import Wanted
+from graspd.worker.scenes.beside import gaps_between, joined_pieces, neighbour_of, scenes_of
+from graspd.worker.scenes.clearance import MARGIN_M, approach
+from graspd.worker.scenes.way import plan_way
 from tests.worker.models import object_from_mesh
 from tests.worker.simulation.test_solids import geom_distances
 from tests.worker.simulation.test_surroundings import mujoco_room
-from worker.grasps import Posture
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
-from worker.planners.port import Wanted
-from worker.scenes.beside import gaps_between, joined_pieces, neighbour_of, scenes_of
-from worker.scenes.clearance import MARGIN_M, approach
-from worker.scenes.way import plan_way
 
 QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2})
 TABLE = {"kind": "half_space"}

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.model.errors import InputError
-from service.model.transforms import apply, compose, invert, quat_from_axis_angle
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import apply, compose, invert, quat_from_axis_angle
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.scenes import transfer
+from graspd.worker.scenes.clearance import MARGIN_M, Rejection, approach
 from tests.worker.models import two_finger_hand
-from worker.grasps import Posture
-from worker.hands.kinematics import body_poses
-from worker.scenes import transfer
-from worker.scenes.clearance import MARGIN_M, Rejection, approach
 
 HAND = two_finger_hand()
 #: Tessellations lie inside round pieces by r (1 - cos(pi / 48)), and a sphere of 642 corners by 0.4 % of r.

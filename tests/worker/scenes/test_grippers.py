@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import trimesh
 
-from service.model.domain import JobOptions
-from service.model.scene_spec import SceneSpec
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.worker.certified import certified_grasps
+from graspd.worker.run import Run
+from graspd.worker.scenes.kinds import rest_poses, supports_of
+from graspd.worker.simulation.surroundings import Scenes
 from tests.worker.hands.grippers import gripper
 from tests.worker.models import object_from_mesh
-from worker.certified import certified_grasps
-from worker.run import Run
-from worker.scenes.kinds import rest_poses, supports_of
-from worker.simulation.surroundings import Scenes
 
 
 def test_a_gripper_lifts_a_box_from_a_table() -> None:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.errors import InputError
-from service.model.scene_spec import SceneSpec
-from service.model.transforms import quat_rotate
+from graspd.service.model.errors import InputError
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.transforms import quat_rotate
+from graspd.worker.scenes.kinds import rest_poses, supports_of
 from tests.worker.models import object_from_mesh
-from worker.scenes.kinds import rest_poses, supports_of
 
 BLOCK = object_from_mesh(trimesh.creation.box((0.05, 0.07, 0.11)), "block")
 

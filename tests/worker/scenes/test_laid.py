@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.errors import SceneError
-from service.model.scene_spec import SceneSpec
-from service.model.transforms import quat_rotate
+from graspd.service.model.errors import SceneError
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.transforms import quat_rotate
+from graspd.worker.scenes.beside import gaps_between, neighbour_of, scenes_of
+from graspd.worker.scenes.kinds import GAP, room_in
+from graspd.worker.scenes.neighbours import BETWEEN
 from tests.worker.models import object_from_mesh
-from worker.scenes.beside import gaps_between, neighbour_of, scenes_of
-from worker.scenes.kinds import GAP, room_in
-from worker.scenes.neighbours import BETWEEN
 
 
 def box(*size: float, name: str = "box"):

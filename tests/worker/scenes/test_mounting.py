@@ -8,30 +8,30 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.model.fidelity import resolve_fidelity
-from service.model.scene_spec import SceneSpec
-from service.model.transforms import IDENTITY_POSE, apply, compose
-from worker.grasps import GraspSet
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
-from worker.hands.model import ConvexPiece, HandModel
-from worker.hands.primitives import tessellate
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
-from worker.planners.fast_graspd.candidates import posture_of
-from worker.planners.fast_graspd.pairs import pair_of
-from worker.planners.fast_graspd.scene_starts import clear_scene_starts, free_ways
-from worker.planners.fast_graspd.starts import CLEAR, start_generator
-from worker.planners.port import Wanted
-from worker.run import ALONE
-from worker.scenes.clearance import MARGIN_M, transfer
-from worker.scenes.kinds import rest_poses, supports_of
-from worker.scenes.trial import scene_verdicts
-from worker.scenes.way import plan_way
-from worker.simulation.mounting import mounting_room
-from worker.simulation.obstacles import DeviceObstacles
-from worker.simulation.surroundings import Scenes
+from graspd.service.model.fidelity import resolve_fidelity
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.transforms import IDENTITY_POSE, apply, compose
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import ConvexPiece, HandModel
+from graspd.worker.hands.primitives import tessellate
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import synthesize
+from graspd.worker.planners.fast_graspd.candidates import posture_of
+from graspd.worker.planners.fast_graspd.pairs import pair_of
+from graspd.worker.planners.fast_graspd.scene_starts import clear_scene_starts, free_ways
+from graspd.worker.planners.fast_graspd.starts import CLEAR, start_generator
+from graspd.worker.planners.port import Wanted
+from graspd.worker.run import ALONE
+from graspd.worker.scenes.clearance import MARGIN_M, transfer
+from graspd.worker.scenes.kinds import rest_poses, supports_of
+from graspd.worker.scenes.trial import scene_verdicts
+from graspd.worker.scenes.way import plan_way
+from graspd.worker.simulation.mounting import mounting_room
+from graspd.worker.simulation.obstacles import DeviceObstacles
+from graspd.worker.simulation.surroundings import Scenes
 
 QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2})
 

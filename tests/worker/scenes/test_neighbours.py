@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.errors import InputError
-from service.model.transforms import apply, compose, quat_from_axis_angle
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import apply, compose, quat_from_axis_angle
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.scenes import Neighbours, drop_together, transfer
+from graspd.worker.scenes.clearance import Rejection
+from graspd.worker.scenes.neighbours import FARTHEST_M, neighbour_clearance
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.scenes.test_clearance import postures
-from worker.grasps import Posture
-from worker.hands.kinematics import body_poses
-from worker.scenes import Neighbours, drop_together, transfer
-from worker.scenes.clearance import Rejection
-from worker.scenes.neighbours import FARTHEST_M, neighbour_clearance
 
 HAND = two_finger_hand()
 #: MuJoCo stores meshes in float32 and its GJK stops at 1e-6 of the size.

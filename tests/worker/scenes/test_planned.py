@@ -11,19 +11,19 @@ import pytest
 from typer.testing import CliRunner
 
 from graspd.cli import build
-from service.model.fidelity import resolve_fidelity
-from service.model.scene_spec import SceneSpec
-from service.store.shards import read_shard
+from graspd.service.model.fidelity import resolve_fidelity
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.store.shards import read_shard
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import synthesize
+from graspd.worker.planners.port import Wanted
+from graspd.worker.scenes.clearance import MARGIN_M, approach
+from graspd.worker.scenes.kinds import rest_poses, supports_of
+from graspd.worker.scenes.way import plan_way
+from graspd.worker.simulation.surroundings import STANDOFF_M, Obstacle, Placed
 from tests.worker.simulation.test_surroundings import mujoco_distances, mujoco_room, parted
-from worker.grasps import Posture
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
-from worker.planners.port import Wanted
-from worker.scenes.clearance import MARGIN_M, approach
-from worker.scenes.kinds import rest_poses, supports_of
-from worker.scenes.way import plan_way
-from worker.simulation.surroundings import STANDOFF_M, Obstacle, Placed
 
 #: What a draft's finish may lack of a distance that it aims at exactly [m].
 DRAFT_M = 5e-4

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.scene_spec import SceneSpec
-from service.model.transforms import quat_conjugate, quat_rotate
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.transforms import quat_conjugate, quat_rotate
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.scenes.kinds import rest_poses
+from graspd.worker.scenes.neighbours import drop_together
+from graspd.worker.scenes.rest import RestingFaces, resting_faces, rolling_note, rolling_poses
+from graspd.worker.scenes.simulate import drop
 from tests.worker.models import object_from_mesh
-from worker.objects.model import ObjectModel
-from worker.scenes.kinds import rest_poses
-from worker.scenes.neighbours import drop_together
-from worker.scenes.rest import RestingFaces, resting_faces, rolling_note, rolling_poses
-from worker.scenes.simulate import drop
 
 UP = np.array([0.0, 0, 1])
 

@@ -8,13 +8,13 @@ import trimesh
 from scipy.spatial import ConvexHull
 from scipy.stats import chisquare
 
-from service.model.errors import InputError, MeshError
-from service.model.transforms import apply, quat_rotate
+from graspd.service.model.errors import InputError, MeshError
+from graspd.service.model.transforms import apply, quat_rotate
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.scenes import drop, simulate
+from graspd.worker.scenes.rest import resting_faces
+from graspd.worker.scenes.simulate import REACH, _build
 from tests.worker.models import object_from_mesh
-from worker.objects.model import ObjectModel
-from worker.scenes import drop, simulate
-from worker.scenes.rest import resting_faces
-from worker.scenes.simulate import REACH, _build
 
 #: Rest poses are computed in float64 from hull vertices of size 0.1 m.
 ROUNDING_M = 1e-9

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.worker.quality.test_lift import BOX, HAND, PLACED, WHOLE, grasp
-from tests.worker.quality.test_short_tests import LEAST
-from worker.grasps import joined
-from worker.quality.referee.judge import KnownTrials, judge
-from worker.quality.referee.lift import Lift
-from worker.quality.referee.lifting import KnownLifts, judge_lifts
-from worker.quality.referee.protocol import Test
-from worker.quality.referee.short import SLIPS, ShortLifts
-from worker.scenes import trial as trials
-from worker.scenes.trial import BEST, FALLS, TOUCHES, hold_trial, lift_trial
-from worker.simulation.surroundings import Placed
+from graspd.worker.grasps import joined
+from graspd.worker.scenes import trial as trials
+from graspd.worker.scenes.trial import BEST, FALLS, TOUCHES, hold_trial, lift_trial
+from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.validation.lift import Lift
+from graspd.worker.validation.lifting import KnownLifts, judge_lifts
+from graspd.worker.validation.prescreening import SLIPS, ShortLifts
+from graspd.worker.validation.protocol import Test
+from graspd.worker.validation.validator import KnownTrials, judge
+from tests.worker.validation.test_lift import BOX, HAND, PLACED, WHOLE, grasp
+from tests.worker.validation.test_prescreening import LEAST
 
 SQUEEZES = (-0.005, 1.3 * LEAST, 4 * LEAST)
 MANY = joined([grasp(squeeze) for squeeze in SQUEEZES])

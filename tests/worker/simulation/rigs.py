@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from worker.hands.model import HandModel
-from worker.hands.surface import sample_surface
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import build
-from worker.objects.repair import Repaired
-from worker.simulation import kernels
-from worker.simulation.data import Data, Schedule
-from worker.simulation.device import DeviceHand, DeviceObject
-from worker.simulation.model import LossOptions, Model
-from worker.simulation.sampling import object_samples
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import build
+from graspd.worker.objects.repair import Repaired
+from graspd.worker.simulation import kernels
+from graspd.worker.simulation.data import Data, Schedule
+from graspd.worker.simulation.device import DeviceHand, DeviceObject
+from graspd.worker.simulation.model import LossOptions, Model
+from graspd.worker.simulation.sampling import object_samples
 
 
 def object_of(mesh: trimesh.Trimesh) -> ObjectModel:

@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from service.model.transforms import apply, invert
-from worker.hands.model import ConvexPiece, HandModel
-from worker.hands.surface import piece_distance
-from worker.simulation.surroundings import Obstacle
+from graspd.service.model.transforms import apply, invert
+from graspd.worker.hands.model import ConvexPiece, HandModel
+from graspd.worker.hands.surface import piece_distance
+from graspd.worker.simulation.surroundings import Obstacle
 
 _GOLDEN = (np.sqrt(5) - 1) / 2
 

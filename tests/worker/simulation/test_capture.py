@@ -10,16 +10,16 @@ import pytest
 import trimesh
 import warp as wp
 
-from service.model.fidelity import FIDELITIES
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.control.opening import OPENING_STEPS
+from graspd.worker.control.postures import pregrasp
+from graspd.worker.grasps import Posture
+from graspd.worker.planners import Wanted
+from graspd.worker.planners.fast_graspd import planner
+from graspd.worker.run import Run
+from graspd.worker.simulation import launches
+from graspd.worker.simulation.launches import Launches
 from tests.worker.models import object_from_mesh, two_finger_hand
-from worker.grasps import Posture
-from worker.planners import Wanted
-from worker.planners.fast_graspd import planner
-from worker.quality.opening import OPENING_STEPS
-from worker.quality.postures import pregrasp
-from worker.run import Run
-from worker.simulation import launches
-from worker.simulation.launches import Launches
 
 FIDELITY = FIDELITIES["draft"].model_copy(update={"coarse_iterations": 20, "fine_iterations": 20})
 

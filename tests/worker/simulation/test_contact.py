@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from worker.simulation import reference
-from worker.simulation.kernels import contact
-from worker.simulation.model import NEAR_GAP, initial_motions
-from worker.simulation.reference import Contacts, World
+from graspd.worker.simulation import reference
+from graspd.worker.simulation.kernels import contact
+from graspd.worker.simulation.model import NEAR_GAP, initial_motions
+from graspd.worker.simulation.reference import Contacts, World
 
 #: float32 solves of 6 x 6 systems with condition numbers up to 1e3, motions of 1e-3 m.
 END_TOLERANCE = 2e-6

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service import user_cache
+from graspd.service import user_cache
+from graspd.worker.objects import disk_cache
+from graspd.worker.simulation import grids, kernels
+from graspd.worker.simulation.device import DeviceObject
+from graspd.worker.simulation.sampling import object_samples
 from tests.worker.simulation.rigs import ball
-from worker.objects import disk_cache
-from worker.simulation import grids, kernels
-from worker.simulation.device import DeviceObject
-from worker.simulation.sampling import object_samples
 
 Grid = dict[str, np.ndarray]
 BALL = ball(subdivisions=2)

@@ -10,14 +10,14 @@ import pytest
 import warp as wp
 import yourdfpy
 
-from service.model.transforms import apply, pose_to_matrix, quat_from_axis_angle, quat_multiply, quat_rotate
+from graspd.service.model.transforms import apply, pose_to_matrix, quat_from_axis_angle, quat_multiply, quat_rotate
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.simulation.data import HandState
+from graspd.worker.simulation.kernels import kinematics, wrenches
+from graspd.worker.simulation.record import record_placement
 from tests.worker.simulation.rigs import ball, rig
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.simulation.data import HandState
-from worker.simulation.kernels import kinematics, wrenches
-from worker.simulation.record import record_placement
 
 #: float32 positions of a hand 0.2 m large through at most 8 joints.
 FK_TOLERANCE = 3e-7

@@ -6,14 +6,14 @@ import numpy as np
 import trimesh
 import warp as wp
 
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.simulation import kernels
+from graspd.worker.simulation.device import DeviceObject, sorted_samples
+from graspd.worker.simulation.grids import feature_normals
+from graspd.worker.simulation.kernels import surface
+from graspd.worker.simulation.sampling import object_samples
 from tests.worker.simulation.rigs import object_of
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import object_from_path
-from worker.simulation import kernels
-from worker.simulation.device import DeviceObject, sorted_samples
-from worker.simulation.grids import feature_normals
-from worker.simulation.kernels import surface
-from worker.simulation.sampling import object_samples
 
 #: float32 coordinates of size 0.1 m: both ways round differently.
 FLOAT32 = 5e-8

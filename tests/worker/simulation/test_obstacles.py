@@ -7,19 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.model.transforms import compose, quat_rotate
+from graspd.service.model.transforms import compose, quat_rotate
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.scenes.beside import outer_solid
+from graspd.worker.simulation.data import Data, HandState
+from graspd.worker.simulation.model import LossOptions, Model
+from graspd.worker.simulation.obstacles import DeviceObstacles
+from graspd.worker.simulation.projection import Projection, ProjectionOptions
+from graspd.worker.simulation.record import record_evaluation, record_placement
+from graspd.worker.simulation.surroundings import Obstacle, Surroundings
 from tests.worker.simulation.rigs import ball, rig, still
 from tests.worker.simulation.solids import nearest_edges
 from tests.worker.simulation.test_penalties import RELATIVE, bodies_of, differences
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.scenes.beside import outer_solid
-from worker.simulation.data import Data, HandState
-from worker.simulation.model import LossOptions, Model
-from worker.simulation.obstacles import DeviceObstacles
-from worker.simulation.projection import Projection, ProjectionOptions
-from worker.simulation.record import record_evaluation, record_placement
-from worker.simulation.surroundings import Obstacle, Surroundings
 
 MARGIN = 0.004
 BALL = np.random.default_rng(5).normal(size=(300, 3))

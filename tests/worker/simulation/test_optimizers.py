@@ -6,12 +6,12 @@ from typing import get_args
 
 import pytest
 
-from service.model.errors import InputError
-from service.model.fidelity import Fidelity
+from graspd.service.model.errors import InputError
+from graspd.service.model.fidelity import Fidelity
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.simulation.model import LossOptions
+from graspd.worker.simulation.record import OPTIMIZERS, record_iteration
 from tests.worker.simulation.rigs import ball, rig
-from worker.hands.load import hand_from_path
-from worker.simulation.model import LossOptions
-from worker.simulation.record import OPTIMIZERS, record_iteration
 
 
 @pytest.mark.parametrize("name", ["lbfgs", "Adam", ""])

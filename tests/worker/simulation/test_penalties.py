@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.model.errors import InputError
-from service.model.transforms import apply, invert, quat_from_axis_angle, quat_multiply
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import apply, invert, quat_from_axis_angle, quat_multiply
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.surface import piece_distance, sample_surface
+from graspd.worker.simulation.data import HandState, Schedule
+from graspd.worker.simulation.model import REFERENCE_POINTS, REFERENCE_SAMPLES, REFERENCE_SELF_POINTS, LossOptions
+from graspd.worker.simulation.record import record_evaluation, record_iteration
+from graspd.worker.simulation.sampling import object_samples
 from tests.worker.simulation.rigs import ball, rig, still
 from tests.worker.simulation.test_kinematics import root_poses
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.hands.surface import piece_distance, sample_surface
-from worker.simulation.data import HandState, Schedule
-from worker.simulation.model import REFERENCE_POINTS, REFERENCE_SAMPLES, REFERENCE_SELF_POINTS, LossOptions
-from worker.simulation.record import record_evaluation, record_iteration
-from worker.simulation.sampling import object_samples
 
 #: float32 depths of 1e-3 m from coordinates of 0.1 m are good to 1e-5 relative; points that enter or leave within the
 #: difference add the rest.

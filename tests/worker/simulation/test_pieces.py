@@ -7,13 +7,13 @@ import pytest
 import trimesh
 import warp as wp
 
-from service.model.transforms import apply, invert
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.hands.surface import piece_distance
-from worker.simulation import kernels
-from worker.simulation.device import DeviceHand, face_planes
-from worker.simulation.kernels import pieces
+from graspd.service.model.transforms import apply, invert
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.surface import piece_distance
+from graspd.worker.simulation import kernels
+from graspd.worker.simulation.device import DeviceHand, face_planes
+from graspd.worker.simulation.kernels import pieces
 
 
 @wp.kernel

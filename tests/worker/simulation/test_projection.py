@@ -8,17 +8,17 @@ import numpy as np
 import trimesh
 import warp as wp
 
-from service.model.transforms import quat_from_axis_angle, quat_multiply
+from graspd.service.model.transforms import quat_from_axis_angle, quat_multiply
+from graspd.worker.hands.kinematics import body_poses, generalized_forces
+from graspd.worker.hands.surface import sample_surface
+from graspd.worker.planners.fast_graspd.candidates import posture_of
+from graspd.worker.simulation.data import Data, HandState, still_schedule
+from graspd.worker.simulation.device import DeviceHand, DeviceObject
+from graspd.worker.simulation.kernels import projection as kernels
+from graspd.worker.simulation.model import LossOptions, Model
+from graspd.worker.simulation.projection import Projection, ProjectionOptions
+from graspd.worker.simulation.sampling import object_samples
 from tests.worker.models import object_from_mesh, two_finger_hand
-from worker.hands.kinematics import body_poses, generalized_forces
-from worker.hands.surface import sample_surface
-from worker.planners.fast_graspd.candidates import posture_of
-from worker.simulation.data import Data, HandState, still_schedule
-from worker.simulation.device import DeviceHand, DeviceObject
-from worker.simulation.kernels import projection as kernels
-from worker.simulation.model import LossOptions, Model
-from worker.simulation.projection import Projection, ProjectionOptions
-from worker.simulation.sampling import object_samples
 
 HAND = two_finger_hand()
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import trimesh
 
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.scenes.beside import MOST_PLANES, outer_solid
+from graspd.worker.simulation.obstacles import FAR_M, obstacle_distances
+from graspd.worker.simulation.surroundings import Obstacle, Surroundings
 from tests.worker.models import piece, two_finger_hand
-from worker.grasps import Posture
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.scenes.beside import MOST_PLANES, outer_solid
-from worker.simulation.obstacles import FAR_M, obstacle_distances
-from worker.simulation.surroundings import Obstacle, Surroundings
 
 UP = np.array([0.0, 0.0, 1.0])
 BOX = Obstacle.box([0, 0, 0, 1, 0, 0, 0], [0.1, 0.1, 0.1])
@@ -113,7 +113,7 @@ def test_no_hand_is_nearer_to_a_solid_than_it_says_by_mujocos_distances(name: st
 
 def geom_distances(hand: HandModel, postures: Posture, solid: Obstacle) -> np.ndarray:
     """(P,) least distance of a hand from a convex solid, by MuJoCo; at most 1 m."""
-    from worker.scenes.neighbours import _add_piece
+    from graspd.worker.scenes.neighbours import _add_piece
 
     spec = mujoco.MjSpec()
     mesh = spec.add_mesh(name="solid", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)

@@ -7,12 +7,12 @@ import pytest
 import trimesh
 import warp as wp
 
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.simulation import kernels
+from graspd.worker.simulation.device import DeviceObject
+from graspd.worker.simulation.kernels import surface
+from graspd.worker.simulation.sampling import object_samples
 from tests.worker.simulation.rigs import ball, object_of
-from worker.objects.model import ObjectModel
-from worker.simulation import kernels
-from worker.simulation.device import DeviceObject
-from worker.simulation.kernels import surface
-from worker.simulation.sampling import object_samples
 
 #: float32 coordinates of size 0.1 m.
 FLOAT32 = 2e-8

@@ -8,14 +8,20 @@ import mujoco
 import numpy as np
 import pytest
 
-from service.model.errors import InputError
-from service.model.transforms import apply, quat_rotate
-from worker.grasps import Posture
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.simulation.obstacles import PosedFeatures, body_distances, body_room, obstacle_distances, obstacle_room
-from worker.simulation.surroundings import CLEAR_M, Obstacle, Placed, Surroundings
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import apply, quat_rotate
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.simulation.obstacles import (
+    PosedFeatures,
+    body_distances,
+    body_room,
+    obstacle_distances,
+    obstacle_room,
+)
+from graspd.worker.simulation.surroundings import CLEAR_M, Obstacle, Placed, Surroundings
 
 TILTED = np.array([0.1, -0.2, 0.3, 0.8, 0.2, -0.4, 0.4]) / [1, 1, 1, 1, 1, 1, 1]
 TILTED[3:] /= np.linalg.norm(TILTED[3:])
@@ -135,7 +141,7 @@ def mujoco_room(hand, postures: Posture, obstacle: Obstacle) -> np.ndarray:
 
 
 def mujoco_distances(hand, postures: Posture, obstacle: Obstacle) -> np.ndarray:
-    from worker.scenes.neighbours import _add_piece
+    from graspd.worker.scenes.neighbours import _add_piece
 
     spec = mujoco.MjSpec()
     if len(obstacle.corners):

@@ -9,14 +9,14 @@ import pytest
 import trimesh
 import warp as wp
 
-from service.model.fidelity import FIDELITIES
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.planners import Wanted
+from graspd.worker.planners.fast_graspd import planner
+from graspd.worker.run import Run
+from graspd.worker.simulation.data import Data
+from graspd.worker.simulation.kernels import packing, wrenches
+from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
 from tests.worker.models import object_from_mesh, two_finger_hand
-from worker.planners import Wanted
-from worker.planners.fast_graspd import planner
-from worker.run import Run
-from worker.simulation.data import Data
-from worker.simulation.kernels import packing, wrenches
-from worker.simulation.kernels.wrenches import Wrenches, add_wrench
 
 FIDELITY = FIDELITIES["draft"].model_copy(update={"coarse_iterations": 20, "fine_iterations": 20})
 

@@ -10,21 +10,18 @@ from typing import cast
 import numpy as np
 import pytest
 
-from service.model.errors import InputError, TaskCancelled
-from service.model.states import AssetKind
-from service.store.asset_summary import summary
-from tests.worker.hands.grippers import OPENING, gripper
-from tests.worker.hands.urdfs import joint, link, robot
-from worker.certified import Certified
-from worker.hands.jaws import jaws_of
-from worker.hands.load import hand_from_path, load_hand
-from worker.hands.model import HandModel
-from worker.hands.oppositions import oppositions_of
-from worker.objects.model import ObjectModel
-from worker.quality.referee.payload import Limit
-from worker.run import Run
-from worker.stages import hand_self_test
-from worker.stages.hand_self_test import (
+from graspd.service.model.errors import InputError, TaskCancelled
+from graspd.service.model.states import AssetKind
+from graspd.service.store.asset_summary import summary
+from graspd.worker.certified import Certified
+from graspd.worker.hands.jaws import jaws_of
+from graspd.worker.hands.load import hand_from_path, load_hand
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.oppositions import oppositions_of
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.run import Run
+from graspd.worker.stages import hand_self_test
+from graspd.worker.stages.hand_self_test import (
     OF_OPENING,
     OF_REACH,
     WIDTH_M,
@@ -34,6 +31,9 @@ from worker.stages.hand_self_test import (
     self_test,
     tried_softly,
 )
+from graspd.worker.validation.payload import Limit
+from tests.worker.hands.grippers import OPENING, gripper
+from tests.worker.hands.urdfs import joint, link, robot
 
 _PALM = '<collision><geometry><box size="0.09 0.09 0.02"/></geometry></collision>'
 _FINGER = '<collision><origin xyz="0 0 0.05"/><geometry><box size="0.012 0.012 0.1"/></geometry></collision>'
@@ -115,7 +115,7 @@ def test_objects_are_no_thinner_than_opposed_pads_come_together(monkeypatch: pyt
     known, width = oppositions_of(hand), fitting_width(hand)
     assert known.width[0] < width
     thick = replace(known, width=known.width + 0.03)
-    monkeypatch.setattr("worker.stages.hand_self_test.oppositions_of", lambda hand: thick)
+    monkeypatch.setattr("graspd.worker.stages.hand_self_test.oppositions_of", lambda hand: thick)
     assert fitting_width(hand) == pytest.approx(thick.width[0])
     assert width < thick.width[0] < WIDTH_M[1]
 

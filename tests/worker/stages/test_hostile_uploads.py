@@ -16,19 +16,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from api.uploads import files_of_upload
-from service.model import names
-from service.model.errors import InputError
-from service.model.messages import IngestMessage
-from service.model.states import AssetKind, Stage
-from service.model.version import TASK_SCHEMA
-from service.queue.port import EventKind
-from service.store.library import publish_asset
-from service.store.store import Store, open_store
+from graspd.api.uploads import files_of_upload
+from graspd.service.model import names
+from graspd.service.model.errors import InputError
+from graspd.service.model.messages import IngestMessage
+from graspd.service.model.states import AssetKind, Stage
+from graspd.service.model.version import TASK_SCHEMA
+from graspd.service.queue.port import EventKind
+from graspd.service.store.library import publish_asset
+from graspd.service.store.store import Store, open_store
+from graspd.worker.process.runner import Runner
+from graspd.worker.stages import ingest
+from graspd.worker.stages.context import TaskContext
 from tests.worker.objects.shapes import join, sphere, stl
-from worker.process.runner import Runner
-from worker.stages import ingest
-from worker.stages.context import TaskContext
 
 UPLOAD_BYTES = 64 * 2**20
 #: What is promised for any upload, as time of computing [s].

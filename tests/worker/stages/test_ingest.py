@@ -9,18 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from service.model import names
-from service.model.errors import InputError, TaskCancelled
-from service.model.messages import IngestMessage
-from service.model.states import AssetKind
-from service.store.library import publish_asset, record_asset, store_files
-from service.store.store import Store, open_store
+from graspd.service.model import names
+from graspd.service.model.errors import InputError, TaskCancelled
+from graspd.service.model.messages import IngestMessage
+from graspd.service.model.states import AssetKind
+from graspd.service.store.library import publish_asset, record_asset, store_files
+from graspd.service.store.store import Store, open_store
+from graspd.worker.hands.model import HandModel
+from graspd.worker.run import Run
+from graspd.worker.stages import hand_self_test, ingest
+from graspd.worker.stages.context import StopReason, TaskContext
+from graspd.worker.stages.hand_self_test import SelfTest
 from tests.worker.hands.grippers import gripper_urdf
-from worker.hands.model import HandModel
-from worker.run import Run
-from worker.stages import hand_self_test, ingest
-from worker.stages.context import StopReason, TaskContext
-from worker.stages.hand_self_test import SelfTest
 
 TETRAHEDRON = """\
 solid t
@@ -199,7 +199,7 @@ def test_a_check_that_is_stopped_ends_its_child(
 
 def test_a_check_loads_no_engine() -> None:
     """It would cost four seconds of computing for every upload, and memory of the child's limit."""
-    code = "import sys, worker.stages.ingest, worker.hands.check, worker.objects.check, worker.stages.models\n"
+    code = "import sys, graspd.worker.stages.ingest, graspd.worker.hands.check, graspd.worker.objects.check, graspd.worker.stages.models\n"
     done = subprocess.run(
         [sys.executable, "-c", f"{code}print(*sys.modules)"], capture_output=True, text=True, check=True
     )

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model import names
-from service.model.states import AssetKind
-from service.model.transforms import IDENTITY_POSE, apply
-from service.store.assets import builtin_files, builtin_model, builtin_names
-from service.store.integrity import sealed
-from service.store.store import open_store
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
-from worker.objects.prepare import object_from_path
-from worker.stages.models import hand_glb, model_of, object_glb, publish_model
+from graspd.service.model import names
+from graspd.service.model.states import AssetKind
+from graspd.service.model.transforms import IDENTITY_POSE, apply
+from graspd.service.store.assets import builtin_files, builtin_model, builtin_names
+from graspd.service.store.integrity import sealed
+from graspd.service.store.store import open_store
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.stages.models import hand_glb, model_of, object_glb, publish_model
 
 #: Positions are single precision: half a micrometre at half a metre.
 TOLERANCE_M = 5e-7
@@ -52,7 +52,7 @@ def test_an_objects_model_is_its_prepared_mesh() -> None:
 def test_the_models_that_come_with_graspd_are_those_of_its_assets(kind: AssetKind) -> None:
     for name in builtin_names(kind):
         assert model_of(kind, name, builtin_files(kind, name)) == builtin_model(kind, name), (
-            "python -m worker.stages.models"
+            "python -m graspd.worker.stages.models"
         )
 
 

@@ -10,32 +10,32 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.model import names
-from service.model.clock import timestamp
-from service.model.digests import digest_bytes, job_id
-from service.model.domain import Asset, JobOptions, JobRequest
-from service.model.messages import IngestMessage
-from service.model.planning import message_of, plan
-from service.model.records import JobRecord
-from service.model.scene_spec import has_table, scene_of
-from service.model.states import AssetKind, Lane, Stage
-from service.queue.port import EventKind
-from service.store.assets import builtin_files, pack
-from service.store.library import load_check, publish_asset
-from service.store.manifests import load_shard
-from service.store.network_file import NETWORK_FILE, check_network
-from service.store.store import Store, open_store
+from graspd.baselines.learned.method import table_height
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.digests import digest_bytes, job_id
+from graspd.service.model.domain import Asset, JobOptions, JobRequest
+from graspd.service.model.messages import IngestMessage
+from graspd.service.model.planning import message_of, plan
+from graspd.service.model.records import JobRecord
+from graspd.service.model.scene_spec import has_table, scene_of
+from graspd.service.model.states import AssetKind, Lane, Stage
+from graspd.service.queue.port import EventKind
+from graspd.service.store.assets import builtin_files, pack
+from graspd.service.store.library import load_check, publish_asset
+from graspd.service.store.manifests import load_shard
+from graspd.service.store.network_file import NETWORK_FILE, check_network
+from graspd.service.store.store import Store, open_store
+from graspd.worker.files.synthesis import synthesized
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.planners import known_networks as known
+from graspd.worker.planners.registry import of_this_machine
+from graspd.worker.process.runner import Runner
+from graspd.worker.run import Run
+from graspd.worker.scenes.kinds import supports_of
+from graspd.worker.stages import assets, ingest, scene, synthesize
+from graspd.worker.stages.context import TaskContext
 from tests.networks import LEARNED, network_files, random_network
-from worker.files.synthesis import synthesized
-from worker.hands.load import hand_from_path
-from worker.planners.learned import known
-from worker.planners.learned.method import table_height
-from worker.planners.registry import of_this_machine
-from worker.process.runner import Runner
-from worker.run import Run
-from worker.scenes.kinds import supports_of
-from worker.stages import assets, ingest, scene, synthesize
-from worker.stages.context import TaskContext
 
 
 @pytest.fixture(scope="module")

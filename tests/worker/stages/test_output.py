@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from service.model.messages import TaskMessage
-from service.model.states import Stage
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.states import Stage
+from graspd.worker.stages.context import batch_seed
 from tests.fakes import request
-from worker.stages.context import batch_seed
 
 
 def message(**changes: Any) -> TaskMessage:

@@ -7,15 +7,15 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from service.model.digests import digest_files
-from service.model.states import AssetKind
-from service.store.library import publish_asset
-from service.store.store import Store, open_store
+from graspd.service.model.digests import digest_files
+from graspd.service.model.states import AssetKind
+from graspd.service.store.library import publish_asset
+from graspd.service.store.store import Store, open_store
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import from_bytes, load_object, to_bytes
+from graspd.worker.stages import assets
+from graspd.worker.stages.assets import prepared_object
 from tests.worker.objects.shapes import box, join, sphere, stl
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import from_bytes, load_object, to_bytes
-from worker.stages import assets
-from worker.stages.assets import prepared_object
 
 #: Two balls in one another: a repair to remember.
 FILES = {"asset.json": b'{"file": "m.stl"}', **stl(join(sphere(segments=32), sphere(segments=32, at=(0.02, 0.0, 0.0))))}

@@ -7,28 +7,28 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.model import names
-from service.model.clock import timestamp
-from service.model.digests import job_id
-from service.model.domain import JobRequest
-from service.model.errors import DamagedShard, TaskCancelled
-from service.model.planning import message_of, plan
-from service.model.records import JobRecord
-from service.model.states import AssetKind, Lane, Stage
-from service.queue.port import EventKind
-from service.store.assets import builtin_files
-from service.store.library import publish_asset
-from service.store.manifests import load_manifest, load_shard
-from service.store.records import put_record
-from service.store.shards import Shard
-from service.store.store import Store, open_store
-from worker import certified
-from worker.planners import NoPlace
-from worker.process.runner import Runner
-from worker.run import Run
-from worker.stages import scene, synthesize
-from worker.stages.context import StopReason, TaskContext
-from worker.stages.ranges import base_rows, batches_of
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.digests import job_id
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import DamagedShard, TaskCancelled
+from graspd.service.model.planning import message_of, plan
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import AssetKind, Lane, Stage
+from graspd.service.queue.port import EventKind
+from graspd.service.store.assets import builtin_files
+from graspd.service.store.library import publish_asset
+from graspd.service.store.manifests import load_manifest, load_shard
+from graspd.service.store.records import put_record
+from graspd.service.store.shards import Shard
+from graspd.service.store.store import Store, open_store
+from graspd.worker import certified
+from graspd.worker.planners import NoPlace
+from graspd.worker.process.runner import Runner
+from graspd.worker.run import Run
+from graspd.worker.stages import scene, synthesize
+from graspd.worker.stages.context import StopReason, TaskContext
+from graspd.worker.stages.ranges import base_rows, batches_of
 
 STAGES = {Stage.SCENE: scene.run, Stage.SYNTHESIZE: synthesize.run}
 #: Batches as small as they can be, so that several take a few seconds.
@@ -37,7 +37,7 @@ SIZE = 3
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("service.model.domain", "service.model.planning", "worker.stages.ranges"):
+    for module in ("graspd.service.model.domain", "graspd.service.model.planning", "graspd.worker.stages.ranges"):
         monkeypatch.setattr(f"{module}.BATCH_SIZE", SIZE)
 
 
@@ -124,7 +124,7 @@ def test_a_base_shard_of_other_batches_is_refused() -> None:
 
 
 def test_a_range_tells_how_far_it_is_and_stops_where_it_is_told_to(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("worker.stages.context.REPORT_EVERY_S", 0.0)
+    monkeypatch.setattr("graspd.worker.stages.context.REPORT_EVERY_S", 0.0)
     store = open_store("memory://")
     job, _ = made(store, 2, grasps=2 * SIZE, want="raw")
     message = message_of(job, next(plan(job)), attempt=1, max_attempt=1)
@@ -160,7 +160,7 @@ def test_a_batch_whose_scenes_leave_no_place_has_no_grasps_but_for_the_first_of_
             raise NoPlace("no hand finds a way in")
         return whole(*given, batch=batch, **options)
 
-    monkeypatch.setattr("worker.together.certified_grasps", some)
+    monkeypatch.setattr("graspd.worker.together.certified_grasps", some)
     asked = {"grasps": 2 * SIZE + 1, "scene": "table", "scenes": 2, "budget": 20}
     if not rows:
         with pytest.raises(AssertionError, match="no hand finds a way in"):

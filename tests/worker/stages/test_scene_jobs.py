@@ -11,32 +11,32 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.model import names
-from service.model.clock import timestamp
-from service.model.digests import job_id
-from service.model.domain import JobRequest
-from service.model.errors import TaskRefused
-from service.model.planning import message_of, plan
-from service.model.records import AttemptRecord, JobRecord
-from service.model.scene_spec import supports_in
-from service.model.states import AssetKind, Lane, Stage
-from service.queue.port import EventKind
-from service.readers import Grasps, Pictures, open_shards
-from service.store.assets import builtin_files
-from service.store.library import publish_asset
-from service.store.manifests import load_manifest, load_shard
-from service.store.records import put_record, read_record
-from service.store.shards import Shard
-from service.store.store import Store, open_store
-from worker.files.provenance import placed_of_shard
-from worker.files.synthesis import synthesized
-from worker.process.runner import Runner
-from worker.rendering import Extras
-from worker.rendering import render as pictures
-from worker.run import Run
-from worker.stages import render, scene, synthesize
-from worker.stages.assets import object_of
-from worker.stages.context import TaskContext, batch_seed
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.digests import job_id
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import TaskRefused
+from graspd.service.model.planning import message_of, plan
+from graspd.service.model.records import AttemptRecord, JobRecord
+from graspd.service.model.scene_spec import supports_in
+from graspd.service.model.states import AssetKind, Lane, Stage
+from graspd.service.queue.port import EventKind
+from graspd.service.readers import Grasps, Pictures, open_shards
+from graspd.service.store.assets import builtin_files
+from graspd.service.store.library import publish_asset
+from graspd.service.store.manifests import load_manifest, load_shard
+from graspd.service.store.records import put_record, read_record
+from graspd.service.store.shards import Shard
+from graspd.service.store.store import Store, open_store
+from graspd.worker.files.provenance import placed_of_shard
+from graspd.worker.files.synthesis import synthesized
+from graspd.worker.process.runner import Runner
+from graspd.worker.rendering import Extras
+from graspd.worker.rendering import render as pictures
+from graspd.worker.run import Run
+from graspd.worker.stages import render, scene, synthesize
+from graspd.worker.stages.assets import object_of
+from graspd.worker.stages.context import TaskContext, batch_seed
 
 TABLE = {
     "grasps": 6,

@@ -17,15 +17,15 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
-from service.model.scene_spec import SceneSpec
-from service.model.transforms import quat_from_axis_angle
-from service.store.shards import Shard, json_attribute, write_shard
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.transforms import quat_from_axis_angle
+from graspd.service.store.shards import Shard, json_attribute, write_shard
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path, load_hand
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.rendering.hands import drawn_bodies
 from tests.worker.hands.urdfs import BOX, joint, link, robot
 from tests.worker.models import object_from_mesh, two_finger_hand
-from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path, load_hand
-from worker.objects.prepare import object_from_path
-from worker.rendering.hands import drawn_bodies
 
 viser = pytest.importorskip("viser", reason="needs the extra: pip install graspd[view]")
 
@@ -63,7 +63,7 @@ SCENE = json_attribute(SceneSpec(kind="bin").model_dump(mode="json"))
 
 @pytest.fixture(scope="module")
 def viewer(block) -> Iterator:
-    from worker.viewing import Shown, Viewer
+    from graspd.worker.viewing import Shown, Viewer
 
     said = {"hand": "two fingers", "object": "block", "scene": SCENE}
     made = Viewer(Shown(Shard("base", said, arrays(2)), HAND, block), port=0)
@@ -128,7 +128,7 @@ def test_only_valid_grasps_are_shown_where_that_is_chosen(viewer):
 
 
 def test_what_a_grasp_lifts_and_whether_it_survives_the_shake_is_told() -> None:
-    from worker.viewing import _figures
+    from graspd.worker.viewing import _figures
 
     found = {"quality/payload_kg": np.array([np.nan, 0.8, 1.5]), "quality/shake_margin": np.array([np.nan, 0.2, 1.0])}
     shard = Shard("base", {}, {**arrays(2), **found})
@@ -156,7 +156,7 @@ def test_a_grasp_in_a_bin_has_five_supports_around_it_and_they_can_be_hidden(vie
 
 
 def test_without_viser_one_line_says_how_to_install_it(tmp_path, monkeypatch):
-    from worker.commands.render import app
+    from graspd.commands.render import app
 
     monkeypatch.setitem(sys.modules, "viser", None)
     result = CliRunner().invoke(app, ["view", str(tmp_path / "grasps.h5")])
@@ -198,7 +198,7 @@ def test_the_command_tells_its_address_and_ends_with_ctrl_c(tmp_path):
 
 
 def test_the_file_that_is_no_shard_is_one_line(tmp_path: Path):
-    from worker.commands.render import app
+    from graspd.commands.render import app
 
     file = tmp_path / "grasps.h5"
     file.write_text("nothing")
@@ -208,7 +208,7 @@ def test_the_file_that_is_no_shard_is_one_line(tmp_path: Path):
 
 
 def test_links_above_the_root_are_drawn_at_the_angles_of_the_wrist_of_each_grasp(block) -> None:
-    from worker.viewing import Shown, Viewer
+    from graspd.worker.viewing import Shown, Viewer
 
     # A copy of the hand behind its root serves as a forearm with two wrist joints.
     forearm, mounted = HAND, replace(HAND, mounting=HAND)
@@ -234,7 +234,7 @@ def test_links_above_the_root_are_drawn_at_the_angles_of_the_wrist_of_each_grasp
 
 
 def test_collision_shapes_take_the_place_of_what_the_hand_looks_like(block) -> None:
-    from worker.viewing import Shown, Viewer
+    from graspd.worker.viewing import Shown, Viewer
 
     seen = '<visual><geometry><sphere radius="0.03"/></geometry></visual>'
     hand = load_hand(

@@ -11,11 +11,11 @@ from typing import Final
 
 import numpy as np
 
-from service.model.errors import GraspdError, MeshError
-from worker.objects.formats import bare, dae, glb, obj
-from worker.objects.formats.obj import Nearby, nothing_nearby
-from worker.objects.formats.soup import MAX_FACES, Soup, check_soup
-from worker.objects.stand_ins import other_format, refuse_stand_in
+from graspd.service.model.errors import GraspdError, MeshError
+from graspd.worker.objects.formats import bare, dae, glb, obj
+from graspd.worker.objects.formats.obj import Nearby, nothing_nearby
+from graspd.worker.objects.formats.soup import MAX_FACES, Soup, check_soup
+from graspd.worker.objects.stand_ins import other_format, refuse_stand_in
 
 __all__ = ["MAX_FACES", "READERS", "Nearby", "Soup", "read_mesh"]
 

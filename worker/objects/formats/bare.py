@@ -9,8 +9,8 @@ from typing import Final
 
 import numpy as np
 
-from service.model.errors import MeshError
-from worker.objects.formats.soup import Soup, check_face_count, triangulate
+from graspd.service.model.errors import MeshError
+from graspd.worker.objects.formats.soup import Soup, check_face_count, triangulate
 
 _TYPES = {
     "char": "i1",

@@ -15,9 +15,9 @@ import numpy as np
 from defusedxml import ElementTree as SafeTree
 from defusedxml.common import DefusedXmlException
 
-from service.model.errors import MeshError
-from worker.objects.formats.obj import Nearby, colour_of, nothing_nearby
-from worker.objects.formats.soup import Soup, check_face_count, triangulate
+from graspd.service.model.errors import MeshError
+from graspd.worker.objects.formats.obj import Nearby, colour_of, nothing_nearby
+from graspd.worker.objects.formats.soup import Soup, check_face_count, triangulate
 
 _MAX_DEPTH: Final = 32
 _MAX_NODES: Final = 10_000

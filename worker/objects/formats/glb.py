@@ -11,10 +11,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from service.model.errors import MeshError
-from service.model.transforms import Floats, quat_to_matrix
-from worker.objects.formats.obj import UNREADABLE, mean_colour
-from worker.objects.formats.soup import Soup, check_face_count
+from graspd.service.model.errors import MeshError
+from graspd.service.model.transforms import Floats, quat_to_matrix
+from graspd.worker.objects.formats.obj import UNREADABLE, mean_colour
+from graspd.worker.objects.formats.soup import Soup, check_face_count
 
 _INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
 #: Positions are floats, or with KHR_mesh_quantization whole numbers that nodes or `normalized` scale.

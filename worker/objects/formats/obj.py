@@ -10,10 +10,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from service.model.errors import MeshError
-from service.model.transforms import Floats
-from service.store.mesh_files import MAX_NAMES, reference_of
-from worker.objects.formats.soup import Soup, check_face_count, triangulate
+from graspd.service.model.errors import MeshError
+from graspd.service.model.transforms import Floats
+from graspd.service.store.mesh_files import MAX_NAMES, reference_of
+from graspd.worker.objects.formats.soup import Soup, check_face_count, triangulate
 
 _SHADES = 8
 _NO_COLOUR = [b"nan", b"nan", b"nan"]

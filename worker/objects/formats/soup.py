@@ -9,8 +9,8 @@ import manifold3d
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import LimitError, MeshError
-from service.model.transforms import Floats
+from graspd.service.model.errors import LimitError, MeshError
+from graspd.service.model.transforms import Floats
 
 MAX_FACES: Final = 1_000_000
 #: Coordinates beyond this are no length in any unit.

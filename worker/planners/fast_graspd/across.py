@@ -21,16 +21,16 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, Floats, apply, spread_directions
-from worker.hands.jaws import thinnest_fingertip
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
-from worker.hands.oppositions import Oppositions, oppositions_of
-from worker.hands.pinches import HEIGHTS_M, pinches_of
-from worker.objects.model import ObjectModel
-from worker.simulation.mounting import OUTERMOST, points_of
-from worker.simulation.obstacles import MARGIN_M
-from worker.simulation.surroundings import CLEAR_M, Surroundings
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, spread_directions
+from graspd.worker.hands.jaws import thinnest_fingertip
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.oppositions import Oppositions, oppositions_of
+from graspd.worker.hands.pinches import HEIGHTS_M, pinches_of
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.simulation.mounting import OUTERMOST, points_of
+from graspd.worker.simulation.obstacles import MARGIN_M
+from graspd.worker.simulation.surroundings import CLEAR_M, Surroundings
 
 #: Points of the surface that pairs are made of, and how far their line may turn from their normals (cosine): within
 #: the cones of half the friction. With 0.9 Allegro lifts .39 of six objects at half of it and Shadow .30, with these

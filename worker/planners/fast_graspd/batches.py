@@ -10,18 +10,18 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError, TaskCancelled
-from service.model.fidelity import Fidelity
-from service.model.integers import distinct_values
-from service.model.transforms import Floats
-from worker.grasps import GraspSet
-from worker.objects.model import ObjectModel
-from worker.planners.fast_graspd.scene_starts import free_ways
-from worker.planners.fast_graspd.schedule import WarmStart, in_scene, with_trial
-from worker.planners.fast_graspd.starts import start_generator
-from worker.planners.port import Asked
-from worker.planners.threads import Steps
-from worker.simulation.surroundings import Placed, placed_together
+from graspd.service.model.errors import InputError, TaskCancelled
+from graspd.service.model.fidelity import Fidelity
+from graspd.service.model.integers import distinct_values
+from graspd.service.model.transforms import Floats
+from graspd.worker.grasps import GraspSet
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fast_graspd.scene_starts import free_ways
+from graspd.worker.planners.fast_graspd.schedule import WarmStart, in_scene, with_trial
+from graspd.worker.planners.fast_graspd.starts import start_generator
+from graspd.worker.planners.port import Asked
+from graspd.worker.planners.threads import Steps
+from graspd.worker.simulation.surroundings import Placed, placed_together
 
 Rows = NDArray[np.intp]
 

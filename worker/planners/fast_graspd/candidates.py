@@ -9,13 +9,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats, quat_rotate
-from worker.grasps import GraspSet, Posture, joined
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.quality.postures import hold_forces, normal_force, pregrasp, squeeze
-from worker.simulation.data import HandState
-from worker.simulation.surroundings import Placed
+from graspd.service.model.transforms import Floats, quat_rotate
+from graspd.worker.control.postures import hold_forces, normal_force, pregrasp, squeeze
+from graspd.worker.grasps import GraspSet, Posture, joined
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.simulation.data import HandState
+from graspd.worker.simulation.surroundings import Placed
 
 #: Hands of each grasp that are seated and tried before the next are: seating costs half of a trial.
 TOGETHER: Final = 2

@@ -8,19 +8,19 @@ from typing import Final
 
 from cachetools import LRUCache
 
-from service.model.fidelity import Fidelity
-from worker.hands.model import HandModel, SurfacePoints
-from worker.hands.surface import sample_surface
-from worker.objects.model import ObjectModel
-from worker.planners.fast_graspd.schedule import loss_options
-from worker.simulation import kernels
-from worker.simulation.data import Data
-from worker.simulation.device import DeviceHand, DeviceObject
-from worker.simulation.launches import Launches
-from worker.simulation.model import LossOptions, Model
-from worker.simulation.obstacles import DeviceObstacles
-from worker.simulation.record import record_iteration
-from worker.simulation.sampling import object_samples
+from graspd.service.model.fidelity import Fidelity
+from graspd.worker.hands.model import HandModel, SurfacePoints
+from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fast_graspd.schedule import loss_options
+from graspd.worker.simulation import kernels
+from graspd.worker.simulation.data import Data
+from graspd.worker.simulation.device import DeviceHand, DeviceObject
+from graspd.worker.simulation.launches import Launches
+from graspd.worker.simulation.model import LossOptions, Model
+from graspd.worker.simulation.obstacles import DeviceObstacles
+from graspd.worker.simulation.record import record_iteration
+from graspd.worker.simulation.sampling import object_samples
 
 #: Cell of the coarse distance grid [m].
 FIELD_CELL: Final = 0.005

@@ -15,15 +15,16 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.model.fidelity import Fidelity
-from service.model.integers import distinct_values
-from service.model.transforms import Floats
-from worker.grasps import GraspSet, joined
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.planners.fast_graspd import scene_starts, starts
-from worker.planners.fast_graspd.batches import Batches, finalists
-from worker.planners.fast_graspd.candidates import (
+from graspd.service.model.fidelity import Fidelity
+from graspd.service.model.integers import distinct_values
+from graspd.service.model.transforms import Floats
+from graspd.worker.control.postures import standing_off, touching_links
+from graspd.worker.grasps import GraspSet, joined
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fast_graspd import scene_starts, starts
+from graspd.worker.planners.fast_graspd.batches import Batches, finalists
+from graspd.worker.planners.fast_graspd.candidates import (
     FRICTION,
     NEAR_M,
     NEARNESS,
@@ -37,21 +38,20 @@ from worker.planners.fast_graspd.candidates import (
     tried,
     with_postures,
 )
-from worker.planners.fast_graspd.pairs import Pair, pair_of
-from worker.planners.fast_graspd.schedule import AROUND, DILATION, WarmStart, coarse_schedule, fine_schedule
-from worker.planners.fast_graspd.starts import NO_PLACE, Probe
-from worker.planners.fast_graspd.withdrawal import hindrance
-from worker.planners.port import Asked, Method, Wanted
-from worker.planners.threads import cut, run_parts
-from worker.quality.gate import MAX_PENETRATION_MM, MIN_CONTACT_LINKS
-from worker.quality.postures import standing_off, touching_links
-from worker.run import Run
-from worker.simulation.data import Data, HandState
-from worker.simulation.launches import Launches
-from worker.simulation.model import Model
-from worker.simulation.obstacles import DeviceObstacles
-from worker.simulation.projection import Projection, ProjectionOptions
-from worker.simulation.surroundings import Placed
+from graspd.worker.planners.fast_graspd.pairs import Pair, pair_of
+from graspd.worker.planners.fast_graspd.schedule import AROUND, DILATION, WarmStart, coarse_schedule, fine_schedule
+from graspd.worker.planners.fast_graspd.starts import NO_PLACE, Probe
+from graspd.worker.planners.fast_graspd.withdrawal import hindrance
+from graspd.worker.planners.port import Asked, Method, Wanted
+from graspd.worker.planners.threads import cut, run_parts
+from graspd.worker.quality.gate import MAX_PENETRATION_MM, MIN_CONTACT_LINKS
+from graspd.worker.run import Run
+from graspd.worker.simulation.data import Data, HandState
+from graspd.worker.simulation.launches import Launches
+from graspd.worker.simulation.model import Model
+from graspd.worker.simulation.obstacles import DeviceObstacles
+from graspd.worker.simulation.projection import Projection, ProjectionOptions
+from graspd.worker.simulation.surroundings import Placed
 
 Rows = NDArray[np.intp]
 

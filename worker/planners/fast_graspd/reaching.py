@@ -16,19 +16,19 @@ import warp as wp
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import IDENTITY_POSE, Floats, quat_from_matrix, quat_rotate
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
-from worker.hands.oppositions import Oppositions, oppositions_of
-from worker.hands.spans import Size, spans_of, widest_span
-from worker.hands.surface import sample_surface
-from worker.objects.model import ObjectModel
-from worker.planners.fast_graspd.across import ALIKE_M, BESIDE_M, NOISE, ROOM_M, crossings_of, frames
-from worker.simulation.data import HandState
-from worker.simulation.device import to_wxyz, to_xyzw
-from worker.simulation.kernels import reaching as kernels
-from worker.simulation.launches import launch
-from worker.simulation.model import Model
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_from_matrix, quat_rotate
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.oppositions import Oppositions, oppositions_of
+from graspd.worker.hands.spans import Size, spans_of, widest_span
+from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fast_graspd.across import ALIKE_M, BESIDE_M, NOISE, ROOM_M, crossings_of, frames
+from graspd.worker.simulation.data import HandState
+from graspd.worker.simulation.device import to_wxyz, to_xyzw
+from graspd.worker.simulation.kernels import reaching as kernels
+from graspd.worker.simulation.launches import launch
+from graspd.worker.simulation.model import Model
 
 #: Draws of one start, and how often the simulation looks at one that is clear by its balls.
 DRAWS: Final = 512

@@ -13,18 +13,24 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError
-from service.model.transforms import Floats, quat_from_axis_angle, quat_from_matrix, quat_multiply, spread_directions
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.planners.fast_graspd.across import NEAR_M, Openings, Reaches, across, promising
-from worker.planners.fast_graspd.candidates import posture_of
-from worker.planners.fast_graspd.starts import CLEAR, POSTURE_NOISE, TILT, Probe
-from worker.planners.port import NoPlace
-from worker.simulation.data import HandState
-from worker.simulation.model import Model
-from worker.simulation.mounting import mounting_lack
-from worker.simulation.surroundings import STANDOFF_M, Placed, Surroundings
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import (
+    Floats,
+    quat_from_axis_angle,
+    quat_from_matrix,
+    quat_multiply,
+    spread_directions,
+)
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fast_graspd.across import NEAR_M, Openings, Reaches, across, promising
+from graspd.worker.planners.fast_graspd.candidates import posture_of
+from graspd.worker.planners.fast_graspd.starts import CLEAR, POSTURE_NOISE, TILT, Probe
+from graspd.worker.planners.port import NoPlace
+from graspd.worker.simulation.data import HandState
+from graspd.worker.simulation.model import Model
+from graspd.worker.simulation.mounting import mounting_lack
+from graspd.worker.simulation.surroundings import STANDOFF_M, Placed, Surroundings
 
 #: Distance from obstacles that a start has besides the margin it keeps later [m].
 ROOM: Final = 0.006

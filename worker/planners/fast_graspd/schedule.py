@@ -8,12 +8,12 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from service.model.fidelity import Fidelity
-from service.model.transforms import Floats
-from worker.simulation.data import HandState, Schedule
-from worker.simulation.model import LossOptions, Model
-from worker.simulation.projection import ProjectionOptions
-from worker.simulation.surroundings import Placed
+from graspd.service.model.fidelity import Fidelity
+from graspd.service.model.transforms import Floats
+from graspd.worker.simulation.data import HandState, Schedule
+from graspd.worker.simulation.model import LossOptions, Model
+from graspd.worker.simulation.projection import ProjectionOptions
+from graspd.worker.simulation.surroundings import Placed
 
 #: Rates of Adam: translation [m], rotation [rad], joints [rad].
 COARSE_RATES: Final = (2e-3, 2e-2, 4e-2)

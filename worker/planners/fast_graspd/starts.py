@@ -17,16 +17,23 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError
-from service.model.transforms import Floats, cross, quat_from_axis_angle, quat_from_matrix, quat_multiply, quat_rotate
-from worker.hands.jaws import Jaws, jaws_of
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.planners.fast_graspd.reaching import LOOKS, Reaching
-from worker.planners.fitting import Pairs, fitting_pairs
-from worker.simulation.data import Data, HandState
-from worker.simulation.model import Model
-from worker.simulation.record import record_placement
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import (
+    Floats,
+    cross,
+    quat_from_axis_angle,
+    quat_from_matrix,
+    quat_multiply,
+    quat_rotate,
+)
+from graspd.worker.hands.jaws import Jaws, jaws_of
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fast_graspd.reaching import LOOKS, Reaching
+from graspd.worker.planners.fitting import Pairs, fitting_pairs
+from graspd.worker.simulation.data import Data, HandState
+from graspd.worker.simulation.model import Model
+from graspd.worker.simulation.record import record_placement
 
 #: Distance of the palm from the surface [m]: nearest, farthest, then the steps of retreat while something touches.
 GAP: Final = (0.002, 0.012)

@@ -11,14 +11,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import Floats, quat_rotate
-from worker.planners.fast_graspd.candidates import posture_of
-from worker.planners.fast_graspd.starts import Probe
-from worker.quality.contact import finger_of_body
-from worker.simulation.data import HandState
-from worker.simulation.model import Model
-from worker.simulation.mounting import mounting_lack
-from worker.simulation.surroundings import RISE_M, Placed, Surroundings
+from graspd.service.model.transforms import Floats, quat_rotate
+from graspd.worker.planners.fast_graspd.candidates import posture_of
+from graspd.worker.planners.fast_graspd.starts import Probe
+from graspd.worker.quality.contact import finger_of_body
+from graspd.worker.simulation.data import HandState
+from graspd.worker.simulation.model import Model
+from graspd.worker.simulation.mounting import mounting_lack
+from graspd.worker.simulation.surroundings import RISE_M, Placed, Surroundings
 
 #: Shares of their range by which fingers have opened, and how far the hand has moved back [m].
 OUT: Final = ((0.2, 0.0), (0.3, 0.015), (0.4, 0.04))

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from worker.rendering.kernels import rays, shading
+from graspd.worker.rendering.kernels import rays, shading
 
 wp.set_module_options({"enable_backward": False})
 

@@ -15,7 +15,7 @@ from typing import Final
 
 import warp as wp
 
-from worker.engines import backend
+from graspd.worker.engines import backend
 
 backend.start()
 

@@ -6,7 +6,7 @@ referee's: how far is a point from the mesh itself, and how deep is it in the ha
 
 import warp as wp
 
-from worker.simulation.kernels.pieces import Pieces, piece_distance
+from graspd.worker.simulation.kernels.pieces import Pieces, piece_distance
 
 wp.set_module_options({"enable_backward": False})
 

@@ -3,11 +3,11 @@ others, hands that stay in touch retreat."""
 
 import warp as wp
 
-from worker.simulation.kernels.chain import Bodies, Chain, joint_value, place_body
-from worker.simulation.kernels.distance import BodyPoints, Skin, nearest, placed_at
-from worker.simulation.kernels.opening import Fingers, Hands
-from worker.simulation.kernels.pieces import Pieces, piece_distance
-from worker.simulation.kernels.touching import Points, point_of
+from graspd.worker.simulation.kernels.chain import Bodies, Chain, joint_value, place_body
+from graspd.worker.simulation.kernels.distance import BodyPoints, Skin, nearest, placed_at
+from graspd.worker.simulation.kernels.opening import Fingers, Hands
+from graspd.worker.simulation.kernels.pieces import Pieces, piece_distance
+from graspd.worker.simulation.kernels.touching import Points, point_of
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 

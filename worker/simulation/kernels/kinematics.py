@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from worker.simulation.kernels.wrenches import Wrenches, clear_wrench, force_on, torque_on
+from graspd.worker.simulation.kernels.wrenches import Wrenches, clear_wrench, force_on, torque_on
 
 wp.set_module_options({"enable_backward": False})
 

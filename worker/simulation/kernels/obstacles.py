@@ -6,8 +6,8 @@ Half-spaces need no more and are seen exactly; for solids see `solids`.
 
 import warp as wp
 
-from worker.simulation.kernels.projection import Residuals, emit
-from worker.simulation.kernels.wrenches import Wrenches, add_wrench
+from graspd.worker.simulation.kernels.projection import Residuals, emit
+from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
 
 wp.set_module_options({"enable_backward": False})
 

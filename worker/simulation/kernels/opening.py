@@ -5,9 +5,9 @@ Fingers are judged each by itself, hands all at once; a hand or a finger that is
 
 import warp as wp
 
-from worker.simulation.kernels.chain import Bodies, Chain, joint_axis, joint_value, place_body
-from worker.simulation.kernels.distance import Skin, nearest
-from worker.simulation.kernels.touching import Points, Touching, point_of
+from graspd.worker.simulation.kernels.chain import Bodies, Chain, joint_axis, joint_value, place_body
+from graspd.worker.simulation.kernels.distance import Skin, nearest
+from graspd.worker.simulation.kernels.touching import Points, Touching, point_of
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 

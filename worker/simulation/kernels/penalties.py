@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from worker.simulation.kernels.wrenches import Wrenches, add_wrench
+from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
 
 wp.set_module_options({"enable_backward": False})
 

@@ -3,7 +3,7 @@ links. Thin parts of an object pass between hand points; they do not pass betwee
 
 import warp as wp
 
-from worker.simulation.kernels.wrenches import Wrenches, add_wrench
+from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
 
 wp.set_module_options({"enable_backward": False})
 

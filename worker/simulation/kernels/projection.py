@@ -7,8 +7,8 @@ sample to a link, or of a point of one link to another link.
 
 import warp as wp
 
-from worker.simulation.kernels.kinematics import Tree
-from worker.simulation.kernels.pieces import (
+from graspd.worker.simulation.kernels.kinematics import Tree
+from graspd.worker.simulation.kernels.pieces import (
     BodyPoints,
     Pieces,
     Samples,

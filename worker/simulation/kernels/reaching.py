@@ -6,7 +6,7 @@ whatever is drawn beside it.
 
 import warp as wp
 
-from worker.simulation.kernels.surface import Surface, cube_around, cube_distance
+from graspd.worker.simulation.kernels.surface import Surface, cube_around, cube_distance
 
 wp.set_module_options({"enable_backward": False})
 

@@ -9,10 +9,10 @@ tangents that meet below it: where they meet is a lower bound, so that edges whi
 
 import warp as wp
 
-from worker.simulation.kernels.obstacles import Features, Obstacles, kept, lowest_point, obstacle_distance, posed
-from worker.simulation.kernels.pieces import Pieces, piece_centre, piece_distance, piece_rotation
-from worker.simulation.kernels.projection import Residuals, emit
-from worker.simulation.kernels.wrenches import Wrenches, add_wrench
+from graspd.worker.simulation.kernels.obstacles import Features, Obstacles, kept, lowest_point, obstacle_distance, posed
+from graspd.worker.simulation.kernels.pieces import Pieces, piece_centre, piece_distance, piece_rotation
+from graspd.worker.simulation.kernels.projection import Residuals, emit
+from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
 
 wp.set_module_options({"enable_backward": False})
 

@@ -9,7 +9,7 @@ the surface. Corner normals stop at creases, so boxes and cylinders keep their e
 
 import warp as wp
 
-from worker.simulation.kernels.nearest import Cells, closest_in_cell
+from graspd.worker.simulation.kernels.nearest import Cells, closest_in_cell
 
 wp.set_module_options({"enable_backward": False})
 

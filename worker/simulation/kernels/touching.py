@@ -5,8 +5,8 @@ import math
 
 import warp as wp
 
-from worker.simulation.kernels.chain import Bodies, Chain, joint_axis
-from worker.simulation.kernels.distance import Skin, nearest
+from graspd.worker.simulation.kernels.chain import Bodies, Chain, joint_axis
+from graspd.worker.simulation.kernels.distance import Skin, nearest
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from service.model import names
-from service.model.clock import timestamp
-from service.model.planning import message_of, plan
-from service.model.records import AttemptRecord, JobRecord
-from service.model.states import AssetKind, Stage
-from service.pipeline.backends import Services
-from service.pipeline.datasets.spec import DatasetRequest
-from service.store.library import publish_asset
-from service.store.records import put_record, read_record
+from graspd.service.model import names
+from graspd.service.model.clock import timestamp
+from graspd.service.model.planning import message_of, plan
+from graspd.service.model.records import AttemptRecord, JobRecord
+from graspd.service.model.states import AssetKind, Stage
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets.spec import DatasetRequest
+from graspd.service.store.library import publish_asset
+from graspd.service.store.records import put_record, read_record
 from tests.fakes import make_shard
 
 

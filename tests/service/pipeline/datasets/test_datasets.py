@@ -6,17 +6,17 @@ import json
 
 import pytest
 
-from service.index.rebuild import differences, rebuild
-from service.model import names
-from service.model.domain import JobRequest
-from service.model.errors import ConflictError, InputError, LimitError, NotFoundError
-from service.model.states import AssetKind, Lane, State
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.pipeline.datasets import actions
-from service.pipeline.datasets.rounds import DatasetRounds
-from service.store.records import job_events
-from service.store.store import open_store
+from graspd.service.index.rebuild import differences, rebuild
+from graspd.service.model import names
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import ConflictError, InputError, LimitError, NotFoundError
+from graspd.service.model.states import AssetKind, Lane, State
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.rounds import DatasetRounds
+from graspd.service.store.records import job_events
+from graspd.service.store.store import open_store
 from tests.dataset_status import status
 from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import add_asset, fail, finish, jobs_of, wanted

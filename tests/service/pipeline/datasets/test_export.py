@@ -10,11 +10,11 @@ from pathlib import Path
 import h5py
 import pytest
 
-from service.model.errors import DamagedShard, InputError, StoreUnavailable
-from service.model.records import Snapshot, SnapshotShard
-from service.pipeline.backends import Services
-from service.pipeline.datasets import actions
-from service.pipeline.datasets.export import export_shards, path_of
+from graspd.service.model.errors import DamagedShard, InputError, StoreUnavailable
+from graspd.service.model.records import Snapshot, SnapshotShard
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.export import export_shards, path_of
 from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import finish, jobs_of, wanted
 

@@ -7,19 +7,19 @@ from typing import Any
 
 import pytest
 
-from service.index.rebuild import rebuild
-from service.model import digests, names
-from service.model.domain import JobRequest
-from service.model.errors import ConflictError, InputError
-from service.model.records import DatasetRecord, JobRecord, request_of
-from service.model.scene_spec import SceneSpec
-from service.model.studies import IN_SCENE
-from service.pipeline.backends import Services
-from service.pipeline.datasets import actions
-from service.pipeline.datasets.cost import estimate
-from service.pipeline.datasets.spec import DatasetRequest
-from service.pipeline.fidelity_choice import Resolver
-from service.store.records import charts_of, load_dataset, publish, read_record
+from graspd.service.index.rebuild import rebuild
+from graspd.service.model import digests, names
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import ConflictError, InputError
+from graspd.service.model.records import DatasetRecord, JobRecord, request_of
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.studies import IN_SCENE
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.cost import estimate
+from graspd.service.pipeline.datasets.spec import DatasetRequest
+from graspd.service.pipeline.fidelity_choice import Resolver
+from graspd.service.store.records import charts_of, load_dataset, publish, read_record
 from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import finish, jobs_of, wanted
 

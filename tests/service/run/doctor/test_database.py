@@ -9,18 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from service.index.database import REVISION
-from service.index.index import Index
-from service.index.notes import Damage
-from service.index.rebuild import rebuild
-from service.model import names
-from service.model.states import Stage
-from service.pipeline import job_actions
-from service.pipeline.backends import Services
-from service.run.doctor import backends
-from service.run.doctor.checks import Condition, Finding
-from service.settings import Settings
-from service.store.store import open_store
+from graspd.service.index.database import REVISION
+from graspd.service.index.index import Index
+from graspd.service.index.notes import Damage
+from graspd.service.index.rebuild import rebuild
+from graspd.service.model import names
+from graspd.service.model.states import Stage
+from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.backends import Services
+from graspd.service.run.doctor import backends
+from graspd.service.run.doctor.checks import Condition, Finding
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
 from tests.fakes import add_assets, request
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue

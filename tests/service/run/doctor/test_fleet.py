@@ -13,16 +13,16 @@ from typing import Any
 
 import pytest
 
-from service.model.clock import timestamp
-from service.model.states import Lane, Stage
-from service.model.version import PACKAGE_VERSION
-from service.model.workers import WorkerBeat
-from service.pipeline.leading import PART
-from service.queue.rq_queue import WORKERS, RqQueue, worker_key
-from service.run.address import record_address
-from service.run.doctor.checks import Condition
-from service.run.doctor.fleet import clocks, controller, port, workers
-from service.settings import Settings
+from graspd.service.model.clock import timestamp
+from graspd.service.model.states import Lane, Stage
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.service.model.workers import WorkerBeat
+from graspd.service.pipeline.leading import PART
+from graspd.service.queue.rq_queue import WORKERS, RqQueue, worker_key
+from graspd.service.run.address import record_address
+from graspd.service.run.doctor.checks import Condition
+from graspd.service.run.doctor.fleet import clocks, controller, port, workers
+from graspd.service.settings import Settings
 from tests.servers import PostgresServer, free_ports
 from tests.service.queue.test_queue import task
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from service.run.doctor.checks import Condition
-from service.run.doctor.machine import data_folder, disk, filesystem, limits, versions
-from service.settings import Settings
+from graspd.service.run.doctor.checks import Condition
+from graspd.service.run.doctor.machine import data_folder, disk, filesystem, limits, versions
+from graspd.service.settings import Settings
 
 GIB = 2**30
 

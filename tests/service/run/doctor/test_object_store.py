@@ -10,10 +10,10 @@ import obstore
 import pytest
 from obstore.store import MemoryStore
 
-from service.run.doctor.backends import judge_store, store
-from service.run.doctor.checks import Condition
-from service.settings import Settings
-from service.store.store import Entry, Store, open_store
+from graspd.service.run.doctor.backends import judge_store, store
+from graspd.service.run.doctor.checks import Condition
+from graspd.service.settings import Settings
+from graspd.service.store.store import Entry, Store, open_store
 
 
 def test_a_folder_is_good_and_nothing_is_left_in_it(tmp_path: Path) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import threading
 
-from service.model.errors import StoreUnavailable
-from service.run.doctor.checks import Check, Condition, Finding, good, run_checks
+from graspd.service.model.errors import StoreUnavailable
+from graspd.service.run.doctor.checks import Check, Condition, Finding, good, run_checks
 
 
 def test_findings_come_in_order_and_one_that_hangs_is_bad() -> None:

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from redis import Redis
 
-from service.queue.connection import connect, redis_url
-from service.queue.rq_queue import RqQueue
-from service.run.doctor.backends import persistence, redis
-from service.run.doctor.checks import Condition
-from service.run.embedded import find_server, server_command
-from service.settings import Settings
+from graspd.service.queue.connection import connect, redis_url
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.run.doctor.backends import persistence, redis
+from graspd.service.run.doctor.checks import Condition
+from graspd.service.run.embedded import find_server, server_command
+from graspd.service.settings import Settings
 from tests.servers import free_ports
 from tests.service.conftest import wait_for_redis
 
@@ -34,7 +34,7 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Settings]:
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is slow is the machine that the tests run on."""
-    monkeypatch.setattr("service.run.doctor.backends._SLOW_REDIS_S", 60.0)
+    monkeypatch.setattr("graspd.service.run.doctor.backends._SLOW_REDIS_S", 60.0)
 
 
 @pytest.fixture

@@ -1,0 +1,233 @@
+"""How near each body is to the object and to other bodies, and how far joints may close before anything can touch."""
+
+import warp as wp
+
+from graspd.worker.simulation.kernels.pieces import (
+    BodyPoints,
+    Pieces,
+    may_touch,
+    piece_centre,
+    piece_distance,
+    piece_rotation,
+    world_extent,
+)
+from graspd.worker.simulation.kernels.surface import Surface, distance
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Closing:
+    """What closing knows of a hand; D dofs, L bodies."""
+
+    direction: wp.array(dtype=wp.float32)  # (D,) -1, 0, +1
+    moves: wp.array2d(dtype=wp.int32)  # (D, L): 1 where the dof moves the body
+    lever: wp.array2d(dtype=wp.float32)  # (D, L): farthest that a point of the body moves per unit of the dof
+    finger: wp.array(dtype=wp.int32)  # (D,) dofs with a common body have a common number
+    lower: wp.array(dtype=wp.float32)
+    upper: wp.array(dtype=wp.float32)
+
+
+@wp.kernel
+def clear(
+    # In:
+    reach_in: wp.float32,
+    # Data out:
+    near_out: wp.array2d(dtype=wp.float32),
+    pair_out: wp.array3d(dtype=wp.float32),
+):
+    """Nothing is nearer than `reach`. Launch over (B, L)."""
+    b, a = wp.tid()
+    near_out[b, a] = reach_in
+    for other in range(pair_out.shape[2]):
+        pair_out[b, a, other] = reach_in
+
+
+@wp.kernel
+def points_to_object(
+    # Model:
+    surface_in: Surface,
+    reach_in: wp.float32,
+    exact_in: wp.float32,
+    body_in: wp.array(dtype=wp.int32),
+    position_in: wp.array(dtype=wp.vec3),
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    # Data out:
+    near_inout: wp.array2d(dtype=wp.float32),
+):
+    """Least distance of each body's points from the object. Launch over (B, N)."""
+    b, i = wp.tid()
+    if active_in[b] == 0:
+        return
+    body = body_in[i]
+    point = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], position_in[i])
+    wp.atomic_min(near_inout, b, body, distance(surface_in, point, reach_in, exact_in, reach_in).distance)
+
+
+@wp.kernel
+def object_to_pieces(
+    # Model:
+    pieces_in: Pieces,
+    bvh_in: wp.uint64,
+    sample_in: wp.array(dtype=wp.vec3),
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    # In:
+    margin_in: wp.float32,
+    # Data out:
+    near_inout: wp.array2d(dtype=wp.float32),
+):
+    """The same asked from the object's samples, for edges between hand points; farther than `margin` is left out.
+
+    Launch over (B, P).
+    """
+    b, piece = wp.tid()
+    if active_in[b] == 0:
+        return
+    q = piece_rotation(pieces_in, piece, b, body_q_in)
+    p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
+    extent = world_extent(q, pieces_in.half[piece]) + wp.vec3(margin_in, margin_in, margin_in)
+    least = float(1.0e3)
+    query = wp.bvh_query_aabb(bvh_in, p - extent, p + extent)
+    index = wp.int32(0)
+    while wp.bvh_query_next(query, index):
+        nd = piece_distance(pieces_in, piece, wp.quat_rotate_inv(q, sample_in[index] - p))
+        least = wp.min(least, nd[3])
+    if least < 1.0e3:
+        wp.atomic_min(near_inout, b, pieces_in.body[piece], least)
+
+
+@wp.kernel
+def bodies_to_pieces(
+    # Model:
+    pieces_in: Pieces,
+    points_in: BodyPoints,
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    # In:
+    margin_in: wp.float32,
+    # Data out:
+    pair_inout: wp.array3d(dtype=wp.float32),
+):
+    """Least distance of each body's points from pieces of bodies that must stay clear of it. Launch over (B, P)."""
+    b, piece = wp.tid()
+    if active_in[b] == 0:
+        return
+    other = pieces_in.body[piece]
+    q = piece_rotation(pieces_in, piece, b, body_q_in)
+    p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
+    reach = wp.length(pieces_in.half[piece]) + margin_in
+    for own in range(body_p_in.shape[1]):
+        if may_touch(pieces_in, points_in, other, p, reach, own, b, body_p_in, body_q_in):
+            least = float(margin_in)
+            for i in range(points_in.first[own], points_in.first[own + 1]):
+                x = body_p_in[b, own] + wp.quat_rotate(body_q_in[b, own], points_in.position[i])
+                nd = piece_distance(pieces_in, piece, wp.quat_rotate_inv(q, x - p))
+                least = wp.min(least, nd[3])
+            wp.atomic_min(pair_inout, b, own, other, least)
+            wp.atomic_min(pair_inout, b, other, own, least)
+
+
+@wp.func
+def nearest_of(
+    closing: Closing,
+    b: wp.int32,
+    d: wp.int32,
+    body: wp.int32,
+    near: wp.array2d(dtype=wp.float32),
+    pair: wp.array3d(dtype=wp.float32),
+):
+    """Distance of a body from what it may hit when dof d moves it; of two fingers each may take half the gap."""
+    least = near[b, body]
+    for other in range(near.shape[1]):
+        if closing.moves[d, other] == 0:
+            least = wp.min(least, 0.5 * pair[b, body, other])
+    return least
+
+
+@wp.kernel
+def close(
+    # Model:
+    closing_in: Closing,
+    # Data in:
+    near_in: wp.array2d(dtype=wp.float32),
+    pair_in: wp.array3d(dtype=wp.float32),
+    # In:
+    touch_in: wp.float32,
+    share_in: wp.float32,
+    largest_in: wp.float32,
+    # Data out:
+    active_inout: wp.array(dtype=wp.int32),
+    stopped_inout: wp.array2d(dtype=wp.int32),
+    q_inout: wp.array2d(dtype=wp.float32),
+):
+    """Stop every dof that moves a touching body; close the others by so little that no point passes its gap. Over B.
+
+    A point of body a moves by at most sum over the dofs d that still close of lever[d, a] |dq_d|: with one step for all
+    dofs of a finger, step = share * gap / sum lever, nothing can be passed through (conservative advancement).
+    """
+    b = wp.tid()
+    if active_inout[b] == 0:
+        return
+    dofs = q_inout.shape[1]
+    for d in range(dofs):
+        if stopped_inout[b, d] == 0:
+            for body in range(near_in.shape[1]):
+                if closing_in.moves[d, body] == 1:
+                    if nearest_of(closing_in, b, d, body, near_in, pair_in) < touch_in:
+                        stopped_inout[b, d] = 1
+    open_dofs = wp.int32(0)
+    for d in range(dofs):
+        if stopped_inout[b, d] == 0:
+            open_dofs += 1
+            step = float(largest_in)
+            # The finger's slowest dof sets the pace of all of them: joints close at equal speed.
+            for e in range(dofs):
+                if stopped_inout[b, e] == 0 and closing_in.finger[e] == closing_in.finger[d]:
+                    for body in range(near_in.shape[1]):
+                        if closing_in.moves[e, body] == 1:
+                            travel = float(0.0)
+                            for k in range(dofs):
+                                if stopped_inout[b, k] == 0:
+                                    travel += closing_in.lever[k, body]
+                            gap = nearest_of(closing_in, b, e, body, near_in, pair_in)
+                            step = wp.min(step, share_in * gap / wp.max(travel, 1.0e-6))
+            value = q_inout[b, d] + closing_in.direction[d] * step
+            if value <= closing_in.lower[d] or value >= closing_in.upper[d]:
+                value = wp.clamp(value, closing_in.lower[d], closing_in.upper[d])
+                stopped_inout[b, d] = 2
+            q_inout[b, d] = value
+    if open_dofs == 0:
+        active_inout[b] = 0
+
+
+@wp.kernel
+def advance(
+    # Data in:
+    near_in: wp.array2d(dtype=wp.float32),
+    # In:
+    direction_in: wp.array(dtype=wp.vec3),
+    standoff_in: wp.float32,
+    share_in: wp.float32,
+    # Data out:
+    active_inout: wp.array(dtype=wp.int32),
+    pivot_inout: wp.array(dtype=wp.vec3),
+):
+    """Move the hand along its approach until its nearest body is `standoff` from the object. Launch over B."""
+    b = wp.tid()
+    if active_inout[b] == 0:
+        return
+    gap = near_in[b, 0]
+    for body in range(1, near_in.shape[1]):
+        gap = wp.min(gap, near_in[b, body])
+    if gap - standoff_in < 1.0e-4:
+        active_inout[b] = 0
+        return
+    pivot_inout[b] = pivot_inout[b] + (share_in * (gap - standoff_in)) * direction_in[b]

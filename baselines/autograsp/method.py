@@ -1,0 +1,234 @@
+"""GraspIt!'s autograsp: a random free start, the palm advances until something is near, the fingers close until
+contact.
+
+GraspIt! closes joints in small steps and goes back when something is hit; here steps follow from distances, which gives
+the same end, contact within `TOUCH_M`, without tunnelling.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from pydantic import Field
+
+from graspd.baselines.autograsp import kernels
+from graspd.baselines.common import free_starts, grasp_set, ground_of, joined
+from graspd.service.model.transforms import Floats, quat_rotate
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.kinematics import ancestors
+from graspd.worker.hands.model import HandModel, JointType, SurfacePoints
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fast_graspd.pairs import Pair
+from graspd.worker.planners.port import Method, Options, Planner, Wanted
+from graspd.worker.planners.threads import Steps, cut, run_parts
+from graspd.worker.run import Run
+from graspd.worker.simulation.data import Data, HandState
+from graspd.worker.simulation.launches import Launches
+from graspd.worker.simulation.model import Model
+from graspd.worker.simulation.record import add_poses
+
+
+class AutograspOptions(Options):
+    """Options of `autograsp`."""
+
+    standoff_m: float = Field(0.005, ge=0.0, le=0.05, description="gap at which the approach ends [m]")
+
+
+class Autograsp:
+    """See `worker.planners.Planner`."""
+
+    def __init__(self, options: AutograspOptions) -> None:
+        self.options = options
+
+    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
+        began = time.perf_counter()
+        pair = ground_of(hand, obj, run.device, kernels)
+        steps = Steps(3 * wanted.count, run)
+
+        def work(indices: range) -> HandState:
+            n = len(indices)
+            state = free_starts(pair, seed=wanted.seed, batch=wanted.batch, indices=indices)
+            steps(n, "starts")
+            closer = Closer(pair, n)
+            state = closer.approach(state, self.options.standoff_m)
+            steps(n, "approach")
+            state = closer.close(state).state
+            steps(n, "closing")
+            return state
+
+        states = run_parts(cut(wanted.count, run), work)
+        return grasp_set(pair, joined(states), began, {})
+
+
+def _planner(options: AutograspOptions) -> Planner:
+    return Autograsp(options)
+
+
+METHOD: Final = Method(
+    summary="a random approach, then the fingers close until contact",
+    source="A. T. Miller and P. K. Allen, GraspIt!, IEEE Robotics and Automation Magazine 2004",
+    planner=_planner,
+    options=AutograspOptions,
+    uses=("face_error_m",),
+)
+
+#: Contact: GraspIt!'s threshold layer [m].
+TOUCH_M: Final = 2e-4
+#: Distances beyond this are not asked for [m].
+REACH_M: Final = 0.03
+#: Gap between fingers beyond which they do not slow each other [m].
+MARGIN_M: Final = 0.005
+#: Share of a gap crossed in one step: far distances come from a grid that may be off by a third.
+SHARE: Final = 0.6
+#: Longest closing step [rad], and most steps.
+LARGEST: Final = 0.1
+STEPS: Final = 400
+#: Most advances of the root: each crosses more than half of what is left.
+ADVANCES: Final = 40
+
+
+def levers(hand: HandModel, points: SurfacePoints) -> Floats:
+    """(D, L) bound on how far a point of body l moves per unit of dof d, by chain lengths [m/rad]."""
+    radius = np.zeros(hand.bodies)
+    np.maximum.at(radius, points.body, np.linalg.norm(points.position, axis=1))
+    length = np.linalg.norm(hand.origin[:, :3], axis=1)
+    moved = ancestors(hand)
+    out = np.zeros((hand.dofs, hand.bodies))
+    for joint in range(1, hand.bodies):
+        for body in np.flatnonzero(moved[:, joint]):
+            between = [k for k in range(1, hand.bodies) if moved[body, k] and moved[k, joint] and k != joint]
+            turning = hand.joint_type[joint] == JointType.REVOLUTE
+            reach = length[between].sum() + radius[body] if turning else 1.0
+            out[hand.dof[joint], body] += abs(hand.multiplier[joint]) * reach
+    return out
+
+
+def finger_groups(moves: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """(D,) a common number for dofs that move a common body, from (D, L)."""
+    group = np.arange(len(moves))
+    for d in range(len(moves)):
+        for e in range(d):
+            if (moves[d] & moves[e]).any():
+                group[group == group[d]] = group[e]
+    return group.astype(np.int32)
+
+
+@dataclass(frozen=True)
+class Closed:
+    """Hands after closing, and what stopped each dof: (B, D) 0 nothing, 1 contact, 2 its limit."""
+
+    state: HandState
+    stopped: NDArray[np.int32]
+
+
+class Closer:
+    """Approach and closing of up to `capacity` hands."""
+
+    def __init__(self, pair: Pair, capacity: int) -> None:
+        self.pair, self.capacity = pair, capacity
+        self.hand = pair.hand.model
+        self.model = Model.create(pair.hand, pair.fine.obj, pair.fine.points, pair.coarse.own, pair.options)
+        # Only the kinematics is run.
+        self.data = Data(self.model, capacity)
+        self._poses = Launches(self.model.device)
+        add_poses(self._poses, self.model, self.data)
+        self.closing = self._closing()
+        with wp.ScopedDevice(self.model.device):
+            self.near = wp.zeros((capacity, self.hand.bodies), dtype=wp.float32)
+            self.pairs = wp.zeros((capacity, self.hand.bodies, self.hand.bodies), dtype=wp.float32)
+            self.stopped = wp.zeros((capacity, self.hand.dofs), dtype=wp.int32)
+
+    def _closing(self) -> Any:
+        hand, points = self.hand, self.pair.fine.points
+        lever = levers(hand, points)
+        moves = lever > 0
+        out = kernels.Closing()
+        with wp.ScopedDevice(self.model.device):
+            out.direction = wp.array(hand.closing, dtype=wp.float32)
+            out.moves = wp.array(moves.astype(np.int32), dtype=wp.int32)
+            out.lever = wp.array(lever, dtype=wp.float32)
+            out.finger = wp.array(finger_groups(moves), dtype=wp.int32)
+            out.lower = wp.array(hand.lower, dtype=wp.float32)
+            out.upper = wp.array(hand.upper, dtype=wp.float32)
+        return out
+
+    def approach(self, state: HandState, standoff: float) -> HandState:
+        """Hands moved along the palm's approach until their nearest body is `standoff` [m] from the object."""
+        n = len(state.pivot)
+        direction = np.zeros((self.capacity, 3))
+        direction[:n] = quat_rotate(state.rotation, self.hand.palm.approach)
+        self.data.set_state(state)
+        active, near = self.data.active, self.near
+        with wp.ScopedDevice(self.model.device):
+            along = wp.array(direction, dtype=wp.vec3)
+        for _ in range(ADVANCES):
+            self._measure()
+            wp.launch(
+                kernels.advance,
+                self.capacity,
+                inputs=[near, along, standoff, SHARE],
+                outputs=[active, self.data.pivot],
+                device=self.model.device,
+            )
+            if not active.numpy().any():
+                break
+        return self.data.state(n)
+
+    def close(self, state: HandState) -> Closed:
+        """Fingers closed until contact or limits; the root and dofs that do not close (spreads) stay."""
+        n, data = len(state.pivot), self.data
+        data.set_state(state)
+        idle = np.tile((self.hand.closing == 0).astype(np.int32) * 2, (self.capacity, 1))
+        self.stopped.assign(idle)
+        for _ in range(STEPS):
+            self._measure(fingers=True)
+            wp.launch(
+                kernels.close,
+                self.capacity,
+                inputs=[self.closing, self.near, self.pairs, TOUCH_M, SHARE, LARGEST],
+                outputs=[data.active, self.stopped, data.q],
+                device=data.device,
+            )
+            if not data.active.numpy().any():
+                break
+        return Closed(data.state(n), self.stopped.numpy()[:n].astype(np.int32))
+
+    def distances(self, state: HandState) -> Floats:
+        """(n, L) least distance of each body from the object, at most `REACH_M` [m]."""
+        self.data.set_state(state)
+        self._measure()
+        return self.near.numpy()[: len(state.pivot)].astype(float)
+
+    def _measure(self, *, fingers: bool = False) -> None:
+        m, d, device = self.model, self.data, self.model.device
+        self._poses.run()
+        pose = [d.body_p, d.body_q]
+        wp.launch(kernels.clear, self.near.shape, inputs=[REACH_M], outputs=[self.near, self.pairs], device=device)
+        wp.launch(
+            kernels.points_to_object,
+            (self.capacity, m.count),
+            inputs=[m.obj.surface, REACH_M, m.options.exact_below, m.point_body, m.point_position, d.active, *pose],
+            outputs=[self.near],
+            device=device,
+        )
+        shape = (self.capacity, m.pieces)
+        wp.launch(
+            kernels.object_to_pieces,
+            shape,
+            inputs=[m.hand.pieces, m.obj.bvh.id, m.obj.samples, d.active, *pose, MARGIN_M],
+            outputs=[self.near],
+            device=device,
+        )
+        if fingers:
+            wp.launch(
+                kernels.bodies_to_pieces,
+                shape,
+                inputs=[m.hand.pieces, m.body_points, d.active, *pose, MARGIN_M],
+                outputs=[self.pairs],
+                device=device,
+            )

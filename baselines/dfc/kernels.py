@@ -1,0 +1,328 @@
+"""DexGraspNet's energies with their gradients on bodies, and its Metropolis-adjusted descent. See `schedule`."""
+
+import warp as wp
+
+from graspd.baselines.dfc.schedule import (
+    CONTACTS,
+    DECAY,
+    DISTANCE_WEIGHT,
+    JOINT_WEIGHT,
+    MOMENT,
+    PENETRATION_WEIGHT,
+    SELF_GAP_M,
+    SELF_WEIGHT,
+    STEP_PERIOD,
+    STEP_SIZE,
+    SWITCH,
+    TEMPERATURE,
+    TEMPERATURE_PERIOD,
+)
+from graspd.worker.simulation.kernels.optimizers import turn
+from graspd.worker.simulation.kernels.pieces import (
+    Pieces,
+    in_box,
+    piece_centre,
+    piece_distance,
+    piece_rotation,
+    world_extent,
+)
+from graspd.worker.simulation.kernels.surface import Surface, mesh_distance
+from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
+
+wp.set_module_options({"enable_backward": False})
+
+N_CONTACTS = wp.constant(CONTACTS)
+W_DISTANCE = wp.constant(DISTANCE_WEIGHT)
+W_PENETRATION = wp.constant(PENETRATION_WEIGHT)
+W_SELF = wp.constant(SELF_WEIGHT)
+W_JOINTS = wp.constant(JOINT_WEIGHT)
+GAP = wp.constant(SELF_GAP_M)
+STEP0 = wp.constant(STEP_SIZE)
+STEP_EVERY = wp.constant(float(STEP_PERIOD))
+T0 = wp.constant(TEMPERATURE)
+T_EVERY = wp.constant(float(TEMPERATURE_PERIOD))
+COOL = wp.constant(DECAY)
+MU = wp.constant(MOMENT)
+SWAP = wp.constant(SWITCH)
+#: Farthest distance asked for [m].
+FAR = wp.constant(1.0)
+
+
+@wp.func
+def step_size(iteration: wp.int32):
+    return STEP0 * wp.pow(COOL, wp.floor(float(iteration) / STEP_EVERY))
+
+
+@wp.func
+def temperature(iteration: wp.int32):
+    return T0 * wp.pow(COOL, wp.floor(float(iteration) / T_EVERY))
+
+
+@wp.kernel
+def propose(
+    # Model:
+    candidates_in: wp.int32,
+    # Data in:
+    iteration_in: wp.array(dtype=wp.int32),
+    gradient_in: wp.array2d(dtype=wp.float32),
+    pivot_in: wp.array(dtype=wp.vec3),
+    rotation_in: wp.array(dtype=wp.quat),
+    q_in: wp.array2d(dtype=wp.float32),
+    contact_in: wp.array2d(dtype=wp.int32),
+    # Data out:
+    rng_inout: wp.array(dtype=wp.uint32),
+    moment_inout: wp.array2d(dtype=wp.float32),
+    pivot_out: wp.array(dtype=wp.vec3),
+    rotation_out: wp.array(dtype=wp.quat),
+    q_out: wp.array2d(dtype=wp.float32),
+    contact_out: wp.array2d(dtype=wp.int32),
+    energy_out: wp.array2d(dtype=wp.float32),
+):
+    """A step down the gradient, each contact drawn anew with probability 1/2, energies set to zero. Over B.
+
+    The source divides by the root mean square over its batch; here it is over translation, rotation and joints of the
+    grasp itself (columns 0 to 2 of `moment`), so that a grasp does not depend on the others of its batch.
+    """
+    b = wp.tid()
+    it = iteration_in[0]
+    size = step_size(it)
+    dofs = q_in.shape[1]
+    scale = wp.vec3(0.0)
+    for group in range(3):
+        first = 3 * group
+        last = first + 3
+        if group == 2:
+            last = 6 + dofs
+        mean = float(0.0)
+        for column in range(first, last):
+            mean += gradient_in[b, column] * gradient_in[b, column]
+        v = MU * mean / float(wp.max(last - first, 1)) + (1.0 - MU) * moment_inout[b, group]
+        moment_inout[b, group] = v
+        scale[group] = size / (wp.sqrt(v) + 1.0e-6)
+    g = wp.vec3(gradient_in[b, 0], gradient_in[b, 1], gradient_in[b, 2])
+    w = wp.vec3(gradient_in[b, 3], gradient_in[b, 4], gradient_in[b, 5])
+    pivot_out[b] = pivot_in[b] - scale[0] * g
+    rotation_out[b] = turn(rotation_in[b], -scale[1] * w)
+    for d in range(dofs):
+        q_out[b, d] = q_in[b, d] - scale[2] * gradient_in[b, 6 + d]
+    rng = rng_inout[b]
+    for k in range(N_CONTACTS):
+        index = contact_in[b, k]
+        if wp.randf(rng) < SWAP:
+            index = wp.min(int(wp.randf(rng) * float(candidates_in)), candidates_in - 1)
+        contact_out[b, k] = index
+    rng_inout[b] = rng
+    for term in range(energy_out.shape[1]):
+        energy_out[b, term] = float(0.0)
+
+
+@wp.kernel
+def force_closure(
+    # Model:
+    surface_in: Surface,
+    body_in: wp.array(dtype=wp.int32),
+    position_in: wp.array(dtype=wp.vec3),
+    # Data in:
+    contact_in: wp.array2d(dtype=wp.int32),
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    # Data out:
+    energy_out: wp.array2d(dtype=wp.float32),
+    wrench_inout: Wrenches,
+):
+    """E_fc = |sum (n, x cross n)|^2 and E_dis = sum |d|; normals count as constant. Columns 0 and 1. Over B."""
+    b = wp.tid()
+    f = wp.vec3(0.0)
+    t = wp.vec3(0.0)
+    for k in range(N_CONTACTS):
+        i = contact_in[b, k]
+        x = body_p_in[b, body_in[i]] + wp.quat_rotate(body_q_in[b, body_in[i]], position_in[i])
+        sample = mesh_distance(surface_in, x, FAR)
+        f += sample.normal
+        t += wp.cross(x, sample.normal)
+    distance_sum = float(0.0)
+    for k in range(N_CONTACTS):
+        i = contact_in[b, k]
+        body = body_in[i]
+        x = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], position_in[i])
+        sample = mesh_distance(surface_in, x, FAR)
+        distance_sum += wp.abs(sample.distance)
+        gradient = 2.0 * wp.cross(sample.normal, t) + (W_DISTANCE * wp.sign(sample.distance)) * sample.normal
+        add_wrench(wrench_inout, b, body, gradient, wp.cross(x, gradient))
+    energy_out[b, 0] = wp.dot(f, f) + wp.dot(t, t)
+    energy_out[b, 1] = distance_sum
+
+
+@wp.kernel
+def penetration(
+    # Model:
+    pieces_in: Pieces,
+    bvh_in: wp.uint64,
+    sample_in: wp.array(dtype=wp.vec3),
+    # Data in:
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    # Data out:
+    energy_inout: wp.array2d(dtype=wp.float32),
+    wrench_inout: Wrenches,
+):
+    """E_pen = sum of depths of object samples in pieces of the hand, column 2. Launch over (B, P)."""
+    b, piece = wp.tid()
+    body = pieces_in.body[piece]
+    q = piece_rotation(pieces_in, piece, b, body_q_in)
+    p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
+    half = pieces_in.half[piece]
+    extent = world_extent(q, half)
+    force = wp.vec3(0.0)
+    torque = wp.vec3(0.0)
+    total = float(0.0)
+    query = wp.bvh_query_aabb(bvh_in, p - extent, p + extent)
+    index = wp.int32(0)
+    while wp.bvh_query_next(query, index):
+        x = sample_in[index]
+        local = wp.quat_rotate_inv(q, x - p)
+        if in_box(local, half):
+            nd = piece_distance(pieces_in, piece, local)
+            if nd[3] < 0.0:
+                # Moving the body along the face's normal deepens the sample.
+                f = W_PENETRATION * wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
+                total -= nd[3]
+                force += f
+                torque += wp.cross(x, f)
+    if total > 0.0:
+        wp.atomic_add(energy_inout, b, 2, total)
+        add_wrench(wrench_inout, b, body, force, torque)
+
+
+@wp.kernel
+def self_penetration(
+    # Model:
+    first_in: wp.array(dtype=wp.int32),
+    second_in: wp.array(dtype=wp.int32),
+    body_in: wp.array(dtype=wp.int32),
+    position_in: wp.array(dtype=wp.vec3),
+    # Data in:
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    # Data out:
+    energy_inout: wp.array2d(dtype=wp.float32),
+    wrench_inout: Wrenches,
+):
+    """E_spen = sum of max(0, gap - distance) over pairs of key points, column 3. Launch over (B, pairs)."""
+    b, pair = wp.tid()
+    i = first_in[pair]
+    j = second_in[pair]
+    x = body_p_in[b, body_in[i]] + wp.quat_rotate(body_q_in[b, body_in[i]], position_in[i])
+    y = body_p_in[b, body_in[j]] + wp.quat_rotate(body_q_in[b, body_in[j]], position_in[j])
+    apart = wp.length(x - y)
+    if apart < GAP and apart > 1.0e-9:
+        wp.atomic_add(energy_inout, b, 3, GAP - apart)
+        f = (-W_SELF / apart) * (x - y)
+        add_wrench(wrench_inout, b, body_in[i], f, wp.cross(x, f))
+        add_wrench(wrench_inout, b, body_in[j], -f, -wp.cross(y, f))
+
+
+@wp.kernel
+def limits(
+    # Model:
+    lower_in: wp.array(dtype=wp.float32),
+    upper_in: wp.array(dtype=wp.float32),
+    # Data in:
+    q_in: wp.array2d(dtype=wp.float32),
+    # Data out:
+    energy_out: wp.array2d(dtype=wp.float32),
+    gradient_inout: wp.array2d(dtype=wp.float32),
+):
+    """E_joints = sum of violations of the limits, column 4. Launch over B."""
+    b = wp.tid()
+    total = float(0.0)
+    for d in range(q_in.shape[1]):
+        above = q_in[b, d] - upper_in[d]
+        below = lower_in[d] - q_in[b, d]
+        if above > 0.0:
+            total += above
+            gradient_inout[b, 6 + d] = gradient_inout[b, 6 + d] + W_JOINTS
+        elif below > 0.0:
+            total += below
+            gradient_inout[b, 6 + d] = gradient_inout[b, 6 + d] - W_JOINTS
+    energy_out[b, 4] = total
+
+
+@wp.func
+def total_energy(terms: wp.array2d(dtype=wp.float32), b: wp.int32):
+    return (
+        terms[b, 0]
+        + W_DISTANCE * terms[b, 1]
+        + W_PENETRATION * terms[b, 2]
+        + W_SELF * terms[b, 3]
+        + W_JOINTS * terms[b, 4]
+    )
+
+
+@wp.func
+def accepted(rise: wp.float32, t: wp.float32, uniform: wp.float32):
+    """Metropolis: 1 where the energy falls, else with probability exp(-rise / t)."""
+    if rise < 0.0:
+        return 1
+    if uniform < wp.exp(-rise / t):
+        return 1
+    return 0
+
+
+@wp.kernel
+def accept(
+    # Data in:
+    iteration_in: wp.array(dtype=wp.int32),
+    new_terms_in: wp.array2d(dtype=wp.float32),
+    new_gradient_in: wp.array2d(dtype=wp.float32),
+    new_pivot_in: wp.array(dtype=wp.vec3),
+    new_rotation_in: wp.array(dtype=wp.quat),
+    new_q_in: wp.array2d(dtype=wp.float32),
+    new_contact_in: wp.array2d(dtype=wp.int32),
+    # Data out:
+    rng_inout: wp.array(dtype=wp.uint32),
+    terms_inout: wp.array2d(dtype=wp.float32),
+    gradient_inout: wp.array2d(dtype=wp.float32),
+    pivot_inout: wp.array(dtype=wp.vec3),
+    rotation_inout: wp.array(dtype=wp.quat),
+    q_inout: wp.array2d(dtype=wp.float32),
+    contact_inout: wp.array2d(dtype=wp.int32),
+    taken_inout: wp.array(dtype=wp.int32),
+):
+    """Take the proposal, or stay. The first one is always taken (its old energy is infinite). Launch over B."""
+    b = wp.tid()
+    rng = rng_inout[b]
+    uniform = wp.randf(rng)
+    rng_inout[b] = rng
+    rise = total_energy(new_terms_in, b) - total_energy(terms_inout, b)
+    if accepted(rise, temperature(iteration_in[0]), uniform) == 0:
+        return
+    taken_inout[b] = taken_inout[b] + 1
+    pivot_inout[b] = new_pivot_in[b]
+    rotation_inout[b] = new_rotation_in[b]
+    for d in range(q_inout.shape[1]):
+        q_inout[b, d] = new_q_in[b, d]
+    for k in range(N_CONTACTS):
+        contact_inout[b, k] = new_contact_in[b, k]
+    for column in range(gradient_inout.shape[1]):
+        gradient_inout[b, column] = new_gradient_in[b, column]
+    for term in range(terms_inout.shape[1]):
+        terms_inout[b, term] = new_terms_in[b, term]
+
+
+@wp.kernel
+def probe(
+    # In:
+    iteration_in: wp.array(dtype=wp.int32),
+    rise_in: wp.array(dtype=wp.float32),
+    uniform_in: wp.array(dtype=wp.float32),
+    # Out:
+    size_out: wp.array(dtype=wp.float32),
+    temperature_out: wp.array(dtype=wp.float32),
+    accepted_out: wp.array(dtype=wp.int32),
+):
+    """The schedule's functions, for tests. Launch over the rows."""
+    i = wp.tid()
+    size_out[i] = step_size(iteration_in[i])
+    temperature_out[i] = temperature(iteration_in[i])
+    accepted_out[i] = accepted(rise_in[i], temperature(iteration_in[i]), uniform_in[i])

@@ -1,0 +1,251 @@
+"""Differentiable force closure: DexGraspNet's starts around the convex hull, then annealed descent. All hands are
+given; info tells which would pass."""
+
+from __future__ import annotations
+
+import time
+from itertools import combinations
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from pydantic import Field
+
+from graspd.baselines.common import grasp_set, ground_of, inside_points, joined
+from graspd.baselines.dfc import kernels
+from graspd.baselines.dfc.schedule import CONTACTS, SELF_GAP_M, STEPS
+from graspd.service.model.transforms import (
+    IDENTITY_POSE,
+    Floats,
+    apply,
+    quat_from_axis_angle,
+    quat_from_matrix,
+    quat_multiply,
+)
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.distance import sample_faces
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fast_graspd.pairs import Pair
+from graspd.worker.planners.port import Method, Options, Planner, Wanted
+from graspd.worker.planners.threads import Steps, cut, run_parts
+from graspd.worker.run import Run
+from graspd.worker.simulation.data import Data, HandState
+from graspd.worker.simulation.kernels import optimizers
+from graspd.worker.simulation.launches import Launches
+from graspd.worker.simulation.model import Model
+from graspd.worker.simulation.record import add_poses, add_root_gradient
+
+#: Force closure, distance and penetration that the source lets pass.
+PASSES: Final = (0.3, 0.005, 0.001)
+#: Distance of the palm from the hull [m]: the source puts the root, which is a palm's length behind, at 0.2 to 0.3.
+DISTANCE: Final = (0.1, 0.2)
+#: Tilt of the approach away from the hull's normal [rad], at most.
+TILT: Final = np.pi / 6
+#: Standard deviation of joints about the pre-shape, as a share of their range.
+POSTURE: Final = 0.1
+
+
+class DfcOptions(Options):
+    """Options of `dfc`."""
+
+    steps: int = Field(STEPS, ge=1, le=100_000, description="proposals of each hand")
+
+
+class Dfc:
+    """See `worker.planners.Planner`."""
+
+    def __init__(self, options: DfcOptions) -> None:
+        self.options = options
+
+    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
+        began = time.perf_counter()
+        pair = ground_of(hand, obj, run.device, kernels)
+        steps = Steps(wanted.count * (self.options.steps + 1), run)
+
+        def work(indices: range) -> tuple[HandState, Floats]:
+            starts = sample_starts(hand, obj, seed=wanted.seed, batch=wanted.batch, indices=indices)
+            steps(len(indices), "starts")
+            descent = Descent(pair, starts, [[wanted.seed, wanted.batch, index] for index in indices])
+            descent.run(self.options.steps, steps)
+            return descent.hands(), descent.energies()
+
+        found = run_parts(cut(wanted.count, run), work)
+        energies = np.concatenate([part[1] for part in found])
+        passed = (energies[:, :3] < np.array(PASSES)).all(axis=1)
+        return grasp_set(pair, joined([part[0] for part in found]), began, {"passed": passed.tolist()})
+
+
+def _planner(options: DfcOptions) -> Planner:
+    return Dfc(options)
+
+
+METHOD: Final = Method(
+    summary="annealed descent of force closure, distance and penetration energies of four contacts",
+    source="R. Wang et al., DexGraspNet, ICRA 2023; T. Liu et al., Differentiable force closure, RA-L 2021",
+    planner=_planner,
+    options=DfcOptions,
+    uses=("face_error_m",),
+    quick={"steps": 60},
+)
+
+
+def sample_starts(hand: HandModel, obj: ObjectModel, *, seed: int, batch: int, indices: range) -> HandState:
+    """One start for each grasp; each depends on its own index only."""
+    rows = [_start(hand, obj, np.random.default_rng([seed, batch, index])) for index in indices]
+    return HandState(*(np.stack([row[k] for row in rows]) for k in range(3)))
+
+
+def _start(hand: HandModel, obj: ObjectModel, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    points, faces = sample_faces(obj.hull_vertices, obj.hull_faces.astype(np.int64), 1, seed=int(rng.integers(2**31)))
+    a, b, c = obj.hull_vertices[obj.hull_faces[faces[0]]]
+    normal = np.cross(b - a, c - a)
+    normal /= np.linalg.norm(normal)
+    side = np.cross(normal, rng.normal(size=3))
+    axis, angle = side / np.linalg.norm(side), rng.uniform(0.0, TILT)
+    normal = normal * np.cos(angle) + np.cross(axis, normal) * np.sin(angle)
+    align = _frame(-normal) @ _frame(hand.palm.approach).T
+    roll = quat_from_axis_angle(-normal, np.array(rng.uniform(0.0, 2 * np.pi)))
+    span = hand.upper - hand.lower
+    q = np.clip(hand.preshape + POSTURE * span * rng.normal(size=hand.dofs), hand.lower, hand.upper)
+    pivot = points[0] + rng.uniform(*DISTANCE) * normal - obj.centre_of_mass
+    return pivot, quat_multiply(roll, quat_from_matrix(align)), q
+
+
+def _frame(z: np.ndarray) -> np.ndarray:
+    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+Ints = NDArray[np.int32]
+
+#: Places that may become contacts, on each link and on the palm.
+EACH: Final = 12
+ON_PALM: Final = 24
+#: Object samples asked for penetration.
+SAMPLES: Final = 2000
+#: Energies: force closure, distance, penetration, self-penetration, joint limits.
+TERMS: Final = 5
+CHUNK: Final = 50
+INFINITE: Final = 1e30
+
+
+def key_points(hand: HandModel) -> tuple[Ints, Floats, Ints, Ints]:
+    """Bodies (K,) and places (K, 3) of the middle of each piece, and the pairs (first, second) to be kept apart.
+
+    Pieces that are near each other at rest by their shape are no pair.
+    """
+    body = np.array([piece.body for piece in hand.pieces], np.int32)
+    place = np.array([piece.vertices.mean(axis=0) for piece in hand.pieces])
+    rest = apply(body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0][body], place)
+    pairs = [
+        (i, j)
+        for i, j in combinations(range(len(body)), 2)
+        if body[i] != body[j]
+        and (min(body[i], body[j]), max(body[i], body[j])) not in hand.neighbours
+        and np.linalg.norm(rest[i] - rest[j]) > SELF_GAP_M
+    ]
+    first, second = (np.array([pair[k] for pair in pairs], np.int32) for k in (0, 1))
+    return body, place, first, second
+
+
+class Descent:
+    """A batch of hands on one object."""
+
+    def __init__(self, pair: Pair, starts: HandState, seeds: list[list[int]]) -> None:
+        self.pair, self.n = pair, len(starts.pivot)
+        hand = pair.hand.model
+        self.obj = pair.fine.obj.thinned(SAMPLES)
+        self.candidates = inside_points(hand, each=EACH, on_palm=ON_PALM)
+        # Holds the proposals; only its kinematics is run.
+        self.model = Model.create(pair.hand, self.obj, pair.coarse.points, pair.coarse.own, pair.options)
+        self.proposal = Data(self.model, self.n)
+        self.device = self.model.device
+        generators = [np.random.default_rng([*seed, 1]) for seed in seeds]
+        random = np.array([g.integers(2**32, dtype=np.uint32) for g in generators], np.uint32)
+        contacts = np.array([g.integers(len(self.candidates), size=CONTACTS) for g in generators], np.int32)
+        with wp.ScopedDevice(self.device):
+            self.rng = wp.array(random, dtype=wp.uint32)
+            self._allocate(contacts)
+            self._upload(hand)
+        self.proposal.set_state(starts)
+        for mine, other in zip(self.state, self._proposed(), strict=True):
+            wp.copy(mine, other)
+        self.launches = self._record()
+
+    def _allocate(self, contacts: Ints) -> None:
+        n, dofs = self.n, self.pair.hand.model.dofs
+        self.state = [wp.zeros(n, dtype=wp.vec3), wp.zeros(n, dtype=wp.quat), wp.zeros((n, dofs), dtype=wp.float32)]
+        self.contact, self.new_contact = (wp.array(contacts, dtype=wp.int32) for _ in range(2))
+        self.terms = wp.full((n, TERMS), INFINITE, dtype=wp.float32)
+        self.new_terms = wp.zeros((n, TERMS), dtype=wp.float32)
+        self.gradient = wp.zeros((n, 6 + dofs), dtype=wp.float32)
+        self.moment = wp.zeros((n, 3), dtype=wp.float32)
+        self.taken = wp.zeros(n, dtype=wp.int32)
+
+    def _upload(self, hand: HandModel) -> None:
+        self.candidate_body = wp.array(self.candidates.body, dtype=wp.int32)
+        self.candidate_position = wp.array(self.candidates.position, dtype=wp.vec3)
+        body, place, first, second = key_points(hand)
+        self.pairs = len(first)
+        self.keys = [wp.array(v, dtype=wp.int32) for v in (first, second, body)] + [wp.array(place, dtype=wp.vec3)]
+
+    def _proposed(self) -> list[Any]:
+        return [self.proposal.pivot, self.proposal.rotation, self.proposal.q]
+
+    def _record(self) -> Launches:
+        s, m, n, out = self.proposal, self.model, self.n, Launches(self.device)
+        pose, own = [s.body_p, s.body_q], [self.new_terms, s.wrench]
+        out.add(
+            kernels.propose,
+            n,
+            inputs=[len(self.candidates), s.iteration, self.gradient, *self.state, self.contact],
+            outputs=[self.rng, self.moment, *self._proposed(), self.new_contact, self.new_terms],
+        )
+        add_poses(out, m, s)
+        out.add(
+            kernels.force_closure,
+            n,
+            inputs=[self.obj.surface, self.candidate_body, self.candidate_position, self.new_contact, *pose],
+            outputs=own,
+        )
+        out.add(
+            kernels.penetration,
+            (n, m.pieces),
+            inputs=[m.hand.pieces, self.obj.bvh.id, self.obj.samples, *pose],
+            outputs=own,
+        )
+        if self.pairs:
+            out.add(kernels.self_penetration, (n, self.pairs), inputs=[*self.keys, *pose], outputs=own)
+        add_root_gradient(out, m, s)
+        out.add(kernels.limits, n, inputs=[m.hand.lower, m.hand.upper, s.q], outputs=[self.new_terms, s.gradient])
+        out.add(
+            kernels.accept,
+            n,
+            inputs=[s.iteration, self.new_terms, s.gradient, *self._proposed(), self.new_contact],
+            outputs=[self.rng, self.terms, self.gradient, *self.state, self.contact, self.taken],
+        )
+        out.add(optimizers.advance, 1, inputs=[], outputs=[s.iteration])
+        return out
+
+    def run(self, steps: int, tell: Steps) -> None:
+        """So many proposals; raises TaskCancelled through `tell`."""
+        for first in range(0, steps, CHUNK):
+            count = min(CHUNK, steps - first)
+            self.launches.run(count)
+            tell(self.n * count, "annealing")
+
+    def hands(self) -> HandState:
+        """Where the hands are, joints inside their limits."""
+        for mine, other in zip(self._proposed(), self.state, strict=True):
+            wp.copy(mine, other)
+        found = self.proposal.state(self.n)
+        hand = self.pair.hand.model
+        return HandState(found.pivot, found.rotation, np.clip(found.q, hand.lower, hand.upper))
+
+    def energies(self) -> Floats:
+        """(n, 5) E_fc, E_dis, E_pen, E_spen, E_joints, unweighted."""
+        return self.terms.numpy().astype(float)

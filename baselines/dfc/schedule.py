@@ -1,0 +1,40 @@
+"""DexGraspNet's annealing: energy weights, step sizes, temperatures, the chance of another contact.
+
+E = E_fc + 100 E_dis + 100 E_pen + 10 E_spen + E_joints
+step 0.005 * 0.95^floor(t / 50), each gradient over its root mean square, v <- 0.98 g^2 + 0.02 v
+temperature 18 * 0.95^floor(t / 30): a proposal is accepted with probability min(1, exp((E - E') / T))
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from graspd.service.model.transforms import Floats
+
+STEPS: Final = 6000
+CONTACTS: Final = 4
+DISTANCE_WEIGHT: Final = 100.0
+PENETRATION_WEIGHT: Final = 100.0
+SELF_WEIGHT: Final = 10.0
+JOINT_WEIGHT: Final = 1.0
+#: Key points of the hand nearer than this count as self-penetration [m].
+SELF_GAP_M: Final = 0.02
+STEP_SIZE: Final = 0.005
+STEP_PERIOD: Final = 50
+TEMPERATURE: Final = 18.0
+TEMPERATURE_PERIOD: Final = 30
+DECAY: Final = 0.95
+MOMENT: Final = 0.98
+SWITCH: Final = 0.5
+
+
+def step_size(iteration: Floats) -> Floats:
+    """Length of a step in units of each gradient's root mean square [m or rad]."""
+    return STEP_SIZE * DECAY ** np.floor(np.asarray(iteration, float) / STEP_PERIOD)
+
+
+def temperature(iteration: Floats) -> Floats:
+    """Temperature of the acceptance test."""
+    return TEMPERATURE * DECAY ** np.floor(np.asarray(iteration, float) / TEMPERATURE_PERIOD)

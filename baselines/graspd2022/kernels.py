@@ -1,0 +1,209 @@
+"""Force-based contact and its relaxation by contact-invariant forces (Mordatch 2012, as Grasp'D uses it).
+
+The hand stands still, the object (mass m) has one of a few small velocities v_j. A hand point at distance d from the
+object's surface, dilated by r, presses with
+
+    f = -k c n - min(kf |v_t|, mu k c) v_t / |v_t|,   c = max(r - d, 0).
+
+The relaxation gives every point and velocity a force of its own, F. Two descents alternate: F towards the nearest
+forces that stop the object (`relax`), and the hand towards a place where the contact forces are F, by the gradient of
+sum |f - F|^2. In that gradient points that do not touch leak a share of it, so that they are drawn in.
+"""
+
+import warp as wp
+
+from graspd.worker.simulation.kernels.surface import Surface, field_distance
+from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
+
+wp.set_module_options({"enable_backward": False})
+
+vec6 = wp.types.vector(length=6, dtype=wp.float32)
+
+
+@wp.struct
+class ForceModel:
+    stiffness: wp.float32  # k [N/m]
+    viscous: wp.float32  # kf [N s/m]
+    friction: wp.float32  # mu
+    leak: wp.float32
+    mismatch: wp.float32  # weight of |F - f|^2 while F is moved
+    gyration: wp.float32  # length that weighs torques [m]
+    tolerance: wp.float32  # residual that counts as stopped [N]
+    damping: wp.float32
+    rate: wp.float32  # of forces and multipliers
+    warmup: wp.float32  # iterations over which rates grow to their value
+
+
+@wp.func
+def contact_force(physics: ForceModel, depth: wp.float32, n: wp.vec3, v: wp.vec3):
+    """Force on the object at a point whose depth in the dilated object is `depth`."""
+    c = wp.max(depth, 0.0)
+    normal = physics.stiffness * c
+    tangential = v - wp.dot(v, n) * n
+    speed = wp.length(tangential)
+    force = -normal * n
+    if speed > 1.0e-12:
+        force -= (wp.min(physics.viscous * speed, physics.friction * normal) / speed) * tangential
+    return force
+
+
+@wp.func
+def force_slope(physics: ForceModel, depth: wp.float32, n: wp.vec3, v: wp.vec3):
+    """d f / d depth, a share `leak` of it where the point does not touch."""
+    slope = -physics.stiffness * n
+    tangential = v - wp.dot(v, n) * n
+    speed = wp.length(tangential)
+    if speed > 1.0e-12:
+        # Friction grows with the depth only where it slides. It is what draws free points in: the normal forces wanted
+        # for opposite velocities cancel, the friction forces do not.
+        if physics.friction * physics.stiffness * depth < physics.viscous * speed:
+            slope -= (physics.friction * physics.stiffness / speed) * tangential
+    if depth <= 0.0:
+        slope = physics.leak * slope
+    return slope
+
+
+@wp.kernel
+def multipliers(
+    # Model:
+    physics: ForceModel,
+    wanted_in: wp.array(dtype=vec6),
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
+    # Data out:
+    total_inout: wp.array2d(dtype=vec6),
+    lambda_inout: wp.array2d(dtype=wp.float32),
+    pull_out: wp.array2d(dtype=vec6),
+    residual_out: wp.array2d(dtype=wp.float32),
+):
+    """Residual of each velocity's task, |wanted + sum F| in newtons; its multiplier; the pull on forces. Over (B, M).
+
+    The constraint residual <= tolerance is kept by the modified differential method of multipliers (Platt & Barr 1988).
+    """
+    b, j = wp.tid()
+    if active_in[b] == 0:
+        return
+    gap = wanted_in[j] + total_inout[b, j]
+    size = wp.length(gap)
+    residual_out[b, j] = size
+    excess = wp.max(size - physics.tolerance, 0.0)
+    multiplier = lambda_inout[b, j]
+    pull = vec6()
+    if excess > 0.0:
+        lambda_inout[b, j] = multiplier + physics.rate
+        pull = ((multiplier + physics.damping * excess) / size) * gap
+    else:
+        lambda_inout[b, j] = wp.max(multiplier - physics.rate, 0.0)
+    pull_out[b, j] = pull
+    total_inout[b, j] = vec6()
+
+
+@wp.func
+def relaxed(physics: ForceModel, force: wp.vec3, wanted: wp.vec3, actual: wp.vec3):
+    """Gradient with respect to F of mismatch |F - f|^2 plus the task's pull."""
+    return 2.0 * physics.mismatch * (force - actual) + wanted
+
+
+@wp.kernel
+def relax(
+    # Model:
+    physics: ForceModel,
+    surface: Surface,
+    velocity_in: wp.array(dtype=wp.vec3),
+    point_body_in: wp.array(dtype=wp.int32),
+    point_position_in: wp.array(dtype=wp.vec3),
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
+    iteration_in: wp.array(dtype=wp.int32),
+    dilation_in: wp.array(dtype=wp.float32),
+    dilation_scale_in: wp.array(dtype=wp.float32),
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    pull_in: wp.array2d(dtype=vec6),
+    # Data out:
+    force_inout: wp.array3d(dtype=wp.vec3),
+    first_inout: wp.array3d(dtype=wp.vec3),
+    largest_inout: wp.array3d(dtype=wp.vec3),
+    total_inout: wp.array2d(dtype=vec6),
+    wrench_inout: Wrenches,
+):
+    """A step of Adamax on every force, then the gradient of sum |f - F|^2 on the bodies. Launch over (B, N)."""
+    b, i = wp.tid()
+    if active_in[b] == 0:
+        return
+    it = iteration_in[0]
+    body = point_body_in[i]
+    x = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], point_position_in[i])
+    sample = field_distance(surface, x)
+    n = sample.normal
+    depth = dilation_scale_in[b] * dilation_in[it] - sample.distance
+    warm = wp.min(float(it) / physics.warmup, 1.0)
+    rate = warm * physics.rate / (1.0 - wp.pow(0.9, float(it + 1)))
+    slope_sum = float(0.0)
+    for j in range(velocity_in.shape[0]):
+        v = velocity_in[j]
+        actual = contact_force(physics, depth, n, v)
+        pull = pull_in[b, j]
+        torque_pull = wp.vec3(pull[3], pull[4], pull[5]) / physics.gyration
+        wanted = wp.vec3(pull[0], pull[1], pull[2]) + wp.cross(torque_pull, x)
+        force = force_inout[b, i, j]
+        g = relaxed(physics, force, wanted, actual)
+        m = 0.9 * first_inout[b, i, j] + 0.1 * g
+        old = largest_inout[b, i, j]
+        u = wp.vec3(
+            wp.max(0.999 * old[0], wp.abs(g[0]) + 1.0e-8),
+            wp.max(0.999 * old[1], wp.abs(g[1]) + 1.0e-8),
+            wp.max(0.999 * old[2], wp.abs(g[2]) + 1.0e-8),
+        )
+        force = force - rate * wp.cw_div(m, u)
+        first_inout[b, i, j] = m
+        largest_inout[b, i, j] = u
+        force_inout[b, i, j] = force
+        t = wp.cross(x, force) / physics.gyration
+        wp.atomic_add(total_inout, b, j, vec6(force[0], force[1], force[2], t[0], t[1], t[2]))
+        slope_sum += 2.0 * wp.dot(actual - force, force_slope(physics, depth, n, v))
+    # The depth falls as the distance grows.
+    g_distance = -slope_sum
+    if g_distance != 0.0 and sample.distance < 1.0e2:
+        f = g_distance * n
+        add_wrench(wrench_inout, b, body, f, wp.cross(x, f))
+
+
+@wp.kernel
+def nearest(
+    # Model:
+    surface: Surface,
+    point_body_in: wp.array(dtype=wp.int32),
+    point_position_in: wp.array(dtype=wp.vec3),
+    # Data in:
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    # Data out:
+    least_inout: wp.array(dtype=wp.float32),
+):
+    """Least distance of each hand's points by the grid. Launch over (B, N)."""
+    b, i = wp.tid()
+    body = point_body_in[i]
+    x = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], point_position_in[i])
+    wp.atomic_min(least_inout, b, field_distance(surface, x).distance)
+
+
+@wp.kernel
+def probe(
+    # Model:
+    physics: ForceModel,
+    surface: Surface,
+    # In:
+    point_in: wp.array(dtype=wp.vec3),
+    velocity_in: wp.vec3,
+    # Out:
+    distance_out: wp.array(dtype=wp.float32),
+    force_out: wp.array(dtype=wp.vec3),
+    slope_out: wp.array(dtype=wp.vec3),
+):
+    """Distance, contact force and its slope at given points, for tests. Launch over them."""
+    i = wp.tid()
+    sample = field_distance(surface, point_in[i])
+    distance_out[i] = sample.distance
+    force_out[i] = contact_force(physics, -sample.distance, sample.normal, velocity_in)
+    slope_out[i] = force_slope(physics, -sample.distance, sample.normal, velocity_in)

@@ -1,0 +1,272 @@
+"""Grasp'D: free starts, descent with relaxed forces, no selection and no repair, as the source has it.
+
+The object is a grid of signed distances, read by trilinear interpolation: an error of second order in the cell.
+"""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from pydantic import Field
+
+from graspd.baselines.common import Kept, free_starts, grasp_set, ground_of, joined
+from graspd.baselines.graspd2022 import kernels
+from graspd.service.model.cores import available_cores
+from graspd.service.model.transforms import Floats, quat_rotate
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fast_graspd.pairs import Pair
+from graspd.worker.planners.port import Method, Options, Planner, Wanted
+from graspd.worker.planners.threads import Steps, cut, run_parts
+from graspd.worker.run import Run
+from graspd.worker.simulation.data import Data, HandState, Schedule
+from graspd.worker.simulation.device import DeviceObject
+from graspd.worker.simulation.kernels import surface
+from graspd.worker.simulation.launches import Launches
+from graspd.worker.simulation.model import MAX_DILATION, Model
+from graspd.worker.simulation.record import add_poses, add_root_gradient, add_self_penalty, add_step
+
+
+class Graspd2022Options(Options):
+    """Options of `graspd2022`."""
+
+    steps: int = Field(10_000, ge=1, le=100_000, description="iterations of descent")
+    grid: int = Field(128, ge=16, le=256, description="cells of the distance grid along its longest side")
+
+
+class Search:
+    """One hand on one object as Grasp'D sees them; hands are given in batches."""
+
+    def __init__(self, pair: Pair, cells: int) -> None:
+        self.pair, self.cells = pair, cells
+        self.grid = distance_grid(pair.fine.obj, cells)
+        self.points = sample_surface(pair.hand.model, POINTS)
+
+    def run(self, starts: HandState, *, steps: int, tell: Steps) -> tuple[HandState, Floats]:
+        """The hands after `steps` iterations, and the residual of their forces against the task, (n,) of 1."""
+        batch = _Batch(self, _retreated(self.pair, starts), steps)
+        n = len(starts.pivot)
+        for first in range(0, steps, CHUNK):
+            count = min(CHUNK, steps - first)
+            batch.run(count)
+            tell(n * count, "descent")
+        return batch.data.state(n), batch.residual()
+
+
+_searches: Final = Kept(Search)
+
+
+class Graspd2022:
+    """See `worker.planners.Planner`."""
+
+    def __init__(self, options: Graspd2022Options) -> None:
+        self.options = options
+
+    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
+        began = time.perf_counter()
+        pair: Pair = ground_of(hand, obj, run.device, kernels)
+        search = _searches(pair, self.options.grid)
+        steps = Steps(wanted.count * (self.options.steps + 1), run)
+
+        def work(indices: range) -> tuple[HandState, Floats]:
+            starts = free_starts(pair, seed=wanted.seed, batch=wanted.batch, indices=indices)
+            steps(len(indices), "starts")
+            return search.run(starts, steps=self.options.steps, tell=steps)
+
+        found = run_parts(cut(wanted.count, run), work)
+        residual = np.concatenate([part[1] for part in found])
+        return grasp_set(pair, joined([part[0] for part in found]), began, {"residual": residual.round(4).tolist()})
+
+
+def _planner(options: Graspd2022Options) -> Planner:
+    return Graspd2022(options)
+
+
+METHOD: Final = Method(
+    summary="descent on a distance grid with force-based contact, relaxed by contact-invariant forces",
+    source="D. Turpin et al., Grasp'D: Differentiable Contact-rich Grasp Synthesis, ECCV 2022",
+    planner=_planner,
+    options=Graspd2022Options,
+    uses=("face_error_m",),
+    quick={"steps": 60},
+)
+#: Hand points: the source's hand has 778 vertices.
+POINTS: Final = 778
+#: The source's constants, SI units: stiffness, viscous friction, friction, time step, speed, mass.
+STIFFNESS: Final = 1e5
+VISCOUS: Final = 1e3
+FRICTION: Final = 0.5
+STEP_S: Final = 1e-5
+SPEED: Final = 0.01
+MASS: Final = 1.0
+LEAK: Final = 0.1
+MISMATCH: Final = 1e-2
+TOLERANCE_N: Final = 10.0
+DAMPING: Final = 1.0
+FORCE_RATE: Final = 1e-2
+#: Rates of Adam: root position [m], root rotation (1e-3 on a quaternion's numbers) [rad], joints [rad].
+RATES: Final = (1e-3, 2e-3, 3e-3)
+BETAS: Final = (0.9, 0.999)
+WARMUP: Final = 200
+#: The dilated object starts this far from the hand [m]; hands start this far behind the nearest free place [m].
+APART_M: Final = 0.01
+BACKOFF_M: Final = 0.05
+CHUNK: Final = 25
+#: How far the grid reaches beyond the object's box [m].
+PAD_M: Final = 0.10
+
+
+def schedule(steps: int) -> Schedule:
+    """Dilation to 0 over the first half; rates grow over the first `WARMUP` iterations."""
+    at = np.arange(steps)
+    dilation = MAX_DILATION * np.clip(1.0 - at / max(0.5 * steps, 1.0), 0.0, 1.0)
+    rates = np.minimum(at / WARMUP, 1.0)[:, None] * np.array(RATES)
+    # Hands in hands press by the same stiffness, squared as the other forces are.
+    own = np.full(steps, STIFFNESS**2)
+    zero = np.zeros(steps)
+    return Schedule(dilation, zero, zero, own, rates)
+
+
+def physics_of(gyration: float, *, mismatch: float = MISMATCH) -> Any:
+    """The constants as the kernels have them; `gyration` [m] weighs torques."""
+    out = kernels.ForceModel()
+    out.stiffness, out.viscous, out.friction, out.leak = STIFFNESS, VISCOUS, FRICTION, LEAK
+    out.mismatch, out.gyration, out.tolerance = mismatch, gyration, TOLERANCE_N
+    out.damping, out.rate, out.warmup = DAMPING, FORCE_RATE, float(WARMUP)
+    return out
+
+
+def _retreated(pair: Pair, starts: HandState) -> HandState:
+    back = quat_rotate(starts.rotation, pair.hand.model.palm.approach)
+    return HandState(starts.pivot - BACKOFF_M * back, starts.rotation, starts.q)
+
+
+class _Batch:
+    """Arrays and launches of a batch."""
+
+    def __init__(self, search: Search, starts: HandState, steps: int) -> None:
+        pair, n = search.pair, len(starts.pivot)
+        self.grid, self.n = search.grid, n
+        self.model = Model.create(pair.hand, pair.fine.obj, search.points, pair.coarse.own, pair.options)
+        self.data = Data(self.model, n)
+        self.device = self.model.device
+        self.physics = physics_of(pair.fine.obj.model.gyration_radius)
+        velocity = SPEED * np.array([[0.0, 0, 0], [1, 1, 1], [-1, -1, -1]])
+        wanted = np.concatenate([MASS / STEP_S * velocity, np.zeros((3, 3))], axis=1)
+        self.wanted = wanted
+        with wp.ScopedDevice(self.device):
+            self.velocity = wp.array(velocity, dtype=wp.vec3)
+            self.task = wp.array(wanted, dtype=kernels.vec6)
+            shape = (n, POINTS, 3)
+            self.force, self.first, self.largest = (wp.zeros(shape, dtype=wp.vec3) for _ in range(3))
+            self.total, self.pull = (wp.zeros((n, 3), dtype=kernels.vec6) for _ in range(2))
+            self.multiplier, self.gap = (wp.zeros((n, 3), dtype=wp.float32) for _ in range(2))
+        self.data.set_schedule(schedule(steps))
+        self.data.set_state(starts)
+        self.data.dilation_scale.assign(self._first_dilation())
+        self.launches = self._record()
+
+    def _first_dilation(self) -> NDArray[np.float32]:
+        """(n,) share of `MAX_DILATION` at which the dilated object is `APART_M` from each hand."""
+        m, d, poses = self.model, self.data, Launches(self.device)
+        add_poses(poses, m, d)
+        poses.run()
+        with wp.ScopedDevice(self.device):
+            least = wp.full(self.n, 1e3, dtype=wp.float32)
+            wp.launch(
+                kernels.nearest,
+                (self.n, POINTS),
+                inputs=[self.grid, m.point_body, m.point_position, d.body_p, d.body_q],
+                outputs=[least],
+            )
+            return np.clip((least.numpy() - APART_M) / MAX_DILATION, 0.0, 1.0).astype(np.float32)
+
+    def _record(self) -> Launches:
+        m, d, n, out = self.model, self.data, self.n, Launches(self.device)
+        add_poses(out, m, d)
+        out.add(
+            kernels.multipliers,
+            (n, 3),
+            inputs=[self.physics, self.task, d.active],
+            outputs=[self.total, self.multiplier, self.pull, self.gap],
+        )
+        out.add(
+            kernels.relax,
+            (n, POINTS),
+            inputs=[
+                self.physics,
+                self.grid,
+                self.velocity,
+                m.point_body,
+                m.point_position,
+                d.active,
+                d.iteration,
+                d.schedule.dilation,
+                d.dilation_scale,
+                d.body_p,
+                d.body_q,
+                self.pull,
+            ],
+            outputs=[self.force, self.first, self.largest, self.total, d.wrench],
+        )
+        add_self_penalty(out, m, d, 0.0)
+        add_root_gradient(out, m, d)
+        add_step(out, m, d, "adam", betas=BETAS)
+        return out
+
+    def run(self, iterations: int) -> None:
+        """Launch so many iterations."""
+        self.launches.run(iterations)
+
+    def residual(self) -> Floats:
+        """(n,) largest residual of the moving tasks, 1: as if nothing touched."""
+        return self.gap.numpy()[:, 1:].max(axis=1).astype(float) / float(np.linalg.norm(self.wanted[1]))
+
+
+def distance_grid(obj: DeviceObject, cells: int) -> Any:
+    """A `Surface` whose field has `cells` cells along the longest side of the padded box, sampled from the mesh.
+
+    Distances are exact at the corners; the array lies on the object's device.
+    """
+    model = obj.model
+    low = model.vertices.min(axis=0) - model.centre_of_mass - PAD_M
+    high = model.vertices.max(axis=0) - model.centre_of_mass + PAD_M
+    cell = float((high - low).max()) / cells
+    shape = [int(n) for n in np.ceil((high - low) / cell).astype(int) + 1]
+    reach = float(np.linalg.norm(high - low))
+    flat = surface.Surface()
+    flat.mesh, flat.corner_normals, flat.alpha = obj.surface.mesh, obj.surface.corner_normals, 0.0
+    flat.cells = obj.surface.cells
+    device = obj.device
+    with wp.ScopedDevice(device):
+        field = wp.empty(tuple(shape), dtype=wp.float32)
+        flat.field = wp.zeros((0, 0, 0), dtype=wp.float32)
+
+    def slab(first: int, last: int) -> None:
+        corner = low + np.array([first * cell, 0.0, 0.0])
+        with wp.ScopedDevice(device):
+            wp.launch(
+                surface.sample_field,
+                dim=(last - first, shape[1], shape[2]),
+                inputs=[flat, wp.vec3(*corner), cell, reach],
+                outputs=[field[first:last]],
+                device=device,
+            )
+
+    threads = 1 if wp.get_device(device).is_cuda else available_cores()
+    bounds = np.linspace(0, shape[0], 4 * threads + 1).astype(int)
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(lambda ends: slab(*ends), pairwise(bounds.tolist())))
+    out = surface.Surface()
+    out.mesh, out.corner_normals, out.alpha, out.cells = flat.mesh, flat.corner_normals, 0.0, flat.cells
+    out.field, out.field_origin, out.field_cell = field, wp.vec3(*low), cell
+    out.field_error = 0.5 * cell
+    return out

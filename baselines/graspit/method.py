@@ -1,0 +1,286 @@
+"""GraspIt!'s annealing: a chain for each grasp over eigengrasps, then autograsp from the chain's best state.
+
+Virtual contacts are few places of a hand: two on each link's inside, and on the palm. GraspIt! ships them as files for
+its own hands; here they are found for any hand.
+
+GraspIt! has eigengrasps for Barrett (spread; all fingers) and the human hand (flexion of the knuckles with a little of
+the joints beyond; the knuckles against the joints beyond), none for Allegro or Shadow. Here a hand whose fingers have
+one closing dof each gets Barrett's, any other the human hand's, by a joint's place along its finger.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from pydantic import Field
+
+from graspd.baselines.autograsp import kernels as closing_kernels
+from graspd.baselines.autograsp.method import Closer
+from graspd.baselines.common import Kept, grasp_set, ground_of, inside_points, joined
+from graspd.baselines.graspit import kernels
+from graspd.baselines.graspit.schedule import FIRST_STEP
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import Floats, quat_from_matrix
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.kinematics import ancestors
+from graspd.worker.hands.model import HandModel, SurfacePoints
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fast_graspd.pairs import Pair
+from graspd.worker.planners.port import Method, Options, Planner, Wanted
+from graspd.worker.planners.threads import Steps, cut, run_parts
+from graspd.worker.run import Run
+from graspd.worker.simulation.data import Data, HandState
+from graspd.worker.simulation.device import to_wxyz, to_xyzw
+from graspd.worker.simulation.model import body_points
+from graspd.worker.simulation.record import record_placement
+
+
+class Search:
+    """Simulated annealing of one hand on one object; chains share all but their states."""
+
+    def __init__(self, pair: Pair) -> None:
+        self.pair, self.hand = pair, pair.hand.model
+        self.device = pair.hand.device
+        self.eigen = eigengrasps(self.hand)
+        with wp.ScopedDevice(self.device):
+            self.problem = self._problem()
+
+    def _problem(self) -> Any:
+        hand, obj, contacts = self.hand, self.pair.fine.obj, virtual_contacts(self.hand)
+        out = kernels.Problem()
+        out.tree, out.surface, out.pieces = self.pair.hand.tree, obj.surface, self.pair.hand.pieces
+        out.points = body_points(self.pair.fine.points, hand.bodies)
+        out.samples, out.bvh = obj.samples, obj.bvh.id
+        out.contact_body = wp.array(contacts.body, dtype=wp.int32)
+        out.contact_position = wp.array(contacts.position, dtype=wp.vec3)
+        out.contact_normal = wp.array(contacts.normal, dtype=wp.vec3)
+        bounds = np.array([*PLACE, *ANGLES, *self.eigen.limits])
+        jumps = [PLACE_JUMP] * 3 + list(ANGLE_JUMPS) + list(np.ptp(self.eigen.limits, axis=1) / 4)
+        out.low, out.high = kernels.vec8(*bounds[:, 0]), kernels.vec8(*bounds[:, 1])
+        out.jump, out.circular = kernels.vec8(*jumps), PHI
+        out.palm = wp.quat(*to_xyzw(_approach_frame(hand)))
+        out.origin = wp.array(self.eigen.origin, dtype=wp.float32)
+        out.eigen = wp.array(self.eigen.directions, dtype=wp.float32)
+        out.lower, out.upper = self.pair.hand.lower, self.pair.hand.upper
+        out.clash = wp.array(clash_grid(self.pair, self.eigen), dtype=wp.int32)
+        return out
+
+    def run(self, seeds: list[list[int]], *, steps: int, keep: int, tell: Steps) -> HandState:
+        """The `keep` best states of each chain, best first, those of a chain side by side.
+
+        Args:
+            seeds: of the chains' random numbers.
+            steps: counter of the schedule at which a chain ends.
+            keep: length of the list of best states.
+            tell: told one unit of work per move.
+
+        Raises:
+            InputError: no place for the hand around the object.
+            TaskCancelled: through `tell`.
+        """
+        chains = len(seeds)
+        random = np.array([np.random.SeedSequence(seed).generate_state(1)[0] for seed in seeds], np.uint32)
+        with wp.ScopedDevice(self.device):
+            rng = wp.array(random, dtype=wp.uint32)
+            state, energy = wp.zeros(chains, dtype=kernels.vec8), wp.zeros(chains, dtype=wp.float32)
+            counter = wp.full(chains, FIRST_STEP, dtype=wp.int32)
+            best = wp.zeros((chains, keep), dtype=kernels.vec8)
+            best_energy = wp.full((chains, keep), NOT_YET, dtype=wp.float32)
+            scratch = [wp.zeros((chains, self.hand.bodies), dtype=kind) for kind in (wp.vec3, wp.quat)]
+            wp.launch(kernels.begin, chains, inputs=[self.problem, START_TRIES], outputs=[rng, state, energy, *scratch])
+            if (energy.numpy() < 0).any():
+                raise InputError(f"{self.hand.name} finds no free place around {self.pair.fine.obj.model.name}")
+            tell(0, "starts")
+            begun, done = state.numpy(), 0
+            for _ in range(0, max(0, PATIENCE * (steps - FIRST_STEP)), ROUNDS):
+                wp.launch(
+                    kernels.anneal,
+                    chains,
+                    inputs=[self.problem, ROUNDS, steps, ALIKE],
+                    outputs=[counter, rng, state, energy, best, best_energy, *scratch],
+                )
+                now = int((counter.numpy() - FIRST_STEP).sum())
+                tell(now - done, "annealing")
+                done = now
+                if now >= chains * (steps - FIRST_STEP):
+                    break
+            return self._hands(_sorted(best.numpy(), best_energy.numpy(), begun))
+
+    def _hands(self, states: Floats) -> HandState:
+        n = len(states)
+        pivot, rotation = wp.zeros(n, dtype=wp.vec3), wp.zeros(n, dtype=wp.quat)
+        q = wp.zeros((n, self.hand.dofs), dtype=wp.float32)
+        given = wp.array(states, dtype=kernels.vec8)
+        wp.launch(kernels.unpack, n, inputs=[self.problem, given], outputs=[pivot, rotation, q])
+        return HandState(pivot.numpy().astype(float), to_wxyz(rotation.numpy().astype(float)), q.numpy().astype(float))
+
+
+_searches: Final = Kept(Search)
+
+
+class GraspitOptions(Options):
+    """Options of `graspit`."""
+
+    steps: int = Field(
+        70_000, gt=FIRST_STEP, le=1_000_000, description=f"step at which annealing ends; it counts from {FIRST_STEP}"
+    )
+    keep: int = Field(1, ge=1, le=20, description="grasps taken from the list of best states of each chain")
+
+
+class Graspit:
+    """See `worker.planners.Planner`."""
+
+    def __init__(self, options: GraspitOptions) -> None:
+        self.options = options
+
+    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
+        began = time.perf_counter()
+        pair = ground_of(hand, obj, run.device, kernels, closing_kernels)
+        search = _searches(pair)
+        keep, moves = self.options.keep, self.options.steps - FIRST_STEP
+        chains = -(-wanted.count // keep)
+        steps = Steps(chains * moves, run)
+
+        def work(indices: range) -> HandState:
+            seeds = [[wanted.seed, wanted.batch, chain] for chain in indices]
+            state = search.run(seeds, steps=self.options.steps, keep=keep, tell=steps)
+            return Closer(pair, len(state.pivot)).close(state).state
+
+        states = joined(run_parts(cut(chains, run), work))
+        return grasp_set(pair, states[: wanted.count], began, {"chains": chains, "moves": moves})
+
+
+def _planner(options: GraspitOptions) -> Planner:
+    return Graspit(options)
+
+
+METHOD: Final = Method(
+    summary="simulated annealing over eigengrasps with contact energy, then autograsp",
+    source="M. T. Ciocarlie and P. K. Allen, Hand posture subspaces for dexterous robotic grasping, IJRR 2009",
+    planner=_planner,
+    options=GraspitOptions,
+    uses=("face_error_m",),
+    quick={"steps": FIRST_STEP + 400},
+)
+#: Bounds of the palm's place about the object's centre of mass [m] and its largest jump (GraspIt!'s, in mm there).
+PLACE: Final = ((-0.25, 0.25), (-0.25, 0.25), (-0.25, 0.35))
+PLACE_JUMP: Final = 0.15
+#: theta, phi, alpha: axis and angle of the rotation; phi wraps around.
+ANGLES: Final = ((0.0, np.pi), (-np.pi, np.pi), (0.0, np.pi))
+ANGLE_JUMPS: Final = (np.pi / 5, np.pi / 2, np.pi / 2)
+PHI: Final = 4
+#: Postures a side at which the hand is tested against itself, and the overlap real hand models have at rest [m].
+CLASH_GRID: Final = 49
+CLASH_M: Final = 2e-3
+#: Uniform draws for a legal start, and rounds between two looks at cancellation.
+START_TRIES: Final = 5000
+ROUNDS: Final = 500
+#: Rounds without a free neighbour count too, up to so many times the moves.
+PATIENCE: Final = 3
+#: Two states of the list are alike below this (GraspIt!).
+ALIKE: Final = 0.2
+NOT_YET: Final = 1e9
+#: Contacts on each link that closes, and on the palm.
+EACH: Final = 2
+ON_PALM: Final = 3
+
+
+def clash_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
+    """(CLASH_GRID, CLASH_GRID): 1 where the posture of these amplitudes overlaps itself by more than `CLASH_M`."""
+    axes = [np.linspace(low, high, CLASH_GRID) for low, high in eigen.limits]
+    amplitudes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    q = eigen.posture(amplitudes, pair.hand.model)
+    n = len(q)
+    model = pair.model(pair.coarse)
+    data = Data(model, n)
+    # Far from the object only the hand itself can be hit.
+    data.set_state(HandState(np.tile([9.0, 0, 0], (n, 1)), np.tile([1.0, 0, 0, 0], (n, 1)), q))
+    record_placement(model, data).run()
+    depth = data.depths.links.numpy()[:n]
+    return (depth > CLASH_M).astype(np.int32).reshape(CLASH_GRID, CLASH_GRID)
+
+
+def _approach_frame(hand: HandModel) -> Floats:
+    """Quaternion w x y z from the frame with z along the approach to the root frame."""
+    z = hand.palm.approach
+    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
+    x /= np.linalg.norm(x)
+    return quat_from_matrix(np.column_stack([x, np.cross(z, x), z]))
+
+
+def _sorted(best: Floats, energy: Floats, begun: Floats) -> Floats:
+    """(chains * keep, 8) best states first; what a chain did not find is its best again, or where it began."""
+    out = np.empty_like(best)
+    for c, (states, energies) in enumerate(zip(best, energy, strict=True)):
+        found = [k for k in np.argsort(energies, kind="stable") if energies[k] < NOT_YET / 2]
+        rows = [states[k] for k in found] or [begun[c]]
+        out[c] = [rows[min(k, len(rows) - 1)] for k in range(len(states))]
+    return out.reshape(-1, best.shape[-1])
+
+
+def virtual_contacts(hand: HandModel) -> SurfacePoints:
+    """Points with normals; none on links that neither close nor carry the palm."""
+    return inside_points(hand, each=EACH, on_palm=ON_PALM)
+
+
+#: Weights of a finger's first, second and later closing joints in the human hand's eigengrasps.
+FLEXION: Final = (1.0, 0.3, 0.15)
+SECOND: Final = (-1.0, 1.0, 0.3)
+#: Where closing joints stand in the mean posture, as a share of their range (Barrett's origin: 0.79 of 2.44 rad).
+ORIGIN: Final = 0.33
+#: Largest amplitude.
+AMPLITUDE: Final = 4.0
+
+
+@dataclass(frozen=True)
+class Eigengrasps:
+    """Postures q = origin + amplitudes @ directions, inside the joint limits."""
+
+    origin: Floats
+    """(D,)"""
+    directions: Floats
+    """(2, D)"""
+    limits: Floats
+    """(2, 2) least and largest amplitude of each: beyond them no joint moves any more."""
+
+    def posture(self, amplitudes: Floats, hand: HandModel) -> Floats:
+        """(n, D) for amplitudes (n, 2)."""
+        return np.clip(self.origin + np.asarray(amplitudes) @ self.directions, hand.lower, hand.upper)
+
+
+def places(hand: HandModel) -> NDArray[np.int32]:
+    """(D,) how many closing dofs stand between a closing dof and the palm; -1 for dofs that do not close."""
+    moved = ancestors(hand)
+    first = [int(np.flatnonzero(hand.dof == d)[0]) for d in range(hand.dofs)]
+    out = np.full(hand.dofs, -1, np.int32)
+    for d, body in enumerate(first):
+        if hand.closing[d]:
+            before = {int(hand.dof[k]) for k in np.flatnonzero(moved[body]) if k > 0} - {d}
+            out[d] = sum(hand.closing[e] != 0 for e in before)
+    return out
+
+
+def eigengrasps(hand: HandModel) -> Eigengrasps:
+    """The two eigengrasps of a hand."""
+    place, closing = places(hand), np.asarray(hand.closing, float)
+    closes = closing != 0
+    if place.max() <= 0:
+        directions = np.array([(~closes).astype(float), closing])
+        if not directions[0].any():  # no spread: the first eigengrasp would be empty
+            directions[0] = closing * np.where(np.arange(hand.dofs) % 2, -1.0, 1.0)
+    else:
+        row = np.clip(place, 0, 2)
+        directions = np.array([closing * np.array(weights)[row] * closes for weights in (FLEXION, SECOND)])
+    opened, span = np.where(closing >= 0, hand.lower, hand.upper), hand.upper - hand.lower
+    origin = np.where(closes, opened + ORIGIN * span * np.where(closing >= 0, 1, -1), (hand.lower + hand.upper) / 2)
+    limits = np.zeros((2, 2))
+    for i, direction in enumerate(directions):
+        moving = direction != 0
+        ends = np.stack([hand.lower - origin, hand.upper - origin])[:, moving] / direction[moving]
+        limits[i] = np.clip([ends.min(), ends.max()], -AMPLITUDE, AMPLITUDE)
+    return Eigengrasps(origin, directions, limits)

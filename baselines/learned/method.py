@@ -1,0 +1,258 @@
+"""The method `learned`: a network sees the object's visible points, and its proposals are starts of fast_graspd's
+descent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from graspd.baselines.learned.network import ProposalNetwork, cloud_inputs, conditions, decode, flow
+from graspd.service.model.base import Digest
+from graspd.service.model.errors import InputError, SceneError
+from graspd.service.model.fidelity import Fidelity
+from graspd.service.model.scene_spec import UPRIGHT
+from graspd.service.model.transforms import Floats, compose, cross, invert, quat_conjugate, quat_rotate
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fast_graspd.planner import plan, plan_joined
+from graspd.worker.planners.fast_graspd.scene_starts import ROOM, clear_scene_starts
+from graspd.worker.planners.fast_graspd.starts import CLEAR, Probe
+from graspd.worker.planners.known_networks import keep_file, kept
+from graspd.worker.planners.port import Asked, Method, Options, Wanted
+from graspd.worker.run import Run
+from graspd.worker.simulation.data import HandState
+from graspd.worker.simulation.model import Model
+from graspd.worker.simulation.surroundings import UP, Obstacle, Placed
+
+
+class LearnedOptions(Options):
+    """Which network, and how far it is followed."""
+
+    network: Digest = Field(description="digest of the network; on the command line its file, in a job its name")
+    starts: int = Field(4, ge=1, le=32, description="proposals of each grasp that set out")
+
+
+class Learned:
+    """fast_graspd from a network's proposals."""
+
+    def __init__(self, options: LearnedOptions) -> None:
+        self.options = options
+
+    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
+        """See `worker.planners.Planner`."""
+        return plan(hand, obj, wanted, run, warm=self._seeds(hand))
+
+    def joined(self, hand: HandModel, obj: ObjectModel, asked: Sequence[Asked]) -> list[GraspSet | Exception]:
+        """See `worker.planners.Joined`."""
+        return plan_joined(hand, obj, asked, warm=self._seeds(hand))
+
+    def _seeds(self, hand: HandModel) -> Seeds:
+        network = kept(self.options.network)
+        if network.joint_names != hand.joint_names or network.hand_digest != hand.digest:
+            raise InputError(
+                f"network {self.options.network[:12]} proposes grasps of {network.hand} ({network.hand_digest[:12]}), "
+                f"not of {hand.name} ({hand.digest[:12]})"
+            )
+        return Seeds(network, self.options.starts)
+
+
+METHOD: Final = Method(
+    summary="fast_graspd from the proposals of a network that saw the object on its table",
+    source="unpublished; PointNet, CVPR 2017, and flow matching, ICLR 2023",
+    planner=Learned,
+    joined=lambda options: Learned(options).joined,
+    in_scenes=True,
+    in_parts=True,
+    free=False,
+    options=LearnedOptions,
+    uses=tuple(name for name in Fidelity.model_fields if name not in ("name", "starts")),
+    files={"network": keep_file},
+)
+
+#: Steps back along the way in while something touches [m].
+RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08)
+#: Proposals of a grasp, shared out to its starts: as many as are computed at once.
+PROPOSALS: Final = 32
+#: A palm that is farther from the object's bounding ball is no start [m].
+FAR_M: Final = 0.15
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """A `WarmStart` from the proposals of a network. A start none of whose proposals comes free is one that fast_graspd
+    finds itself."""
+
+    network: ProposalNetwork
+    starts: int
+    """Hands of each grasp that set out."""
+
+    def adapted(self, fidelity: Fidelity) -> Fidelity:
+        """See `WarmStart`."""
+        finalists = min(fidelity.finalists, self.starts)
+        return fidelity.model_copy(update={"starts": self.starts, "finalists": finalists})
+
+    def __call__(
+        self, model: Model, generators: list[np.random.Generator], *, each: int, placed: Placed, ways: Sequence[Floats]
+    ) -> tuple[HandState, Floats]:
+        """See `scene_starts.clear_scene_starts`.
+
+        Raises:
+            SceneError: the scenes have no table.
+        """
+        scene = np.repeat(placed.index, each)
+        drawn, away = self._proposed(model, generators, each, placed)
+        state, depth = _clear(model, drawn, away, scene, placed)
+        rest = np.flatnonzero(depth > CLEAR)
+        if len(rest):
+            own, depth[rest] = clear_scene_starts(
+                model, [generators[i] for i in rest], each=1, placed=placed.take(rest // each), ways=ways
+            )
+            state.pivot[rest], state.rotation[rest], state.q[rest] = own.pivot, own.rotation, own.q
+        return state, depth
+
+    def _proposed(
+        self, model: Model, generators: list[np.random.Generator], each: int, placed: Placed
+    ) -> tuple[HandState, Floats]:
+        """Hands (n * draws) as proposed, open, those of a start side by side, and (n * draws, 3) ways out; object
+        frame."""
+        hand, obj, table = model.hand.model, model.obj.model, table_height(placed.supports)
+        seen, draws = Seen.of(obj), max(1, PROPOSALS // each)
+        pivot, rotation, q, away = [], [], [], []
+        for number, scene in enumerate(placed.index.tolist()):
+            mine = generators[number * each : (number + 1) * each]
+            pose = np.asarray(placed.object_pose[scene], float)
+            cloud = seen.cloud(pose, seen.camera(pose, mine[0]), self.network.points, mine[0])
+            inputs, anchor = cloud_inputs(*cloud, table)
+            condition = conditions(self.network, inputs[None], anchor[2:] - table)
+            # A grasp's proposals are computed apart from those of others, so that they cannot depend on these.
+            noise = np.concatenate([g.standard_normal((draws, self.network.numbers)) for g in mine])
+            rows = flow(self.network, noise.astype(np.float32), np.repeat(condition, len(noise), axis=0))
+            found = decode(rows, anchor)
+            at = compose(invert(pose), found.hand_pose)
+            pivot.append(at[:, :3] + quat_rotate(at[:, 3:], hand.palm.centre) - obj.centre_of_mass)
+            rotation.append(at[:, 3:])
+            q.append(np.clip(hand.reduce(found.pregrasp), hand.lower, hand.upper))
+            away.append(-quat_rotate(quat_conjugate(pose[3:]), found.approach))
+        return HandState(*map(np.concatenate, (pivot, rotation, q))), np.concatenate(away)
+
+
+def table_height(supports: Sequence[Obstacle]) -> float:
+    """z of the table among the supports of a scene [m].
+
+    Raises:
+        SceneError: there is none: no half-space below a level plane.
+    """
+    heights = [float(o.planes[0, 3]) for o in supports if len(o.planes) == 1 and o.planes[0, :3] @ UP > UPRIGHT]
+    if not heights:
+        raise SceneError("method learned proposes grasps of things on a table; this scene has none, choose fast_graspd")
+    return max(heights)
+
+
+def _clear(
+    model: Model, drawn: HandState, away: Floats, scene: NDArray[np.intp], placed: Placed
+) -> tuple[HandState, Floats]:
+    """Of the hands of each start (n) the one that is clear at the fewest steps back, and its depth (n,) [m]; inf where
+    there is none. What a hand lacks of its room from obstacles it is raised first."""
+    count, probe = len(scene), Probe(model, len(scene), room=ROOM)
+    draws = len(drawn.pivot) // count
+    near = (np.linalg.norm(drawn.pivot, axis=1) < model.obj.model.radius + FAR_M).reshape(count, draws)
+    up = np.array([s.up for s in placed.scenes])[scene]
+    raised = np.zeros_like(drawn.pivot)
+    for draw in range(draws):
+        rows = np.arange(count) * draws + draw
+        probe.data.set_scenes(scene)
+        probe.depths(drawn[rows])
+        raised[rows] = probe.data.depths.obstacles.numpy()[:count, None].astype(float) * up
+    best, depth = drawn[np.arange(count) * draws], np.full(count, np.inf)
+    for back, draw in product(RETREATS, range(draws)):
+        left = np.flatnonzero((depth > CLEAR) & near[:, draw])
+        if not len(left):
+            continue
+        rows = left * draws + draw
+        states = drawn[rows]
+        states.pivot[:] += raised[rows] + back * away[rows]
+        probe.data.set_scenes(scene[left])
+        found = probe.depths(states)
+        clear = np.flatnonzero(found <= CLEAR)
+        taken = left[clear]
+        depth[taken] = found[clear]
+        best.pivot[taken], best.rotation[taken], best.q[taken] = (
+            part[clear] for part in (states.pivot, states.rotation, states.q)
+        )
+    return best, depth
+
+
+#: Elevation of a camera above the table [rad]; share of its field of view (half of it [rad]) that the object's bounding
+#: ball fills; nearest distance of the ball [m]: as pictures of a job have them.
+ELEVATION: Final = (np.radians(18.0), np.radians(62.0))
+HALF_FIELD: Final = np.radians(20.0)
+FILL: Final = (0.7, 1.0)
+NEAREST_M: Final = 0.25
+#: Points of the surface, and pixels across the bounding ball, each of which shows the nearest point in it: about five
+#: visible ones fall into each, so that little shows through where a thing is hollow.
+DENSE: Final = 32768
+PIXELS: Final = 48
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The surface of an object as cameras look at it."""
+
+    obj: ObjectModel
+    points: Floats
+    """(DENSE, 3) in the object frame [m]."""
+    normals: Floats
+    """(DENSE, 3) unit, outward."""
+
+    @classmethod
+    def of(cls, obj: ObjectModel) -> Seen:
+        """Points even over the area, the same for the same object."""
+        rng = np.random.default_rng(0)
+        corners = obj.vertices[obj.faces]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(cross, axis=1)
+        sums = np.cumsum(area)
+        face = np.minimum(np.searchsorted(sums, sums[-1] * rng.random(DENSE)), len(area) - 1)
+        u, v = rng.random((2, DENSE, 1))
+        u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+        a, b, c = np.moveaxis(corners[face], 1, 0)
+        return cls(obj, a + u * (b - a) + v * (c - a), cross[face] / np.maximum(area[face, None], 1e-20))
+
+    def camera(self, pose: Floats, rng: np.random.Generator) -> Floats:
+        """(3,) where a camera that looks at the object at `pose` (7,), z up, stands [m]."""
+        azimuth, fill = rng.uniform(0, 2 * np.pi), rng.uniform(*FILL)
+        elevation = np.arcsin(rng.uniform(*np.sin(ELEVATION)))  # even over the sphere
+        level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        toward = np.cos(elevation) * level + np.sin(elevation) * np.array([0, 0, 1.0])
+        distance = max(NEAREST_M + self.obj.radius, self.obj.radius / np.sin(fill * HALF_FIELD))
+        return np.asarray(self._middle(pose) + distance * toward)
+
+    def cloud(self, pose: Floats, camera: Floats, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+        """Points and normals (count, 3) of the object at `pose` (7,) that a camera sees: one a pixel, of which `count`
+        are drawn."""
+        points, normals = quat_rotate(pose[3:], self.points) + pose[:3], quat_rotate(pose[3:], self.normals)
+        rays = points - camera
+        facing = np.flatnonzero((normals * rays).sum(axis=1) < 0)
+        toward = camera - self._middle(pose)
+        distance = float(np.linalg.norm(toward))
+        toward = toward / distance
+        right = cross(np.array([0, 0, 1.0]), toward)
+        right = right / np.linalg.norm(right)
+        depth = -(rays[facing] @ toward)
+        slopes = np.stack([rays[facing] @ right, rays[facing] @ cross(toward, right)], axis=1) / depth[:, None]
+        widest = np.tan(np.arcsin(self.obj.radius / distance))
+        pixel = np.clip((0.5 * (slopes / widest + 1) * PIXELS).astype(int), 0, PIXELS - 1) @ np.array([1, PIXELS])
+        order = np.lexsort((depth, pixel))
+        shown = facing[order[np.unique(pixel[order], return_index=True)[1]]]
+        drawn = shown[rng.choice(len(shown), count, replace=len(shown) < count)]
+        return points[drawn], normals[drawn]
+
+    def _middle(self, pose: Floats) -> Floats:
+        return np.asarray(quat_rotate(pose[3:], self.obj.centre_of_mass) + pose[:3])

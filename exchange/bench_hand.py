@@ -1,0 +1,328 @@
+"""A hand as DexGraspBench keeps it: an MJCF model with position actuators, its configuration, and the map of its
+joints.
+
+The model's world frame is the frame of our root link, so `qpos` begins with our pose of it. Bodies are named
+`root_<link>` and `f<number of the finger>_<link>`: the evaluator finds fingers by the beginning of a body's name.
+"""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ElementTree
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Final
+from xml.etree.ElementTree import Element, SubElement
+
+import mujoco
+import numpy as np
+from pydantic_core import from_json
+
+from graspd.exchange.imported import write_obj
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
+from graspd.worker.hands.model import ConvexPiece, HandModel, JointType
+
+#: Joint damping over position gain [s]: that of DexGraspBench's Allegro hand.
+_DAMPING_TIME: Final = 0.02
+#: A coupling is stiffer than a contact, or a pressed finger would stretch it.
+_COUPLING: Final = {"solref": "0.008 1", "solimp": "0.98 0.999 0.0001 0.5 2"}
+_BARE: Final = {"mass": 1e-3, "radius": 0.01}
+_COLOUR: Final = (0.87, 0.45, 0.2, 1.0)
+
+
+def write_hand(hand: HandModel, config: str, root: Path) -> Path:
+    """Write model and configuration of a hand below `root`, which stands for a checkout of DexGraspBench.
+
+    Args:
+        hand: the hand.
+        config: name of the configuration, `hand=...` of the evaluator.
+
+    Returns:
+        the model's file, relative to `root`.
+    """
+    folder = Path("assets") / "hand" / config
+    (root / folder / "meshes").mkdir(parents=True, exist_ok=True)
+    for number, piece in enumerate(hand.pieces):
+        if piece.kind == "hull":
+            write_obj(root / folder / "meshes" / f"piece_{number:03}.obj", piece.vertices, piece.faces)
+    tree = _model(hand)
+    ElementTree.indent(tree)
+    (root / folder / "hand.xml").write_text(ElementTree.tostring(tree, encoding="unicode") + "\n")
+    (root / "config" / "hand").mkdir(parents=True, exist_ok=True)
+    (root / "config" / "hand" / f"{config}.yaml").write_text(_configuration(hand, folder / "hand.xml"))
+    return folder / "hand.xml"
+
+
+def joint_order(file: Path) -> tuple[str, ...]:
+    """Joints of a model in the order of its `qpos`: MuJoCo's own, not the URDF's."""
+    model = mujoco.MjModel.from_xml_path(str(file))
+    return tuple(model.joint(number).name for number in range(model.njnt))
+
+
+def body_names(hand: HandModel) -> tuple[str, ...]:
+    """Name of each body in the model."""
+    return tuple(f"{'root' if b == 0 else _finger(hand, b)}_{name}" for b, name in enumerate(hand.body_names))
+
+
+def _finger(hand: HandModel, body: int) -> str:
+    """The finger that a body belongs to: the root's child above it."""
+    while hand.parent[body] > 0:
+        body = int(hand.parent[body])
+    return f"f{np.flatnonzero(hand.parent == 0).tolist().index(body)}"
+
+
+def _configuration(hand: HandModel, model: Path) -> str:
+    """JSON values are YAML as they are."""
+    names = body_names(hand)
+    fingers = [f"{_finger(hand, int(b))}_" for b in np.flatnonzero(hand.parent == 0)]
+    values: dict[str, Any] = {
+        "xml_path": model.as_posix(),
+        "mocap": True,
+        "exclude_table_contact": None,
+        "tendon": None,
+        "color": list(_COLOUR),
+        "finger_prefix": fingers,
+        "valid_body_name": list(names),
+        "tip_body_name": [names[b] for b in hand.fingertips],
+    }
+    return "".join(f"{key}: {json.dumps(value)}\n" for key, value in values.items())
+
+
+def _model(hand: HandModel) -> Element:
+    top = Element("mujoco", model=hand.name)
+    SubElement(top, "compiler", angle="radian", meshdir="meshes", autolimits="true")
+    assets, world = SubElement(top, "asset"), SubElement(top, "worldbody")
+    names, bodies = body_names(hand), list[Element]()
+    for b in range(hand.bodies):
+        if b == 0:
+            body = SubElement(world, "body", name=names[0])
+        else:
+            pose = hand.origin[b]
+            above = bodies[int(hand.parent[b])]
+            body = SubElement(above, "body", name=names[b], pos=_text(pose[:3]), quat=_text(pose[3:]))
+            _add_joint(body, hand, b)
+        bodies.append(body)
+        _add_solids(body, assets, hand, b)
+    _add_exclusions(SubElement(top, "contact"), hand, names)
+    if hand.tendons:
+        _add_tendons(SubElement(top, "tendon"), hand)
+    _add_drives(SubElement(top, "equality"), SubElement(top, "actuator"), hand)
+    return top
+
+
+def _joint_of(hand: HandModel, body: int) -> str:
+    return hand.joint_names[hand.joint_body.tolist().index(body)]
+
+
+def _add_joint(body: Element, hand: HandModel, b: int) -> None:
+    d, m, shift = int(hand.dof[b]), float(hand.multiplier[b]), float(hand.offset[b])
+    ends = sorted((m * float(hand.lower[d]) + shift, m * float(hand.upper[d]) + shift))
+    SubElement(
+        body,
+        "joint",
+        name=_joint_of(hand, b),
+        axis=_text(hand.axis[b]),
+        range=_text(ends),
+        type="hinge" if hand.joint_type[b] == JointType.REVOLUTE else "slide",
+        damping=_text([_DAMPING_TIME * float(hand.stiffness[d])]),
+    )
+
+
+def _add_solids(body: Element, assets: Element, hand: HandModel, b: int) -> None:
+    mass = max(float(hand.masses[b]), _BARE["mass"])
+    mine = [(number, piece) for number, piece in enumerate(hand.pieces) if piece.body == b]
+    if not mine:
+        inertia = 0.4 * mass * _BARE["radius"] ** 2
+        SubElement(body, "inertial", pos="0 0 0", mass=_text([mass]), diaginertia=_text([inertia] * 3))
+        return
+    share = np.array([float(np.prod(np.ptp(piece.vertices, axis=0))) for _, piece in mine])
+    for (number, piece), part in zip(mine, share / share.sum(), strict=True):
+        geom = SubElement(body, "geom", {"mass": _text([mass * float(part)]), **_shape(piece, number)})
+        if piece.kind == "hull":
+            geom.set("mesh", f"piece_{number:03}")
+            SubElement(assets, "mesh", name=f"piece_{number:03}", file=f"piece_{number:03}.obj")
+
+
+def _shape(piece: ConvexPiece, number: int) -> dict[str, str]:
+    if piece.kind == "hull":
+        return {"name": f"piece_{number:03}", "type": "mesh"}
+    size = [0.5 * extent for extent in piece.size]
+    if piece.kind != "box":
+        # Radius, then half the length.
+        size = [piece.size[0], *(0.5 * length for length in piece.size[1:])]
+    place = {"pos": _text(piece.pose[:3]), "quat": _text(piece.pose[3:])}
+    return {"name": f"piece_{number:03}", "type": piece.kind, "size": _text(size), **place}
+
+
+def _add_exclusions(contact: Element, hand: HandModel, names: tuple[str, ...]) -> None:
+    """Neighbours, and parents with their children: these touch by design."""
+    pairs = set(hand.neighbours) | {(int(hand.parent[b]), b) for b in range(1, hand.bodies)}
+    for a, b in sorted(pairs):
+        SubElement(contact, "exclude", body1=names[a], body2=names[b])
+
+
+def _add_drives(equality: Element, actuators: Element, hand: HandModel) -> None:
+    """A position actuator on the first joint of each degree of freedom; the others are coupled to that joint. Dofs on a
+    tendon have one on it."""
+    pulled = {d: tendon for tendon in hand.tendons for d in tendon.dofs}
+    for d, name in enumerate(hand.dof_names):
+        if (tendon := pulled.get(d)) is not None:
+            if d == min(tendon.dofs):
+                limit = tendon.limit(hand.effort)
+                SubElement(
+                    actuators,
+                    "position",
+                    name=name,
+                    tendon=tendon.name,
+                    kp=_text([tendon.gain(hand.stiffness)]),
+                    forcerange=_text([-limit, limit]),
+                )
+            continue
+        lead, *others = [int(b) for b in hand.joint_body if hand.dof[b] == d]
+        m = float(hand.multiplier[lead])
+        limit = float(hand.effort[d]) / abs(m)
+        SubElement(
+            actuators,
+            "position",
+            name=name,
+            joint=_joint_of(hand, lead),
+            kp=_text([float(hand.stiffness[d]) / m**2]),
+            forcerange=_text([-limit, limit]),
+        )
+        for b in others:
+            ratio = float(hand.multiplier[b]) / m
+            start = float(hand.offset[b]) - ratio * float(hand.offset[lead])
+            pair = {"joint1": _joint_of(hand, b), "joint2": _joint_of(hand, lead)}
+            SubElement(equality, "joint", {**pair, "polycoef": _text([start, ratio, 0, 0, 0]), **_COUPLING})
+
+
+def _add_tendons(tendons: Element, hand: HandModel) -> None:
+    for tendon in hand.tendons:
+        fixed = SubElement(tendons, "fixed", name=tendon.name)
+        for d, pull in zip(tendon.dofs, tendon.coefficients, strict=True):
+            SubElement(fixed, "joint", joint=hand.dof_names[d], coef=_text([pull]))
+
+
+def _text(values: Any) -> str:
+    return " ".join(f"{float(value):.12g}" for value in values)
+
+
+#: Folder of the grasps of an experiment; the mapping lies beside it.
+GRASPS: Final = "graspdata"
+#: Folder of grasps that were collected for training.
+COLLECTED: Final = "succ_collect"
+FILE: Final = "hand_mapping.json"
+#: Folders of files with the same fields: grasps, and what the evaluator makes of them.
+_FOLDERS: Final = (GRASPS, COLLECTED, "evaluation", "succgrasp")
+
+
+@dataclass(frozen=True)
+class HandMapping:
+    """`qpos` = pose of the model's root (7,), then its joints in its own order."""
+
+    hand: str
+    root_link: str
+    """Our root, a link of the URDF."""
+    config: str
+    """Configuration of the benchmark that names the model: `hand=...`."""
+    model: str
+    root_in_model: tuple[float, ...]
+    """(7,) pose of our root link in the frame that `qpos` begins with the pose of; m, w x y z."""
+    joints: tuple[tuple[str, str], ...]
+    """(model's joint, URDF's joint) in the order of `qpos`; angles are the same."""
+    links: tuple[tuple[str, str], ...] = ()
+    """(model's body, URDF's link)"""
+
+    def qpos(self, hand: HandModel, root: Floats, joints: Floats) -> Floats:
+        """(7 + J,) from our root's pose (7,) and our joints (J,)."""
+        return np.concatenate([compose(root, invert(np.array(self.root_in_model))), joints[self._order(hand)]])
+
+    def posture(self, hand: HandModel, qpos: Floats) -> tuple[Floats, Floats]:
+        """Our root's poses (N, 7) and our joints (N, J) from (N, 7 + J)."""
+        joints = np.empty_like(qpos[:, 7:])
+        joints[:, self._order(hand)] = qpos[:, 7:]
+        return compose(qpos[:, :7], np.array(self.root_in_model)), joints
+
+    def _order(self, hand: HandModel) -> list[int]:
+        names = [ours for _, ours in self.joints]
+        if hand.root_link != self.root_link or sorted(names) != sorted(hand.joint_names):
+            raise InputError(
+                f"the grasps are of {self.hand} from {self.root_link!r} on with {len(names)} joints, {hand.name} "
+                f"begins at {hand.root_link!r} and has {len(hand.joint_names)}; is --hand the right hand?"
+            )
+        return [hand.joint_names.index(name) for name in names]
+
+    def write(self, folder: Path) -> None:
+        """As JSON for people and programs."""
+        said = asdict(self) | {"unit": "m, rad", "quaternion": "w x y z", "qpos": "root position, quaternion, joints"}
+        (folder / FILE).write_text(json.dumps(said, indent=1) + "\n")
+
+
+def mapping_of(file: Path) -> HandMapping | None:
+    """The mapping that lies beside the folder of a grasp's file; None where there is none.
+
+    Raises:
+        InputError: it is there and cannot be read.
+    """
+    for above in file.resolve().parents:
+        if above.name in _FOLDERS:
+            return _read(above.parent / FILE)
+    return None
+
+
+@lru_cache(maxsize=64)
+def _read(path: Path) -> HandMapping | None:
+    if not path.is_file():
+        return None
+    try:
+        said: dict[str, Any] = from_json(path.read_bytes())
+        pose = tuple(float(value) for value in said["root_in_model"])
+        joints, links = (tuple((str(a), str(b)) for a, b in said[key]) for key in ("joints", "links"))
+        hand, root, config, model = (str(said[key]) for key in ("hand", "root_link", "config", "model"))
+    except (ValueError, TypeError, KeyError):
+        raise InputError(f"{path} is no mapping of a hand; export the grasps again or remove it") from None
+    if len(pose) != len(IDENTITY_POSE):
+        raise InputError(f"{path}: root_in_model has {len(pose)} numbers instead of {len(IDENTITY_POSE)}")
+    return HandMapping(hand, root, config, model, pose, joints, links)
+
+
+def link_names(hand: HandModel) -> tuple[tuple[str, str], ...]:
+    """(body of our model, link of the URDF) of every body."""
+    return tuple(zip(body_names(hand), hand.body_names, strict=True))
+
+
+_SHADOW: Final = tuple(
+    f"{finger}J{number}"
+    for finger, count in (("FF", 4), ("MF", 4), ("RF", 4), ("LF", 5), ("TH", 5))
+    for number in range(count, 0, -1)
+)
+_ALLEGRO: Final = tuple(f"{finger}j{number}" for finger in ("ff", "mf", "rf", "th") for number in range(4))
+_ALLEGRO_URDFS: Final = (
+    tuple(f"joint_{number}.0" for number in range(16)),
+    tuple(
+        f"{finger}_{part}"
+        for finger in ("index", "middle", "ring", "thumb")
+        for part in ("rotation" if finger == "thumb" else "abduction", "proximal", "middle", "distal")
+    ),
+)
+#: Their Allegro palm lies turned in the model's world frame: quaternion 0 1 0 1.
+_ALLEGRO_ROOT: Final = (0.0, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, 0.5**0.5)
+#: Their Shadow palm keeps the place that it has above the wrist, which is left out.
+_SHADOW_ROOT: Final = (0.0, 0.0, 0.034, 1.0, 0.0, 0.0, 0.0)
+
+
+def of_the_benchmark(hand: HandModel) -> HandMapping | None:
+    """The mapping onto DexGraspBench's own model of the same hand; None where it has none."""
+    for names in _ALLEGRO_URDFS:
+        if set(names) == set(hand.joint_names) and hand.root_link in ("base_link", "palm"):
+            joints = tuple(zip(_ALLEGRO, names, strict=True))
+            return _theirs(hand, "allegro", _ALLEGRO_ROOT, joints)
+    if set(_SHADOW) == set(hand.joint_names) and hand.root_link == "palm":
+        return _theirs(hand, "shadow", _SHADOW_ROOT, tuple((f"rh_{name}", name) for name in _SHADOW))
+    return None
+
+
+def _theirs(hand: HandModel, config: str, root: tuple[float, ...], joints: tuple[tuple[str, str], ...]) -> HandMapping:
+    return HandMapping(hand.name, hand.root_link, config, f"assets/hand/{config}/right_hand.xml", root, joints)

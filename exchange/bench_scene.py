@@ -1,0 +1,120 @@
+"""Grasps on a table as DexGraspBench's tabletop test takes them, and back.
+
+Frame of all poses in the files: the table's, z up, its top at z = 0; the evaluator has a floor there and nothing else.
+Besides the fields of every grasp: `approach_qpos` (W, 7 + J) from the standoff to the pregrasp with the hand open, and
+`lift_qpos` (7 + J,), the squeeze raised. The evaluator raises a flying hand itself; settings with an arm read them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+import numpy as np
+
+from graspd.exchange.bench_hand import HandMapping
+from graspd.exchange.imported import load_npy
+from graspd.service.model.errors import InputError
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.model import HandModel
+from graspd.worker.scenes.kinds import supports_of
+from graspd.worker.simulation.surroundings import Placed
+
+Row = dict[str, Any]
+
+#: Folder of scenes with a table, and part of the name of an experiment.
+TABLETOP: Final = "tabletop"
+#: Poses that differ by less are one scene, and a floor that does lies at z = 0 [m, and in quaternions].
+SAME: Final = 1e-9
+
+
+def check_table(placed: Placed) -> None:
+    """Raises InputError unless the scenes are a table with its top at z = 0 and nothing else."""
+    table = placed.supports[0].planes if len(placed.supports) == 1 else np.zeros((0, 4))
+    if table.shape != (1, 4) or not np.allclose(table[0], [0, 0, 1, 0], rtol=0, atol=SAME):
+        raise InputError(
+            "DexGraspBench's tabletop test knows a floor at z = 0 and nothing else, the shard's scene is another; "
+            "export grasps that were planned with --scene table"
+        )
+
+
+def tabletop_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, pose: Floats) -> Row:
+    """`approach_qpos` and `lift_qpos` of a grasp whose object stands at `pose` (7,)."""
+    assert grasps.approach is not None, "grasps in scenes have their approach"
+    assert grasps.coming is not None
+    assert grasps.lift is not None
+    way = compose(pose, grasps.approach[row])
+    raised = compose(pose, grasps.lift.hand_pose[row])
+    return {
+        "approach_qpos": np.array([mapping.qpos(hand, at, grasps.coming[row]) for at in way]),
+        "lift_qpos": mapping.qpos(hand, raised, grasps.lift.joint_positions[row]),
+    }
+
+
+def is_tabletop(row: Row) -> bool:
+    """Whether a grasp's file says that its object stands on a table."""
+    return any(part.startswith(TABLETOP) for part in str(row.get("scene_path", "")).split("/"))
+
+
+def placed_of(obj_pose: Floats) -> Placed:
+    """The tables that N grasps are on, which fingertips may touch, from their objects' poses (N, 7): equal ones are one
+    scene."""
+    _, first, index = np.unique(np.round(obj_pose / SAME), axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    number = np.empty(len(order), np.intp)
+    number[order] = np.arange(len(order))
+    return Placed(supports_of(SceneSpec(kind="table")), obj_pose[first[order]], number[index.reshape(-1)])
+
+
+def object_of_scene(file: Path, scene_path: str) -> Row:
+    """`obj_pose` and `obj_scale` of the object that a scene is about.
+
+    Args:
+        file: a grasp's file that names the scene.
+        scene_path: relative to a folder above `file`, and below its `assets`.
+
+    Raises:
+        InputError: it leads elsewhere, there is no such file, or it is no scene.
+    """
+    place = PurePosixPath(scene_path)
+    if place.is_absolute() or ".." in place.parts or place.parts[:1] != ("assets",):
+        raise InputError(f"{file} names the scene {scene_path!r}; a scene lies below assets/")
+    path = next((above / place for above in file.resolve().parents if (above / place).is_file()), None)
+    if path is None:
+        raise InputError(f"{file} names the scene {scene_path}, which is in no folder above; keep assets/ whole")
+    found = load_npy(path)
+    try:
+        thing = found["scene"][found["task"]["obj_name"]]
+        pose, scale = np.ravel(thing["pose"]).astype(float), np.ravel(thing["scale"]).astype(float)
+    except (KeyError, TypeError, ValueError, IndexError):
+        raise InputError(f"{path} is no scene with a task and its object") from None
+    if pose.shape != IDENTITY_POSE.shape or not len(scale) or np.ptp(scale) > SAME:
+        raise InputError(f"{path}: the object has a pose of {pose.size} numbers and the scale {scale.tolist()}")
+    return {"obj_pose": pose, "obj_scale": float(scale[0])}
+
+
+def with_way(
+    hand: HandModel, grasps: GraspSet, rows: Sequence[Row], obj_pose: Floats, mapping: HandMapping | None
+) -> GraspSet:
+    """The grasps with the approach and the lift of their files, in the object frame, where all files have them alike:
+    as many waypoints, and joints that stand still on the way."""
+    if not all({"approach_qpos", "lift_qpos"} <= set(row) for row in rows):
+        return grasps
+    ways = [np.asarray(row["approach_qpos"], float) for row in rows]
+    width = 7 + len(hand.joint_names)
+    if {way.shape for way in ways} != {(len(ways[0]), width)} or np.ptp(ways, axis=1)[:, 7:].max() > SAME:
+        return grasps
+    lifts = np.array([np.ravel(row["lift_qpos"]) for row in rows], float)
+    away = invert(obj_pose)
+
+    def posture(qpos: Floats) -> Posture:
+        root, joints = (qpos[:, :7], qpos[:, 7:]) if mapping is None else mapping.posture(hand, qpos)
+        return Posture(compose(away, root), joints)
+
+    path = [posture(np.array([way[k] for way in ways])) for k in range(len(ways[0]))]
+    grasps.approach = np.stack([at.hand_pose for at in path], axis=1)
+    grasps.coming, grasps.lift = path[-1].joint_positions, posture(lifts)
+    return grasps

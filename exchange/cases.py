@@ -1,0 +1,136 @@
+"""Grasps to evaluate from files: our base shards, published reference grasps, DexGraspBench folders."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.exchange import dexgraspbench, published
+from graspd.service.model.errors import InputError, NotFoundError
+from graspd.service.store.shards import kind_of, open_shard, read_shard
+from graspd.worker.files.provenance import hand_of_shard, object_of_shard, placed_of_shard
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.simulation.surroundings import Placed
+
+#: JSON files beside shards that hold no grasps.
+BESIDE_SHARDS: Final = ("snapshot.json", "subset.json", "card.json")
+
+
+@dataclass(frozen=True)
+class Case:
+    """Grasps of one hand on one object."""
+
+    name: str
+    hand: HandModel
+    obj: ObjectModel
+    grasps: GraspSet
+    friction: float | None = None
+    """Coulomb coefficient the file states for its metrics."""
+    seconds: float | None = None
+    """What making the grasps took, where it is known."""
+    judged: bool = False
+    """Whether those seconds hold the referee's work on them already."""
+    published: NDArray[np.int8] | None = None
+    """(N,) success as published: 1, 0, -1 unknown."""
+    placed: Placed | None = None
+    """The scenes that the grasps were planned in, if any."""
+
+    @property
+    def centred(self) -> Case:
+        """The same about the middle of the object, where measurements do not depend on the file's origin."""
+        return replace(
+            self,
+            obj=self.obj.centred,
+            grasps=self.grasps.moved(np.negative(self.obj.centre)),
+            placed=None if self.placed is None else self.placed.centred(self.obj),
+        )
+
+
+def expand(path: Path) -> list[Path]:
+    """What a path stands for: itself; of a folder without `.npy` files, base shards and reference grasps below it.
+
+    Raises:
+        InputError: a folder without any grasps.
+    """
+    if not path.is_dir() or any(path.rglob("*.npy")):
+        return [path]
+    # Beside shards lie JSON files that tell of them: snapshot.json, subset.json, card.json.
+    shards = (file for file in path.rglob("*.h5") if not _of_scenes(file))
+    found = sorted([*shards, *(file for file in path.rglob("*.json") if file.name not in BESIDE_SHARDS)])
+    if not found:
+        raise InputError(f"{path} has no shards (.h5), reference grasps (.json) or DexGraspBench files (.npy)")
+    return found
+
+
+def _of_scenes(path: Path) -> bool:
+    """Whether a file is a shard of scenes or of views, which has no grasps of its own."""
+    with open_shard(path) as file:
+        return kind_of(file, str(path)) != "base"
+
+
+def load_case(path: Path, *, hand: str | None = None, obj: str | None = None) -> Case:
+    """Read a file or folder of grasps.
+
+    Args:
+        path: a base shard (HDF5), a reference-grasps JSON, or a folder with DexGraspBench `.npy` files.
+        hand: URDF or built-in hand, over what the file says.
+        obj: mesh or built-in object, over what the file says.
+
+    Raises:
+        NotFoundError: no such file.
+        InputError: not one of these formats, or it does not fit the hand.
+    """
+    if path.is_dir():
+        return _bench_folder(path, hand, obj)
+    if not path.is_file():
+        raise NotFoundError(f"{path} does not exist")
+    return _reference(path, hand, obj) if path.suffix == ".json" else _shard(path, hand, obj)
+
+
+def _shard(path: Path, hand: str | None, obj: str | None) -> Case:
+    shard = read_shard(path, kind="base")
+    model, thing = hand_of_shard(shard, hand), object_of_shard(shard, obj)
+    grasps = GraspSet.from_columns(shard.arrays)
+    _check_joints(path, model, grasps.grasp)
+    said = shard.attributes
+    return Case(
+        path.name,
+        model,
+        thing,
+        grasps,
+        friction=float(said["mu"]) if "mu" in said else None,  # type: ignore[arg-type]
+        seconds=float(said["seconds"]) if "seconds" in said else None,  # type: ignore[arg-type]
+        judged=said.get("verdict_level", "none") != "none",
+        placed=placed_of_shard(shard),
+    )
+
+
+def _reference(path: Path, hand: str | None, obj: str | None) -> Case:
+    (found,) = published.read_reference(path, hand=hand, obj=obj)
+    return Case(
+        path.name, found.hand, found.obj, found.grasps, friction=published.friction(path), published=found.published
+    )
+
+
+def _bench_folder(path: Path, hand: str | None, obj: str | None) -> Case:
+    if hand is None or obj is None:
+        raise InputError("a DexGraspBench folder does not hold the hand and the object; name both: --hand and --object")
+    sets = dexgraspbench.read(path, hand=hand, obj=obj)
+    if len(sets) > 1:
+        kinds = ", ".join(f"scale {one.scale:g}{' on a table' if one.placed else ''}" for one in sets)
+        raise InputError(f"{path} holds {len(sets)} kinds of grasps ({kinds}); give the folder of one")
+    found = sets[0]
+    return Case(path.name, found.hand, found.obj, found.grasps, published=found.published, placed=found.placed)
+
+
+def _check_joints(path: Path, hand: HandModel, grasp: Posture) -> None:
+    if grasp.joint_positions.shape[1] != len(hand.joint_names):
+        raise InputError(
+            f"{path} has {grasp.joint_positions.shape[1]} joints, {hand.name} {len(hand.joint_names)}; give --hand"
+        )

@@ -1,0 +1,237 @@
+"""DexGraspBench's layout: one pickled dictionary a grasp, and the files that its evaluator needs to judge it.
+
+Fields: `obj_path`, `obj_scale`, `obj_pose` (7,), and `pregrasp_qpos`, `grasp_qpos`, `squeeze_qpos` (7 + J,) each: root
+position, root quaternion w x y z, joints. Root and object stand in one world frame. Root and order of the joints are
+those of the model that a benchmark's configuration names; a mapping beside the grasps says how ours lie in it. Grasps
+on a table have more, see `bench_scene`.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from graspd.exchange.bench_hand import (
+    GRASPS,
+    HandMapping,
+    joint_order,
+    link_names,
+    mapping_of,
+    of_the_benchmark,
+    write_hand,
+)
+from graspd.exchange.bench_object import SCALE, write_object, write_table
+from graspd.exchange.bench_scene import (
+    TABLETOP,
+    check_table,
+    is_tabletop,
+    object_of_scene,
+    placed_of,
+    tabletop_fields,
+    with_way,
+)
+from graspd.exchange.imported import Imported, load_npy, scaled_object
+from graspd.exchange.lots import plain_name
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.simulation.surroundings import Placed
+
+Row = dict[str, Any]
+POSTURES: Final = ("pregrasp", "grasp", "squeeze")
+#: Prefix of the configurations of our hands, and name of the experiment that the grasps are.
+NAME: Final = "graspd"
+
+
+def read(path: Path, *, hand: str, obj: str) -> list[Imported]:
+    """Grasps of one hand on one object, a set for each scale of the object, those on tables apart from the others.
+
+    Args:
+        path: a file, or a folder searched whole.
+        hand: URDF or built-in hand; without a mapping beside the grasps, the one whose root and joints they have.
+        obj: mesh or built-in object at scale 1.
+
+    Raises:
+        InputError: no such files, grasps for several models of a hand, or they do not fit the hand.
+    """
+    # Descriptions of scenes are pickled dictionaries too.
+    files = [path] if path.is_file() else [f for f in sorted(path.rglob("*.npy")) if "scene_cfg" not in f.parts]
+    if not files:
+        raise InputError(f"{path} has no .npy files; DexGraspBench has one for each grasp")
+    mappings = {mapping_of(file) for file in files}
+    if len(mappings) > 1:
+        names = ", ".join(sorted(one.config if one else "another" for one in mappings))
+        raise InputError(f"{path} holds grasps for {len(mappings)} models of a hand ({names}); give the folder of one")
+    sets: dict[tuple[float, bool], list[Row]] = defaultdict(list)
+    for file in files:
+        for row in _rows(file):
+            sets[_scale(row), is_tabletop(row)].append(row)
+    model, mapping = hand_from_path(hand), mappings.pop()
+    return [
+        _set(path, model, scaled_object(obj, scale), rows, scale, mapping, on_table=on_table)
+        for (scale, on_table), rows in sorted(sets.items(), key=lambda item: item[0])
+    ]
+
+
+def write(
+    hand: HandModel, obj: ObjectModel, grasps: GraspSet, rows: Sequence[int], folder: Path, placed: Placed | None = None
+) -> list[Path]:
+    """Write grasps with all that DexGraspBench's evaluator reads: laid over its checkout, the folder is complete.
+
+    The object has scale 1. It stands in the origin, or, where the grasps are `placed`, on its table, as the tabletop
+    test wants it; both go to experiments of their own. The hand goes with it as a model of our own; where the benchmark
+    has a model of the same hand, the grasps are written for that one as well.
+
+    Returns:
+        the files of the grasps, one each, for our model of the hand.
+
+    Raises:
+        InputError: the grasps' scenes are more than a table.
+        MeshError: the object's convex pieces are no picture of it.
+    """
+    if placed is not None:
+        check_table(placed)
+    name = plain_name(obj.name)
+    obj_path, scene = write_object(obj, name, folder)
+    scenes = {0: (IDENTITY_POSE, scene)}
+    number = np.zeros(len(grasps), np.intp)
+    if placed is not None:
+        number = placed.index
+        poses = np.asarray(placed.object_pose, float)
+        scenes = {k: (poses[k], write_table(name, poses[k], k, folder)) for k in sorted(set(number[list(rows)]))}
+    paths: list[Path] = []
+    for mapping in models_of(hand, folder):
+        out = folder / "output" / f"{experiment(placed)}_{mapping.config}"
+        out.mkdir(parents=True, exist_ok=True)
+        mapping.write(out)
+        written = [out / GRASPS / name / f"{SCALE}_pose{number[row]:03}" / f"{row}.npy" for row in rows]
+        for row, file in zip(rows, written, strict=True):
+            pose, path = scenes[number[row]]
+            record: Row = {
+                "obj_path": obj_path.as_posix(),
+                "obj_scale": 1.0,
+                "obj_pose": pose.copy(),
+                "scene_path": path.as_posix(),
+            }
+            record |= postures(mapping, hand, grasps, row, None if placed is None else pose)
+            if placed is not None:
+                record |= tabletop_fields(mapping, hand, grasps, row, pose)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            np.save(file, np.array(record, dtype=object), allow_pickle=True)
+        paths = paths or written
+    return paths
+
+
+def models_of(hand: HandModel, folder: Path) -> list[HandMapping]:
+    """How the hand lies in each model that grasps are written for: our own, which is written below `folder`, and the
+    benchmark's where it has the hand."""
+    config = f"{NAME}_{plain_name(hand.name)}"
+    model = write_hand(hand, config, folder)
+    order = joint_order(folder / model)
+    ours = HandMapping(
+        hand.name,
+        hand.root_link,
+        config,
+        model.as_posix(),
+        tuple(IDENTITY_POSE),
+        tuple((j, j) for j in order),
+        link_names(hand),
+    )
+    return [ours, *filter(None, [of_the_benchmark(hand)])]
+
+
+def experiment(placed: Placed | None) -> str:
+    """Name of the experiment: free grasps and grasps on tables are two."""
+    return NAME if placed is None else f"{NAME}_{TABLETOP}"
+
+
+def postures(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, pose: Floats | None) -> Row:
+    """The `..._qpos` of a grasp: around the origin, or where the object stands at `pose` (7,) on a table."""
+    record: Row = {}
+    for name in POSTURES:
+        found: Posture = getattr(grasps, name)
+        root = found.hand_pose[row] if pose is None else compose(pose, found.hand_pose[row])
+        record[f"{name}_qpos"] = mapping.qpos(hand, root, found.joint_positions[row])
+    return record
+
+
+def _rows(file: Path) -> list[Row]:
+    """The grasps of a file: one, or, where `..._qpos` have an axis more, as many as that is long.
+
+    A file that does not say where its object stands names a scene that does.
+    """
+    found = load_npy(file)
+    if not isinstance(found, dict):
+        raise InputError(f"{file} holds no dictionary; DexGraspBench has one a file")
+    if missing := [f"{name}_qpos" for name in POSTURES if f"{name}_qpos" not in found]:
+        raise InputError(f"{file} has no {missing[0]}")
+    if "obj_pose" not in found and "scene_path" in found:
+        found |= object_of_scene(file, str(found["scene_path"]))
+    count = {len(found[f"{name}_qpos"]) if np.ndim(found[f"{name}_qpos"]) == 2 else 0 for name in POSTURES}
+    if count == {0}:
+        return [_scaled(found)]
+    if len(count) > 1 or 0 in count:
+        raise InputError(f"{file}: pregrasp, grasp and squeeze are not as many as one another")
+    return [_scaled({key: _part(value, k, count) for key, value in found.items()}) for k in range(min(count))]
+
+
+def _part(value: Any, k: int, count: set[int]) -> Any:
+    """Of what a file has for each of its grasps that of grasp k; of them all what it has once."""
+    each = isinstance(value, np.ndarray) and value.ndim > 0 and {len(value)} == count and value.dtype != object
+    return value[k] if each else value
+
+
+def _scaled(row: Row) -> Row:
+    """With `scene_scale` put on the object's scale."""
+    if "scene_scale" not in row:
+        return row
+    return row | {"obj_scale": _scale(row) * float(np.ravel(row["scene_scale"])[0])}
+
+
+def _scale(row: Row) -> float:
+    return float(np.ravel(row.get("obj_scale", 1.0))[0])
+
+
+def _set(
+    path: Path,
+    hand: HandModel,
+    obj: ObjectModel,
+    rows: list[Row],
+    scale: float,
+    mapping: HandMapping | None,
+    *,
+    on_table: bool,
+) -> Imported:
+    pose = np.array([np.ravel(row.get("obj_pose", IDENTITY_POSE)) for row in rows], float)
+    parts = {name: _posture(path, hand, name, rows, pose, mapping) for name in POSTURES}
+    grasps = GraspSet(parts["grasp"], parts["pregrasp"], parts["squeeze"], np.full(len(rows), np.nan))
+    published = np.array([int(bool(row["succ_flag"])) if "succ_flag" in row else -1 for row in rows], np.int8)
+    name = str(rows[0].get("obj_path", obj.name)).rstrip("/").rsplit("/", 1)[-1]
+    placed = placed_of(pose) if on_table else None
+    if placed is not None:
+        grasps = replace(with_way(hand, grasps, rows, pose, mapping), scene=placed.index)
+    return Imported(hand, obj, grasps, name, scale, published, placed)
+
+
+def _posture(
+    path: Path, hand: HandModel, name: str, rows: list[Row], obj_pose: Floats, mapping: HandMapping | None
+) -> Posture:
+    try:
+        qpos = np.array([np.ravel(row[f"{name}_qpos"]) for row in rows], float)
+    except ValueError as error:
+        raise InputError(f"{path}: {name}_qpos has not one length in all files: {error}") from None
+    if qpos.shape[1] != 7 + len(hand.joint_names):
+        raise InputError(
+            f"{path}: {name}_qpos has {qpos.shape[1]} numbers, {hand.name} needs 7 + {len(hand.joint_names)}; "
+            "is --hand the right hand?"
+        )
+    root, joints = (qpos[:, :7], qpos[:, 7:]) if mapping is None else mapping.posture(hand, qpos)
+    return Posture(compose(invert(obj_pose), root), joints)

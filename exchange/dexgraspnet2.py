@@ -1,0 +1,293 @@
+"""DexGraspNet 2.0's folder: scenes as GraspNet-1Billion has them, and grasps of dexterous hands for each.
+
+Zhang et al., DexGraspNet 2.0, CoRL 2024. Below `data/`, NNNN a scene and VVVV a view of it:
+
+    scenes/scene_NNNN/realsense/
+        depth_gt/VVVV.png           16 bits, steps of one metre over `factor_depth`, 0: nothing
+        label_gt/VVVV.png           0: table and background, 1: the object, 2, ...: others
+        meta/VVVV.mat               `intrinsic_matrix`, `factor_depth`, `cls_indexes`, `poses` (3, 4, 1)
+        camera_poses.npy            (256, 4, 4) camera of a view in that of view 0
+        cam0_wrt_table.npy          (4, 4) camera of view 0 in the table's frame
+    dex_grasps_new/scene_NNNN/HAND/OBJECT.npz
+        `translation` (N, 3), `rotation` (N, 3, 3): root link in the camera of view 0; `point` (N, 3): of the object's
+        surface, at which the grasp points, in the same frame; and each joint by its name (N,)
+    dex_graspness_new/scene_NNNN/realsense/VVVV.npy
+        (P, 1) f4 graspness of the P points that its loader makes of the view, in the order of the pixels
+
+Its loader takes pixel (u, v) for the place u, v; ours has pixel centres at +0.5. The intrinsics say so.
+"""
+
+from __future__ import annotations
+
+import shutil
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import scipy.io
+from numpy.typing import NDArray
+
+from graspd.exchange.dexgraspnet2_graspness import SceneGraspness, surface_samples
+from graspd.exchange.imported import Imported, completed, joints_by_name, scaled_object, verdicts
+from graspd.exchange.lots import Look, Lot, Written, by_scene, looks, plain_name
+from graspd.service.model.base import why
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import Floats, apply, compose, invert, pose_from_matrix, pose_to_matrix
+from graspd.service.readers import DepthNoise, Pictures
+from graspd.service.readers.clouds import CloudView
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.rendering.annotate import OBJECT
+from graspd.worker.rendering.export import export_png
+
+CAMERA: Final = "realsense"
+#: Views of a scene, among which its loader draws.
+VIEWS: Final = 256
+#: Steps of a metre in a depth picture: 16 bits reach 6.5 m.
+FACTOR: Final = 10000
+#: Numbers of scenes: its split `train_1` with those of `part`; and `val` with the `test` ones.
+TRAIN: Final = (range(90), range(1000, 8500))
+HELD_OUT: Final = (range(90, 100), range(100, 190))
+#: Keys of a file of grasps that are no joints.
+_PLACE: Final = ("translation", "rotation", "point")
+_OURS: Final = ("pregrasp_qpos", "squeeze_qpos", "success", "row")
+#: What NumPy's writer takes for arguments of its own.
+_NUMPYS: Final = ("file", "args", "kwds", "allow_pickle")
+#: A `meta` file takes two kilobytes; unpacked it is at most a thousand times as large [bytes].
+_LARGEST_META: Final = 64 * 2**10
+#: Most that the members of a file may unpack to [bytes]; no file of grasps of one object comes near.
+LARGEST: Final = 2**30
+#: Most members.
+_MEMBERS: Final = 1024
+
+
+def write(
+    lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
+) -> Written:
+    """Write each scene that has pictures and grasps.
+
+    Args:
+        lots: grasps, planned in the scenes or carried over into them.
+        pictures: of the scenes.
+        folder: stands for a checkout; made if absent.
+        out: objects that are held out.
+        noise: depth camera whose depth is written; None: perfect depth.
+
+    Returns:
+        numbers of grasps, scenes, views and files of grasps.
+
+    Raises:
+        InputError: such a folder is there already, there are no pictures, more scenes than the splits have numbers, or
+            a joint has the name of another key.
+    """
+    top = folder / "data"
+    if top.exists():
+        raise InputError(f"{top} is there already; give another folder as --output")
+    known = {lot.id: lot for lot in lots}
+    seen = by_scene(list(looks(pictures))).values()
+    scenes = [some for some in seen if some[0].base in known and len(some[0].rows)]
+    if not scenes:
+        if any(some[0].base in known for some in seen):
+            raise InputError(
+                "no grasp is valid and clear in the scenes of the pictures; plan them in scenes: synth --scene"
+            )
+        raise InputError("no picture shows a scene with grasps; put views beside the grasps: graspd render")
+    done = Written({"grasps": 0, "scenes": len(scenes), "views": 0, "files": len(scenes)})
+    numbers = {held: _numbers(held, scenes, known, out) for held in (False, True)}
+    samples: dict[str, Floats] = {}
+    for some in scenes:
+        lot = known[some[0].base]
+        name = f"scene_{next(numbers[lot.name in out]):04}"
+        if lot.id not in samples:
+            samples[lot.id] = surface_samples(lot.obj)
+        graspness = SceneGraspness.of(lot.hand, lot.grasps.grasp.take(some[0].rows), samples[lot.id])
+        _write_scene(some[:VIEWS], pictures, top, name, noise, graspness)
+        _write_grasps(some[0], lot, top / "dex_grasps_new" / name / plain_name(lot.hand.name), graspness)
+        done.counts["grasps"] += len(some[0].rows)
+        done.counts["views"] += min(len(some), VIEWS)
+    if not out:
+        done.notes.append("one object: all scenes are numbered for training, none for a test")
+    return done
+
+
+def _numbers(held: bool, scenes: list[list[Look]], known: dict[str, Lot], out: frozenset[str]) -> Iterator[int]:
+    """Of the scenes of one side, as its splits have them."""
+    count = sum((known[some[0].base].name in out) is held for some in scenes)
+    room = [number for numbers in (HELD_OUT if held else TRAIN) for number in numbers]
+    if count > len(room):
+        what = "held-out objects" if held else "objects to train on"
+        raise InputError(f"there are {count} scenes of {what}, DexGraspNet 2.0 has numbers for {len(room)}")
+    return islice(room, count)
+
+
+def _write_scene(
+    some: list[Look], pictures: Pictures, top: Path, name: str, noise: DepthNoise | None, graspness: SceneGraspness
+) -> None:
+    path, values = top / "scenes" / name / CAMERA, top / "dex_graspness_new" / name / CAMERA
+    kinds = ((path / "depth_gt", "png"), (path / "label_gt", "png"), (path / "meta", "mat"), (values, "npy"))
+    for folder, _ in kinds:
+        folder.mkdir(parents=True)
+    first = pose_to_matrix(invert(pose_from_matrix(some[0].extrinsics)))
+    poses = [pose_to_matrix(compose(pose_from_matrix(some[0].extrinsics), _camera(look))) for look in some]
+    np.save(path / "cam0_wrt_table.npy", first)
+    np.save(path / "camera_poses.npy", np.array([poses[view % len(some)] for view in range(VIEWS)]))
+    for view, look in enumerate(some):
+        sample = pictures[look.index]
+        steps = CloudView.of(sample, noise, np.random.default_rng(look.index)).seen * FACTOR
+        steps = np.where(steps < np.iinfo(np.uint16).max + 0.5, np.rint(steps), 0)
+        export_png(path / "depth_gt" / f"{view:04}.png", steps.astype(np.uint16))
+        labels = np.maximum(np.asarray(sample["image/segmentation"], int) - (OBJECT - 1), 0).astype(np.uint8)
+        export_png(path / "label_gt" / f"{view:04}.png", labels)
+        intrinsics = np.asarray(sample["camera/intrinsics"], float) - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        pose = np.asarray(sample["object/pose"])
+        meta = {
+            "intrinsic_matrix": intrinsics,
+            "factor_depth": np.array([[FACTOR]]),
+            "cls_indexes": np.array([[1]]),
+            "poses": pose_to_matrix(pose)[:3, :, None],
+        }
+        scipy.io.savemat(path / "meta" / f"{view:04}.mat", meta)
+        if labels.any():  # its loader passes over a view of nothing, which has no workspace
+            found = graspness.of_view(steps / FACTOR, labels, intrinsics, first @ poses[view], pose)
+            np.save(values / f"{view:04}.npy", found)
+    # It draws among 256 views: the rest are the same files again.
+    for view in range(len(some), VIEWS):
+        for folder, suffix in kinds:
+            _again(folder / f"{view % len(some):04}.{suffix}", folder / f"{view:04}.{suffix}")
+
+
+def _again(file: Path, copy: Path) -> None:
+    if not file.exists():
+        return
+    try:
+        copy.hardlink_to(file)
+    except OSError:
+        shutil.copyfile(file, copy)
+
+
+def _camera(look: Look) -> Floats:
+    """(7,) where the camera stands on the table."""
+    return invert(pose_from_matrix(look.extrinsics))
+
+
+def _write_grasps(look: Look, lot: Lot, folder: Path, graspness: SceneGraspness) -> None:
+    names = lot.hand.joint_names
+    if taken := set(names) & {*_PLACE, *_OURS, *_NUMPYS}:
+        raise InputError(f"{lot.hand.name} has a joint {sorted(taken)[0]!r}, which is a key of DexGraspNet 2.0's files")
+    in_camera = compose(pose_from_matrix(look.extrinsics), look.object_pose)
+    some = {name: getattr(lot.grasps, name).take(look.rows) for name in ("pregrasp", "grasp", "squeeze")}
+    placed = {name: compose(in_camera, part.hand_pose) for name, part in some.items()}
+    matrices = pose_to_matrix(placed["grasp"])
+    point = apply(in_camera, graspness.samples[graspness.pointed])
+    arrays: dict[str, Any] = {"translation": matrices[:, :3, 3], "rotation": matrices[:, :3, :3], "point": point}
+    arrays |= {name: some["grasp"].joint_positions[:, k] for k, name in enumerate(names)}
+    # Its loader takes these along and does not look at them: what brings the grasps back as they were.
+    arrays |= {
+        f"{name}_qpos": np.concatenate([placed[name], some[name].joint_positions], axis=1)
+        for name in ("pregrasp", "squeeze")
+    }
+    arrays |= {"success": lot.verdict[look.rows], "row": look.rows}
+    folder.mkdir(parents=True)
+    np.savez_compressed(folder / f"{lot.name}.npz", **arrays)
+
+
+def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[Imported]:
+    """The grasps of one object in one scene, in the object's frame.
+
+    Args:
+        path: `dex_grasps_new/SCENE/HAND/OBJECT.npz`, in its folder `data` with the scene's `meta`.
+        hand: URDF or built-in hand, whose root link and joints they have.
+        obj: mesh of the object.
+        number: which object of the scene, counted from 0.
+
+    Raises:
+        InputError: not such a file, its scene is not there, or its joints are not the hand's.
+    """
+    found = load_npz(path)
+    try:
+        count = len(found["translation"])
+        matrices = np.tile(np.eye(4), (count, 1, 1))
+        matrices[:, :3, :3], matrices[:, :3, 3] = found["rotation"], found["translation"]
+    except (KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{path} is no file of grasps of DexGraspNet 2.0: {error}") from None
+    if not np.isfinite(matrices).all():
+        raise InputError(f"{path} has grasps whose place is no number")
+    away = invert(_object_pose(path, number))
+    model, thing = hand_from_path(hand), scaled_object(obj)
+    names = [name for name in found if name not in (*_PLACE, *_OURS)]
+    try:
+        values = np.stack([np.asarray(found[name], float).reshape(count) for name in names], axis=1)
+    except ValueError as error:
+        raise InputError(f"{path} has not one value of each joint for each of {count} grasps: {error}") from None
+    grasp = Posture(compose(away, pose_from_matrix(matrices)), joints_by_name(model, names, values, what=str(path)))
+    published = found.get("success")
+    set_ = _with_ours(path, model, found, grasp, away)
+    return [
+        Imported(
+            model,
+            thing,
+            completed(model, thing, grasp) if set_ is None else set_,
+            path.stem,
+            published=None if published is None or len(np.ravel(published)) != count else verdicts(published),
+        )
+    ]
+
+
+def _with_ours(
+    path: Path, hand: HandModel, found: dict[str, NDArray[Any]], grasp: Posture, away: Floats
+) -> GraspSet | None:
+    """The grasps with the postures before and after contact that we write; None where there are none."""
+    if not {"pregrasp_qpos", "squeeze_qpos"} <= set(found):
+        return None
+    parts = []
+    for name in ("pregrasp_qpos", "squeeze_qpos"):
+        qpos = np.asarray(found[name], float)
+        if qpos.shape != (len(grasp), 7 + len(hand.joint_names)):
+            raise InputError(f"{path}: {name} has the shape {qpos.shape}")
+        parts.append(Posture(compose(away, qpos[:, :7]), qpos[:, 7:]))
+    return GraspSet(grasp, parts[0], parts[1], np.full(len(grasp), np.nan))
+
+
+def _object_pose(path: Path, number: int) -> Floats:
+    """(7,) of the object in the camera of view 0, in which grasps are told."""
+    try:
+        scene, data = path.resolve().parents[1].name, path.resolve().parents[3]
+    except IndexError:
+        raise InputError(f"{path} is in no folder dex_grasps_new/SCENE/HAND") from None
+    file = data / "scenes" / scene / CAMERA / "meta" / "0000.mat"
+    if not file.is_file():
+        raise InputError(f"{path} needs its scene: {file} is not there")
+    if file.stat().st_size > _LARGEST_META:
+        raise InputError(f"{file} is larger than {_LARGEST_META >> 10} KiB, which no description of a view is")
+    try:
+        poses = np.asarray(scipy.io.loadmat(file)["poses"], float)
+        pose = np.concatenate([poses[:3, :, number], [[0, 0, 0, 1]]])
+    except Exception as error:
+        # SciPy raises what its readers happen to raise; all of it means that the file is not what it should be.
+        raise InputError(f"{file} does not say where object {number} stands: {error}") from None
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise InputError(f"{file} does not say where object {number} stands")
+    return pose_from_matrix(pose)
+
+
+def load_npz(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of a `.npz` file.
+
+    Raises:
+        InputError: no such file, objects in it, or it unpacks to more than `LARGEST`.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+        # A member is never unpacked further than it says here.
+        if len(members) > _MEMBERS or sum(member.file_size for member in members) > LARGEST:
+            raise InputError(f"{path} unpacks to more than {LARGEST >> 20} MiB or to more than {_MEMBERS} arrays")
+        with np.load(path, allow_pickle=False) as found:
+            return {name: found[name] for name in found.files}
+    except (OSError, ValueError, EOFError, KeyError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path} is no .npz file that can be read safely: {why(error)}") from None

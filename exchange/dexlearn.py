@@ -1,0 +1,237 @@
+"""DexLearn's folder: collected grasps with a list of them in each file, splits, scenes, and partial clouds.
+
+It is laid over a checkout of DexLearn (Chen et al., baselines of BODex and Dexonomy), all in one `assets/`:
+
+    grasp/NAME/succ_collect/TYPE/OBJECT/.../*.npy   `..._qpos` (K, 7 + J), `scene_path`, `scene_scale` (K,)
+    object/graspd/valid_split/{train,test}.json     names of objects
+    object/graspd/scene_cfg/OBJECT/...              as DexGraspBench has them, with a `scene_id`
+    object/graspd/vision_data/azure_kinect_dk/SCENE_ID/partial_pc_NN.npy    (P, 3) points [m]
+
+Root poses and points stand in one frame: the table's, or, for grasps of a free object, the object's. Roots and joints
+are those of a model of the hand that DexGraspBench evaluates, see `bench_mapping`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.exchange.bench_hand import COLLECTED, HandMapping
+from graspd.exchange.bench_object import SET, write_object, write_table
+from graspd.exchange.bench_scene import TABLETOP, check_table
+from graspd.exchange.dexgraspbench import POSTURES, experiment, models_of, postures
+from graspd.exchange.lots import Look, Lot, Written, looks, object_points
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, invert
+from graspd.service.readers import DepthNoise, Pictures
+from graspd.worker.grasps import GraspSet
+
+#: Folder of each `quality/grasp_type`; the number before the line is what a network is told.
+TYPES: Final = ("0_any", "1_power", "2_precision", "3_lateral")
+VISION: Final = SET / "vision_data" / "azure_kinect_dk"
+#: Points that a network gets, drawn from a cloud with repetition.
+POINTS: Final = 1024
+_FREE: Final = -1
+
+
+def write(
+    lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
+) -> Written:
+    """Write grasps and what their cameras see.
+
+    Args:
+        lots: grasps, free or on tables.
+        pictures: of their scenes; may be none.
+        folder: stands for a checkout of DexLearn.
+        out: objects that are held out.
+        noise: depth camera whose clouds are written; None: perfect depth.
+
+    Returns:
+        numbers of grasps, scenes, clouds and files.
+
+    Raises:
+        InputError: such a folder is there already, or scenes are more than a table.
+        MeshError: an object's convex pieces are no picture of it.
+    """
+    if (folder / SET).exists():
+        raise InputError(f"{folder} holds objects of an export already; give another folder as --output")
+    for lot in lots:
+        if lot.placed is not None:
+            check_table(lot.placed)
+    scenes = _scenes(lots, folder)
+    clouds, bare = _clouds(pictures, lots, scenes, folder, noise)
+    done = Written({"grasps": 0, "scenes": len({*scenes.values()}), "clouds": clouds, "files": 0})
+    if not clouds:
+        done.notes.append("there are no pictures, so no clouds: put views beside the grasps (graspd render) to train")
+    elif bare:
+        done.counts["scenes"] -= bare
+        done.notes.append(f"{bare} scenes are seen by no picture; their grasps are left out")
+    for group in _groups(lots):
+        _write_group(group, scenes, folder, out, done, seen=bool(clouds))
+    names = {lot.name for lot in lots}
+    _splits(folder / SET / "valid_split", names, out, done)
+    return done
+
+
+#: The scene's file below the folder, by shard and scene; free grasps have the one of their object.
+_Scenes = dict[tuple[str, int], Path]
+#: Rows of a lot that are of one scene and one type.
+_Part = tuple[Lot, Path, int, NDArray[np.intp]]
+
+
+def _scenes(lots: Sequence[Lot], folder: Path) -> _Scenes:
+    """Write objects and scenes; scenes of several shards of an object are numbered through."""
+    scenes: _Scenes = {}
+    free: dict[str, Path] = {}
+    count: dict[str, int] = {}
+    for lot in lots:
+        if lot.name not in free:
+            free[lot.name] = write_object(lot.obj, lot.name, folder)[1]
+        if lot.placed is None:
+            scenes[lot.id, _FREE] = free[lot.name]
+            continue
+        poses = np.asarray(lot.placed.object_pose, float)
+        for scene in sorted({int(lot.placed.index[row]) for row in lot.rows}):
+            number = count[lot.name] = count.get(lot.name, -1) + 1
+            scenes[lot.id, scene] = write_table(lot.name, poses[scene], number, folder)
+    return scenes
+
+
+def _clouds(
+    pictures: Pictures, lots: Sequence[Lot], scenes: _Scenes, folder: Path, noise: DepthNoise | None
+) -> tuple[int, int]:
+    """Write what each picture shows of its object; the numbers of clouds, and of scenes that are left without."""
+    on_table = {lot.id: lot.placed is not None for lot in lots}
+    written: dict[Path, int] = {}
+    for look in looks(pictures):
+        scene = scenes.get((look.base, look.scene if on_table.get(look.base) else _FREE))
+        if scene is None or not len(points := points_of(pictures, look, noise, on_table=on_table[look.base])):
+            continue
+        number = written[scene] = written.get(scene, -1) + 1
+        place = folder / VISION / _scene_id(scene)
+        place.mkdir(parents=True, exist_ok=True)
+        np.save(place / f"partial_pc_{number:02}.npy", points.astype(np.float32))
+    bare = set(scenes.values()) - set(written)
+    for scene in bare if written else ():
+        # Its test draws a cloud of every scene that it finds.
+        (folder / scene).unlink()
+    return sum(number + 1 for number in written.values()), len(bare)
+
+
+def points_of(pictures: Pictures, look: Look, noise: DepthNoise | None, *, on_table: bool) -> Floats:
+    """(P, 3) what a picture shows of its object, in the table's frame, or where it is none in the object's own [m]."""
+    points = object_points(pictures[look.index], look.index, noise)
+    return points if on_table else apply(invert(look.object_pose), points)
+
+
+def _scene_id(scene: Path) -> Path:
+    return scene.relative_to(SET / "scene_cfg").with_suffix("")
+
+
+def _groups(lots: Sequence[Lot]) -> Iterable[list[Lot]]:
+    """Lots of one hand that are all free or all on tables: a data set of their own."""
+    groups: dict[tuple[str, bool], list[Lot]] = {}
+    for lot in lots:
+        groups.setdefault((lot.hand.digest, lot.placed is None), []).append(lot)
+    return groups.values()
+
+
+def _write_group(
+    lots: list[Lot], scenes: _Scenes, folder: Path, out: frozenset[str], done: Written, *, seen: bool
+) -> None:
+    parts = [(lot, *part) for lot in lots for part in _rows_of(lot, scenes, folder, seen=seen)]
+    listed = sorted({kind for _, _, kind, _ in parts if _in_both(kind, parts, out)})
+    if not listed:
+        # No type has objects in both splits: all grasps are of one.
+        parts, listed = [(lot, scene, 0, rows) for lot, scene, rows in _untyped(parts)], [0]
+    done.counts["grasps"] += sum(len(rows) for *_, rows in parts)
+    for mapping in models_of(lots[0].hand, folder):
+        name = f"{experiment(lots[0].placed)}_{mapping.config}"
+        top = folder / "assets" / "grasp" / name
+        top.mkdir(parents=True, exist_ok=True)
+        mapping.write(top)
+        for lot, scene, kind, rows in parts:
+            file = top / COLLECTED / TYPES[kind] / lot.name / scene.parent.name / f"{scene.stem}_{lot.tag}.npy"
+            _save(file, _record(mapping, lot, rows, scene))
+        done.counts["files"] += len(parts)
+        _configure(folder, name, lots[0], [TYPES[kind] for kind in listed])
+
+
+def _rows_of(lot: Lot, scenes: _Scenes, folder: Path, *, seen: bool) -> Iterator[tuple[Path, int, NDArray[np.intp]]]:
+    """The lot's rows by the file of their scene and their type; without those of scenes that nobody sees, where others
+    are seen."""
+    index = np.full(len(lot.grasps), _FREE) if lot.placed is None else np.asarray(lot.placed.index)
+    types = np.asarray(lot.shard.arrays.get("quality/grasp_type", np.zeros(len(index))), np.intp)
+    for scene in sorted({int(index[row]) for row in lot.rows}):
+        path = scenes[lot.id, scene]
+        if seen and not (folder / path).is_file():
+            continue
+        rows = lot.rows[index[lot.rows] == scene]
+        for kind in np.unique(types[rows]):
+            yield path, int(kind), rows[types[rows] == kind]
+
+
+def _in_both(kind: int, parts: Sequence[_Part], out: frozenset[str]) -> bool:
+    """Whether a type has grasps on objects of both splits. DexLearn draws a type and then an object of it, and fails on
+    one that has none."""
+    names = {lot.name for lot, _, other, _ in parts if other == kind}
+    return not out or bool(names & out and names - out)
+
+
+def _untyped(parts: Sequence[_Part]) -> Iterator[tuple[Lot, Path, NDArray[np.intp]]]:
+    together: dict[tuple[str, Path], list[_Part]] = {}
+    for part in parts:
+        together.setdefault((part[0].id, part[1]), []).append(part)
+    for (_, scene), some in together.items():
+        yield some[0][0], scene, np.sort(np.concatenate([part[3] for part in some]))
+
+
+def _record(mapping: HandMapping, lot: Lot, rows: NDArray[np.intp], scene: Path) -> dict[str, Any]:
+    grasps: GraspSet = lot.grasps
+    record: dict[str, Any] = {"scene_path": scene.as_posix(), "scene_scale": np.ones(len(rows))}
+    poses = [None if lot.placed is None else np.asarray(lot.placed.object_pose[lot.placed.index[row]]) for row in rows]
+    each = [postures(mapping, lot.hand, grasps, int(row), pose) for row, pose in zip(rows, poses, strict=True)]
+    record |= {f"{name}_qpos": np.array([one[f"{name}_qpos"] for one in each]) for name in POSTURES}
+    # Not read by DexLearn: what brings the grasps back as they were.
+    record["obj_pose"] = np.array([IDENTITY_POSE if pose is None else pose for pose in poses])
+    return record | {"succ_flag": lot.verdict[rows], "row": np.asarray(rows)}
+
+
+def _save(file: Path, record: dict[str, Any]) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    np.save(file, np.array(record, dtype=object), allow_pickle=True)
+
+
+def _configure(folder: Path, name: str, lot: Lot, types: list[str]) -> None:
+    """DexLearn's configuration of the data."""
+    values: dict[str, Any] = {
+        "num_workers": 8,
+        "num_points": POINTS,
+        "traj_length": len(POSTURES),
+        "joint_num": len(lot.hand.joint_names),
+        "grasp_type_lst": types,
+        "grasp_type_cond": len(types) > 1,
+        "pc_centering": False,
+        "grasp_path": f"${{data_folder}}/grasp/{name}/{COLLECTED}",
+        "object_path": "${data_folder}/object/graspd",
+        "split_path": "valid_split",
+        "pc_path": VISION.relative_to(SET).as_posix(),
+        "test_split": "test",
+        "test_scene_cfg": f"{'floating' if lot.placed is None else TABLETOP}/**.npy",
+        "mini_test": False,
+    }
+    file = folder / "dexlearn" / "config" / "data" / f"{name}.yaml"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text("".join(f"{key}: {json.dumps(value)}\n" for key, value in values.items()))
+
+
+def _splits(folder: Path, names: set[str], out: frozenset[str], done: Written) -> None:
+    if not out:
+        done.notes.append("one object: train.json and test.json both name it, so the test tells nothing of unseen ones")
+    for split, some in (("train", names - out), ("test", out or names)):
+        (folder / f"{split}.json").write_text(json.dumps(sorted(some), indent=1) + "\n")

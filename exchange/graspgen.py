@@ -1,0 +1,283 @@
+"""GraspGen's data: a JSON record for each object in tar files, with an index, lists of objects, and their meshes.
+
+Murali et al., GraspGen, ICRA 2026. Written and read:
+
+    grasps/GRIPPER/shard_000.tar         members UUID.grasps.json; uuid_index.json: {UUID: number of the shard}
+    splits/GRIPPER/{train,valid}.txt     a UUID in each line
+    objects/UUID.obj                     and map_uuid_to_path.json: {UUID: file}
+    grippers/GRIPPER.yaml                width, depth, and where its convention's frame is: z approaches, x closes
+
+A record: `object` {file, scale}, `grasps` {`transforms` (N, 4, 4): pose of the gripper's base link in the object's
+frame, the mesh multiplied by `scale`; `object_in_gripper` (N,) true or false}. Its readers leave out what else we write
+there: `joint_names`, and of pregrasp, grasp and squeeze root and joints, which bring a grasp of many fingers back.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.baselines.autograsp import kernels
+from graspd.baselines.autograsp.method import Closer
+from graspd.baselines.common import ground_of
+from graspd.exchange.imported import Imported, completed, joints_by_name, mesh_file, scaled_object
+from graspd.exchange.lots import Lot, Written, plain_name
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import Floats, apply, pose_from_matrix, pose_to_matrix, quat_from_matrix
+from graspd.service.store import validity
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.jaws import jaws_of
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fast_graspd.candidates import posture_of
+from graspd.worker.simulation.data import HandState
+
+MEMBER: Final = "grasps.json"
+INDEX: Final = "uuid_index.json"
+POSTURES: Final = ("pregrasp", "grasp", "squeeze")
+#: Objects in a tar file.
+PER_SHARD: Final = 64
+#: A record that is larger is not read [bytes]; 2,000 grasps take half a megabyte.
+LARGEST: Final = 256 * 2**20
+#: Its generator leaves out objects with fewer good grasps.
+FEWEST: Final = 5
+#: How far a published matrix may be from a rotation: they are printed with six digits and more.
+_ROTATION: Final = 1e-3
+#: Hands that are closed at once.
+_AT_ONCE: Final = 256
+
+
+def write(lots: Sequence[Lot], folder: Path, out: frozenset[str]) -> Written:
+    """Write all judged grasps of each hand, good ones and bad ones.
+
+    Args:
+        lots: grasps; their `rows` are those that were judged.
+        folder: where to; made if absent.
+        out: objects that are held out: `valid.txt`.
+
+    Returns:
+        numbers of grasps, of good ones among them, of objects and of tar files.
+
+    Raises:
+        InputError: the folder holds such files already.
+    """
+    if (folder / "grasps").exists():
+        raise InputError(f"{folder} holds grasps already; give another folder as --output")
+    done = Written({"grasps": 0, "good": 0, "objects": 0, "files": 0})
+    meshes = {uuid_of(lot): lot.obj for lot in lots}
+    (folder / "objects").mkdir(parents=True, exist_ok=True)
+    for uuid, obj in meshes.items():
+        mesh_file(obj, folder / "objects" / f"{uuid}.obj")
+    _json(folder / "objects" / "map_uuid_to_path.json", {uuid: f"{uuid}.obj" for uuid in meshes})
+    hands = {lot.hand.digest: lot.hand for lot in lots}
+    for hand in hands.values():
+        some = [lot for lot in lots if lot.hand.digest == hand.digest]
+        _write_hand(hand, some, folder, {uuid_of(lot) for lot in lots if lot.name in out}, done)
+    done.counts["objects"] = len(meshes)
+    return done
+
+
+def uuid_of(lot: Lot) -> str:
+    """The object's name there. WebDataset ends a key at the first dot."""
+    return lot.name.replace(".", "-")
+
+
+def _write_hand(hand: HandModel, lots: list[Lot], folder: Path, out: set[str], done: Written) -> None:
+    name = plain_name(hand.name)
+    records = {uuid: _record(hand, list(some)) for uuid, some in _by_object(lots)}
+    (folder / "grasps" / name).mkdir(parents=True)
+    index: dict[str, int] = {}
+    uuids = sorted(records)
+    for number, first in enumerate(range(0, len(uuids), PER_SHARD)):
+        with tarfile.open(folder / "grasps" / name / f"shard_{number:03}.tar", "w") as tar:
+            for uuid in uuids[first : first + PER_SHARD]:
+                data = json.dumps(records[uuid], allow_nan=False).encode()
+                entry = tarfile.TarInfo(f"{uuid}.{MEMBER}")
+                entry.size = len(data)
+                tar.addfile(entry, io.BytesIO(data))
+                index[uuid] = number
+        done.counts["files"] += 1
+    _json(folder / "grasps" / name / INDEX, index)
+    (folder / "splits" / name).mkdir(parents=True, exist_ok=True)
+    if not out:
+        done.notes.append("one object: train.txt and valid.txt both name it")
+    for split, some in (("train", set(uuids) - out), ("valid", set(uuids) & out if out else set(uuids))):
+        (folder / "splits" / name / f"{split}.txt").write_text("".join(f"{uuid}\n" for uuid in sorted(some)))
+    (folder / "grippers").mkdir(exist_ok=True)
+    values = convention(hand)
+    text = "".join(f"{key}: {json.dumps(value)}\n" for key, value in values.items())
+    (folder / "grippers" / f"{name}.yaml").write_text(text)
+    good = {uuid: sum(record["grasps"]["object_in_gripper"]) for uuid, record in records.items()}
+    done.counts["grasps"] += sum(len(record["grasps"]["transforms"]) for record in records.values())
+    done.counts["good"] += sum(good.values())
+    if few := sorted(uuid for uuid, count in good.items() if count < FEWEST):
+        done.notes.append(
+            f"GraspGen's generator leaves out objects with fewer than {FEWEST} good grasps: {few[0]}, say"
+        )
+
+
+def _by_object(lots: list[Lot]) -> Iterator[tuple[str, list[Lot]]]:
+    for uuid in sorted({uuid_of(lot) for lot in lots}):
+        yield uuid, [lot for lot in lots if uuid_of(lot) == uuid]
+
+
+def _record(hand: HandModel, lots: list[Lot]) -> dict[str, Any]:
+    parts: dict[str, Any] = {}
+    for name in POSTURES:
+        some: list[Posture] = [getattr(lot.grasps, name).take(lot.rows) for lot in lots]
+        parts[f"{name}_pose"] = np.concatenate([part.hand_pose for part in some])
+        parts[f"{name}_joints"] = np.concatenate([part.joint_positions for part in some])
+    held = np.concatenate([validity.valid(lot.shard.arrays)[lot.rows] for lot in lots])
+    grasps = {"transforms": pose_to_matrix(parts["grasp_pose"]).tolist(), "object_in_gripper": held.tolist()}
+    return {
+        "object": {"file": f"{uuid_of(lots[0])}.obj", "scale": 1.0},
+        "grasps": grasps | {name: values.tolist() for name, values in parts.items()},
+        "gripper": {"name": hand.name, "base_link": hand.root_link, "joint_names": list(hand.joint_names)},
+    }
+
+
+def convention(hand: HandModel) -> dict[str, Any]:
+    """What a gripper's YAML tells: clear width [m], reach along its approach [m], and the frame of GraspGen's
+    convention in the base link's, as [[x, y, z], [x, y, z, w]].
+
+    Of a hand of more than two jaws x is the direction across the approach in which its open fingertips are farthest
+    apart.
+    """
+    z, jaws = hand.palm.approach, jaws_of(hand)
+    if jaws is not None:
+        widest = int(np.argmax(jaws.width))
+        x, width, depth = jaws.axis[widest], jaws.opening, float(jaws.middle[widest] @ z)
+    else:
+        poses = body_poses(hand, np.array([[0.0, 0, 0, 1, 0, 0, 0]]), hand.expand(hand.preshape[None]))[0]
+        tips = poses[list(hand.fingertips), :3] if hand.fingertips else hand.palm.centre[None]
+        apart = (tips[:, None] - tips).reshape(-1, 3)
+        apart = apart - np.outer(apart @ z, z)
+        x = apart[int(np.argmax(np.linalg.norm(apart, axis=1)))]
+        width, depth = float(np.linalg.norm(x)), float((tips @ z).mean())
+    x = x - (x @ z) * z
+    if np.linalg.norm(x) < 1e-6:
+        x = np.eye(3)[int(np.argmin(np.abs(z)))]
+        x = x - (x @ z) * z
+    x = x / np.linalg.norm(x)
+    w, *xyz = quat_from_matrix(np.stack([x, np.cross(z, x), z], axis=1)).tolist()
+    return {
+        "width": width,
+        "depth": depth,
+        "transform_offset_from_asset_to_graspgen_convention": [[0.0, 0.0, 0.0], [*xyz, w]],
+    }
+
+
+def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Imported]:
+    """The grasps of one object. Where the record has no joints, fingers close until they touch.
+
+    Args:
+        path: a record, a tar file of them, or a folder of tar files.
+        hand: URDF or built-in hand: the gripper, whose root link is the base link.
+        obj: mesh of the object at scale 1.
+        object_name: the object's UUID; may be left out where there is one object.
+
+    Raises:
+        InputError: not such files, no such object, or it is larger than a record may be.
+    """
+    file, record = _found(path, object_name)
+    try:
+        scale, grasps = float(record["object"]["scale"]), record["grasps"]
+        matrices = np.asarray(grasps["transforms"], float)
+        held = np.ravel(np.asarray(grasps["object_in_gripper"])).astype(bool)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{file} is no record of GraspGen: {error!r}") from None
+    if matrices.shape != (len(held), 4, 4) or not len(held):
+        raise InputError(f"{file} has transforms of shape {matrices.shape} for {len(held)} grasps")
+    turns = matrices[:, :3, :3]
+    if not np.abs(turns @ np.swapaxes(turns, 1, 2) - np.eye(3)).max() < _ROTATION or np.linalg.det(turns).min() < 0:
+        raise InputError(f"{file} has transforms that are no poses")
+    if not 0 < scale < np.inf:
+        raise InputError(f"{file} has an object of scale {scale:g}")
+    model, thing = hand_from_path(hand), scaled_object(obj, scale)
+    set_ = _grasps(file, model, record, pose_from_matrix(matrices))
+    if set_ is None:
+        set_ = completed(model, thing, closed_at(model, thing, pose_from_matrix(matrices)))
+    name = object_name or Path(str(record["object"].get("file", ""))).stem or thing.name
+    return [Imported(model, thing, set_, name, scale, held.astype(np.int8))]
+
+
+def _grasps(file: str, hand: HandModel, record: dict[str, Any], pose: Floats) -> GraspSet | None:
+    """The grasps with the joints that we write beside them; None where there are none."""
+    grasps, names = record["grasps"], record.get("gripper", {}).get("joint_names")
+    if not names or not all(f"{name}_joints" in grasps for name in POSTURES):
+        return None
+    parts = []
+    for name in POSTURES:
+        joints = joints_by_name(hand, names, grasps[f"{name}_joints"], what=file)
+        place = pose if name == "grasp" else np.asarray(grasps[f"{name}_pose"], float)
+        if place.shape != pose.shape or len(joints) != len(pose):
+            raise InputError(f"{file}: pregrasp, grasp and squeeze are not as many as one another")
+        parts.append(Posture(place, joints))
+    return GraspSet(parts[1], parts[0], parts[2], np.full(len(pose), np.nan))
+
+
+def _found(path: Path, uuid: str) -> tuple[str, dict[str, Any]]:
+    """The record of an object, and what to call it in errors."""
+    if path.suffix == ".json":
+        with path.open("rb") as stream:
+            return str(path), _parsed(str(path), stream.read(LARGEST + 1))
+    files = sorted(path.glob("*.tar")) if path.is_dir() else [path]
+    names: list[str] = []
+    found: tuple[str, dict[str, Any]] | None = None
+    for file in files:
+        try:
+            # Not compressed, so that a member is as large as it takes room in the file.
+            with tarfile.open(file, "r:") as tar:
+                for member in tar:
+                    key, _, what = Path(member.name).name.partition(".")
+                    if what != MEMBER or not member.isfile():
+                        continue
+                    names.append(key)
+                    if found is None and uuid in ("", key):
+                        content = tar.extractfile(member)
+                        assert content is not None, "a plain file has content"
+                        found = f"{file}: {key}", _parsed(f"{file}: {key}", content.read(LARGEST + 1))
+        except (OSError, tarfile.TarError) as error:
+            raise InputError(f"{file} is no tar file: {error}") from None
+    if found is None or (not uuid and len(names) > 1):
+        there = f"it has {len(names)}, {', '.join(names[:5])} among them" if names else "it has none"
+        raise InputError(f"{path} has no object {uuid!r}; name one with --name: {there}")
+    return found
+
+
+def _parsed(what: str, data: bytes) -> dict[str, Any]:
+    if len(data) > LARGEST:
+        raise InputError(f"{what} is larger than {LARGEST >> 20} MiB, which no record is")
+    try:
+        record = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{what} is no JSON: {error}") from None
+    if not isinstance(record, dict):
+        raise InputError(f"{what} is no record of GraspGen: it holds no object")
+    return record
+
+
+def _json(path: Path, value: Any) -> None:
+    path.write_text(json.dumps(value, indent=1) + "\n")
+
+
+def closed_at(hand: HandModel, obj: ObjectModel, hand_pose: NDArray[np.float64]) -> Posture:
+    """The hand at poses (N, 7) in the object frame, its fingers closed from its preshape until they touch or end."""
+    pair = ground_of(hand, obj, "cpu", kernels)
+    joints = np.zeros((len(hand_pose), len(hand.joint_names)))
+    for first in range(0, len(hand_pose), _AT_ONCE):
+        pose = hand_pose[first : first + _AT_ONCE]
+        palm = apply(pose, hand.palm.centre) - obj.centre_of_mass
+        state = HandState(palm, pose[:, 3:], np.tile(hand.preshape, (len(pose), 1)))
+        closed = Closer(pair, len(pose)).close(state).state
+        joints[first : first + len(pose)] = posture_of(hand, obj, closed).joint_positions
+    return Posture(hand_pose, joints)

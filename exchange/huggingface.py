@@ -1,0 +1,271 @@
+"""A folder that `datasets.load_dataset` reads: a table of grasps, and one of pictures with the grasps of their scenes.
+
+    grasps/{train,test}-00000.parquet     a grasp a row: postures in the object's frame, verdict, quality
+    pictures/{train,test}-00000.parquet   a picture a row: colour, depth, labels, camera, grasps in its frame
+    README.md                             says which files are which
+
+Columns, units and frames are those of `GRASPS` and `PICTURES`; docs/how-to/exchange/huggingface.md is the reference.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from graspd.exchange.bench_scene import placed_of
+from graspd.exchange.imported import Imported, joints_by_name, scaled_object, verdicts
+from graspd.exchange.lots import Lot, Written
+from graspd.service import parquet
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import IDENTITY_POSE, Floats
+from graspd.service.readers import DepthNoise, Pictures
+from graspd.service.readers.clouds import CloudView
+from graspd.service.readers.ways import scene_spec_of
+from graspd.service.store.manifests import INDEX_THRESHOLD_M
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.rendering.export import PNG_STEP_M
+
+POSTURES: Final = ("pregrasp", "grasp", "squeeze")
+#: Kinds of scenes that a grasp may be planned in, as a row tells them.
+FREE: Final = "free"
+TABLE: Final = "table"
+#: Columns of grasps, by the words of `parquet.type_of`.
+GRASPS: Final = {
+    "hand": "text",
+    "object": "text",
+    "shard": "text",
+    "row": "int64",
+    "root_link": "text",
+    "joint_names": "text[]",
+    **{f"{name}_{what}": word for name in POSTURES for what, word in (("pose", "float64[7]"), ("joints", "float64[]"))},
+    "verdict": "int8",
+    "verdict_level": "text",
+    "epsilon": "float64",
+    "penetration_depth_mm": "float64",
+    "grasp_type": "int32",
+    "scene_kind": "text",
+    "scene": "int32",
+    "object_pose": "float64[7]",
+}
+#: And of pictures.
+PICTURES: Final = {
+    "hand": "text",
+    "object": "text",
+    "shard": "text",
+    "row": "int64",
+    "scene": "int32",
+    "rgb": parquet.IMAGE,
+    "depth": parquet.IMAGE,
+    "segmentation": parquet.IMAGE,
+    "intrinsics": "float64[3][3]",
+    "extrinsics": "float64[4][4]",
+    "object_pose": "float64[7]",
+    "grasp_shard": "text",
+    "grasp_rows": "int64[]",
+    "hand_poses": "float64[7][]",
+    "joint_positions": "float64[][]",
+}
+#: Pictures in a row group.
+_PICTURES_AT_ONCE: Final = 50
+
+
+def write(
+    lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
+) -> Written:
+    """Write both tables, of training and of held-out objects.
+
+    Args:
+        lots: grasps.
+        pictures: of their scenes, with colour; may be none.
+        folder: where to; made if absent.
+        out: objects that are held out: split `test`.
+        noise: depth camera whose depth is written; None: perfect depth.
+
+    Raises:
+        InputError: pyarrow is absent, or the folder holds such a table already.
+    """
+    parquet.arrow()
+    if (folder / "grasps").exists():
+        raise InputError(f"{folder} holds a table of grasps already; give another folder as --output")
+    done = Written({"grasps": 0, "pictures": 0, "files": 0})
+    sides = {"train": {lot.name for lot in lots} - out, "test": set(out)}
+    names = {lot.id: lot.name for lot in lots}
+    for split, some in sides.items():
+        if not some:
+            done.notes.append("one object: all of it is train, there is no test")
+            continue
+        mine = [lot for lot in lots if lot.name in some]
+        file = folder / "grasps" / f"{split}-00000.parquet"
+        done.counts["grasps"] += parquet.write(file, parquet.schema_of(GRASPS), map(_grasps, mine))
+        done.counts["files"] += 1
+        if len(pictures):
+            file = folder / "pictures" / f"{split}-00000.parquet"
+            shown = {shard: name for shard, name in names.items() if name in some}
+            groups = _groups(pictures, shown, noise)
+            done.counts["pictures"] += parquet.write(file, parquet.schema_of(PICTURES), groups)
+            done.counts["files"] += 1
+    (folder / "README.md").write_text(_card([split for split, some in sides.items() if some], seen=bool(len(pictures))))
+    return done
+
+
+def _grasps(lot: Lot) -> list[dict[str, Any]]:
+    said, arrays = lot.shard.attributes, lot.shard.arrays
+    thresholds = np.asarray(arrays["quality/thresholds_m"], float)
+    at = int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))
+    spec = scene_spec_of(lot.shard)
+    kind = FREE if lot.placed is None or spec is None else spec.kind
+    types = np.asarray(arrays.get("quality/grasp_type", np.zeros(len(lot.grasps), int)))
+    rows = []
+    for row in lot.rows.tolist():
+        one: dict[str, Any] = {
+            "hand": lot.hand.name,
+            "object": lot.name,
+            "shard": lot.id,
+            "row": row,
+            "root_link": lot.hand.root_link,
+            "joint_names": list(lot.hand.joint_names),
+            "verdict": int(lot.verdict[row]),
+            "verdict_level": str(said.get("verdict_level", "none")),
+            "epsilon": float(np.asarray(arrays["quality/epsilon"], float)[row, at]),
+            "penetration_depth_mm": float(arrays["quality/penetration_depth_mm"][row]),
+            "grasp_type": int(types[row]),
+            "scene_kind": kind,
+            "scene": -1,
+            "object_pose": IDENTITY_POSE.tolist(),
+        }
+        if lot.placed is not None:
+            scene = int(lot.placed.index[row])
+            one |= {"scene": scene, "object_pose": np.asarray(lot.placed.object_pose[scene], float).tolist()}
+        for name in POSTURES:
+            part: Posture = getattr(lot.grasps, name)
+            one |= {f"{name}_pose": part.hand_pose[row].tolist(), f"{name}_joints": part.joint_positions[row].tolist()}
+        rows.append(one)
+    return rows
+
+
+def _groups(pictures: Pictures, names: Mapping[str, str], noise: DepthNoise | None) -> Iterator[list[dict[str, Any]]]:
+    """The pictures of some base shards, given with the names of their objects."""
+    group: list[dict[str, Any]] = []
+    for index in range(len(pictures)):
+        sample = pictures[index]
+        if sample["base_id"] in names:
+            depth = CloudView.of(sample, noise, np.random.default_rng(index)).seen
+            group.append(_picture(sample, names[sample["base_id"]], depth))
+        if len(group) == _PICTURES_AT_ONCE:
+            yield group
+            group = []
+    if group:
+        yield group
+
+
+def _picture(sample: Mapping[str, Any], name: str, depth: Floats) -> dict[str, Any]:
+    steps = np.where(depth / PNG_STEP_M < np.iinfo(np.uint16).max + 0.5, np.rint(depth / PNG_STEP_M), 0)
+    return {
+        "hand": sample["hand"],
+        "object": name,
+        "shard": sample["shard_id"],
+        "row": int(sample["row"]),
+        "scene": int(sample["scene"]),
+        "rgb": png(sample["image/rgb"]),
+        "depth": png(steps.astype(np.uint16)),
+        "segmentation": png(sample["image/segmentation"]),
+        "intrinsics": np.asarray(sample["camera/intrinsics"], float).tolist(),
+        "extrinsics": np.asarray(sample["camera/extrinsics"], float).tolist(),
+        "object_pose": np.asarray(sample["object/pose"], float).tolist(),
+        "grasp_shard": sample["base_id"],
+        "grasp_rows": np.asarray(sample["grasp/base_row"]).tolist(),
+        "hand_poses": np.asarray(sample["grasp/hand_pose"], float).tolist(),
+        "joint_positions": np.asarray(sample["grasp/joint_positions"], float).tolist(),
+    }
+
+
+def png(pixels: NDArray[Any]) -> dict[str, Any]:
+    """A picture as Hugging Face's readers take it."""
+    data = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(data, format="PNG", compress_level=1)
+    return {"bytes": data.getvalue(), "path": None}
+
+
+def _card(splits: list[str], *, seen: bool) -> str:
+    """The head of the data set's card: JSON is YAML."""
+    tables = [
+        {
+            "config_name": table,
+            "default": table == "grasps",
+            "data_files": [{"split": split, "path": f"{table}/{split}-*.parquet"} for split in splits],
+        }
+        for table in (["grasps", "pictures"] if seen else ["grasps"])
+    ]
+    head = f"---\nconfigs: {json.dumps(tables)}\n---\n\n"
+    return (
+        head
+        + "# Grasps made with graspd\n\nColumns, units and frames: docs/how-to/exchange/huggingface.md of graspd.\n"
+    )
+
+
+def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Imported]:
+    """The grasps of one object, those of free objects apart from those on tables.
+
+    Args:
+        path: a file of grasps, or a folder with `grasps/*.parquet`.
+        hand: URDF or built-in hand; joints are found by name.
+        obj: mesh of the object.
+        object_name: the object's name in the file; may be left out where there is one.
+
+    Raises:
+        InputError: pyarrow is absent, no such file or object, or grasps for another kind of scene than a table.
+    """
+    files = [path] if path.is_file() else sorted((path / "grasps").glob("*.parquet"))
+    columns: dict[str, list[Any]] = {}
+    for file in files:
+        for name, values in parquet.read(file, GRASPS).items():
+            columns.setdefault(name, []).extend(values)
+    needed = ["object", "joint_names", *(f"{name}_{what}" for name in POSTURES for what in ("pose", "joints"))]
+    if missing := [name for name in needed if name not in columns]:
+        raise InputError(f"{path} has no column {missing[0]!r}, so it is no table of grasps")
+    columns["object"] = list(map(str, columns["object"]))
+    names = sorted(set(columns["object"]))
+    if len(names) != 1 and object_name not in names:
+        raise InputError(f"{path} has grasps on {', '.join(names[:8]) or 'nothing'}; name one object of them: --name")
+    wanted = object_name or names[0]
+    kinds = columns.get("scene_kind", [])
+    if len(kinds) != len(columns["object"]):
+        kinds = [FREE] * len(columns["object"])
+    rows = [k for k, name in enumerate(columns["object"]) if name == wanted]
+    if other := {kinds[k] for k in rows} - {FREE, TABLE}:
+        raise InputError(f"{path} has grasps for scenes of the kind {sorted(other)[0]!r}; only tables come back")
+    apart = {kind: [k for k in rows if kinds[k] == kind] for kind in (FREE, TABLE)}
+    return [
+        _set(path, hand, obj, wanted, columns, some, on_table=kind == TABLE) for kind, some in apart.items() if some
+    ]
+
+
+def _set(
+    path: Path, hand: str, obj: str, name: str, columns: dict[str, list[Any]], rows: list[int], *, on_table: bool
+) -> Imported:
+    model, thing = hand_from_path(hand), scaled_object(obj)
+    try:
+        joints = {tuple(columns["joint_names"][k]) for k in rows}
+        (order,) = joints if len(joints) == 1 else ((),)
+        parts = {}
+        for what in POSTURES:
+            pose = np.array([columns[f"{what}_pose"][k] for k in rows], float).reshape(len(rows), 7)
+            values = np.array([columns[f"{what}_joints"][k] for k in rows], float)
+            parts[what] = Posture(pose, joints_by_name(model, order, values, what=str(path)))
+        verdict = verdicts([columns["verdict"][k] for k in rows]) if "verdict" in columns else None
+        place = np.array([columns["object_pose"][k] for k in rows], float) if on_table else None
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise InputError(f"{path} is no table of grasps: {error}") from None
+    grasps = GraspSet(parts["grasp"], parts["pregrasp"], parts["squeeze"], np.full(len(rows), np.nan))
+    placed = None if place is None else placed_of(place)
+    if placed is not None:
+        grasps.scene = placed.index
+    return Imported(model, thing, grasps, name, 1.0, verdict, placed)

@@ -1,0 +1,163 @@
+"""Grasps of others before our quality stage has seen them: objects at their scale, pickled NumPy files read without
+running them.
+
+A pickle may name any function to be called while it is read. Only arrays, numbers, words and their containers are
+let through here.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.service.model.base import why
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import Floats
+from graspd.worker.control.postures import pregrasp, squeeze
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.simulation.surroundings import Placed
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where grasps come from, and on what terms."""
+
+    format: str
+    source: str
+    """Where a reader finds them: an address or a citation."""
+    licence: str
+
+
+@dataclass(frozen=True)
+class Imported:
+    """Grasps of one hand on one object, all three postures."""
+
+    hand: HandModel
+    obj: ObjectModel
+    grasps: GraspSet
+    name: str
+    """Of the object, as the source calls it."""
+    scale: float = 1.0
+    """Factor that the source puts on the object's mesh."""
+    published: NDArray[np.int8] | None = None
+    """(N,) success as published: 1, 0, -1 unknown."""
+    placed: Placed | None = None
+    """The scenes that the grasps are for, if any."""
+
+
+def completed(hand: HandModel, obj: ObjectModel, grasp: Posture) -> GraspSet:
+    """Grasps with postures of ours before and after contact, for sources that have only the grasp."""
+    return GraspSet(grasp, pregrasp(hand, obj, grasp), squeeze(hand, obj, grasp), np.full(len(grasp), np.nan))
+
+
+def verdicts(values: Sequence[Any] | NDArray[Any]) -> NDArray[np.int8]:
+    """(N,) what a file says of its grasps as 1 held, 0 dropped, -1: nothing that says so."""
+    return np.array([int(value) if value in (0, 1) else -1 for value in np.ravel(values).tolist()], np.int8)
+
+
+def joints_by_name(hand: HandModel, names: Sequence[str], values: Any, *, what: str) -> Floats:
+    """(N, J) joint positions in the hand's order from (N, n) values in the order of `names`.
+
+    Joints that the source does not have are led by a mimic or stand at their middle.
+
+    Raises:
+        InputError: a name is not a joint of the hand, or the widths differ.
+    """
+    given = np.atleast_2d(np.asarray(values, float))
+    if given.shape[1] != len(names):
+        raise InputError(f"{what}: {given.shape[1]} joint values for {len(names)} joints")
+    if unknown := [name for name in names if name not in hand.joint_names]:
+        raise InputError(
+            f"{what}: {hand.name} has no joint {unknown[0]!r}; its joints are {', '.join(hand.joint_names)}"
+        )
+    order = [hand.joint_names.index(name) for name in names]
+    middle = hand.expand(0.5 * (hand.lower + hand.upper)[None])[0]
+    out = np.tile(middle, (len(given), 1))
+    out[:, order] = given
+    return out
+
+
+def scaled_object(path: str | Path, scale: float = 1.0) -> ObjectModel:
+    """A mesh or built-in object, its size multiplied by `scale`.
+
+    Sources that scale their meshes mean the numbers in the file, so no unit is guessed.
+
+    Raises:
+        NotFoundError, MeshError: see `object_from_path`.
+    """
+    if scale == 1.0:
+        return object_from_path(path)
+    plain = object_from_path(path, options={"units": "m"})
+    extent = float(np.ptp(plain.vertices, axis=0).max())
+    return object_from_path(path, options={"units": "m", "scale_to": extent * scale})
+
+
+def mesh_file(obj: ObjectModel, path: Path) -> Path:
+    """The object's prepared mesh as an OBJ file, for readers that have no other."""
+    return write_obj(path, obj.vertices, obj.faces, f"{obj.name}, metres")
+
+
+def write_obj(path: Path, vertices: Any, faces: Any, comment: str = "metres") -> Path:
+    """Write a triangle mesh (V, 3), (F, 3) as an OBJ file."""
+    lines = [f"# {comment}"]
+    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices]
+    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+_HARMLESS: Final = {
+    ("numpy", "ndarray"),
+    ("numpy", "dtype"),
+    ("numpy.core.multiarray", "_reconstruct"),
+    ("numpy._core.multiarray", "_reconstruct"),
+    ("numpy.core.multiarray", "scalar"),
+    ("numpy._core.multiarray", "scalar"),
+    ("numpy.core.numeric", "_frombuffer"),
+    ("numpy._core.numeric", "_frombuffer"),
+}
+
+
+class _Reader(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in _HARMLESS:
+            raise pickle.UnpicklingError(f"it would run {module}.{name}")
+        return super().find_class(module, name)
+
+
+def load_npy(path: Path) -> Any:
+    """What a `.npy` file holds: an array, or the one object in it.
+
+    Raises:
+        InputError: no NumPy file, or one that would run code.
+    """
+    try:
+        with path.open("rb") as file:
+            if (array := _plain(file)) is not None:
+                return array
+            found = _Reader(file).load()
+    except pickle.UnpicklingError as error:
+        raise InputError(f"{path} cannot be read safely: {error}") from None
+    except Exception as error:  # a pickle of a stranger may raise anything
+        raise InputError(f"{path} is no NumPy file: {why(error)}") from None
+    return found.item() if isinstance(found, np.ndarray) and found.shape == () else found
+
+
+def _plain(file: BinaryIO) -> np.ndarray | None:
+    """The array, if it has no objects; else the file is left where its pickle begins."""
+    version = np.lib.format.read_magic(file)
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    _, _, dtype = header(file)
+    if dtype.hasobject:
+        return None
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)

@@ -1,0 +1,362 @@
+"""A LeRobot data set (v3.0): the way of a grasp as an episode, seen by one camera before the hand comes.
+
+    meta/info.json, meta/stats.json                       features, numbers, statistics of each feature
+    meta/tasks.parquet, meta/episodes/chunk-000/...       words of the tasks; where each episode's frames are
+    data/chunk-CCC/file-FFF.parquet                       frames; pictures are in them as PNG
+
+A frame is a waypoint of the way, from the standoff to the squeeze: `observation.state` is where the hand is, `action`
+where it goes next, the last of an episode the lift: root position [m] and quaternion w x y z in the table's frame, then
+all moving joints [rad or m]. `observation.environment_state` is the object's pose at rest, in the same frame. Waypoints
+are places and not instants, so `fps` only numbers them.
+
+Grasps back from a LeRobot data set of ours, see `lerobot`: the way of each episode, in its object's frame.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.exchange.bench_scene import placed_of
+from graspd.exchange.huggingface import png
+from graspd.exchange.imported import Imported, joints_by_name, scaled_object, verdicts
+from graspd.exchange.lots import Look, Lot, Written, by_scene, looks
+from graspd.service import parquet
+from graspd.service.model.base import why
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import POSE_PARTS, Floats, compose, invert
+from graspd.service.readers import Pictures
+from graspd.service.readers.ways import way_of
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.load import hand_from_path
+
+VERSION: Final = "v3.0"
+FPS: Final = 10
+STATE, ACTION, OBJECT, PICTURE = (
+    "observation.state",
+    "action",
+    "observation.environment_state",
+    "observation.images.scene",
+)
+EPISODE: Final = "episode_index"
+#: What the list of episodes says besides.
+VERDICT: Final = "graspd/verdict"
+#: Columns that each frame has, whatever the features.
+NUMBERS: Final = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    EPISODE: "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
+#: Episodes in a file, and files in a folder.
+_EPISODES: Final = 100
+_FILES: Final = 1000
+_QUANTILES: Final = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+#: Tells pandas that the words of the tasks are the index of their table.
+_INDEXED: Final = {
+    "index_columns": ["task"],
+    "column_indexes": [],
+    "pandas_version": "2.0.0",
+    "columns": [
+        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
+        for name, kind, numpy in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
+    ],
+}
+
+
+def write(lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[str]) -> Written:
+    """Write an episode for each grasp whose scene has a picture; of several pictures each takes the next one.
+
+    Args:
+        lots: grasps planned in scenes, of one hand.
+        pictures: of the scenes, with colour.
+        folder: the data set; made if absent.
+        out: objects that are held out: their episodes stand last, split `test`.
+
+    Raises:
+        InputError: pyarrow is absent, there is such a data set, grasps of several hands or of free objects, no
+            pictures, or pictures of several sizes.
+    """
+    parquet.arrow()
+    if (folder / "meta").exists():
+        raise InputError(f"{folder} holds a data set already; give another folder as --output")
+    if len({lot.hand.digest for lot in lots}) > 1:
+        raise InputError(f"a LeRobot data set is of one robot; {folder} would be of several hands: export them apart")
+    ways = [lot for lot in sorted(lots, key=lambda lot: lot.name in out) if lot.placed is not None]
+    if not ways:
+        raise InputError("grasps of free objects have no way to their object; plan them in a scene: --scene table")
+    seen = {(some[0].base, some[0].scene): some for some in by_scene(list(looks(pictures))).values()}
+    episodes = [(lot, row, look) for lot in ways for row, look in _seen(lot, seen)]
+    if not episodes:
+        raise InputError("no picture shows the scene of a grasp; put views beside the grasps: graspd render")
+    tasks = {name: k for k, name in enumerate(dict.fromkeys(lot.name for lot, _, _ in episodes))}
+    writer = _Writer(folder, ways[0], pictures, tasks)
+    for first in range(0, len(episodes), _EPISODES):
+        writer.file(episodes[first : first + _EPISODES])
+    writer.meta(sum(lot.name not in out for lot, _, _ in episodes))
+    done = Written({"grasps": len(episodes), "frames": writer.frames, "files": -(-len(episodes) // _EPISODES)})
+    if left := sum(len(lot.rows) for lot in lots) - len(episodes):
+        done.notes.append(f"{left} grasps are left out: they are free, or no picture shows their scene")
+    return done
+
+
+def _seen(lot: Lot, seen: Mapping[tuple[str, int], list[Look]]) -> Iterator[tuple[int, Look]]:
+    """The lot's rows with a picture of their scene."""
+    assert lot.placed is not None
+    for k, row in enumerate(lot.rows.tolist()):
+        if found := seen.get((lot.id, int(lot.placed.index[row]))):
+            yield row, found[k % len(found)]
+
+
+def postures_of(lot: Lot, row: int) -> Floats:
+    """(W, 7 + J) root and joints on the way of a grasp, in the frame of its table."""
+    assert lot.placed is not None
+    rest = np.asarray(lot.placed.object_pose[lot.placed.index[row]], float)
+    way = way_of(lot.shard, row)
+    return np.array([np.concatenate([compose(rest, at.hand_pose), at.joint_positions]) for at in way])
+
+
+class _Writer:
+    """Files of frames, and what is told of all of them."""
+
+    def __init__(self, folder: Path, lot: Lot, pictures: Pictures, tasks: dict[str, int]) -> None:
+        self.folder, self.hand, self.pictures, self.tasks = folder, lot.hand, pictures, tasks
+        self.frames, self.episodes = 0, list[dict[str, Any]]()
+        self._size: tuple[int, ...] = ()
+        self._values: dict[str, list[NDArray[Any]]] = {}
+
+    def file(self, episodes: Sequence[tuple[Lot, int, Look]]) -> None:
+        """Write a file, each episode a row group."""
+        number = len(self.episodes) // _EPISODES
+        width = 7 + len(self.hand.joint_names)
+        columns = {
+            STATE: f"float32[{width}]",
+            ACTION: f"float32[{width}]",
+            OBJECT: "float32[7]",
+            PICTURE: parquet.IMAGE,
+        }
+        place = {"data/chunk_index": number // _FILES, "data/file_index": number % _FILES}
+        path = (
+            self.folder
+            / "data"
+            / f"chunk-{place['data/chunk_index']:03}"
+            / f"file-{place['data/file_index']:03}.parquet"
+        )
+        parquet.write(path, parquet.schema_of(columns | NUMBERS), (self._episode(*one, place) for one in episodes))
+
+    def _episode(self, lot: Lot, row: int, look: Look, place: Mapping[str, int]) -> list[dict[str, Any]]:
+        way = postures_of(lot, row).astype(np.float32)
+        colour = np.asarray(self.pictures[look.index]["image/rgb"])
+        if self._size not in ((), colour.shape):
+            raise InputError(f"pictures of {colour.shape[:2]} and {self._size[:2]} pixels do not go into one data set")
+        self._size = colour.shape
+        picture, number, count = png(colour), len(self.episodes), len(way) - 1
+        rest = look.object_pose.astype(np.float32)
+        numbers: dict[str, NDArray[Any]] = {
+            "timestamp": (np.arange(count) / FPS).astype(np.float32),
+            "frame_index": np.arange(count),
+            EPISODE: np.full(count, number),
+            "index": self.frames + np.arange(count),
+            "task_index": np.full(count, self.tasks[lot.name]),
+        }
+        self._keep({STATE: way[:-1], ACTION: way[1:], OBJECT: np.tile(rest, (count, 1)), **numbers}, colour)
+        self.episodes.append(
+            {
+                EPISODE: number,
+                "tasks": [task_of(lot.name)],
+                "length": count,
+                **place,
+                "dataset_from_index": self.frames,
+                "dataset_to_index": self.frames + count,
+                "meta/episodes/chunk_index": 0,
+                "meta/episodes/file_index": 0,
+                "graspd/shard": lot.id,
+                "graspd/row": row,
+                VERDICT: int(lot.verdict[row]),
+            }
+        )
+        self.frames += count
+        return [
+            {
+                STATE: way[k].tolist(),
+                ACTION: way[k + 1].tolist(),
+                OBJECT: rest.tolist(),
+                PICTURE: picture,
+                **{name: values[k].item() for name, values in numbers.items()},
+            }
+            for k in range(count)
+        ]
+
+    def _keep(self, values: Mapping[str, NDArray[Any]], colour: NDArray[Any]) -> None:
+        for name, some in values.items():
+            self._values.setdefault(name, []).append(some.reshape(len(some), -1))
+        # A tenth of the pixels tells a picture's colours.
+        self._values.setdefault(PICTURE, []).append(colour.reshape(-1, colour.shape[-1])[::10] / 255)
+
+    def meta(self, train: int) -> None:
+        """Write what is told of all: the first `train` episodes are for training."""
+        meta, total = self.folder / "meta", len(self.episodes)
+        meta.mkdir(parents=True)
+        splits = {"train": f"0:{train}"} | ({"test": f"{train}:{total}"} if train < total else {})
+        info = {
+            "codebase_version": VERSION,
+            "robot_type": self.hand.name,
+            "total_episodes": total,
+            "total_frames": self.frames,
+            "total_tasks": len(self.tasks),
+            "chunks_size": _FILES,
+            "fps": FPS,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 500,
+            "splits": splits,
+            "video_path": None,
+            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+            "features": self._features(),
+        }
+        (meta / "info.json").write_text(json.dumps(info, indent=4) + "\n")
+        stats = {
+            name: _statistics(np.concatenate(some), picture=name == PICTURE) for name, some in self._values.items()
+        }
+        (meta / "stats.json").write_text(json.dumps(stats, indent=4) + "\n")
+        schema = parquet.schema_of({"task_index": "int64", "task": "text"}, {"pandas": json.dumps(_INDEXED)})
+        rows = [{"task_index": number, "task": task_of(name)} for name, number in self.tasks.items()]
+        parquet.write(meta / "tasks.parquet", schema, [rows])
+        words = {"tasks": "text[]", "graspd/shard": "text"}
+        columns = {name: words.get(name, "int64") for name in self.episodes[0]}
+        path = meta / "episodes" / "chunk-000" / "file-000.parquet"
+        parquet.write(path, parquet.schema_of(columns), [self.episodes])
+
+    def _features(self) -> dict[str, Any]:
+        names = [*POSE_PARTS, *self.hand.joint_names]
+        moving = {"dtype": "float32", "shape": [len(names)], "names": names}
+        return {
+            STATE: moving,
+            ACTION: moving,
+            OBJECT: {"dtype": "float32", "shape": [7], "names": list(POSE_PARTS)},
+            PICTURE: {"dtype": "image", "shape": list(self._size), "names": ["height", "width", "channels"]},
+            **{name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in NUMBERS.items()},
+        }
+
+
+def task_of(name: str) -> str:
+    """What an episode does, in words."""
+    return f"lift the {name}"
+
+
+def _statistics(values: NDArray[Any], *, picture: bool) -> dict[str, Any]:
+    """Over frames (F, n), of pictures over pixels (P, 3), as (n,) and (3, 1, 1)."""
+    values = np.asarray(values, float)
+    found = {
+        "min": values.min(axis=0),
+        "max": values.max(axis=0),
+        "mean": values.mean(axis=0),
+        "std": values.std(axis=0),
+    }
+    found |= {name: np.quantile(values, share, axis=0) for name, share in _QUANTILES.items()}
+    shaped = {name: (one[:, None, None] if picture else one).tolist() for name, one in found.items()}
+    return shaped | {"count": [len(values)]}
+
+
+#: Postures that end a way: pregrasp, grasp, squeeze, lift.
+_STOPS = 4
+#: What `info.json` may take [bytes].
+_LARGEST = 2**22
+
+
+def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Imported]:
+    """The grasps on one object, on tables, with their ways as far as all episodes have as many waypoints.
+
+    Args:
+        path: the data set.
+        hand: URDF or built-in hand; joints are found by name.
+        obj: mesh of the object.
+        object_name: as the tasks name it; may be left out where there is one task.
+
+    Raises:
+        InputError: pyarrow is absent, no such data set or object, or one that graspd did not write.
+    """
+    names = _names(path)
+    task = _task(path, object_name)
+    ways, rest, numbers = _ways(path, task)
+    if not len(ways) or min(map(len, ways)) < _STOPS:
+        raise InputError(f"{path} has no episodes of the task {task_of(object_name)!r} with a whole way")
+    model, thing = hand_from_path(hand), scaled_object(obj)
+
+    def posture(qpos: Floats) -> Posture:
+        pose = qpos[:, :7].copy()
+        # float32 leaves quaternions a little off the unit sphere.
+        pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+        return Posture(compose(invert(rest), pose), joints_by_name(model, names, qpos[:, 7:], what=str(path)))
+
+    pregrasp, grasp, squeeze, lift = (posture(np.array([way[k] for way in ways])) for k in range(-_STOPS, 0))
+    grasps = GraspSet(grasp, pregrasp, squeeze, np.full(len(ways), np.nan))
+    placed = placed_of(rest)
+    grasps.scene, grasps.lift = placed.index, lift
+    if len({len(way) for way in ways}) == 1 and len(ways[0]) > _STOPS:
+        coming = [posture(np.array([way[k] for way in ways])) for k in range(len(ways[0]) - _STOPS)]
+        grasps.approach = np.stack([at.hand_pose for at in coming], axis=1)
+        grasps.coming = coming[-1].joint_positions
+    return [Imported(model, thing, grasps, object_name or thing.name, 1.0, _verdicts(path, numbers), placed)]
+
+
+def _names(path: Path) -> list[str]:
+    """The joints that states have, in their order."""
+    file = path / "meta" / "info.json"
+    try:
+        with file.open("rb") as stream:
+            names = [str(name) for name in json.loads(stream.read(_LARGEST))["features"][STATE]["names"]]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"{file} is no description of a LeRobot data set: {why(error)}") from None
+    if tuple(names[:7]) != POSE_PARTS:
+        raise InputError(f"{path} is no data set of ours: its states do not begin with {', '.join(POSE_PARTS)}")
+    return names[7:]
+
+
+def _task(path: Path, object_name: str) -> int:
+    found = parquet.read(path / "meta" / "tasks.parquet", ("task", "task_index"))
+    words, numbers = found.get("task", []), found.get("task_index", [])
+    if not object_name and len(numbers) == 1:
+        return int(numbers[0])
+    if task_of(object_name) not in words:
+        raise InputError(f"{path} has the tasks {', '.join(map(str, words[:8]))}; name an object of them: --name")
+    return int(numbers[words.index(task_of(object_name))])
+
+
+def _ways(path: Path, task: int) -> tuple[list[Floats], Floats, list[int]]:
+    """Of each episode of a task all postures (W, 7 + J), the object's pose, and its number."""
+    ways: list[Floats] = []
+    rest: list[Floats] = []
+    numbers: list[int] = []
+    wanted = (STATE, ACTION, OBJECT, EPISODE, "frame_index", "task_index")
+    for file in sorted((path / "data").glob("*/*.parquet")):
+        found: dict[str, Any] = parquet.read(file, wanted)
+        try:
+            episode, frame, kind = (np.asarray(found[name], np.int64) for name in wanted[3:])
+            for number in np.unique(episode[kind == task]):
+                rows = np.flatnonzero(episode == number)
+                rows = rows[np.argsort(frame[rows], kind="stable")]
+                way = [found[STATE][k] for k in rows] + [found[ACTION][rows[-1]]]
+                ways.append(np.array(way, float))
+                rest.append(np.array(found[OBJECT][rows[0]], float).reshape(7))
+                numbers.append(int(number))
+        except (KeyError, ValueError, TypeError) as error:
+            raise InputError(f"{file} is no file of frames of ours: {error}") from None
+    place = np.array(rest).reshape(len(rest), 7)
+    place[:, 3:] /= np.maximum(np.linalg.norm(place[:, 3:], axis=1, keepdims=True), 1e-12)
+    return ways, place, numbers
+
+
+def _verdicts(path: Path, episodes: list[int]) -> NDArray[np.int8] | None:
+    """(N,) as the list of episodes tells them."""
+    found: dict[Any, Any] = {}
+    for file in sorted((path / "meta" / "episodes").glob("*/*.parquet")):
+        columns = parquet.read(file, (EPISODE, VERDICT))
+        if VERDICT in columns and EPISODE in columns:
+            found |= dict(zip(columns[EPISODE], columns[VERDICT], strict=True))
+    return verdicts([found.get(number) for number in episodes]) if found else None

@@ -1,0 +1,138 @@
+"""Every file of an export is opened by a library of its target before the export says that it is done."""
+
+from __future__ import annotations
+
+import csv
+import json
+import tarfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+from xml.etree import ElementTree
+
+import numpy as np
+
+from graspd.service.model.errors import GraspdError
+from graspd.service.parquet import arrow
+
+
+@contextmanager
+def opened(folder: Path) -> Iterator[None]:
+    """Open what is written into a folder within this context, however the writer names its files.
+
+    Raises:
+        GraspdError: a file that a library of its target does not read.
+    """
+    before = _stamps(folder)
+    yield
+    for path, stamp in sorted(_stamps(folder).items()):
+        if before.get(path) != stamp and (reader := READERS.get(path.suffix)):
+            _open(path, *reader)
+
+
+def _stamps(folder: Path) -> dict[Path, tuple[int, int]]:
+    found = ((path, path.stat()) for path in folder.rglob("*") if path.is_file())
+    return {path: (stat.st_mtime_ns, stat.st_size) for path, stat in found}
+
+
+def _open(path: Path, library: str, read: Callable[[Path], Any]) -> None:
+    try:
+        read(path)
+    except ImportError:
+        return  # The writer did without this library, so its user may have another.
+    except Exception as error:  # Each library has errors of its own.
+        why = " ".join(str(error).split())[:300]
+        raise GraspdError(
+            f"{path} was written but {library} cannot read it ({why}); report this with the shard"
+        ) from error
+
+
+def _mjcf(path: Path) -> None:
+    import mujoco
+
+    mujoco.MjModel.from_xml_path(str(path))
+
+
+def _stage(path: Path) -> None:
+    from pxr import Usd
+
+    stage = Usd.Stage.Open(str(path))
+    if not stage.GetDefaultPrim().IsValid():
+        raise ValueError("it has no default prim")
+
+
+def _mesh(path: Path) -> None:
+    import trimesh
+
+    if trimesh.load_scene(path, process=False).is_empty:
+        raise ValueError("it is empty")
+
+
+def _yaml(path: Path) -> None:
+    import yaml
+
+    yaml.load(path.read_bytes(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+
+
+def _rows(path: Path) -> None:
+    with path.open(newline="", encoding="utf-8") as file:
+        if len({len(row) for row in csv.reader(file)}) != 1:
+            raise ValueError("its rows have different lengths")
+
+
+def _arrays(path: Path) -> None:
+    # Our own file of this moment: DexGraspBench's are pickled dictionaries.
+    np.load(path, allow_pickle=True)
+
+
+def _hdf5(path: Path) -> None:
+    import h5py
+
+    with h5py.File(path) as file:
+        file.visititems(lambda _, item: item[()] if isinstance(item, h5py.Dataset) else None)
+
+
+def _table(path: Path) -> None:
+    arrow().parquet.ParquetFile(path).read_row_group(0)
+
+
+def _tar(path: Path) -> None:
+    with tarfile.open(path) as file:
+        file.getnames()
+
+
+def _picture(path: Path) -> None:
+    from PIL import Image
+
+    with Image.open(path) as image:
+        image.verify()
+
+
+def _depth(path: Path) -> None:
+    import OpenEXR
+
+    with OpenEXR.File(str(path)) as file:
+        file.channels()
+
+
+#: By the end of a file's name: the library, and how it opens a file.
+READERS: Final[dict[str, tuple[str, Callable[[Path], Any]]]] = {
+    ".xml": ("mujoco", _mjcf),
+    ".urdf": ("an XML parser", ElementTree.parse),
+    ".usd": ("pxr", _stage),
+    ".glb": ("trimesh", _mesh),
+    ".obj": ("trimesh", _mesh),
+    ".stl": ("trimesh", _mesh),
+    ".yaml": ("PyYAML", _yaml),
+    ".json": ("json", lambda path: json.loads(path.read_bytes())),
+    ".jsonl": ("json", lambda path: [json.loads(line) for line in path.read_text().splitlines()]),
+    ".csv": ("csv", _rows),
+    ".npy": ("NumPy", _arrays),
+    ".npz": ("NumPy", _arrays),
+    ".h5": ("h5py", _hdf5),
+    ".parquet": ("pyarrow", _table),
+    ".tar": ("tarfile", _tar),
+    ".png": ("Pillow", _picture),
+    ".exr": ("OpenEXR", _depth),
+}

@@ -1,0 +1,261 @@
+"""Published grasp sets, read: DDGC, DexGraspNet, MultiDex (GenDexGrasp), and `reference-grasps/1`.
+
+Lundell et al., DDGC, RA-L 2021. For each object of the scene a list of grasps: position and quaternion x y z w of the
+hand in the object's frame; eight joint angles, spread, medial and distal of finger 1, of finger 2, then medial and
+distal of finger 3, closing positive.
+
+DexGraspNet's layout: a `.npy` for each object, a list of dictionaries with `qpos` by joint name and `scale`.
+
+Wang et al., DexGraspNet, ICRA 2023. `qpos` has the root's translation WRJTx, y, z [m], its rotation WRJRx, y, z (Euler
+angles about the fixed axes x, y, z in turn [rad]), and the joints `robot0:FFJ3` ... of the MuJoCo Shadow hand, whose
+numbers are one less than those of the URDF (FFJ4 ...). The object's mesh is multiplied by `scale`.
+
+MultiDex, the dataset of GenDexGrasp: a torch file with a list `metadata` of (..., q, object, robot) tuples.
+
+Li et al., GenDexGrasp, ICRA 2023. `q` has the root's translation [m], the first two columns of its rotation matrix,
+and the joints in the order of the robot's URDF. The original entries begin with a contact map; later versions of the
+file leave it out, and some give the rotation as three Euler angles (rotating axes x, y, z).
+
+Reference grasps as JSON (`reference-grasps/1`): poses as matrices, joints by name, published scores beside them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from pydantic_core import from_json
+
+from graspd.exchange.imported import Imported, completed, joints_by_name, load_npy, scaled_object
+from graspd.service.model.base import why
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import (
+    Floats,
+    compose,
+    pose_from_matrix,
+    quat_from_axis_angle,
+    quat_from_matrix,
+    quat_multiply,
+)
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+
+#: What the name of each joint matches, in the order of the file: finger and phalanx in words, or the maker's numbers.
+ROLES: Final = tuple(
+    rf"(?=.*{finger}).*({words})|j{finger}{number}"
+    for finger, phalanges in (("1", "smd"), ("2", "smd"), ("3", "md"))
+    for words, number in ({"s": ("prox|spread", 1), "m": ("med", 2), "d": ("dist", 3)}[part] for part in phalanges)
+)
+
+
+def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[Imported]:
+    """The grasps of one object of a scene.
+
+    Args:
+        path: `barrett_translation_K.npy`; its `barrett_representation_K.npy` lies beside it.
+        hand: URDF or built-in Barrett hand whose joints name finger (1, 2, 3) and phalanx (spread or prox, med, dist).
+        obj: mesh of the object.
+        number: which object of the scene.
+
+    Raises:
+        InputError: not such files, or no such object in the scene.
+    """
+    beside = path.with_name(path.name.replace("translation", "representation"))
+    if beside == path or not beside.is_file():
+        raise InputError(f"{path} needs its barrett_representation_K.npy beside it")
+    places, joints = (list(load_npy(file)) for file in (path, beside))
+    if number >= len(places) or len(places) != len(joints):
+        raise InputError(f"{path} has {len(places)} objects and {beside.name} {len(joints)}; none is number {number}")
+    place, values = np.asarray(places[number], float), np.asarray(joints[number], float)
+    if place.ndim != 2 or place.shape[1] != 7 or values.shape != (len(place), len(ROLES)):
+        raise InputError(f"{path}: object {number} has grasps of shape {place.shape} and joints of {values.shape}")
+    model, thing = hand_from_path(hand), scaled_object(obj)
+    pose = np.concatenate([place[:, :3], place[:, 6:], place[:, 3:6]], axis=1)
+    grasp = Posture(pose, joints_by_name(model, _names(model), values * _signs(model), what=str(path)))
+    return [Imported(model, thing, completed(model, thing, grasp), thing.name)]
+
+
+def _names(hand: HandModel) -> list[str]:
+    """The hand's joint for each role."""
+    names = []
+    for role in ROLES:
+        found = [name for name in hand.joint_names if re.search(role, name)]
+        if len(found) != 1:
+            raise InputError(f"{hand.name} has no one joint that matches {role!r}: it is no Barrett hand")
+        names.append(found[0])
+    return names
+
+
+def _signs(hand: HandModel) -> np.ndarray:
+    """Where the hand's joint closes towards negative angles, the file's sign is turned."""
+    high, low = hand.expand(hand.upper[None])[0], hand.expand(hand.lower[None])[0]
+    return np.array(
+        [
+            1.0 if max(high[k], low[k]) > -min(high[k], low[k]) else -1.0
+            for k in (hand.joint_names.index(name) for name in _names(hand))
+        ]
+    )
+
+
+_TRANSLATION: Final = ("WRJTx", "WRJTy", "WRJTz")
+_ROTATION: Final = ("WRJRx", "WRJRy", "WRJRz")
+_MUJOCO: Final = "robot0:"
+
+
+def read_dexgraspnet(path: Path, *, hand: str, obj: str, root_offset: np.ndarray | None = None) -> list[Imported]:
+    """Grasps of one object, a set for each scale.
+
+    Args:
+        path: the object's `.npy`.
+        hand: URDF or built-in hand.
+        obj: the object's mesh at scale 1.
+        root_offset: (7,) pose of the hand's root link in the frame that the source calls the root; by default they
+            are one frame.
+
+    Raises:
+        InputError: not such a file, or its joints are not the hand's.
+    """
+    found = load_npy(path)
+    rows = list(found) if isinstance(found, list | np.ndarray) else []
+    if not rows or not all(isinstance(row, dict) and "qpos" in row for row in rows):
+        raise InputError(f"{path} is no list of grasps with `qpos`, as DexGraspNet has it")
+    by_scale: dict[float, list[dict[str, Any]]] = defaultdict(list)
+    for row in rows:
+        by_scale[float(row.get("scale", 1.0))].append(row)
+    model = hand_from_path(hand)
+    sets = []
+    for scale, some in sorted(by_scale.items()):
+        thing = scaled_object(obj, scale)
+        grasps = completed(model, thing, _grasp(path, model, some, root_offset))
+        sets.append(Imported(model, thing, grasps, path.stem, scale))
+    return sets
+
+
+def _grasp(path: Path, hand: HandModel, rows: list[dict[str, Any]], root_offset: Any) -> Posture:
+    try:
+        place = np.array([[row["qpos"][name] for name in _TRANSLATION] for row in rows], float)
+        angles = np.array([[row["qpos"][name] for name in _ROTATION] for row in rows], float)
+        names = [name for name in rows[0]["qpos"] if name not in (*_TRANSLATION, *_ROTATION)]
+        values = np.array([[row["qpos"][name] for name in names] for row in rows], float)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: a grasp has no {error}") from None
+    turns = [quat_from_axis_angle(axis, angles[:, k]) for k, axis in enumerate(np.eye(3))]
+    pose = np.concatenate([place, quat_multiply(turns[2], quat_multiply(turns[1], turns[0]))], axis=1)
+    if root_offset is not None:
+        pose = compose(pose, np.asarray(root_offset, float))
+    return Posture(pose, joints_by_name(hand, [_urdf_name(name, hand) for name in names], values, what=str(path)))
+
+
+def _urdf_name(name: str, hand: HandModel) -> str:
+    """`robot0:FFJ3` is FFJ4 of the URDF, perhaps behind a prefix such as `rh_`; other names stand as they are."""
+    if not name.startswith(_MUJOCO):
+        return name
+    plain = name.removeprefix(_MUJOCO)
+    urdf = f"{plain[:-1]}{int(plain[-1]) + 1}"
+    return next((joint for joint in hand.joint_names if joint == urdf or joint.endswith(f"_{urdf}")), urdf)
+
+
+def read_multidex(path: Path, *, hand: str, obj: str, robot: str, object_name: str) -> list[Imported]:
+    """The grasps of one robot on one object.
+
+    Args:
+        path: `cmap_dataset.pt`. Read by torch with nothing but tensors and plain values let through.
+        hand: URDF or built-in hand: the robot.
+        obj: mesh of the object.
+        robot: the robot's name in the file, `allegro` say.
+        object_name: the object's name in the file, `contactdb+mug` say.
+
+    Raises:
+        InputError: torch is missing, not such a file, or nothing of that robot and object in it.
+    """
+    rows = [row for row in _metadata(path) if len(row) >= 3 and row[-1] == robot and row[-2] == object_name]
+    if not rows:
+        raise InputError(f"{path} has no grasp of {robot!r} on {object_name!r}")
+    model, thing = hand_from_path(hand), scaled_object(obj)
+    q = np.stack([np.asarray(row[-3], float).ravel() for row in rows])
+    joints = len(model.joint_names)
+    if q.shape[1] not in (9 + joints, 6 + joints):
+        raise InputError(f"{path}: q has {q.shape[1]} numbers, {model.name} needs 9 + {joints} or 6 + {joints}")
+    turn = rotation_of_columns(q[:, 3:9]) if q.shape[1] == 9 + joints else rotation_of_angles(q[:, 3:6])
+    grasp = Posture(np.concatenate([q[:, :3], turn], axis=1), q[:, -joints:])
+    return [Imported(model, thing, completed(model, thing, grasp), object_name.rpartition("+")[2])]
+
+
+def rotation_of_columns(columns: Floats) -> Floats:
+    """(N, 4) quaternion of rotations given by their first two columns (N, 6), made orthogonal evenly."""
+    x, y = (_unit(part) for part in (columns[:, :3], columns[:, 3:]))
+    middle, across = _unit(x + y), _unit(x - y)
+    x, y = _unit(middle + across), _unit(middle - across)
+    return quat_from_matrix(np.stack([x, y, _unit(np.cross(x, y))], axis=-1))
+
+
+def rotation_of_angles(angles: Floats) -> Floats:
+    """(N, 4) quaternion of rotations about the rotating axes x, y, z in turn (N, 3) [rad]."""
+    x, y, z = (quat_from_axis_angle(axis, angles[:, k]) for k, axis in enumerate(np.eye(3)))
+    return quat_multiply(x, quat_multiply(y, z))
+
+
+def _unit(vectors: Floats) -> Floats:
+    unit: Floats = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+    return unit
+
+
+def _metadata(path: Path) -> list[Any]:
+    try:
+        import torch
+    except ModuleNotFoundError:
+        raise InputError(f"{path} is a torch file; `pip install torch` to read it") from None
+    try:
+        found = torch.load(path, map_location="cpu", weights_only=True)
+        return list(found["metadata"])
+    except Exception as error:
+        # torch raises what its readers happen to raise; all of it means that the file is not what it should be.
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise InputError(f"{path} is no MultiDex file that can be read safely: {reason}") from None
+
+
+def read_reference(path: Path, *, hand: str | None = None, obj: str | None = None) -> list[Imported]:
+    """The grasps of one file; hand and object by default those beside it that the file names.
+
+    Raises:
+        InputError: not such a file.
+    """
+    stored = _stored(path)
+    try:
+        rows = stored["grasps"]
+        # The set's root has hands/, objects/ and reference_grasps/ in it.
+        root = path.resolve().parents[2]
+        model = hand_from_path(hand or root / stored["hand"]["urdf"])
+        thing = scaled_object(obj or root / "objects" / stored["object"] / "clean.stl")
+        pose = pose_from_matrix(np.array([row["T_object_base"] for row in rows], float))
+        values = np.array([row["q"] for row in rows], float)
+        joints = joints_by_name(model, stored["hand"]["joint_names"], values, what=str(path))
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise InputError(f"{path} is no file of reference grasps: {error!r}") from None
+    published = np.array([_flag(row.get("pick_success_published")) for row in rows], np.int8)
+    grasps = completed(model, thing, Posture(pose, joints))
+    return [Imported(model, thing, grasps, str(stored["object"]), published=published)]
+
+
+def friction(path: Path) -> float | None:
+    """Coulomb coefficient that the file states for its metrics."""
+    value = _stored(path).get("contact_model", {}).get("mu")
+    return None if value is None else float(value)
+
+
+def _stored(path: Path) -> dict[str, Any]:
+    try:
+        found = from_json(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} is no JSON file: {why(error)}") from None
+    if not isinstance(found, dict):
+        raise InputError(f"{path} is no file of reference grasps: it holds no object")
+    return found
+
+
+def _flag(value: object) -> int:
+    return -1 if value is None else int(bool(value))

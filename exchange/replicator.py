@@ -1,0 +1,140 @@
+"""Views in the layout of Omniverse Replicator's BasicWriter, so that its readers work on them.
+
+Beside the image files of `worker.rendering.export`: `bounding_box_2d_tight_NNNN.npy`, `..._2d_loose_NNNN.npy` and
+`..._3d_NNNN.npy` as structured arrays with their `_labels_` and `_prim_paths_` JSON files,
+`semantic_segmentation_labels_NNNN.json` and `camera_params_NNNN.json`. USD's conventions: matrices act on row vectors,
+cameras look along -z with y up, pixels count from the upper left.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.exchange.lots import prim_name
+from graspd.service.model.transforms import Floats
+from graspd.service.store.shards import Shard
+from graspd.worker.rendering.annotate import BACKGROUND, OBJECT, TABLE
+from graspd.worker.rendering.export import export_images
+
+_BOX_2D: Final = np.dtype(
+    [
+        ("semanticId", "<u4"),
+        ("x_min", "<i4"),
+        ("y_min", "<i4"),
+        ("x_max", "<i4"),
+        ("y_max", "<i4"),
+        ("occlusionRatio", "<f4"),
+    ]
+)
+_BOX_3D: Final = np.dtype(
+    [
+        ("semanticId", "<u4"),
+        ("x_min", "<f4"),
+        ("y_min", "<f4"),
+        ("z_min", "<f4"),
+        ("x_max", "<f4"),
+        ("y_max", "<f4"),
+        ("z_max", "<f4"),
+        ("transform", "<f4", (4, 4)),
+        ("occlusionRatio", "<f4"),
+    ]
+)
+#: Width of the sensor that the focal length is stated for, USD's default [mm].
+APERTURE_MM: Final = 20.955
+NEAR_FAR_M: Final = (0.01, 100.0)
+#: From a camera that looks along +z with y down to one that looks along -z with y up.
+_FLIP: Final = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def write(views: Shard, folder: Path) -> list[Path]:
+    """Every picture of a views shard with its annotations.
+
+    Returns:
+        the files.
+
+    Raises:
+        InputError: the folder cannot be written, or has such files already.
+    """
+    written = export_images(views, folder, depth="exr")
+    name = str(views.attributes.get("object", "object"))
+    for view in range(len(views["camera/eye"])):
+        written += _annotations(views, view, name, folder)
+    return written
+
+
+def box_3d(corners: Floats, extrinsics: Floats) -> tuple[Floats, Floats, Floats]:
+    """Lower and upper corner of an object-aligned box in its own frame, and its frame in the world.
+
+    Args:
+        corners: (8, 3) in the camera frame; corner k takes the maximum of x, y, z where bit 0, 1, 2 of k is set.
+        extrinsics: (4, 4) world to camera.
+
+    Returns:
+        (3,), (3,), and (4, 4) acting on row vectors; the box's frame is centred in it.
+    """
+    world = (corners - extrinsics[:3, 3]) @ extrinsics[:3, :3]
+    edges = np.stack([world[1 << axis] - world[0] for axis in range(3)])
+    half = 0.5 * np.linalg.norm(edges, axis=1)
+    transform = np.eye(4)
+    transform[:3, :3] = edges / np.maximum(2 * half[:, None], 1e-12)
+    transform[3, :3] = world.mean(axis=0)
+    return -half, half, transform
+
+
+def camera_params(views: Shard, view: int) -> dict[str, Any]:
+    """The camera in USD's words."""
+    height, width = views["image/rgb"].shape[1:3]
+    k, extrinsics = (np.asarray(views[f"camera/{name}"][view], float) for name in ("intrinsics", "extrinsics"))
+    near, far = NEAR_FAR_M
+    projection = np.array(
+        [
+            [2 * k[0, 0] / width, 0, 1 - 2 * k[0, 2] / width, 0],
+            [0, 2 * k[1, 1] / height, 2 * k[1, 2] / height - 1, 0],
+            [0, 0, -(far + near) / (far - near), -2 * far * near / (far - near)],
+            [0, 0, -1, 0],
+        ]
+    )
+    return {
+        "cameraModel": "pinhole",
+        "cameraViewTransform": (_FLIP @ extrinsics).T.ravel().tolist(),
+        "cameraProjection": projection.T.ravel().tolist(),
+        "cameraFocalLength": float(k[0, 0] * APERTURE_MM / width),
+        "cameraAperture": [APERTURE_MM, APERTURE_MM * height / width],
+        "cameraNearFar": list(NEAR_FAR_M),
+        "metersPerSceneUnit": 1.0,
+        "renderProductResolution": [int(width), int(height)],
+    }
+
+
+def _annotations(views: Shard, view: int, name: str, folder: Path) -> list[Path]:
+    hidden = np.asarray(views.arrays.get("box/occlusion_ratio", np.full(view + 1, np.nan)), float)[view]
+    boxes: dict[str, NDArray[Any]] = {}
+    for kind in ("tight", "loose"):
+        corners = np.asarray(views[f"box/bounding_box_2d_{kind}"][view], float)
+        # A box that is not there is left out, as the writer does with objects that are not seen.
+        found = [(0, *np.rint(corners).astype(int), hidden)] if np.isfinite(corners).all() else []
+        boxes[f"bounding_box_2d_{kind}"] = np.array(found, _BOX_2D)
+    low, high, transform = box_3d(
+        np.asarray(views["box/bounding_box_3d"][view], float), np.asarray(views["camera/extrinsics"][view], float)
+    )
+    boxes["bounding_box_3d"] = np.array([(0, *low, *high, transform, hidden)], _BOX_3D)
+    written = [_json(folder / f"camera_params_{view:04}.json", camera_params(views, view))]
+    for what, rows in boxes.items():
+        np.save(folder / f"{what}_{view:04}.npy", rows)
+        written.append(folder / f"{what}_{view:04}.npy")
+        written.append(_json(folder / f"{what}_labels_{view:04}.json", {"0": {"class": name}}))
+        written.append(_json(folder / f"{what}_prim_paths_{view:04}.json", [f"/World/{prim_name(name)}"] * len(rows)))
+    labels = {BACKGROUND: "BACKGROUND", TABLE: "table", OBJECT: name}
+    said = {str(label): {"class": word} for label, word in labels.items()}
+    written.append(_json(folder / f"semantic_segmentation_labels_{view:04}.json", said))
+    return written
+
+
+def _json(path: Path, value: Any) -> Path:
+    path.write_text(json.dumps(value) + "\n")
+    return path

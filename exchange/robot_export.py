@@ -1,0 +1,190 @@
+"""From a shard to the files of a robot: chosen grasps, their ways and trajectories, written in one format."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.exchange.cases import load_case
+from graspd.exchange.lots import Written
+from graspd.exchange.robots.arm import Description, describe, read_arm
+from graspd.exchange.robots.bundle import Bundle, Carrier
+from graspd.exchange.robots.execution import (
+    ASSUMED_M_S,
+    ASSUMED_RAD_S,
+    Executions,
+    Limits,
+    Trajectory,
+    executions,
+    hand_limits,
+    parse_pose,
+    straight_paths,
+    timed,
+    tool_frame,
+)
+from graspd.exchange.robots.reach import Reach
+from graspd.service.model.errors import InputError, one_of
+from graspd.service.model.transforms import IDENTITY_POSE
+from graspd.service.store.shards import Shard, read_shard
+from graspd.worker.files.provenance import hand_files_of_shard
+from graspd.worker.files.subsets import choose
+from graspd.worker.rendering.sheets import best as best_of
+from graspd.worker.run import ALONE, Run
+from graspd.worker.validation.decomposition import decompose
+
+FORMATS: Final = ("mujoco", "usd", "glb", "moveit", "isaac", "csv")
+#: Other names of formats.
+ALIASES: Final = {"urdf+yaml": "moveit"}
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What a user asks for, as the command line has it."""
+
+    hand: str | None = None
+    obj: str | None = None
+    unjudged: bool = False
+    every: bool = False
+    best: int = 0
+    """At most so many, the best by epsilon first; 0: all, in the order of the shard."""
+    tool: str | None = None
+    speed: float = 0.5
+    """Share of the velocity limits that trajectories use."""
+    arm: str | None = None
+    """The arm's description; the next three say how it stands and carries the hand."""
+    mount: str | None = None
+    base: str | None = None
+    mount_pose: str | None = None
+
+
+def export_grasps(source: Path, format_: str, wishes: Wishes, folder: Path, run: Run = ALONE) -> Written:
+    """Write grasps of a base shard as a robot or its simulator reads them.
+
+    Raises:
+        InputError: unknown format, no such grasps, a tool frame or mount that is none, no grasp that can be reached, or
+            an extra package is absent.
+    """
+    format_ = ALIASES.get(format_, format_)
+    if format_ not in FORMATS:
+        raise InputError(f"there is no robot format {format_!r}; choose one of {one_of(format_, FORMATS)}")
+    if not 0 < wishes.speed <= 1:
+        raise InputError(f"--speed is {wishes.speed:g}; give a share of the velocity limits above 0 and at most 1")
+    _check_arm(wishes)
+    shard = read_shard(source, kind="base")
+    files = hand_files_of_shard(shard, wishes.hand)
+    description = describe(files.files, files.options)
+    written = Written({})
+    found = _found(source, shard, description, wishes, written)
+    limits = hand_limits(found.hand)
+    written.notes += _assumptions(limits)
+    if wishes.arm is None:
+        found = found.take(np.arange(len(found))[: wishes.best or None])
+        trajectories = [_trajectory(found, row, limits, wishes.speed) for row in range(len(found))]
+        bundle = Bundle(found, trajectories, description)
+    else:
+        bundle = _carried(found, description, limits, wishes, written, run)
+    paths = _write(bundle, format_, folder, files.files)
+    written.counts |= {"grasps": len(bundle.found), "files": len(paths)}
+    return written
+
+
+def _check_arm(wishes: Wishes) -> None:
+    """Raises InputError where an arm lacks its mount or base, or they lack an arm."""
+    if wishes.arm is None:
+        if wishes.mount or wishes.base or wishes.mount_pose:
+            raise InputError("--mount, --mount-pose and --base go with an arm; name its file: --arm ARM.urdf")
+        return
+    if not wishes.mount:
+        raise InputError("an arm needs the link that the hand is mounted on: --mount LINK")
+
+
+def _carried(
+    found: Executions, description: Description, limits: Limits, wishes: Wishes, written: Written, run: Run
+) -> Bundle:
+    """The grasps that the arm carries out, with its trajectories."""
+    assert wishes.arm is not None and wishes.mount is not None
+    base = IDENTITY_POSE if wishes.base is None else parse_pose(wishes.base, "--base")
+    mount_pose = IDENTITY_POSE if wishes.mount_pose is None else parse_pose(wishes.mount_pose, "--mount-pose")
+    arm = read_arm(wishes.arm, wishes.mount, mount_pose)
+    reach = Reach(arm, base, found, decompose(found.obj))
+    reached = reach.all(wishes.best, run)
+    why = ", ".join(f"{count} {reason}" for reason, count in reached.refused.most_common(3))
+    if not reached.rows:
+        raise InputError(
+            f"the arm {arm.model.name} carries out none of {reached.tried} grasps ({why}); place it elsewhere: --base"
+        )
+    written.counts |= {"tried": reached.tried, "reach_share": round(reached.share, 4), "refused": dict(reached.refused)}
+    if reached.refused:
+        written.notes.append(f"the arm carries out {len(reached.rows)} of {reached.tried} grasps; left out: {why}")
+    of_arm = hand_limits(arm.model)
+    written.notes += _assumptions(of_arm)
+    names = (*arm.model.joint_names, *found.hand.joint_names)
+    velocity = np.concatenate([of_arm.velocity, limits.velocity])
+    trajectories = [timed(paths, names, velocity, speed=wishes.speed) for paths in reached.paths]
+    kept = found.take(np.array(reached.rows, np.intp))
+    return Bundle(kept, trajectories, description, Carrier(arm, base, reach.world, reached.paths))
+
+
+def _found(source: Path, shard: Shard, description: Description, wishes: Wishes, written: Written) -> Executions:
+    case = load_case(source, hand=wishes.hand, obj=wishes.obj)
+    mask, word = choose(shard, unjudged=wishes.unjudged, every=wishes.every)
+    rows = best_of(shard.arrays, len(mask), mask) if wishes.best else np.flatnonzero(mask)
+    tool = tool_frame(wishes.tool, case.hand.root_link, description.links)
+    found = executions(
+        case.hand,
+        case.obj,
+        case.grasps.take(rows),
+        rows=rows,
+        tool=tool,
+        quality=_quality(shard, rows),
+        placed=None if case.placed is None else case.placed.take(rows),
+    )
+    if lost := len(rows) - len(found):
+        written.notes.append(f"{lost} of {len(rows)} {word} have no straight way of 10 cm free of the object: left out")
+    return found
+
+
+def _quality(shard: Shard, rows: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
+    arrays = shard.arrays
+    success = np.asarray(arrays.get("quality/success", np.full(len(arrays["quality/valid"]), -1)))
+    thresholds = np.asarray(arrays["quality/thresholds_m"], float)
+    epsilon = np.asarray(arrays["quality/epsilon"], float)[:, int(np.argmin(np.abs(thresholds - 0.005)))]
+    return {"valid": np.asarray(arrays["quality/valid"])[rows], "success": success[rows], "epsilon": epsilon[rows]}
+
+
+def _trajectory(found: Executions, row: int, limits: Limits, speed: float) -> Trajectory:
+    return timed(straight_paths(found, row), found.hand.joint_names, limits.velocity, speed=speed)
+
+
+def _assumptions(limits: Limits) -> list[str]:
+    if not limits.assumed:
+        return []
+    names = ", ".join(limits.assumed[:3]) + (", ..." if len(limits.assumed) > 3 else "")
+    return [
+        f"{len(limits.assumed)} joints have no velocity limit ({names}): {ASSUMED_RAD_S:g} rad/s and {ASSUMED_M_S:g} "
+        "m/s were assumed"
+    ]
+
+
+def _write(bundle: Bundle, format_: str, folder: Path, hand_files: dict[str, bytes]) -> list[Path]:
+    from graspd.exchange.robots import moveit, mujoco_scene, posed_meshes, tables
+
+    if format_ == "csv":
+        return tables.write_tables(bundle, folder)
+    if format_ == "isaac":
+        return tables.write_isaac(bundle, folder)
+    if format_ == "glb":
+        return posed_meshes.write_glb(bundle, folder)
+    if format_ == "usd":
+        return posed_meshes.write_usd(bundle, folder)
+    if format_ == "moveit":
+        return moveit.write(bundle, folder, hand_files)
+    if format_ == "mujoco":
+        return mujoco_scene.write_scene(bundle, folder, decompose(bundle.found.obj)) + mujoco_scene.write_arm(
+            bundle, folder
+        )
+    raise InputError(format_)

@@ -1,0 +1,111 @@
+"""An arm that carries a hand: the joints up to the hand's mount, and the frames and couplings of its description."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graspd.service.model.digests import digest_files
+from graspd.service.model.errors import InputError
+from graspd.service.model.states import AssetKind
+from graspd.service.model.transforms import Floats
+from graspd.worker.hands.collisions import resting_neighbours
+from graspd.worker.hands.load import body_model, files_from_path, main_file
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.options import HandOptions, parse_options
+from graspd.worker.hands.robot import FREE, MOVING, Robot, chain_to
+from graspd.worker.hands.tree import build_tree
+from graspd.worker.hands.xacro import read_robot
+
+
+@dataclass(frozen=True)
+class Arm:
+    """The chain of an arm, with all that hangs on it but what its mount carried."""
+
+    model: HandModel
+    """Bodies, joints, limits and convex pieces; it has no palm and no fingers."""
+    mount: str
+    mount_body: int
+    mount_pose: Floats
+    """(7,) of the mount link in its body's frame."""
+    hand_pose: Floats
+    """(7,) of the hand's root link in the mount link."""
+
+
+def read_arm(path: str | Path, mount: str, hand_pose: Floats) -> Arm:
+    """The arm of a URDF, its folder or a ZIP.
+
+    What hangs on the mount, such as a gripper, is left out; joints that do not lead to it stand still at zero, or at
+    the nearest value that they can have.
+
+    Raises:
+        NotFoundError: no such file.
+        HandError: it is no usable description.
+        InputError: it has no such link, or no joint moves that link.
+    """
+    name, files, stated = files_from_path(path)
+    options = parse_options(files, stated)
+    main = main_file(files, options)
+    robot = read_robot(files, main, options.xacro)
+    if mount not in robot.links:
+        near = ", ".join(list(robot.links)[-6:])
+        raise InputError(f"the arm {name} has no link {mount[:80]!r} to mount a hand on; its last links: {near}")
+    moving = [joint.name for joint in chain_to(robot, mount) if joint.type in MOVING]
+    if not moving:
+        raise InputError(f"no joint of the arm {name} moves the link {mount!r}; name the link behind its last joint")
+    chosen = HandOptions(
+        file=main,
+        xacro=options.xacro,
+        root=robot.root,
+        drop=tuple(joint.child for joint in robot.joints.values() if joint.parent == mount),
+        fix={joint: _rest(robot, joint) for joint in _others(robot, moving, mount)},
+    )
+    tree = build_tree(robot, chosen)
+    digest = digest_files(AssetKind.HAND, files)
+    model = body_model(robot, tree, chosen, files, main, name=name, digest=digest)
+    model = replace(model, neighbours=resting_neighbours(model))
+    body, pose = tree.links[mount]
+    return Arm(model, mount, body, np.asarray(pose, float), hand_pose)
+
+
+def _others(robot: Robot, moving: list[str], mount: str) -> list[str]:
+    """Joints that stand still: those that do not lead to the mount, and one by which the base floats."""
+    chain = {joint.name for joint in chain_to(robot, mount)}
+    return [
+        name
+        for name, joint in robot.joints.items()
+        if name not in moving and joint.type != "fixed" and (name not in chain or joint.type in FREE)
+    ]
+
+
+def _rest(robot: Robot, joint: str) -> float:
+    limits = robot.joints[joint]
+    return float(np.clip(0.0, limits.lower, limits.upper))
+
+
+@dataclass(frozen=True)
+class Description:
+    """Facts on a hand's links and joints."""
+
+    links: Mapping[str, tuple[int, Floats]]
+    """Each link below the root: its body, and its pose (7,) in the body's frame."""
+    mimics: frozenset[str]
+    """Joints that the description itself couples to others: whoever reads it moves them by itself."""
+
+
+def describe(files: Mapping[str, bytes], options: Mapping[str, Any] | None = None) -> Description:
+    """The description of a hand's files; see `load_hand`.
+
+    Raises:
+        HandError: the files describe no usable hand.
+    """
+    settings = parse_options(files, options)
+    robot = read_robot(files, main_file(files, settings), settings.xacro)
+    tree = build_tree(robot, settings)
+    return Description(
+        dict(tree.links), frozenset(name for name in tree.joint_names if robot.joints[name].mimic is not None)
+    )

@@ -1,0 +1,89 @@
+"""What the writers of robots' formats are given, and what they share."""
+
+from __future__ import annotations
+
+import pathlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import yaml
+
+from graspd.exchange.lots import plain_name, prim_names
+from graspd.exchange.robots.arm import Arm, Description
+from graspd.exchange.robots.execution import Executions, Path, Trajectory
+from graspd.exchange.robots.reach import World
+from graspd.service.model.transforms import Floats, compose, invert
+
+
+@dataclass(frozen=True)
+class Carrier:
+    """The arm that carries the hand, where it stands, and its motions."""
+
+    arm: Arm
+    base: Floats
+    """(7,) its base in the frame of the grasps."""
+    world: World
+    paths: list[list[Path]]
+    """Of each grasp; joints are the arm's, then the hand's."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Grasps with their trajectories, ready to be written."""
+
+    found: Executions
+    trajectories: list[Trajectory]
+    """One for each grasp; its joints are the arm's, if there is one, then the hand's."""
+    description: Description
+    carrier: Carrier | None = None
+    """The arm, if there is one."""
+
+    @property
+    def frame(self) -> str:
+        """Name of the frame in which poses are written: the arm's base, the scene, or the object."""
+        if self.carrier is not None:
+            return self.carrier.arm.model.root_link
+        return "scene" if self.found.placed is not None else plain_name(self.found.obj.name)
+
+    def seen(self, pose: Floats) -> Floats:
+        """Poses (..., 7) in the frame `frame`."""
+        return np.asarray(pose, float) if self.carrier is None else compose(invert(self.carrier.base), pose)
+
+    def seen_tool(self, root_pose: Floats) -> Floats:
+        """Poses (..., 7) of the tool frame in the frame `frame`, from those of the hand's root link."""
+        return self.seen(compose(root_pose, self.found.tool.pose))
+
+    @property
+    def prims(self) -> tuple[str, str]:
+        """Names of the object's and the hand's prims below `/World`, beside `scene`."""
+        _, thing, hand = prim_names(["scene", self.found.obj.name, self.found.hand.name])
+        return thing, hand
+
+    def name(self, row: int) -> str:
+        """Name of a grasp, after its row in the shard."""
+        return f"grasp_{self.found.rows[row]:04}"
+
+    @property
+    def steered(self) -> list[int]:
+        """Columns of the hand's joints that are commanded: those that the URDF does not couple to others."""
+        names = self.found.hand.joint_names
+        return [k for k, name in enumerate(names) if name not in self.description.mimics]
+
+
+class _Plain(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
+    """YAML without anchors, which not every reader of messages knows."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def dump_yaml(file: pathlib.Path, value: Any) -> pathlib.Path:
+    """Write a value as YAML, in the order of its keys."""
+    file.write_text(yaml.dump(value, Dumper=_Plain, sort_keys=False, default_flow_style=None, width=120))
+    return file
+
+
+def numbers(values: Any) -> list[float]:
+    """Plain rounded floats: a nanometre, a nanoradian; never a negative zero."""
+    return [round(float(value), 9) + 0.0 for value in np.ravel(values)]

@@ -1,0 +1,351 @@
+"""Grasps ready to be carried out: six postures each, in a frame that the user names, and the timed trajectory between
+them.
+
+Each motion starts and ends at rest: its share s of the way follows 10 u^3 - 15 u^4 + 6 u^5 of the share u of its time
+(minimum jerk, Flash and Hogan 1985), whose steepest slope is 15/8.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, slerp
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel, JointType
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.scenes.way import plan_free_way
+from graspd.worker.simulation.surroundings import STANDOFF_M, Placed
+
+#: Postures of a grasp in their order. The hand comes from `standoff` to `arrival` with open fingers, takes the shape of
+#: `pregrasp`, closes to `grasp`, is commanded to `squeeze`, and rises to `lift`.
+POSTURES: Final = ("standoff", "arrival", "pregrasp", "grasp", "squeeze", "lift")
+#: Motions from one posture to the next.
+PHASES: Final = ("approach", "shape", "close", "squeeze", "lift")
+
+
+@dataclass(frozen=True)
+class ToolFrame:
+    """A frame fixed to the hand's root link: what is steered to a pose."""
+
+    name: str
+    pose: Floats
+    """(7,) in the frame of the root link."""
+
+
+@dataclass(frozen=True)
+class Executions:
+    """N grasps of one hand on one object with all their postures.
+
+    Poses stand in the frame named `frame`: the object's own, or the scene's (z up) where they were planned in one.
+    """
+
+    hand: HandModel
+    obj: ObjectModel
+    tool: ToolFrame
+    frame: str
+    rows: NDArray[np.intp]
+    """(N,) row of each grasp in its shard."""
+    object_pose: Floats
+    """(N, 7) the object at rest."""
+    postures: dict[str, Posture]
+    """The N postures of each of `POSTURES`; hand poses are those of the root link."""
+    placed: Placed | None
+    """The scene of each grasp, if they have one."""
+    quality: dict[str, NDArray[Any]]
+    """(N,) verdicts and metrics: valid, success, epsilon."""
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def scene_index(self) -> NDArray[np.intp]:
+        """(N,) number of each grasp's scene; 0 around a free object."""
+        return np.zeros(len(self), np.intp) if self.placed is None else self.placed.index
+
+    def tool_pose(self, posture: str) -> Floats:
+        """(N, 7) of the tool frame in a posture."""
+        return compose(self.postures[posture].hand_pose, self.tool.pose)
+
+    @property
+    def approach(self) -> Floats:
+        """(N, 3) unit vectors along which the hand comes."""
+        return self._direction("standoff", "arrival")
+
+    @property
+    def retreat(self) -> Floats:
+        """(N, 3) unit vectors along which the hand leaves with the object."""
+        return self._direction("squeeze", "lift")
+
+    def _direction(self, start: str, end: str) -> Floats:
+        way = self.postures[end].hand_pose[:, :3] - self.postures[start].hand_pose[:, :3]
+        return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True))
+
+    @property
+    def lifted_object_pose(self) -> Floats:
+        """(N, 7) the object after the lift, held as it was grasped."""
+        pose = np.array(self.object_pose, float)
+        pose[:, :3] += self.postures["lift"].hand_pose[:, :3] - self.postures["squeeze"].hand_pose[:, :3]
+        return pose
+
+    def take(self, rows: NDArray[np.intp]) -> Executions:
+        """Some of the grasps, in the order of `rows`."""
+        return replace(
+            self,
+            rows=self.rows[rows],
+            object_pose=self.object_pose[rows],
+            postures={name: part.take(rows) for name, part in self.postures.items()},
+            placed=None if self.placed is None else self.placed.take(rows),
+            quality={name: values[rows] for name, values in self.quality.items()},
+        )
+
+
+def executions(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    *,
+    rows: NDArray[np.intp],
+    placed: Placed | None,
+    tool: ToolFrame,
+    quality: dict[str, NDArray[Any]],
+) -> Executions:
+    """Grasps with their ways: those they were planned with in their scene, or around a free object planned here.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        grasps: N grasps.
+        rows: (N,) their rows in the shard.
+        placed: the scene of each, None around a free object.
+        tool: the tool frame.
+        quality: (N,) columns that are handed on.
+
+    Returns:
+        Those that have a way. Around a free object it may be that no straight retreat of 10 cm is free of it.
+
+    Raises:
+        InputError: none has a way.
+    """
+    frame, at = "object", np.tile(IDENTITY_POSE, (len(grasps), 1))
+    free = np.ones(len(grasps), bool)
+    if placed is None or grasps.approach is None or grasps.coming is None or grasps.lift is None:
+        way = plan_free_way(hand, obj, grasps)
+        free, coming = ~way.touching, way.open
+        ends, lift = (way.approach[:, 0], way.approach[:, -1]), way.lift
+    else:
+        frame, at = "scene", np.asarray(placed.object_pose, float)[placed.index]
+        coming, ends, lift = grasps.coming, (grasps.approach[:, 0], grasps.approach[:, -1]), grasps.lift
+    found = {
+        "standoff": Posture(ends[0], coming),
+        "arrival": Posture(ends[1], coming),
+        "pregrasp": grasps.pregrasp,
+        "grasp": grasps.grasp,
+        "squeeze": grasps.squeeze,
+        "lift": lift,
+    }
+    postures = {name: Posture(compose(at, part.hand_pose), part.joint_positions) for name, part in found.items()}
+    whole = Executions(hand, obj, tool, frame, np.asarray(rows, np.intp), at, postures, placed, dict(quality))
+    if not free.any():
+        raise InputError(
+            f"none of {len(grasps)} grasps can be reached along a straight way of {100 * STANDOFF_M:.0f} cm that is "
+            "free of the object"
+        )
+    return whole.take(np.flatnonzero(free))
+
+
+def posed_bodies(found: Executions, posture: str, row: int) -> Floats:
+    """(L, 7) poses of the hand's bodies in one posture of one grasp."""
+    part = found.postures[posture]
+    return np.asarray(body_poses(found.hand, part.hand_pose[row], part.joint_positions[row])[0])
+
+
+#: How far a quaternion may be from length 1 before it is taken for a mistake.
+_SLACK = 1e-2
+
+
+def parse_pose(text: str, what: str) -> Floats:
+    """(7,) from `x y z qw qx qy qz`, separated by spaces or commas [m, 1].
+
+    Raises:
+        InputError: not seven finite numbers, or no unit quaternion.
+    """
+    try:
+        values = np.array([float(part) for part in text[:400].replace(",", " ").split()])
+    except ValueError:
+        values = np.zeros(0)
+    if values.shape != (7,) or not np.isfinite(values).all():
+        raise InputError(f"{what} {text[:80]!r} is no pose; give seven numbers: x y z qw qx qy qz")
+    length = float(np.linalg.norm(values[3:]))
+    if abs(length - 1.0) > _SLACK:
+        raise InputError(f"{what}: the quaternion qw qx qy qz has length {length:.3g}; it must be 1")
+    values[3:] /= length
+    return values
+
+
+def tool_frame(text: str | None, root_link: str, links: Mapping[str, tuple[int, Floats]]) -> ToolFrame:
+    """The tool frame that a user names: a link that does not move with a finger, or a pose in the root link's frame.
+
+    Args:
+        text: a link's name or seven numbers; None: the root link itself.
+        root_link: name of the hand's root link.
+        links: body and pose of each link, see `Description`.
+
+    Raises:
+        InputError: there is no such link, it moves with a finger, or the numbers are no pose.
+    """
+    if not text or text == root_link:
+        return ToolFrame(root_link, IDENTITY_POSE.copy())
+    if text in links:
+        body, pose = links[text]
+        if body:
+            raise InputError(f"the link {text!r} moves with a finger; a tool frame is fixed to {root_link!r}")
+        return ToolFrame(text, np.array(pose, float))
+    if _is_pose(text):
+        return ToolFrame("tool", parse_pose(text, "--tool-frame"))
+    still = [name for name, (body, _) in links.items() if body == 0]
+    near = difflib.get_close_matches(text, links, 1)
+    hint = f"; did you mean {near[0]!r}?" if near else ";"
+    raise InputError(
+        f"the hand has no link {text[:80]!r}{hint} fixed links: {', '.join(still[:8])}; or give a "
+        "pose x y z qw qx qy qz"
+    )
+
+
+def _is_pose(text: str) -> bool:
+    first = text.replace(",", " ").split()[:1]
+    try:
+        return bool(first) and np.isfinite(float(first[0]))
+    except ValueError:
+        return False
+
+
+#: Velocity of a joint whose description states none [rad/s, m/s].
+ASSUMED_RAD_S: Final = 1.0
+ASSUMED_M_S: Final = 0.05
+#: The hand as a whole moves and turns no faster [m/s, rad/s].
+HAND_M_S: Final = 0.25
+HAND_RAD_S: Final = 1.0
+#: Shortest motion, and time between points [s].
+SHORTEST_S: Final = 0.4
+STEP_S: Final = 0.05
+_STEEPEST: Final = 15 / 8
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Velocity limits of joints."""
+
+    velocity: Floats
+    """(J,) [rad/s or m/s]"""
+    assumed: tuple[str, ...]
+    """Joints whose limit nobody states."""
+
+
+@dataclass(frozen=True)
+class Path:
+    """A motion of hand and joints without times: M points at even shares of the way."""
+
+    phase: str
+    hand_pose: Floats
+    """(M, 7)"""
+    joints: Floats
+    """(M, J)"""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """K points of all motions of a grasp, in time."""
+
+    joint_names: tuple[str, ...]
+    phase: tuple[str, ...]
+    """(K,) the motion that each point belongs to; the first point begins the first one."""
+    time: Floats
+    """(K,) since the beginning [s]."""
+    hand_pose: Floats
+    """(K, 7) of the root link."""
+    joints: Floats
+    """(K, J)"""
+    velocity: Floats
+    """(K, J) of the joints, by differences."""
+
+
+def hand_limits(hand: HandModel) -> Limits:
+    """Velocity limits of a hand's joints: those of its description, else `ASSUMED_RAD_S` or `ASSUMED_M_S`."""
+    body = hand.joint_body
+    stated = np.abs(hand.multiplier[body]) * hand.velocity[hand.dof[body]]
+    default = np.where(hand.joint_type[body] == JointType.REVOLUTE, ASSUMED_RAD_S, ASSUMED_M_S)
+    silent = tuple(name for name, known in zip(hand.joint_names, stated, strict=True) if known <= 0)
+    return Limits(np.where(stated > 0, stated, default), silent)
+
+
+def straight_paths(found: Executions, row: int, points: int = 2) -> list[Path]:
+    """The motions of one grasp: root and joints evenly from posture to posture, the root's turn at an even rate."""
+    paths = []
+    for phase, start, end in zip(PHASES, POSTURES[:-1], POSTURES[1:], strict=True):
+        a, b = found.postures[start], found.postures[end]
+        shares = np.linspace(0.0, 1.0, points)[:, None]
+        joints = (1 - shares) * a.joint_positions[row] + shares * b.joint_positions[row]
+        paths.append(Path(phase, _poses(a.hand_pose[row], b.hand_pose[row], shares[:, 0]), joints))
+    return paths
+
+
+def timed(paths: Sequence[Path], names: Sequence[str], velocity: Floats, *, speed: float) -> Trajectory:
+    """Motions one after the other, each at rest at both ends.
+
+    Args:
+        paths: the motions; each begins where the one before ends.
+        names: (J,) names of the joints.
+        velocity: (J,) limits [rad/s or m/s].
+        speed: share of these limits, and of the hand's, that is used; above 0, at most 1.
+    """
+    phase, time, pose, joints = [paths[0].phase], [0.0], [paths[0].hand_pose[:1]], [paths[0].joints[:1]]
+    for path in paths:
+        seconds = max(SHORTEST_S, _STEEPEST * _slowness(path, velocity) / speed)
+        count = math.ceil(seconds / STEP_S)
+        u = np.arange(1, count + 1) / count
+        share = u**3 * (10 - 15 * u + 6 * u**2)
+        phase += [path.phase] * count
+        begun = time[-1]
+        time += (begun + seconds * u).tolist()
+        at = share * (len(path.joints) - 1)
+        left = np.minimum(at.astype(int), len(path.joints) - 2)
+        rest = at - left
+        joints.append((1 - rest)[:, None] * path.joints[left] + rest[:, None] * path.joints[left + 1])
+        pose.append(
+            np.array(
+                [
+                    _poses(path.hand_pose[k], path.hand_pose[k + 1], np.array([r]))[0]
+                    for k, r in zip(left, rest, strict=True)
+                ]
+            )
+        )
+    found, when = np.concatenate(joints), np.array(time)
+    rate = np.gradient(found, when, axis=0)
+    rate[[0, -1]] = 0.0
+    return Trajectory(tuple(names), tuple(phase), when, np.concatenate(pose), found, rate)
+
+
+def _slowness(path: Path, velocity: Floats) -> float:
+    """Seconds that the motion takes at its limits if its share of the way grows evenly."""
+    pieces = len(path.joints) - 1
+    joints = np.abs(np.diff(path.joints, axis=0)) / velocity
+    way = np.linalg.norm(np.diff(path.hand_pose[:, :3], axis=0), axis=1) / HAND_M_S
+    cosine = np.abs((path.hand_pose[1:, 3:] * path.hand_pose[:-1, 3:]).sum(axis=1))
+    turn = 2 * np.arccos(np.minimum(cosine, 1.0)) / HAND_RAD_S
+    return pieces * float(max(joints.max(initial=0.0), way.max(), turn.max()))
+
+
+def _poses(start: Floats, end: Floats, shares: NDArray[np.float64]) -> Floats:
+    """(M, 7) poses between two at shares (M,) of the way."""
+    place = (1 - shares)[:, None] * start[:3] + shares[:, None] * end[:3]
+    turn = np.array([slerp(start[3:], end[3:], float(share)) for share in shares])
+    return np.concatenate([place, turn], axis=1)

@@ -1,0 +1,166 @@
+"""Grasps as `moveit_msgs/Grasp` and `moveit_msgs/RobotTrajectory` messages in YAML, with the URDF of hand and object.
+
+`grasp_pose` is that of the tool frame, which for MoveIt is the link that the end-effector hangs on. Directions stand
+in the frame of the pose. ROS quaternions are x y z w. `effort` [N m or N] is what the squeeze presses with: stiffness
+times the way from grasp to squeeze.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+import numpy as np
+
+from graspd.exchange.imported import mesh_file
+from graspd.exchange.lots import plain_name
+from graspd.exchange.robots.bundle import Bundle, dump_yaml, numbers
+from graspd.exchange.robots.execution import Trajectory
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import Floats
+
+#: Share of a straight motion that must be possible for the grasp to be tried.
+LEAST_SHARE: Final = 0.5
+
+
+def write(bundle: Bundle, folder: Path, hand_files: Mapping[str, bytes]) -> list[Path]:
+    """Write `grasps.yaml`, `trajectories/GRASP.yaml`, the hand's own files into `hand/`, and the object into `object/`.
+
+    Args:
+        bundle: the grasps.
+        folder: where to write.
+        hand_files: the hand's URDF and meshes.
+
+    Raises:
+        InputError: a file of the hand has a name that leads out of its folder.
+    """
+    (folder / "trajectories").mkdir(parents=True, exist_ok=True)
+    grasps = folder / "grasps.yaml"
+    dump_yaml(grasps, [_grasp(bundle, row) for row in range(len(bundle.found))])
+    written = [grasps]
+    for row, trajectory in enumerate(bundle.trajectories):
+        written.append(folder / "trajectories" / f"{bundle.name(row)}.yaml")
+        dump_yaml(written[-1], _trajectory(bundle, trajectory))
+    return written + _hand(folder / "hand", hand_files) + _object(bundle, folder / "object")
+
+
+def _grasp(bundle: Bundle, row: int) -> dict[str, Any]:
+    found = bundle.found
+    postures = found.postures
+    names = [found.hand.joint_names[k] for k in bundle.steered]
+
+    def point(posture: str, seconds: float, effort: Floats | None = None) -> dict[str, Any]:
+        return _point(postures[posture].joint_positions[row, bundle.steered], seconds, effort=effort)
+
+    # The end of each motion: the last time that bears its name.
+    times = dict(zip(bundle.trajectories[row].phase, bundle.trajectories[row].time, strict=True))
+    stiffness = found.hand.stiffness[found.hand.dof[found.hand.joint_body]]
+    press = stiffness * (postures["squeeze"].joint_positions[row] - postures["grasp"].joint_positions[row])
+    closing, squeezing = times["close"] - times["shape"], times["squeeze"] - times["shape"]
+    return {
+        "id": bundle.name(row),
+        "pre_grasp_posture": _joint_trajectory(bundle, names, [point("pregrasp", times["shape"] - times["approach"])]),
+        "grasp_posture": _joint_trajectory(
+            bundle, names, [point("grasp", closing), point("squeeze", squeezing, press[bundle.steered])]
+        ),
+        "grasp_pose": {"header": _header(bundle), "pose": _pose(bundle.seen_tool(postures["grasp"].hand_pose[row]))},
+        "grasp_quality": numbers(found.quality["epsilon"][row])[0],
+        "pre_grasp_approach": _translation(bundle, row, "standoff", "arrival"),
+        "post_grasp_retreat": _translation(bundle, row, "squeeze", "lift"),
+        "post_place_retreat": _translation(bundle, row, "arrival", "standoff"),
+        "max_contact_force": 0.0,
+        "allowed_touch_objects": [plain_name(found.obj.name)],
+    }
+
+
+def _header(bundle: Bundle) -> dict[str, Any]:
+    return {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": bundle.frame}
+
+
+def _pose(pose: Floats) -> dict[str, Any]:
+    x, y, z, qw, qx, qy, qz = numbers(pose)
+    return {"position": {"x": x, "y": y, "z": z}, "orientation": {"x": qx, "y": qy, "z": qz, "w": qw}}
+
+
+def _transform(pose: Floats) -> dict[str, Any]:
+    found = _pose(pose)
+    return {"translation": found["position"], "rotation": found["orientation"]}
+
+
+def _translation(bundle: Bundle, row: int, start: str, end: str) -> dict[str, Any]:
+    a, b = (bundle.seen_tool(bundle.found.postures[name].hand_pose[row])[:3] for name in (start, end))
+    length = float(np.linalg.norm(b - a))
+    x, y, z = numbers((b - a) / length)
+    return {
+        "direction": {"header": _header(bundle), "vector": {"x": x, "y": y, "z": z}},
+        "desired_distance": round(length, 9),
+        "min_distance": round(LEAST_SHARE * length, 9),
+    }
+
+
+def _joint_trajectory(bundle: Bundle, names: list[str], points: list[dict[str, Any]]) -> dict[str, Any]:
+    return {"header": _header(bundle), "joint_names": names, "points": points}
+
+
+def _point(
+    positions: Floats, seconds: float, velocities: Floats | None = None, effort: Floats | None = None
+) -> dict[str, Any]:
+    return {
+        "positions": numbers(positions),
+        "velocities": [] if velocities is None else numbers(velocities),
+        "accelerations": [],
+        "effort": [] if effort is None else numbers(effort),
+        "time_from_start": _duration(seconds),
+    }
+
+
+def _duration(seconds: float) -> dict[str, int]:
+    whole = round(seconds * 1e9)
+    return {"sec": whole // 10**9, "nanosec": whole % 10**9}
+
+
+def _trajectory(bundle: Bundle, path: Trajectory) -> dict[str, Any]:
+    """A RobotTrajectory: the joints, and beside them the way of the tool frame as that of a floating joint."""
+    kept = [k for k, name in enumerate(path.joint_names) if name not in bundle.description.mimics]
+    names = [path.joint_names[k] for k in kept]
+    points = [
+        _point(joints[kept], time, rate[kept])
+        for joints, time, rate in zip(path.joints, path.time, path.velocity, strict=True)
+    ]
+    ways = [
+        {"transforms": [_transform(pose)], "velocities": [], "accelerations": [], "time_from_start": _duration(time)}
+        for pose, time in zip(bundle.seen_tool(path.hand_pose), path.time, strict=True)
+    ]
+    floating = {"header": _header(bundle), "joint_names": [bundle.found.tool.name], "points": ways}
+    return {"joint_trajectory": _joint_trajectory(bundle, names, points), "multi_dof_joint_trajectory": floating}
+
+
+def _hand(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
+    written = []
+    for name, data in files.items():
+        parts = PurePosixPath(name).parts
+        if not parts or ".." in parts or PurePosixPath(name).is_absolute() or "\\" in name:
+            raise InputError(f"the hand's file {name[:80]!r} leads out of its folder")
+        written.append(folder / name)
+        written[-1].parent.mkdir(parents=True, exist_ok=True)
+        written[-1].write_bytes(data)
+    return written
+
+
+def _object(bundle: Bundle, folder: Path) -> list[Path]:
+    obj, name = bundle.found.obj, plain_name(bundle.found.obj.name)
+    folder.mkdir(parents=True, exist_ok=True)
+    mesh = f'<geometry><mesh filename="{name}.obj"/></geometry>'
+    lines = [
+        f'<robot name="{name}">',
+        f'  <link name="{name}">',
+        f"    <visual>{mesh}</visual>",
+        f"    <collision>{mesh}</collision>",
+        "  </link>",
+        "</robot>",
+        "",
+    ]
+    urdf = folder / f"{name}.urdf"
+    urdf.write_text("\n".join(lines))
+    return [mesh_file(obj, folder / f"{name}.obj"), urdf]

@@ -1,0 +1,225 @@
+"""Grasps as MuJoCo scenes with a key frame for each posture: the hand alone with the validator's physics, or on its
+arm.
+
+The world is the frame of the grasps, z up in a scene. A mocap body leads the hand's root; position actuators bear the
+names of the degrees of freedom. In a scene gravity pulls the object alone; a free object floats.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any, Final
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+
+from graspd.exchange.lots import plain_name
+from graspd.exchange.robots.bundle import Bundle, Carrier
+from graspd.exchange.robots.execution import POSTURES, Executions
+from graspd.service.model.matter import ACCELERATION
+from graspd.service.model.transforms import compose
+from graspd.worker.hands.model import HandModel
+from graspd.worker.validation.decomposition import ConvexPieces
+from graspd.worker.validation.model import MujocoOptions, Scene, build, scene_spec
+
+#: Of the hand, the object, and all else.
+_COLOURS: Final = ("0.36 0.45 0.58 1", "0.87 0.45 0.2 1", "0.75 0.75 0.72 1")
+#: Attributes of MJCF that the specification knows by another name.
+_SPEC_NAMES: Final = {"vertex": "uservert"}
+
+
+def write_scene(bundle: Bundle, folder: Path, pieces: ConvexPieces) -> list[Path]:
+    """Write `scene.xml`, which needs no other file, and `replay.py`, which plays and judges its grasps.
+
+    Args:
+        bundle: the grasps.
+        folder: where to write.
+        pieces: the object's convex pieces, as the referee has them.
+    """
+    found = bundle.found
+    folder.mkdir(parents=True, exist_ok=True)
+    around = ((), ()) if found.placed is None else (found.placed.supports, found.placed.neighbours)
+    physics = MujocoOptions()
+    scene = build(found.hand, found.obj, pieces, physics, *around)
+    spec = scene_spec(found.hand, found.obj, pieces, physics, *around)
+    spec.modelname = f"{plain_name(found.hand.name)} and {plain_name(found.obj.name)}"
+    tree = ElementTree.fromstring(spec.to_xml())
+    _restore_digits(tree, spec)
+    for geom in tree.iter("geom"):
+        number = scene.model.geom(geom.attrib["name"]).id
+        geom.set("user", element_text([scene.tip_geoms[number], scene.pressing[number]]))
+    site = {"name": "object_frame", "pos": element_text(-scene.centre), "size": "0.002", "group": "4"}
+    SubElement(one(tree, ".//body[@name='object']"), "site", site)
+    _settle(tree, found)
+    dress(tree, found, ("body0", "object", "supports", *(f"neighbour{k}" for k in range(len(scene.neighbours)))))
+    _add_keys(tree, bundle, scene)
+    rename(tree, _names(found.hand))
+    ElementTree.indent(tree)
+    file, script = folder / "scene.xml", folder / "replay.py"
+    file.write_text(ElementTree.tostring(tree, encoding="unicode") + "\n")
+    script.write_text(Path(__file__).with_name("replay.py").read_text())
+    return [file, script]
+
+
+def _restore_digits(tree: Element, spec: Any) -> None:
+    """Numbers with all their digits: MuJoCo writes six, and contacts that decide a verdict are told apart by less."""
+    for tag in ("body", "joint", "geom", "mesh"):
+        for element in tree.iter(tag):
+            source = getattr(spec, tag)(element.get("name")) if element.get("name") else None
+            for key, text in element.attrib.items():
+                values = getattr(source, _SPEC_NAMES.get(key, key), None)
+                if values is not None and not isinstance(values, str) and np.ndim(values) == 1:
+                    written = text.split()
+                    exact = np.asarray(values, float)[: len(written)]
+                    if np.allclose(exact, np.array(written, float), rtol=1e-5, atol=1e-9):
+                        element.set(key, element_text(exact))
+
+
+def _settle(tree: Element, found: Executions) -> None:
+    """Supports stand still in the world; gravity as in the lift test: on the object alone."""
+    option = one(tree, "option")
+    support = tree.find(".//body[@name='supports']")
+    if support is not None:
+        support.attrib.pop("mocap", None)
+    if found.placed is None:
+        option.set("gravity", "0 0 0")
+    else:
+        option.set("gravity", f"0 0 {-ACCELERATION:g}")
+        for body in one(tree, ".//body[@name='body0']").iter("body"):
+            body.set("gravcomp", "1")
+    flag = option.find("flag")
+    if flag is not None:
+        flag.attrib.pop("gravity", None)
+
+
+def dress(tree: Element, found: Executions, names: tuple[str, ...]) -> None:
+    """Colours of hand, object and what stands around (bodies of these names), light and a camera: none moves a body."""
+    for name, colour in zip_longest(names, _COLOURS[: len(names)], fillvalue=_COLOURS[-1]):
+        for body in tree.findall(f".//body[@name='{name}']"):
+            for geom in body.iter("geom"):
+                geom.set("rgba", colour)
+    world, size = one(tree, "worldbody"), 2 * found.obj.radius + 0.3
+    middle = found.object_pose[0, :3]
+    world.insert(
+        0,
+        Element(
+            "light", pos=element_text(middle + np.array([0.5, -0.5, 2.0])), dir="-0.25 0.25 -1", diffuse="0.9 0.9 0.9"
+        ),
+    )
+    visual = SubElement(tree, "visual")
+    SubElement(visual, "headlight", ambient="0.4 0.4 0.4", diffuse="0.4 0.4 0.4")
+    SubElement(visual, "global", azimuth="130", elevation="-25", offwidth="1280", offheight="960")
+    SubElement(tree, "statistic", center=element_text(middle), extent=element_text([size]))
+
+
+def _add_keys(tree: Element, bundle: Bundle, scene: Scene) -> None:
+    keys = SubElement(tree, "keyframe")
+    for row in range(len(bundle.found)):
+        for posture in POSTURES:
+            name = f"{bundle.name(row)}/{posture}"
+            SubElement(keys, "key", {"name": name, **_key(bundle.found, scene, posture, row)})
+
+
+def _key(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, str]:
+    """State and targets. A squeeze is only commanded: the fingers stand where the grasp has them."""
+    command = found.postures[posture]
+    stands = found.postures["grasp"] if posture in ("squeeze", "lift") else command
+    pose = command.hand_pose[row]
+    qpos = np.zeros(scene.model.nq)
+    qpos[scene.joint_qpos] = stands.joint_positions[row]
+    qpos[scene.root_qpos : scene.root_qpos + 7] = pose
+    at = found.lifted_object_pose[row] if posture == "lift" else found.object_pose[row]
+    qpos[scene.object_qpos : scene.object_qpos + 7] = compose(at, np.array([*scene.centre, 1, 0, 0, 0]))
+    for k, free in enumerate(scene.neighbours):
+        assert found.placed is not None and found.placed.neighbour_pose is not None
+        rest = found.placed.neighbour_pose[found.scene_index[row], k]
+        qpos[free.qpos : free.qpos + 7] = compose(rest, np.array([*free.centre, 1, 0, 0, 0]))
+    control = scene.controls(command.joint_positions[row])
+    return {
+        "qpos": element_text(qpos),
+        "ctrl": element_text(control),
+        "mpos": element_text(pose[:3]),
+        "mquat": element_text(pose[3:]),
+    }
+
+
+def _names(hand: HandModel) -> Mapping[str, str]:
+    """The hand's own names for those of the referee's model; `object`, `supports`, `root` and `mocap` are taken."""
+    taken = {"object", "supports", "root", "mocap", "world"}
+    found: dict[str, str] = {}
+    for prefix, names in (("body", enumerate(hand.body_names)), ("dof", enumerate(hand.dof_names))):
+        found |= {f"{prefix}{k}": name if name not in taken else f"hand_{name}" for k, name in names}
+    joints = zip(hand.joint_body, hand.joint_names, strict=True)
+    return found | {f"joint{b}": name if name not in taken else f"hand_{name}" for b, name in joints}
+
+
+def rename(tree: Element, names: Mapping[str, str]) -> None:
+    """Give bodies, joints, tendons and actuators other names, wherever they are named."""
+    for element in tree.iter():
+        if element.tag not in ("mesh", "geom", "key", "site"):
+            element.attrib.update({key: names[text] for key, text in element.attrib.items() if text in names})
+
+
+def one(tree: Element, path: str) -> Element:
+    """An element that is there."""
+    found = tree.find(path)
+    assert found is not None, path
+    return found
+
+
+def element_text(values: Any) -> str:
+    """Numbers as MJCF has them."""
+    return " ".join(f"{float(value):.17g}" for value in np.ravel(values))
+
+
+def write_arm(bundle: Bundle, folder: Path) -> list[Path]:
+    """Write `arm.xml`; nothing where there is no arm."""
+    if (carrier := bundle.carrier) is None:
+        return []
+    tree = ElementTree.fromstring(carrier.world.spec.to_xml())
+    tree.set("model", f"{carrier.arm.model.name} with {bundle.found.hand.name}")
+    dress(tree, bundle.found, ("hand0", "object"))
+    for geom in tree.iterfind("./worldbody/geom"):
+        geom.set("rgba", "0.75 0.75 0.72 1")
+    for geom in one(tree, ".//body[@name='arm0']").iter("geom"):
+        if "rgba" not in geom.attrib:
+            geom.set("rgba", "0.85 0.85 0.87 1")
+    _add_arm_keys(tree, bundle, carrier)
+    rename(tree, _arm_names(bundle, carrier))
+    ElementTree.indent(tree)
+    file = folder / "arm.xml"
+    file.write_text(ElementTree.tostring(tree, encoding="unicode") + "\n")
+    return [file]
+
+
+def _add_arm_keys(tree: Element, bundle: Bundle, carrier: Carrier) -> None:
+    keys, world, found = SubElement(tree, "keyframe"), carrier.world, bundle.found
+    arms = len(carrier.arm.model.joint_names)
+    for row, paths in enumerate(carrier.paths):
+        ends = [paths[0].joints[0], *(path.joints[-1] for path in paths)]
+        for posture, joints in zip(POSTURES, ends, strict=True):
+            thing = found.lifted_object_pose[row] if posture == "lift" else found.object_pose[row]
+            qpos = np.zeros(world.model.nq)
+            qpos[world.arm_qpos], qpos[world.hand_qpos] = joints[:arms], joints[arms:]
+            SubElement(
+                keys,
+                "key",
+                name=f"{bundle.name(row)}/{posture}",
+                qpos=element_text(qpos),
+                mpos=element_text(thing[:3]),
+                mquat=element_text(thing[3:]),
+            )
+
+
+def _arm_names(bundle: Bundle, carrier: Carrier) -> dict[str, str]:
+    """The arm's and the hand's own names; those of the hand that the arm has as well begin with `hand_`."""
+    found: dict[str, str] = {}
+    taken = {"object", "world", "flange"}
+    for prefix, model in (("arm", carrier.arm.model), ("hand", bundle.found.hand)):
+        names = [name if name not in taken else f"{prefix}_{name}" for name in model.body_names]
+        found |= {f"{prefix}{k}": name for k, name in enumerate(names)}
+        taken |= set(names)
+    return found

@@ -1,0 +1,219 @@
+"""Grasps as posed meshes, one file each: binary glTF (+y up), and USD stages with the trajectory over time (extra
+`usd`).
+
+A stage is in metres and z up. Its default values show the grasp; time samples, 24 a second, lead from the standoff to
+the lift.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from graspd.exchange.lots import plain_name, prim_names
+from graspd.exchange.robots.bundle import Bundle
+from graspd.exchange.robots.execution import Executions, Trajectory, posed_bodies
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import Floats, pose_to_matrix
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.primitives import hull
+from graspd.worker.hands.robot import Ints
+from graspd.worker.objects.glb_document import Document, plain
+from graspd.worker.objects.mesh_geometry import corner_normals
+from graspd.worker.rendering.hands import drawn_bodies, hand_parts
+from graspd.worker.simulation.surroundings import Obstacle
+
+#: From z up to glTF's y up: a quarter turn about x, as x y z w.
+_UPRIGHT: Final = [-float(np.sqrt(0.5)), 0.0, 0.0, float(np.sqrt(0.5))]
+
+
+def write_glb(bundle: Bundle, folder: Path) -> list[Path]:
+    """Write `GRASP.glb`: nodes bear the names of the hand's links, of the object, of supports, and `tool_frame`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    found, written = bundle.found, []
+    moving, thing, standing = hand_meshes(found), object_mesh(found), support_meshes(found)
+    for row in range(len(found)):
+        document = Document()
+        nodes: list[dict[str, Any]] = [{"name": bundle.name(row), "rotation": _UPRIGHT}]
+
+        def add(solid: Solid, pose: Floats | None, document: Document = document, nodes: list[Any] = nodes) -> None:
+            primitive = document.triangles(solid.vertices, solid.faces, solid.normals, solid.colour)
+            nodes.append({"name": solid.name, "mesh": document.mesh([primitive]), **_placed(pose)})
+
+        bodies = posed_bodies(found, "grasp", row)
+        for solid in moving:
+            add(solid, bodies[solid.body])
+        add(thing, found.object_pose[row])
+        for solid in standing:
+            add(solid, None)
+        nodes.append({"name": "tool_frame", **_placed(found.tool_pose("grasp")[row])})
+        nodes[0]["children"] = list(range(1, len(nodes)))
+        said = {"kind": "grasp", "row": int(found.rows[row]), "frame": found.frame, "tool_frame": found.tool.name}
+        written.append(folder / f"{bundle.name(row)}.glb")
+        written[-1].write_bytes(document.bytes(nodes, said))
+    return written
+
+
+def _placed(pose: Floats | None) -> dict[str, Any]:
+    if pose is None:
+        return {}
+    return {"translation": plain(pose[:3]), "rotation": plain(np.roll(pose[3:], -1))}
+
+
+Colour = tuple[float, float, float]
+OBJECT_COLOUR: Final[Colour] = (0.72, 0.2, 0.04)
+SUPPORT_COLOUR: Final[Colour] = (0.5, 0.5, 0.47)
+#: A half-space is shown as a slab of this width and thickness [m].
+SLAB_M: Final = (1.0, 0.02)
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A mesh in the frame of what carries it."""
+
+    name: str
+    vertices: Floats
+    faces: Ints
+    normals: Floats
+    """(F, 3, 3) unit normals of the corners of faces."""
+    colour: Colour
+    """Linear RGB, 0 .. 1."""
+    body: int | None = None
+    """The body of the hand that carries it; None: the object, or nothing."""
+
+
+def hand_meshes(found: Executions) -> list[Solid]:
+    """One for each body of the hand that is seen, in the body's frame."""
+    hand = found.hand
+    return [
+        Solid(
+            _name_of(hand, number),
+            part.solid.vertices,
+            part.solid.faces,
+            part.solid.corner_normals,
+            part.look.base,
+            part.body,
+        )
+        for number, part in enumerate(hand_parts(hand))
+    ]
+
+
+def object_mesh(found: Executions) -> Solid:
+    """The object in its own frame."""
+    return Solid(
+        plain_name(found.obj.name), found.obj.vertices, found.obj.faces, found.obj.corner_normals, OBJECT_COLOUR
+    )
+
+
+def support_meshes(found: Executions) -> list[Solid]:
+    """The supports in the frame of the scene; half-spaces as slabs about the objects."""
+    supports = () if found.placed is None else found.placed.supports
+    middle = found.object_pose[:, :3].mean(axis=0)
+    return [_support(f"support_{k}", _corners(one, middle)) for k, one in enumerate(supports)]
+
+
+def _support(name: str, corners: Floats) -> Solid:
+    vertices, faces = hull(corners)
+    return Solid(name, vertices, faces, corner_normals(vertices, faces), SUPPORT_COLOUR)
+
+
+def _corners(support: Obstacle, middle: Floats) -> Floats:
+    if len(support.corners):
+        return support.corners
+    normal, offset = support.planes[0, :3], float(support.planes[0, 3])
+    foot = middle - (middle @ normal - offset) * normal
+    across = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+    across /= np.linalg.norm(across)
+    width, thickness = SLAB_M
+    ends = [(a, b, c) for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-1, 0)]
+    beside = np.cross(normal, across)
+    return np.array([foot + width * (a * across + b * beside) + thickness * c * normal for a, b, c in ends])
+
+
+def _name_of(hand: HandModel, number: int) -> str:
+    """A body's name; its second solid and those after it are numbered."""
+    bodies = drawn_bodies(hand)
+    before = bodies[:number].count(bodies[number])
+    return hand.body_names[bodies[number]] + (f"_{before + 1}" if before else "")
+
+
+RATE: Final = 24.0
+
+
+def write_usd(bundle: Bundle, folder: Path) -> list[Path]:
+    """Write `GRASP.usd` with `/World/HAND/LINK`, `/World/OBJECT` and `/World/scene`.
+
+    Raises:
+        InputError: usd-core is not installed.
+    """
+    try:
+        from pxr import Usd, UsdGeom
+    except ImportError:
+        raise InputError("the format usd needs usd-core; run pip install 'graspd[usd]'") from None
+    folder.mkdir(parents=True, exist_ok=True)
+    found, written = bundle.found, []
+    moving, thing, standing = hand_meshes(found), object_mesh(found), support_meshes(found)
+    for row, trajectory in enumerate(bundle.trajectories):
+        written.append(folder / f"{bundle.name(row)}.usd")
+        written[-1].unlink(missing_ok=True)
+        stage = Usd.Stage.CreateNew(str(written[-1]))
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        stage.SetTimeCodesPerSecond(RATE)
+        stage.SetStartTimeCode(0.0)
+        stage.SetEndTimeCode(RATE * float(trajectory.time[-1]))
+        stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/World").GetPrim())
+        object_prim, hand_prim = bundle.prims
+        root = f"/World/{hand_prim}"
+        UsdGeom.Xform.Define(stage, root)
+        bodies, times = _bodies(found, trajectory), RATE * trajectory.time
+        at_grasp = posed_bodies(found, "grasp", row)
+        for solid, name in zip(moving, prim_names([solid.name for solid in moving]), strict=True):
+            _add(stage, f"{root}/{name}", solid, at_grasp[solid.body], bodies[:, solid.body], times)
+        pose = found.object_pose[row]
+        _add(stage, f"/World/{object_prim}", thing, pose, _object_poses(found, row, trajectory), times)
+        for solid in standing:
+            _add(stage, f"/World/scene/{solid.name}", solid)
+        stage.Save()
+    return written
+
+
+def _bodies(found: Executions, trajectory: Trajectory) -> Floats:
+    """(K, L, 7) bodies of the hand at each point; the hand's joints are the last of the trajectory's."""
+    joints = trajectory.joints[:, -len(found.hand.joint_names) :]
+    return body_poses(found.hand, trajectory.hand_pose, joints)
+
+
+def _object_poses(found: Executions, row: int, trajectory: Trajectory) -> Floats:
+    """(K, 7) of the object: at rest, then carried by the lift."""
+    poses = np.tile(found.object_pose[row], (len(trajectory.time), 1))
+    lifting = np.array([phase == "lift" for phase in trajectory.phase])
+    start = found.postures["squeeze"].hand_pose[row, :3]
+    poses[lifting, :3] += trajectory.hand_pose[lifting, :3] - start
+    return poses
+
+
+def _add(
+    stage: Any, path: str, solid: Solid, pose: Floats | None = None, poses: Floats | None = None, times: Any = ()
+) -> None:
+    from pxr import Gf, UsdGeom, Vt
+
+    frame = UsdGeom.Xform.Define(stage, path)
+    if pose is not None and poses is not None:
+        operation = frame.AddTransformOp()
+        # USD multiplies row vectors.
+        operation.Set(Gf.Matrix4d(pose_to_matrix(pose).T))
+        for time, matrix in zip(times, pose_to_matrix(poses), strict=True):
+            operation.Set(Gf.Matrix4d(matrix.T), float(time))
+    mesh = UsdGeom.Mesh.Define(stage, f"{path}/mesh")
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(solid.vertices, np.float32)))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(solid.faces), 3, np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(solid.faces, np.int32).ravel()))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.CreateDisplayColorAttr([Gf.Vec3f(*solid.colour)])
+    low, high = (np.asarray(bound(solid.vertices, axis=0), float) for bound in (np.min, np.max))
+    mesh.CreateExtentAttr([Gf.Vec3f(*map(float, low)), Gf.Vec3f(*map(float, high))])

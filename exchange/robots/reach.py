@@ -1,0 +1,327 @@
+"""Grasps that an arm can carry out: inverse kinematics along the trajectory, joint limits, collisions in MuJoCo.
+
+Differential inverse kinematics by mink: each step is a quadratic program in the joints' increments that holds their
+limits. From one pose of the way to the next the arm must move on without a jump.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.exchange.robots.arm import Arm
+from graspd.exchange.robots.execution import Executions, Path, straight_paths
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import Floats
+from graspd.worker.engines.mujoco_warnings import ARENA
+from graspd.worker.hands.model import HandModel, JointType
+from graspd.worker.run import ALONE, Run
+from graspd.worker.simulation.surroundings import Obstacle
+from graspd.worker.validation.decomposition import ConvexPieces
+from graspd.worker.validation.model import add_shape
+
+#: The hand is where it should be within this [m, rad].
+NEAR_M: Final = 1e-4
+NEAR_RAD: Final = 1e-3
+#: Postures from which the arm sets out to find the grasp, and steps of each search.
+STARTS: Final = 24
+STEPS: Final = 80
+#: Farthest that a joint moves from one point of the way to the next, 5 mm [rad or m].
+JUMP: Final = 0.25
+#: Points of the two long motions, and of those in which mainly the fingers move.
+LONG: Final = 21
+SHORT: Final = 5
+_LONG_PHASES: Final = ("approach", "lift")
+#: Why an arm does not carry out a grasp.
+REASONS: Final = ("out of reach", "way not possible", "collision")
+
+
+@dataclass
+class Reached:
+    """What an arm can do of N grasps."""
+
+    rows: list[int] = field(default_factory=list)
+    """Those that it carries out, of the N."""
+    paths: list[list[Path]] = field(default_factory=list)
+    """Their motions; joints are the arm's, then the hand's."""
+    refused: Counter[str] = field(default_factory=Counter)
+    """How many of the others for which reason."""
+    tried: int = 0
+
+    @property
+    def share(self) -> float:
+        """Of those that were tried."""
+        return len(self.rows) / max(1, self.tried)
+
+
+class Reach:
+    """Searches the ways of one arm with one hand around one object. Not for several threads at once."""
+
+    def __init__(self, arm: Arm, base: Floats, found: Executions, pieces: ConvexPieces) -> None:
+        """Raises InputError where mink is not installed."""
+        try:
+            import mink
+        except ImportError:
+            raise InputError("arms need mink; run pip install 'graspd[arm]'") from None
+        self.arm, self.found = arm, found
+        supports = () if found.placed is None else found.placed.supports
+        self.world = World(arm, base, found.hand, pieces, supports)
+        self._mink = mink
+        self._model = arm_spec(arm, base).compile()
+        self._configuration = mink.Configuration(self._model)
+        self._task = mink.FrameTask(MOUNT, "site", position_cost=1.0, orientation_cost=0.3, lm_damping=1e-3)
+        self._limits = [mink.ConfigurationLimit(self._model)]
+        self._order = np.array([int(self._model.joint(f"arm{b}").qposadr[0]) for b in arm.model.joint_body], np.intp)
+
+    def all(self, wanted: int = 0, run: Run = ALONE) -> Reached:
+        """All grasps, or in their order until so many are found."""
+        reached = Reached()
+        for row in range(len(self.found)):
+            run.check("the search of an arm's ways")
+            reached.tried += 1
+            paths, reason = self.one(row)
+            if paths is None:
+                reached.refused[reason] += 1
+            else:
+                reached.rows.append(row)
+                reached.paths.append(paths)
+            run.progress(row + 1, len(self.found), "inverse kinematics")
+            if wanted and len(reached.rows) >= wanted:
+                break
+        return reached
+
+    def one(self, row: int) -> tuple[list[Path] | None, str]:
+        """The motions of one grasp, or why there are none: the reason of the start that got farthest."""
+        long, short = (straight_paths(self.found, row, points) for points in (LONG, SHORT))
+        ways = [a if a.phase in _LONG_PHASES else b for a, b in zip(long, short, strict=True)]
+        rng, farthest, reason = np.random.default_rng(row), -1, ""
+        arm = self.arm.model
+        for start in range(STARTS):
+            middle = 0.5 * (arm.lower + arm.upper)
+            q = middle if start == 0 else rng.uniform(arm.lower, arm.upper)
+            found, why = self._from(q, ways, row)
+            if found is not None:
+                return found, ""
+            stage = next(k for k, one in enumerate(REASONS) if why.startswith(one))
+            if stage > farthest:
+                farthest, reason = stage, why
+        return None, reason
+
+    def _from(self, q: Floats, ways: list[Path], row: int) -> tuple[list[Path] | None, str]:
+        """The motions from one start, or why there are none."""
+        approach, *others = ways
+        arrived = self._solve(q, approach.hand_pose[-1], STEPS)
+        if arrived is None:
+            return None, REASONS[0]
+        back = self._follow(arrived, approach.hand_pose[::-1])
+        if back is None:
+            return None, REASONS[1]
+        joined, at = [back[::-1]], arrived
+        for path in others:
+            onward = self._follow(at, path.hand_pose)
+            if onward is None:
+                return None, REASONS[1]
+            joined.append(onward)
+            at = onward[-1]
+        if pair := self._collision(joined, ways, row):
+            return None, f"{REASONS[2]} of {pair}"
+        return [
+            replace(path, joints=np.concatenate([self.arm.model.expand(arm), path.joints], axis=1))
+            for path, arm in zip(ways, joined, strict=True)
+        ], ""
+
+    def _follow(self, q: Floats, poses: Floats) -> Floats | None:
+        """(M, A) dofs along root poses (M, 7) of the hand, the first of which q has; None: not without a jump."""
+        rows = [q]
+        for pose in poses[1:]:
+            onward = self._solve(rows[-1], pose, STEPS // 4)
+            if onward is None or np.abs(onward - rows[-1]).max() > JUMP:
+                return None
+            rows.append(onward)
+        return np.array(rows)
+
+    def _solve(self, q: Floats, root_pose: Floats, steps: int) -> Floats | None:
+        """Dofs (A,) that put the hand's root link at a pose (7,), within the limits; None: not found from q."""
+        mink, configuration, task = self._mink, self._configuration, self._task
+        full = np.zeros(self._model.nq)
+        full[self._order] = self.arm.model.expand(q)
+        configuration.update(full)
+        rotation = mink.SO3(np.asarray(root_pose[3:], float))
+        task.set_target(mink.SE3.from_rotation_and_translation(rotation, np.asarray(root_pose[:3], float)))
+        for _ in range(steps):
+            error = task.compute_error(configuration)
+            if np.linalg.norm(error[:3]) < NEAR_M and np.linalg.norm(error[3:]) < NEAR_RAD:
+                found = self.arm.model.reduce(configuration.q[self._order])
+                return found if self._inside(found) else None
+            try:
+                velocity: Any = mink.solve_ik(
+                    configuration, [task], 1.0, solver="daqp", damping=1e-6, limits=self._limits
+                )
+            except mink.NoSolutionFound:
+                return None
+            configuration.integrate_inplace(velocity, 1.0)
+        return None
+
+    def _inside(self, q: Floats) -> bool:
+        arm = self.arm.model
+        return bool((q >= arm.lower - 1e-6).all() and (q <= arm.upper + 1e-6).all())
+
+    def _collision(self, joined: list[Floats], ways: list[Path], row: int) -> str:
+        """The first two bodies that meet on the way; empty: none do."""
+        rest = np.asarray(self.found.object_pose[row], float)
+        for arm, path in zip(joined, ways, strict=True):
+            for q, joints, pose in zip(arm, path.joints, path.hand_pose, strict=True):
+                at = rest.copy()
+                if path.phase == "lift":
+                    at[:3] += pose[:3] - path.hand_pose[0, :3]
+                if pair := self.world.touches(q, joints, at):
+                    return pair
+        return ""
+
+
+#: Pairs of bodies that touch in this share of random postures cannot be apart: their hulls are larger than they are.
+ALWAYS: Final = 0.95
+SAMPLES: Final = 100
+#: Name of the frame that carries the hand.
+MOUNT: Final = "mount"
+#: The arm meets everything; the hand, the object and supports meet the arm alone: the rest was looked at before.
+_ARM: Final = {"contype": 1, "conaffinity": 1}
+_OTHER: Final = {"contype": 0, "conaffinity": 1}
+
+
+def arm_spec(arm: Arm, base: Floats) -> Any:
+    """The arm alone, its base at a pose (7,), with a site `mount` where the hand's root link is."""
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.memory = ARENA
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    root = spec.worldbody.add_body(name="arm0", pos=base[:3], quat=base[3:])
+    bodies = _add_tree(spec, root, arm.model, "arm", _ARM)
+    frame = bodies[arm.mount_body].add_body(name="flange", pos=arm.mount_pose[:3], quat=arm.mount_pose[3:])
+    frame.add_site(name=MOUNT, pos=arm.hand_pose[:3], quat=arm.hand_pose[3:])
+    for a, b in sorted(arm.model.neighbours):
+        spec.add_exclude(bodyname1=f"arm{a}", bodyname2=f"arm{b}")
+    return spec
+
+
+class World:
+    """The arm with its hand among what stands around it. Not for several threads at once."""
+
+    def __init__(
+        self, arm: Arm, base: Floats, hand: HandModel, pieces: ConvexPieces, supports: Sequence[Obstacle]
+    ) -> None:
+        self.arm, self.hand = arm, hand
+        self.spec = arm_spec(arm, base)
+        flange = self.spec.body("flange")
+        root = flange.add_body(name="hand0", pos=arm.hand_pose[:3], quat=arm.hand_pose[3:])
+        _add_tree(self.spec, root, hand, "hand", _OTHER)
+        thing = self.spec.worldbody.add_body(name="object", mocap=True)
+        for k, corners in enumerate(pieces.vertices):
+            _hull(self.spec, thing.add_geom(**_OTHER), corners, f"object{k}")
+        self._add_supports(supports)
+        self.spec.add_exclude(bodyname1=f"arm{arm.mount_body}", bodyname2="hand0")
+        self._exclude_what_always_touches()
+        self.model: Any = self.spec.compile()
+        self.data: Any = mujoco.MjData(self.model)
+        self.arm_qpos = _addresses(self.model, arm.model, "arm")
+        self.hand_qpos = _addresses(self.model, hand, "hand")
+
+    def touches(self, arm_joints: Floats, hand_joints: Floats, object_pose: Floats) -> str:
+        """What runs into what at arm dofs (A,), hand joints (J,) and an object pose (7,); empty: nothing."""
+        self._put(self.model, self.data, arm_joints, hand_joints)
+        self.data.mocap_pos[0], self.data.mocap_quat[0] = object_pose[:3], object_pose[3:]
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_collision(self.model, self.data)
+        for contact in self.data.contact:
+            if contact.dist < 0:
+                return " and ".join(self._told(int(geom)) for geom in contact.geom)
+        return ""
+
+    def qpos(self, arm_joints: Floats, hand_joints: Floats) -> Floats:
+        """The model's coordinates."""
+        found = np.zeros(self.model.nq)
+        found[self.arm_qpos] = self.arm.model.expand(arm_joints)
+        found[self.hand_qpos] = hand_joints
+        return found
+
+    def _told(self, geom: int) -> str:
+        body = self.model.body(int(self.model.geom_bodyid[geom])).name
+        for prefix, names in (("arm", self.arm.model.body_names), ("hand", self.hand.body_names)):
+            if body.startswith(prefix):
+                return names[int(body.removeprefix(prefix))]
+        return "what stands there" if body == "world" else str(body)
+
+    def _put(self, model: Any, data: Any, arm_joints: Floats, hand_joints: Floats) -> None:
+        data.qpos[_addresses(model, self.arm.model, "arm")] = self.arm.model.expand(arm_joints)
+        data.qpos[_addresses(model, self.hand, "hand")] = hand_joints
+
+    def _add_supports(self, supports: Sequence[Obstacle]) -> None:
+        for k, support in enumerate(supports):
+            geom = self.spec.worldbody.add_geom(name=f"support{k}", **_OTHER)
+            if len(support.corners):
+                _hull(self.spec, geom, support.corners, f"support{k}")
+                continue
+            normal, offset = support.planes[0, :3], support.planes[0, 3]
+            geom.type, geom.size, geom.pos = mujoco.mjtGeom.mjGEOM_PLANE, [0, 0, 0.1], offset * normal
+            mujoco.mju_quatZ2Vec(geom.quat, normal)
+
+    def _exclude_what_always_touches(self) -> None:
+        """As MoveIt's setup does: pairs of bodies of arm and hand that touch in nearly all of many random postures."""
+        model = self.spec.compile()
+        data, rng = mujoco.MjData(model), np.random.default_rng(0)
+        arm, hand = self.arm.model, self.hand
+        open_ = hand.expand(hand.preshape)
+        data.mocap_pos[0] = [0, 0, 1e3]
+        count: dict[tuple[int, int], int] = {}
+        for _ in range(SAMPLES):
+            self._put(model, data, rng.uniform(arm.lower, arm.upper), open_)
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
+            pairs = {tuple(sorted(model.geom_bodyid[c.geom].tolist())) for c in data.contact if c.dist < 0}
+            for pair in pairs:
+                count[pair] = count.get(pair, 0) + 1
+        for (a, b), times in sorted(count.items()):
+            # The first link turns where the base stands; any other that is always in a support says that the base is.
+            if times >= ALWAYS * SAMPLES and (a or model.body(b).name == "arm1"):
+                self.spec.add_exclude(bodyname1=model.body(a).name, bodyname2=model.body(b).name)
+
+
+def _add_tree(spec: Any, root: Any, model: HandModel, prefix: str, contact: dict[str, int]) -> list[Any]:
+    """Bodies with joints and shapes below `root`, which is body 0."""
+    bodies = [root]
+    for b in range(1, model.bodies):
+        pose = model.origin[b]
+        body = bodies[model.parent[b]].add_body(name=f"{prefix}{b}", pos=pose[:3], quat=pose[3:])
+        turning = model.joint_type[b] == JointType.REVOLUTE
+        d, m, shift = int(model.dof[b]), float(model.multiplier[b]), float(model.offset[b])
+        ends = sorted((m * float(model.lower[d]) + shift, m * float(model.upper[d]) + shift))
+        body.add_joint(
+            name=f"{prefix}{b}",
+            type=mujoco.mjtJoint.mjJNT_HINGE if turning else mujoco.mjtJoint.mjJNT_SLIDE,
+            axis=model.axis[b],
+            range=ends,
+            limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        )
+        # Nothing is simulated: any mass will do.
+        body.mass, body.inertia, body.ipos, body.explicitinertial = 1.0, np.full(3, 1e-2), np.zeros(3), True
+        bodies.append(body)
+    for k, piece in enumerate(model.pieces):
+        add_shape(spec, bodies[piece.body].add_geom(**contact), piece, f"{prefix}_{k}")
+    return bodies
+
+
+def _hull(spec: Any, geom: Any, corners: Floats, name: str) -> None:
+    mesh = spec.add_mesh(name=name)
+    mesh.uservert = np.ascontiguousarray(corners, np.float32).ravel()
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+    geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, name
+
+
+def _addresses(model: Any, tree: HandModel, prefix: str) -> NDArray[np.intp]:
+    return np.array([int(model.joint(f"{prefix}{b}").qposadr[0]) for b in tree.joint_body], np.intp)

@@ -1,0 +1,143 @@
+"""Grasps as text files: three tables of comma-separated values, and the grasp file of Isaac Sim (`isaac_grasp`, version
+1.0).
+
+Poses are those of the tool frame: x y z [m], unit quaternion qw qx qy qz. Joints are radians or metres, in columns that
+bear their names.
+
+A grasp is the pose of the gripper's frame in the object's: position [m], quaternion w and xyz; `cspace_position` are
+the joints that hold, `pregrasp_cspace_position` those before. Joints that the URDF couples are left out. The two frames
+are told to people only; Isaac Sim's page calls them `..._frame_link`, that of Isaac ROS `..._frame`: both stand there.
+Commanded joints that press, and the way, are under a key of our own, which readers pass over.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from graspd.exchange.lots import plain_name, prim_name
+from graspd.exchange.robots.bundle import Bundle, dump_yaml, numbers
+from graspd.exchange.robots.execution import POSTURES
+from graspd.service.model.transforms import POSE_PARTS, compose, invert
+
+
+def write_tables(bundle: Bundle, folder: Path) -> list[Path]:
+    """Write `grasps.csv`, `postures.csv` and `trajectories.csv`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    joints = bundle.found.hand.joint_names
+    of_trajectory = bundle.trajectories[0].joint_names
+    return [
+        _table(
+            folder / "grasps.csv",
+            (
+                "grasp",
+                "row",
+                "frame",
+                "tool_frame",
+                "scene",
+                "valid",
+                "success",
+                "epsilon",
+                *(f"object_{part}" for part in POSE_PARTS),
+            ),
+            _grasps(bundle),
+        ),
+        _table(folder / "postures.csv", ("grasp", "posture", *POSE_PARTS, *joints), _postures(bundle)),
+        _table(
+            folder / "trajectories.csv",
+            ("grasp", "phase", "time_s", *POSE_PARTS, *of_trajectory),
+            _trajectories(bundle),
+        ),
+    ]
+
+
+def _grasps(bundle: Bundle) -> Iterable[list[Any]]:
+    found = bundle.found
+    for row in range(len(found)):
+        scene = "" if found.placed is None else int(found.placed.index[row])
+        judged = [int(found.quality["valid"][row]), int(found.quality["success"][row])]
+        yield [
+            bundle.name(row),
+            int(found.rows[row]),
+            bundle.frame,
+            found.tool.name,
+            scene,
+            *judged,
+            *numbers(found.quality["epsilon"][row]),
+            *numbers(bundle.seen(found.object_pose[row])),
+        ]
+
+
+def _postures(bundle: Bundle) -> Iterable[list[Any]]:
+    for row in range(len(bundle.found)):
+        for name in POSTURES:
+            part = bundle.found.postures[name]
+            pose = bundle.seen_tool(part.hand_pose[row])
+            yield [bundle.name(row), name, *numbers(pose), *numbers(part.joint_positions[row])]
+
+
+def _trajectories(bundle: Bundle) -> Iterable[list[Any]]:
+    for row, path in enumerate(bundle.trajectories):
+        poses = bundle.seen_tool(path.hand_pose)
+        for phase, time, pose, joints in zip(path.phase, path.time, poses, path.joints, strict=True):
+            yield [bundle.name(row), phase, *numbers(time), *numbers(pose), *numbers(joints)]
+
+
+def _table(file: Path, heading: Sequence[str], rows: Iterable[list[Any]]) -> Path:
+    with file.open("w", newline="", encoding="utf-8") as opened:
+        writer = csv.writer(opened)
+        writer.writerow(heading)
+        writer.writerows(rows)
+    return file
+
+
+FORMAT: Final = {"format": "isaac_grasp", "format_version": "1.0"}
+
+
+def write_isaac(bundle: Bundle, folder: Path) -> list[Path]:
+    """Write `HAND_OBJECT.yaml`."""
+    found = bundle.found
+    folder.mkdir(parents=True, exist_ok=True)
+    thing, hand = (f"/World/{name}" for name in bundle.prims)
+    tool = f"{hand}/{prim_name(found.tool.name)}"
+    document = {
+        **FORMAT,
+        "object_frame_link": thing,
+        "gripper_frame_link": tool,
+        "object_frame": thing,
+        "gripper_frame": tool,
+        "grasps": {bundle.name(row): _grasp(bundle, row) for row in range(len(found))},
+    }
+    file = folder / f"{plain_name(found.hand.name)}_{plain_name(found.obj.name)}.yaml"
+    return [dump_yaml(file, document)]
+
+
+def _grasp(bundle: Bundle, row: int) -> dict[str, Any]:
+    found = bundle.found
+
+    def pose(posture: str) -> dict[str, Any]:
+        x, y, z, w, *xyz = numbers(compose(invert(found.object_pose[row]), found.tool_pose(posture)[row]))
+        return {"position": [x, y, z], "orientation": {"w": w, "xyz": xyz}}
+
+    def joints(posture: str) -> dict[str, float]:
+        values = numbers(found.postures[posture].joint_positions[row])
+        return {found.hand.joint_names[k]: values[k] for k in bundle.steered}
+
+    return {
+        "confidence": 1.0 if found.quality["valid"][row] else 0.0,
+        **pose("grasp"),
+        "cspace_position": joints("grasp"),
+        "pregrasp_cspace_position": joints("pregrasp"),
+        "graspd": {
+            "squeeze_cspace_position": joints("squeeze"),
+            "open_cspace_position": joints("standoff"),
+            "standoff": pose("standoff"),
+            "pregrasp": pose("pregrasp"),
+            "lift": pose("lift"),
+            "epsilon": numbers(np.asarray(found.quality["epsilon"][row]))[0],
+        },
+    }

@@ -1,0 +1,96 @@
+"""Grasps of others through our quality stage, as base shards that say where they come from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from graspd.exchange.imported import Imported, Origin, mesh_file
+from graspd.exchange.lots import plain_name
+from graspd.service.model.digests import digest_files, digest_json
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import InputError
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.states import AssetKind
+from graspd.service.store.columns import Attribute
+from graspd.service.store.shards import json_attribute, write_shard
+from graspd.worker.certified import scored
+from graspd.worker.files.provenance import base_attributes
+from graspd.worker.objects.options import as_asked
+from graspd.worker.objects.prepare import files_from_path
+from graspd.worker.run import ALONE, Run
+
+
+def write_scored(
+    found: Imported, origin: Origin, folder: Path, *, referee: str, friction: float, ordinal: int = 0, run: Run = ALONE
+) -> Path:
+    """Judge and measure a set of grasps and write it as a base shard, its object's mesh beside it.
+
+    Grasps in scenes are lifted out of them; the way of the hand is planned anew, as for grasps of our own.
+
+    Args:
+        found: the grasps.
+        origin: goes into the shard's attributes.
+        folder: where to; made if absent.
+        referee: level of the verdicts, or none.
+        friction: Coulomb coefficient of the metrics.
+        ordinal: number of the set, part of the file's name.
+        run: told of the share that is done; asked often whether to stop.
+
+    Returns:
+        the shard's path.
+
+    Raises:
+        InputError: unknown level, or the file is there already.
+        MeshError: the object has no convex pieces that the referee could use.
+    """
+    name = plain_name(found.name)
+    path = folder / f"{plain_name(found.hand.name)}-{name}-{ordinal:03}.h5"
+    if path.exists():
+        raise InputError(f"{path} exists already; give another folder as --output")
+    try:
+        request = JobRequest(
+            hand=plain_name(found.hand.name),
+            object=name,
+            grasps=max(1, len(found.grasps)),
+            want="raw",
+            referee=referee,
+            friction=friction,
+            audits=0,
+        )
+    except ValueError:
+        raise InputError(f"unknown level {referee!r}; choose letter, certificate, screen or none") from None
+    scenes = None if found.placed is None else found.placed.everywhere
+    obj = as_asked(found.obj, request)
+    made = scored(found.hand, obj, found.grasps, request, scenes=scenes, run=run)
+    folder.mkdir(parents=True, exist_ok=True)
+    mesh = mesh_file(found.obj, folder / f"{name}-{found.scale:g}.obj")
+    attributes: dict[str, Attribute] = {
+        "hand": found.hand.name,
+        "hand_digest": found.hand.digest,
+        "object": name,
+        "object_digest": _digest(mesh),
+        "object_scale": found.scale,
+        "method": f"imported:{origin.format}",
+        "source": origin.source,
+        "licence": origin.licence,
+        "fidelity": json_attribute({"face_error_m": 0.0}),
+        "shard_id": digest_json([origin.source, found.hand.digest, _digest(mesh), ordinal, len(found.grasps)]),
+        "batch": ordinal,
+    }
+    attributes |= base_attributes(found.hand, obj, request, tried=made.tried, verdict_key=made.verdict_key)
+    arrays = {**made.grasps.to_columns(), **made.columns}
+    if found.published is not None and (found.published >= 0).any():
+        arrays["quality/published"] = found.published
+    if scenes is not None:
+        # A table is the only scene that other formats have.
+        attributes["scene"] = json_attribute(SceneSpec(kind="table").model_dump(mode="json"))
+        arrays["scene/object_pose"] = scenes.object_pose
+        arrays["scene/rest_probability"] = np.full(len(scenes.object_pose), np.nan)
+    path.write_bytes(write_shard("base", arrays, attributes))
+    return path
+
+
+def _digest(mesh: Path) -> str:
+    return digest_files(AssetKind.OBJECT, files_from_path(mesh)[1])

@@ -1,0 +1,107 @@
+"""Pictures with their grasps as WebDataset tar files: members that share a key are one sample.
+
+For each picture `KEY.rgb.png`, `KEY.depth.exr` (float32 [m]), `KEY.segmentation.png` and `KEY.json`: camera, boxes, and
+the grasps of the scene that are clear of the table, in the camera's frame. Only what a views shard has is written.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from graspd.service.model.errors import InputError
+from graspd.service.readers import Pictures, Shards
+from graspd.service.store.shards import Shard, read_shard
+from graspd.worker.rendering.export import describe, export_exr, export_png
+
+_COLUMNS: Final = ("image/rgb", "image/depth", "image/segmentation", "camera/intrinsics", "camera/extrinsics")
+
+
+def write(
+    shards: Shards, folder: Path, *, pictures_a_file: int = 1000, valid: bool = True, unjudged: bool = False
+) -> list[Path]:
+    """Write `pictures-NNNNNN.tar` files.
+
+    Args:
+        shards: views shards with the scene and base shards they were made of.
+        folder: where to; made if absent.
+        pictures_a_file: samples in one tar file.
+        valid: only valid grasps; False: all of them.
+        unjudged: instead of valid ones those that are sound and that nobody judged.
+
+    Returns:
+        the files.
+
+    Raises:
+        InputError: no picture in the shards, or tar files in the folder already.
+    """
+    pictures = Pictures(
+        shards, _COLUMNS, grasp_quality=("quality/epsilon", "quality/success"), valid=valid, unjudged=unjudged
+    )
+    if not len(pictures):
+        raise InputError("the shards hold no picture; ask for views when you submit, or run graspd render")
+    folder.mkdir(parents=True, exist_ok=True)
+    if any(folder.glob("pictures-*.tar")):
+        raise InputError(f"{folder} holds tar files of pictures already; give another folder as --output")
+    written = []
+    for first in range(0, len(pictures), pictures_a_file):
+        path = folder / f"pictures-{first // pictures_a_file:06}.tar"
+        with tarfile.open(path, "w") as tar:
+            for index in range(first, min(first + pictures_a_file, len(pictures))):
+                for name, data in _members(shards, pictures[index]):
+                    _add(tar, f"{index:08}.{name}", data)
+        written.append(path)
+    return written
+
+
+def _members(shards: Shards, sample: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
+    with tempfile.TemporaryDirectory() as scratch:
+        png, exr = Path(scratch) / "file.png", Path(scratch) / "file.exr"
+        yield "rgb.png", export_png(png, sample["image/rgb"]).read_bytes()
+        yield "segmentation.png", export_png(png, sample["image/segmentation"]).read_bytes()
+        yield "depth.exr", export_exr(exr, "Z", [sample["image/depth"]]).read_bytes()
+    yield "json", json.dumps(_record(shards, sample), allow_nan=False).encode()
+
+
+def _record(shards: Shards, sample: dict[str, Any]) -> dict[str, Any]:
+    views = _views(shards, sample["shard_id"])
+    grasps = {
+        "hand_pose": sample["grasp/hand_pose"],
+        "joint_positions": sample["grasp/joint_positions"],
+        "base_row": sample["grasp/base_row"],
+        "epsilon": sample["quality/epsilon"],
+    }
+    return {
+        "hand": sample["hand"],
+        "object": sample["object"],
+        "views_shard": sample["shard_id"],
+        "base_shard": sample["base_id"],
+        "row": sample["row"],
+        "grasps": {name: np.asarray(values, float).tolist() for name, values in grasps.items()},
+        "grasp_frame": "camera",
+        **describe(views, sample["row"]),
+    }
+
+
+_SHOWN: dict[str, Shard] = {}
+
+
+def _views(shards: Shards, shard: str) -> Shard:
+    """The views shard without its pictures, kept while its samples are written."""
+    if shard not in _SHOWN:
+        _SHOWN.clear()
+        _SHOWN[shard] = read_shard(shards.path(shards.by_id(shard)), kind="views", without=("image/depth",))
+    return _SHOWN[shard]
+
+
+def _add(tar: tarfile.TarFile, name: str, data: bytes) -> None:
+    entry = tarfile.TarInfo(name)
+    entry.size = len(data)
+    tar.addfile(entry, io.BytesIO(data))

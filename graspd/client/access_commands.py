@@ -1,0 +1,284 @@
+"""`graspd keys`, `graspd projects` and `graspd webhooks`: who may use the service, how much, and who is told of
+ends."""
+
+from __future__ import annotations
+
+import re
+from datetime import timedelta
+from typing import Annotated, Final
+
+import typer
+
+from graspd.api.access.keys import Key, KeyFile, KeyLimits, ProjectLimits, Scope
+from graspd.api.formatting import minute
+from graspd.client.client import path_of
+from graspd.client.reports import UrlOption, YesOption, confirm, open_client, say_deleted
+from graspd.service.cli import JsonFlag, emit, load_settings, plain_console, plain_table, reporting_errors
+from graspd.service.model.errors import InputError
+
+keys_app = typer.Typer(no_args_is_help=True, help="Make, list, rotate, limit and revoke API keys.")
+
+_UNITS: Final = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days"}
+
+NameArgument = Annotated[str, typer.Argument(help="Whose key it is.")]
+ProjectOption = Annotated[
+    str, typer.Option(help="Project that it belongs to; keys of other projects see nothing of it.", metavar="NAME")
+]
+LifetimeOption = Annotated[
+    str | None, typer.Option("--expires", help="How long it lives: 90d, 12h; default: for ever.")
+]
+RequestsOption = Annotated[int | None, typer.Option(min=0, help="Requests a minute; 0: no limit.")]
+ConcurrencyOption = Annotated[int | None, typer.Option(min=0, help="Requests answered at once; 0: no limit.")]
+GraspsOption = Annotated[int | None, typer.Option(min=0, help="Grasps in unfinished jobs; 0: no limit.")]
+JobsOption = Annotated[int | None, typer.Option(min=0, help="New jobs a day (UTC); 0: no limit.")]
+
+
+@keys_app.command("add", epilog="graspd keys add alice --scope submit --expires 90d --grasps-in-flight 100000")
+@reporting_errors
+def add_key(
+    name: NameArgument,
+    scope: Annotated[Scope, typer.Option(help="What it may do.")] = Scope.SUBMIT,
+    project: ProjectOption = "",
+    expires: LifetimeOption = None,
+    requests_per_minute: RequestsOption = None,
+    concurrency: ConcurrencyOption = None,
+    grasps_in_flight: GraspsOption = None,
+    jobs_per_day: JobsOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Make a key and show it, this once. Limits that are not given are those of the settings."""
+    limits = _limits(requests_per_minute, concurrency, grasps_in_flight, jobs_per_day)
+    lifetime = duration(expires) if expires else None
+    token = _key_file().add(name, scope, lifetime=lifetime, limits=limits, project=project)
+    _show_token(name, scope, token, json=json)
+
+
+@keys_app.command("rotate", epilog="graspd keys rotate alice --grace 24h")
+@reporting_errors
+def rotate_key(
+    name: NameArgument,
+    grace: Annotated[str, typer.Option(help="How long the old secret still opens: 24h, 7d; 0s: not at all.")] = "0s",
+    expires: LifetimeOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Give a key a new secret and show it, this once. Scope and limits stay."""
+    keys = _key_file()
+    token = keys.rotate(name, grace=duration(grace), lifetime=duration(expires) if expires else None)
+    _show_token(name, next(key.scope for key in reversed(keys.list()) if key.name == name), token, json=json)
+
+
+@keys_app.command("limit", epilog="graspd keys limit alice --requests-per-minute 60 --jobs-per-day 100")
+@reporting_errors
+def limit_key(
+    name: NameArgument,
+    requests_per_minute: RequestsOption = None,
+    concurrency: ConcurrencyOption = None,
+    grasps_in_flight: GraspsOption = None,
+    jobs_per_day: JobsOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Change what a key may use; it counts from the next request on."""
+    wanted = _limits(requests_per_minute, concurrency, grasps_in_flight, jobs_per_day)
+    if not wanted.model_fields_set:
+        raise InputError("give at least one limit, such as --jobs-per-day 100")
+    limits = _key_file().limit(name, wanted)
+    if json:
+        emit({"name": name, "limits": limits.model_dump(exclude_none=True)})
+        return
+    typer.echo(f"limits of {name}: {_key_limits(limits)}")
+
+
+@keys_app.command("list", epilog="graspd keys list --json")
+@reporting_errors
+def list_keys(json: JsonFlag = False) -> None:
+    """All keys, without their secrets."""
+    found = _key_file().list()
+    if json:
+        emit({"keys": [key.model_dump(mode="json", exclude={"sha256"}) for key in found]})
+        return
+    has_projects = any(key.project for key in found)
+    names = ["name", "scope", *(["project"] if has_projects else []), "state", "created", "expires", "limits"]
+    table = plain_table(*names, whole=("state", "created", "expires"))
+    for key in found:
+        of = [key.project or "-"] if has_projects else []
+        times = minute(key.created), minute(key.expires)
+        table.add_row(key.name, key.scope, *of, _state(key), *times, _key_limits(key.limits))
+    plain_console().print(table if found else "no key; the service is open and answers on this machine only")
+
+
+@keys_app.command("revoke", epilog="graspd keys revoke alice")
+@reporting_errors
+def revoke_key(name: NameArgument, json: JsonFlag = False) -> None:
+    """End a key's life; it is refused from the next request on."""
+    _key_file().revoke(name)
+    if json:
+        emit({"name": name, "revoked": True})
+        return
+    typer.echo(f"the key {name} is revoked")
+
+
+def duration(text: str) -> timedelta:
+    """A time such as 90d, 12h, 30m or 45s; InputError for anything else."""
+    match = re.fullmatch(r"(\d{1,6})([smhd])", text.strip())
+    if match is None:
+        raise InputError(f"{text!r} is no length of time; write 90d, 12h, 30m or 45s")
+    return timedelta(**{_UNITS[match[2]]: int(match[1])})
+
+
+def _limits(requests: int | None, concurrency: int | None, grasps: int | None, jobs: int | None) -> KeyLimits:
+    given = {
+        "requests_per_minute": requests,
+        "concurrency": concurrency,
+        "grasps_in_flight": grasps,
+        "jobs_per_day": jobs,
+    }
+    return KeyLimits(**{name: value for name, value in given.items() if value is not None})
+
+
+def _show_token(name: str, scope: Scope, token: str, *, json: bool) -> None:
+    if json:
+        emit({"name": name, "scope": scope, "key": token})
+        return
+    typer.echo(token)
+    typer.echo("This is the only time the key is shown. Send it as `Authorization: Bearer ...`.", err=True)
+
+
+def _state(key: Key) -> str:
+    if key.is_live:
+        return "live"
+    return f"revoked {key.revoked[:16]}" if key.revoked else "expired"
+
+
+def _key_limits(limits: KeyLimits) -> str:
+    found = limits.model_dump(exclude_none=True)
+    return ", ".join(f"{value or 'no limit on'} {name.replace('_', ' ')}" for name, value in found.items()) or "default"
+
+
+def _key_file() -> KeyFile:
+    return KeyFile(load_settings().resolved_keys_file)
+
+
+projects_app = typer.Typer(no_args_is_help=True, help="List projects of keys, and limit what each may use.")
+
+
+@projects_app.command("list", epilog="graspd projects list --json")
+@reporting_errors
+def list_projects(json: JsonFlag = False) -> None:
+    """Projects that keys belong to, and their limits. `graspd keys add NAME --project PROJECT` makes one."""
+    file = KeyFile(load_settings().resolved_keys_file)
+    live: dict[str, list[str]] = {}
+    for key in file.list():
+        if key.is_live and key.name not in live.setdefault(key.project, []):
+            live[key.project].append(key.name)
+    found = file.projects()
+    if json:
+        rows = [
+            {"project": name, "keys": live.get(name, []), "limits": limits.model_dump(exclude_none=True)}
+            for name, limits in found.items()
+        ]
+        emit({"projects": rows})
+        return
+    table = plain_table("project", "keys", "limits")
+    for name, limits in found.items():
+        table.add_row(name, ", ".join(live.get(name, [])) or "none that opens", _project_limits(limits))
+    plain_console().print(table if found else "no project yet; `graspd keys add NAME --project PROJECT` makes one")
+
+
+@projects_app.command(
+    "limit", epilog="graspd projects limit vision --grasps-per-day 1000000 --gpu-seconds-per-day 86400"
+)
+@reporting_errors
+def limit_project(
+    name: Annotated[str, typer.Argument(help="The project.")],
+    grasps_in_flight: Annotated[int | None, typer.Option(min=0, help="Grasps in unfinished jobs; 0: no limit.")] = None,
+    grasps_per_day: Annotated[int | None, typer.Option(min=0, help="Grasps asked for a day; 0: no limit.")] = None,
+    gpu_seconds_per_day: Annotated[
+        int | None, typer.Option(min=0, help="Seconds of GPU workers a day (UTC), then no new job; 0: no limit.")
+    ] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Change what the keys of a project may use together; it counts from the next submission on."""
+    given = {
+        "grasps_in_flight": grasps_in_flight,
+        "grasps_per_day": grasps_per_day,
+        "gpu_seconds_per_day": gpu_seconds_per_day,
+    }
+    wanted = ProjectLimits(**{limit: value for limit, value in given.items() if value is not None})
+    if not wanted.model_fields_set:
+        raise InputError("give at least one limit, such as --grasps-per-day 1000000")
+    limits = KeyFile(load_settings().resolved_keys_file).limit_project(name, wanted)
+    if json:
+        emit({"project": name, "limits": limits.model_dump(exclude_none=True)})
+        return
+    typer.echo(f"limits of {name}: {_project_limits(limits)}")
+
+
+def _project_limits(limits: ProjectLimits) -> str:
+    found = {name: value for name, value in limits.model_dump().items() if value}
+    return ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in found.items()) or "none"
+
+
+webhooks_app = typer.Typer(no_args_is_help=True, help="Addresses that are told when jobs and datasets end.")
+
+IdArgument = Annotated[str, typer.Argument(metavar="ID", help="Of the webhook: `graspd webhooks list`.")]
+
+
+@webhooks_app.command("add", epilog="graspd webhooks add https://ci.example.org/graspd --on succeeded,failed")
+@reporting_errors
+def add_webhook(
+    address: Annotated[str, typer.Argument(help="Where to POST: https://host/path.")],
+    on: Annotated[str, typer.Option(help="Ends to tell, with commas.")] = "succeeded,failed,cancelled",
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Tell an address of ends from now on, and show the secret that signs what is sent, this once."""
+    states = [one.strip() for one in on.split(",") if one.strip()]
+    with open_client(url) as client:
+        made = client.send("POST", "/v1/webhooks", json={"url": address, "states": states}).json()
+    if json:
+        emit(made)
+        return
+    typer.echo(made["secret"])
+    typer.echo(f"webhook {made['id']}. This is the only time its secret is shown.", err=True)
+
+
+@webhooks_app.command("list", epilog="graspd webhooks list")
+@reporting_errors
+def list_webhooks(url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Webhooks that the key may change."""
+    with open_client(url) as client:
+        found = client.send("GET", "/v1/webhooks").json()
+    if json:
+        emit({"webhooks": found})
+        return
+    table = plain_table("id", "address", "on", "since", whole=("id", "since"))
+    for one in found:
+        table.add_row(one["id"], one["url"], ", ".join(one["states"]), minute(one["created"]))
+    plain_console().print(table if found else "no webhook yet; `graspd webhooks add URL` makes one")
+
+
+@webhooks_app.command("log", epilog="graspd webhooks log 1a2b3c")
+@reporting_errors
+def show_log(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """What became of telling it, the newest first."""
+    with open_client(url) as client:
+        found = client.send("GET", path_of("webhooks", webhook, "deliveries")).json()
+    if json:
+        emit({"deliveries": found})
+        return
+    table = plain_table("what", "ended", "delivery", "attempts", "last", "", whole=("ended", "delivery", "last"))
+    for one in found:
+        what = f"{one['kind']} {one['subject'][:12] if one['kind'] == 'job' else one['subject']}"
+        tried = (str(one["attempts"]), minute(one["tried"]))
+        table.add_row(what, one["ended"], one["state"], *tried, one["detail"])
+    plain_console().print(table if found else "nothing was to be told yet")
+
+
+@webhooks_app.command("delete", epilog="graspd webhooks delete 1a2b3c")
+@reporting_errors
+def delete_webhook(webhook: IdArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Tell it nothing any more. Its secret is gone for good."""
+    with open_client(url) as client:
+        confirm(f"Delete the webhook {webhook} and its secret for good?", f"the webhook {webhook}", yes=yes)
+        client.delete(path_of("webhooks", webhook))
+    say_deleted("webhook", webhook, json=json)

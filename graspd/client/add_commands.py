@@ -1,0 +1,308 @@
+"""`graspd hands add`, `objects add` and `networks add`: upload one, or every object of a folder, and wait for the
+check. A hand on the user's disk is a folder, or a description with what belongs to it: it becomes one ZIP."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any, Final
+
+import typer
+
+from graspd.api.uploads import name_of_upload
+from graspd.client.client import Client
+from graspd.client.reports import UrlOption, open_client, show_asset
+from graspd.service.cli import JsonFlag, emit, reporting_errors
+from graspd.service.model.errors import InputError
+from graspd.service.model.states import AssetKind
+from graspd.service.store.asset_options import (
+    AllowOpenOption,
+    ApproachOption,
+    ClosingOption,
+    CompoundOption,
+    DensityOption,
+    DropOption,
+    FingertipsOption,
+    FixOption,
+    FrictionOption,
+    KeepLargestOption,
+    LicenceOption,
+    MassOption,
+    PalmOption,
+    PreShapeOption,
+    RootOption,
+    ScaleSweepOption,
+    SourceOption,
+    UnitsOption,
+    UrdfOption,
+    XacroOption,
+    hand_options,
+    object_options,
+    provenance,
+    sizes_of,
+)
+from graspd.service.store.asset_summary import verdict_line
+from graspd.service.store.assets import pack
+from graspd.service.store.descriptions import json_object
+from graspd.service.store.hand_files import SUFFIXES, files_of_hand, hand_name
+from graspd.service.store.object_sets import SUFFIXES as MESHES
+from graspd.service.store.object_sets import Objects, files_of_set
+
+NameOption = Annotated[str | None, typer.Option("--name", help="Name to give it; default: the file's.")]
+SharedOption = Annotated[bool, typer.Option("--shared", help="Let every project use it, not only that of the key.")]
+WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until a worker has checked it.")]
+#: How long a check is waited for, without and with a self-test [s].
+_CHECK_S: Final = 120.0
+_SELF_TEST_S: Final = 900.0
+
+
+@reporting_errors
+def add_hand(
+    file: Annotated[Path, typer.Argument(help="A URDF, xacro or MJCF, with its meshes; its folder; or a ZIP of that.")],
+    name: NameOption = None,
+    urdf: UrdfOption = None,
+    xacro: XacroOption = None,
+    palm: PalmOption = None,
+    approach: ApproachOption = None,
+    root: RootOption = None,
+    pre_shape: PreShapeOption = None,
+    closing: ClosingOption = None,
+    fingertips: FingertipsOption = None,
+    fix: FixOption = None,
+    drop: DropOption = None,
+    licence: LicenceOption = None,
+    source: SourceOption = None,
+    self_test: Annotated[
+        bool, typer.Option("--self-test/--no-self-test", help="Record what it holds and lifts of plain objects.")
+    ] = True,
+    shared: SharedOption = False,
+    wait: WaitOption = True,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Upload a hand, wait for its check, say what was guessed and what it holds of plain objects."""
+    options = hand_options(
+        urdf=urdf,
+        xacro=xacro,
+        palm=palm,
+        approach=approach,
+        root=root,
+        pre_shape=pre_shape,
+        closing=closing,
+        fingertips=fingertips,
+        fix=fix,
+        drop=drop,
+    )
+    options |= provenance(licence, source)
+    with upload_of(file) as (upload, main):
+        said = ({"file": main} if main else {}) | options
+        _add(AssetKind.HAND, upload, name, said, self_test=self_test, shared=shared, wait=wait, url=url, json=json)
+
+
+@reporting_errors
+def add_object(
+    file: Annotated[Path, typer.Argument(help="A mesh, or a ZIP with one; or a folder or ZIP of many objects.")],
+    name: NameOption = None,
+    units: UnitsOption = None,
+    scale_to: ScaleSweepOption = None,
+    keep_largest: KeepLargestOption = False,
+    compound: CompoundOption = False,
+    allow_open: AllowOpenOption = False,
+    density: DensityOption = None,
+    mass: MassOption = None,
+    friction: FrictionOption = None,
+    licence: LicenceOption = None,
+    source: SourceOption = None,
+    shared: SharedOption = False,
+    wait: WaitOption = True,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Upload an object or a whole set of them, wait for the check, and say what was repaired."""
+    sizes = sizes_of(scale_to)
+    one_size = sizes[0] if len(sizes) == 1 else None
+    options = object_options(
+        units=units,
+        scale_to=one_size,
+        keep_largest=keep_largest,
+        compound=compound,
+        allow_open=allow_open,
+        density=density,
+        mass=mass,
+        friction=friction,
+    )
+    options |= provenance(licence, source)
+    if len(sizes) > 1:
+        swept = sweep(files_of_set(file) or one_of_set(file, name), sizes)
+        add = partial(add_set, swept, name=name or name_of_set(file), prefix=None)
+    elif files := files_of_set(file):
+        add = partial(add_set, files, name=name or name_of_set(file), prefix=name)
+    else:
+        add = partial(_add, AssetKind.OBJECT, file, name)
+    add(options=options, shared=shared, wait=wait, url=url, json=json)
+
+
+@reporting_errors
+def add_network(
+    file: Annotated[Path, typer.Argument(help="An .npz of the schema graspd/proposals@1.")],
+    name: NameOption = None,
+    licence: LicenceOption = None,
+    source: SourceOption = None,
+    shared: SharedOption = False,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Upload a network that proposes grasps of a hand: jobs with `--method learned` set out from them."""
+    _add(AssetKind.NETWORK, file, name, provenance(licence, source), shared=shared, wait=False, url=url, json=json)
+
+
+def _add(
+    kind: AssetKind,
+    file: Path,
+    name: str | None,
+    options: dict[str, Any],
+    *,
+    self_test: bool = False,
+    shared: bool = False,
+    wait: bool,
+    url: str | None,
+    json: bool,
+) -> None:
+    with open_client(url) as client:
+        name = name or name_of_upload(file.name)
+        asset = client.upload(kind, file, name=name, options=options, self_test=self_test, shared=shared)
+        if wait:
+            asset = client.wait_checked(kind, asset.digest, timeout_s=_SELF_TEST_S if self_test else _CHECK_S)
+    show_asset(asset.model_dump(mode="json"), json=json)
+    if asset.verdict == "refuse":
+        raise InputError(f"refused: {asset.message}")
+
+
+@contextmanager
+def upload_of(path: Path) -> Iterator[tuple[Path, str]]:
+    """The file to send, and the name of the hand's description in it (empty: told from the file).
+
+    The file is the path itself, or a ZIP of what belongs to it, removed afterwards.
+
+    Raises:
+        InputError, LimitError: see `files_of_hand`.
+    """
+    alone = not path.is_dir() and (path.suffix.lower() not in SUFFIXES or not path.is_file())
+    files, main = ({}, "") if alone else files_of_hand(path)
+    if len(files) <= 1 and not path.is_dir():
+        yield path, ""
+        return
+    with TemporaryDirectory(prefix="graspd-hand-") as folder:
+        # The file's name is the hand's, unless the user says another.
+        archive = Path(folder) / f"{hand_name(path.resolve().name)}.zip"
+        archive.write_bytes(pack({name: file.read_bytes() for name, file in files.items()}))
+        yield archive, main
+
+
+def one_of_set(path: Path, name: str | None) -> Objects:
+    """A mesh file as a set of one object; InputError for anything else."""
+    if path.suffix.lower() not in MESHES or not path.is_file():
+        raise InputError(f"several sizes are made of a mesh file or a folder of them, not of {path}")
+    return {name or name_of_upload(path.name): {path.name: path.read_bytes()}}
+
+
+def sweep(objects: Objects, sizes: Sequence[float]) -> Objects:
+    """Each object in each size [m]: `mug` at 0.08 is `mug-80mm`."""
+    made: Objects = {}
+    for name, files in objects.items():
+        mesh = next(file for file in files if file != "asset.json")
+        described = {"file": mesh, **json_object(files.get("asset.json", b"{}"), "asset.json")}
+        for size in sizes:
+            text = json.dumps(described | {"scale_to": size})
+            made[f"{name}-{1000 * size:g}mm"] = files | {"asset.json": text.encode()}
+    return made
+
+
+def name_of_set(path: Path) -> str:
+    """Name of the set that a folder or ZIP becomes."""
+    place = path.resolve()
+    return name_of_upload(f"{place.name}.zip" if place.is_dir() else place.name)
+
+
+def add_set(
+    objects: Objects,
+    *,
+    name: str,
+    prefix: str | None,
+    options: dict[str, Any],
+    shared: bool = False,
+    wait: bool,
+    url: str | None,
+    json: bool,
+) -> None:
+    """Upload all, wait for all checks, give them a name together; what is refused does not stop the others.
+
+    Raises:
+        InputError: some were refused; each is listed before.
+    """
+    with open_client(url) as client:
+        say = None if json else typer.echo
+        told = upload_set(client, objects, prefix=prefix, options=options, shared=shared, wait=wait, say=say)
+        taken = [one["name"] for one in told if one["verdict"] != "refuse"]
+        if taken:
+            client.add_object_set(name, taken)
+    refused = [one["name"] for one in told if one["verdict"] == "refuse"]
+    if json:
+        emit({"objects": told, "refused": refused, "set": name if taken else None})
+    elif taken:
+        typer.echo(f"set {name}: {len(taken)} objects; `graspd datasets create NAME --hands HANDS --objects {name}`")
+    if refused:
+        raise InputError(f"{len(refused)} of {len(told)} objects were refused: {', '.join(refused[:5])}")
+
+
+def upload_set(
+    client: Client,
+    objects: Objects,
+    *,
+    prefix: str | None = None,
+    options: dict[str, Any] | None = None,
+    shared: bool = False,
+    wait: bool = True,
+    say: Callable[[str], None] | None = None,
+) -> list[dict[str, Any]]:
+    """Upload objects and wait for their checks: name, verdict, message and repairs of each.
+
+    Args:
+        say: told of each as soon as its check is done.
+    """
+    told = [
+        _upload(client, f"{prefix}-{name}" if prefix else name, files, options or {}, shared=shared)
+        for name, files in objects.items()
+    ]
+    for one in told:
+        if wait and one["verdict"] is None:
+            asset = client.wait_checked(AssetKind.OBJECT, one["digest"])
+            one.update(verdict=asset.verdict, message=asset.message or "", repairs=asset.repairs)
+        if say is not None:
+            say(verdict_line(one))
+    return told
+
+
+def _upload(
+    client: Client, name: str, files: dict[str, bytes], options: dict[str, Any], *, shared: bool
+) -> dict[str, Any]:
+    """One object of a set: its name and what is known of it yet."""
+    try:
+        with tempfile.TemporaryDirectory(prefix="graspd-set-") as folder:
+            archive = Path(folder) / "object.zip"
+            archive.write_bytes(pack(files))
+            asset = client.upload(AssetKind.OBJECT, archive, name=name, options=options, shared=shared)
+    except InputError as error:
+        return {"name": name, "verdict": "refuse", "message": str(error), "repairs": []}
+    return {
+        "name": asset.name,
+        "digest": asset.digest,
+        "verdict": asset.verdict,
+        "message": asset.message or "",
+        "repairs": asset.repairs,
+    }

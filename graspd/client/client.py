@@ -1,0 +1,370 @@
+"""A thin HTTP client: the documents of `api.models` in, problem documents back as the exceptions they came from."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self, TypeVar
+from urllib.parse import quote
+
+import httpx
+from httpx_sse import EventSource
+from pydantic import BaseModel, TypeAdapter
+
+from graspd.api.formatting import is_loopback
+from graspd.api.models import GraspQuery, Health, Job, JobDetail, Shard
+from graspd.service.index.views import AssetView, CellView, DatasetView, GraspView, ObjectSetView, Page, SnapshotView
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import ERRORS, GraspdError, InputError, RateError, UnavailableError, without_secrets
+from graspd.service.model.records import Snapshot
+from graspd.service.model.states import AssetKind, State
+from graspd.service.pipeline.datasets.estimate import Estimate
+from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix
+
+_PATIENCE_S: Final = 30.0
+_CONNECT_S: Final = 5.0
+_TIMEOUT: Final = httpx.Timeout(_PATIENCE_S, connect=_CONNECT_S)
+#: The server sends a sign of life every 15 s.
+_STREAM_TIMEOUT: Final = httpx.Timeout(40.0, connect=5.0)
+_POLL_S: Final = 0.3
+_DATASET_POLL_S: Final = 1.0
+#: Rows of a page.
+_PAGE: Final = 200
+#: Longest waits before another try when the service says that requests come too fast [s].
+_WAITS_S: Final = (2.0, 5.0, 10.0, 20.0)
+
+View = TypeVar("View", bound=BaseModel)
+
+
+class Client:
+    """Talks to one graspd API. Usable as a context manager.
+
+    Args:
+        url: where the API answers, e.g. http://127.0.0.1:8000.
+        key: Bearer key, if the service asks for one.
+        transport: replaces the network in tests.
+
+    Raises:
+        InputError: the address or the key cannot be used.
+    """
+
+    def __init__(self, url: str, *, key: str | None = None, transport: httpx.BaseTransport | None = None) -> None:
+        address = _address(url.strip().rstrip("/"))
+        self.url = without_secrets(str(address)).rstrip("/")
+        # A proxy of the environment cannot reach this machine's own addresses.
+        is_local = is_loopback(address.host)
+        self._http = httpx.Client(
+            base_url=address,
+            headers=_authorization((key or "").strip()),
+            timeout=_TIMEOUT,
+            transport=transport,
+            follow_redirects=True,
+            trust_env=not is_local,
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._http.close()
+
+    def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobDetail:
+        """Submit a job; the same request gives the same job."""
+        headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
+        answer = self.send("POST", "/v1/jobs", json=request.model_dump(mode="json"), headers=headers)
+        return JobDetail.model_validate_json(answer.content)
+
+    def job(self, job_id: str) -> JobDetail:
+        return JobDetail.model_validate_json(self.send("GET", path_of("jobs", job_id)).content)
+
+    def jobs(self, *, state: State | None = None, limit: int = 50, cursor: str | None = None) -> Page[Job]:
+        """Jobs, newest first."""
+        params = {"state": state, "limit": limit, "cursor": cursor}
+        return Page[Job].model_validate_json(self.send("GET", "/v1/jobs", params=params).content)
+
+    def cancel(self, job_id: str) -> JobDetail:
+        return JobDetail.model_validate_json(self.send("POST", path_of("jobs", job_id, "cancel")).content)
+
+    def delete(self, path: str, **params: Any) -> None:
+        """Take away what stands under an address: `/v1/jobs/ID`, `/v1/objects/NAME`."""
+        self.send("DELETE", path, params=params)
+
+    def retry(self, job_id: str) -> JobDetail:
+        return JobDetail.model_validate_json(self.send("POST", path_of("jobs", job_id, "retry")).content)
+
+    def grasps(self, query: GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
+        params = query.model_dump(mode="json", exclude_none=True) | {"limit": limit, "cursor": cursor}
+        return Page[GraspView].model_validate_json(self.send("GET", "/v1/grasps", params=params).content)
+
+    def assets(self, kind: AssetKind, *, refused: bool = False) -> Iterator[AssetView]:
+        """All hands, objects or networks; those that the check refused only where asked for."""
+        return self._pages(AssetView, f"/v1/{kind.value}s", refused=refused)
+
+    def asset(self, kind: AssetKind, name: str) -> AssetView:
+        return AssetView.model_validate_json(self.send("GET", path_of(f"{kind.value}s", name)).content)
+
+    def upload(
+        self,
+        kind: AssetKind,
+        path: Path,
+        *,
+        name: str | None = None,
+        options: dict[str, Any] | None = None,
+        self_test: bool = False,
+        shared: bool = False,
+    ) -> AssetView:
+        """Send a file or a ZIP, with keys that go over its `asset.json`; InputError if it cannot be opened.
+
+        The check of a hand ends with the self-test if wanted; what is shared may be used by every project.
+        """
+        fields = ({"name": name} if name else {}) | ({"options": json.dumps(options)} if options else {})
+        fields |= {name: "true" for name, wanted in {"self_test": self_test, "shared": shared}.items() if wanted}
+        try:
+            with path.open("rb") as file:
+                answer = self.send(
+                    "POST",
+                    f"/v1/{kind.value}s",
+                    files={"file": (path.name, file)},
+                    data=fields,
+                )
+        except OSError as error:
+            raise InputError(f"{path} cannot be read: {error.strerror}") from None
+        return AssetView.model_validate_json(answer.content)
+
+    def wait_checked(self, kind: AssetKind, digest: str, *, timeout_s: float = 120.0) -> AssetView:
+        """An uploaded asset once a worker has checked it; UnavailableError if none did in time.
+
+        Args:
+            digest: of its files: a name stands for another asset as soon as this one is refused.
+        """
+        deadline = time.monotonic() + timeout_s
+        while (asset := self.asset(kind, digest)).verdict is None:
+            if time.monotonic() > deadline:
+                why = asset.message or "is one running?"
+                raise UnavailableError(f"no worker has checked {kind.value} {asset.name!r} yet; {why}")
+            time.sleep(_POLL_S)
+        return asset
+
+    def fetch(
+        self, path: str, *, params: dict[str, str] | None = None, patience_s: float = _PATIENCE_S
+    ) -> Iterator[bytes]:
+        """Chunks of a file of the API, none of which may take longer than `patience_s` [s]."""
+        timeout = httpx.Timeout(patience_s, connect=_CONNECT_S)
+        with _Translated(self.url), self._http.stream("GET", path, params=params, timeout=timeout) as answer:
+            _raise_for(answer)
+            yield from answer.iter_bytes()
+
+    def download(self, shard: Shard, path: Path) -> Path:
+        """Fetch a shard's file; the name appears once it is whole."""
+        return self.save(shard.file, path)
+
+    def save(
+        self, address: str, path: Path, *, params: dict[str, str] | None = None, patience_s: float = _PATIENCE_S
+    ) -> Path:
+        """Fetch a file of the API; the name appears once it is whole. `patience_s` as for `fetch`."""
+        draft = path.with_name(f".{path.name}.part")
+        try:
+            with draft.open("wb") as file:
+                for chunk in self.fetch(address, params=params, patience_s=patience_s):
+                    file.write(chunk)
+            draft.replace(path)
+        finally:
+            draft.unlink(missing_ok=True)
+        return path
+
+    def health(self) -> Health:
+        """State of the parts, also when one of them is down."""
+        with _Translated(self.url):
+            return Health.model_validate_json(self._http.get("/readyz").content)
+
+    def watch(self, job_id: str) -> Iterator[Job]:
+        """A job at each change until it ends; survives a restart of the API."""
+        while True:
+            try:
+                for event, data in self._events(path_of("jobs", job_id, "events")):
+                    if event in ("progress", "end"):
+                        yield Job.model_validate(data)
+                    if event == "end":
+                        return
+            except UnavailableError:
+                if not self._comes_back():
+                    raise
+            time.sleep(_POLL_S)
+
+    def wait(self, job_id: str, on_progress: Callable[[Job], None] | None = None) -> JobDetail:
+        """The job in its final state."""
+        for job in self.watch(job_id):
+            if on_progress is not None:
+                on_progress(job)
+        return self.job(job_id)
+
+    def create_dataset(self, request: DatasetRequest) -> DatasetView:
+        answer = self.send("POST", "/v1/datasets", json=_matrix_body(request))
+        return DatasetView.model_validate_json(answer.content)
+
+    def estimate(self, matrix: Matrix) -> Estimate:
+        """What the datasets of a matrix would take."""
+        body = {name: value for name, value in _matrix_body(matrix).items() if name in Matrix.model_fields}
+        return Estimate.model_validate_json(self.send("POST", "/v1/datasets/estimate", json=body).content)
+
+    def datasets(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
+        """Datasets, newest first."""
+        answer = self.send("GET", "/v1/datasets", params={"limit": limit, "cursor": cursor})
+        return Page[DatasetView].model_validate_json(answer.content)
+
+    def dataset(self, name: str) -> DatasetView:
+        return DatasetView.model_validate_json(self.send("GET", path_of("datasets", name)).content)
+
+    def cells(self, name: str, *, state: State | None = None) -> Iterator[CellView]:
+        """All cells of a dataset, or those in a state."""
+        return self._pages(CellView, path_of("datasets", name, "cells"), state=state)
+
+    def cancel_dataset(self, name: str) -> DatasetView:
+        return DatasetView.model_validate_json(self.send("POST", path_of("datasets", name, "cancel")).content)
+
+    def retry_dataset(self, name: str) -> DatasetView:
+        return DatasetView.model_validate_json(self.send("POST", path_of("datasets", name, "retry")).content)
+
+    def take_snapshot(self, name: str) -> SnapshotView:
+        return SnapshotView.model_validate_json(self.send("POST", path_of("datasets", name, "snapshots")).content)
+
+    def snapshot(self, name: str, digest: str) -> Snapshot:
+        """A snapshot with its list of shards."""
+        return Snapshot.model_validate_json(self.send("GET", path_of("datasets", name, "snapshots", digest)).content)
+
+    def watch_dataset(self, name: str) -> Iterator[DatasetView]:
+        """A dataset every second until it ends."""
+        while True:
+            dataset = self.dataset(name)
+            yield dataset
+            if dataset.state.is_final:
+                return
+            time.sleep(_DATASET_POLL_S)
+
+    def add_object_set(self, name: str, objects: Iterable[str]) -> ObjectSetView:
+        answer = self.send("POST", "/v1/object-sets", json={"name": name, "objects": list(objects)})
+        return ObjectSetView.model_validate_json(answer.content)
+
+    def object_sets(self) -> list[ObjectSetView]:
+        return TypeAdapter(list[ObjectSetView]).validate_json(self.send("GET", "/v1/object-sets").content)
+
+    def _pages(self, kind: type[View], path: str, **params: Any) -> Iterator[View]:
+        """What a list of the API holds, page after page."""
+        cursor: str | None = None
+        while True:
+            answer = self.send("GET", path, params={"limit": _PAGE, "cursor": cursor, **params})
+            page = Page[kind].model_validate_json(answer.content)  # type: ignore[valid-type]
+            yield from page.items
+            cursor = page.next
+            if cursor is None:
+                return
+
+    def _comes_back(self, timeout_s: float = 30.0) -> bool:
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            try:
+                self.send("GET", "/healthz")
+            except UnavailableError:
+                time.sleep(_POLL_S)
+            else:
+                return True
+        return False
+
+    def _events(self, path: str) -> Iterator[tuple[str, Any]]:
+        with _Translated(self.url), self._http.stream("GET", path, timeout=_STREAM_TIMEOUT) as answer:
+            _raise_for(answer)
+            yield from events_of(answer)
+
+    def send(self, method: str, path: str, *, params: dict[str, Any] | None = None, **options: Any) -> httpx.Response:
+        """The answer to a request; the error behind a problem document is raised."""
+        given = {name: value for name, value in (params or {}).items() if value is not None}
+        for wait in (*_WAITS_S, None):
+            with _Translated(self.url):
+                answer = self._http.request(method, path, params=given or None, **options)
+            if wait is None or not _is_too_fast(answer):
+                break
+            time.sleep(min(wait, float(answer.headers.get("retry-after", wait))))
+        _raise_for(answer)
+        return answer
+
+
+def path_of(*parts: str) -> str:
+    """Address of a thing of the API by its parts, whatever characters a name holds: `/v1/tags/good%20ones/remove`."""
+    return "/v1/" + "/".join(quote(part, safe="") for part in parts)
+
+
+def _matrix_body(matrix: Matrix) -> dict[str, Any]:
+    """The body of a request; what is empty is left out, as an older service does not know all of it."""
+    return {name: value for name, value in matrix.model_dump(mode="json").items() if value not in ({}, "")}
+
+
+def _address(url: str) -> httpx.URL:
+    mend = "give http://HOST:PORT or https://HOST/PATH, an IPv6 address in brackets: http://[::1]:8000"
+    try:
+        found = httpx.URL(url)
+    except (httpx.InvalidURL, ValueError):
+        found = httpx.URL()
+    if found.scheme not in ("http", "https") or not found.host:
+        raise InputError(f"the address of the API {url!r} cannot be used; {mend}")
+    return found
+
+
+def _authorization(key: str) -> dict[str, str]:
+    if not key:
+        return {}
+    if not (key.isascii() and key.isprintable() and " " not in key):
+        raise InputError("the API key (GRASPD_API_KEY) holds a character that no key has; copy it again")
+    return {"Authorization": f"Bearer {key}"}
+
+
+def _is_too_fast(answer: httpx.Response) -> bool:
+    """A quota is used up for longer than anybody waits: only the rate of requests is worth another try."""
+    return answer.status_code == 429 and RateError.slug in answer.text
+
+
+def events_of(answer: httpx.Response) -> Iterator[tuple[str, Any]]:
+    """(event, decoded data) of a text/event-stream."""
+    for event in EventSource(answer).iter_sse():
+        if event.data:
+            yield event.event, event.json()
+
+
+class _Translated:
+    """Errors of the network as UnavailableError."""
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if isinstance(error, httpx.ConnectError | httpx.ConnectTimeout):
+            raise UnavailableError(
+                f"no graspd answers at {self.url}; start one with `graspd up`, or set GRASPD_API_URL"
+            ) from None
+        if isinstance(error, httpx.HTTPError | httpx.InvalidURL):
+            raise UnavailableError(f"the connection to {self.url} broke: {error or type(error).__name__}") from None
+
+
+def _raise_for(answer: httpx.Response) -> None:
+    if answer.is_success:
+        return
+    answer.read()
+    try:
+        problem = answer.json()
+        slug, detail = str(problem["type"]).rpartition("/")[2], str(problem["detail"])
+    except (ValueError, KeyError, TypeError):
+        slug, detail = "", f"{answer.url} answered {answer.status_code}, and not as graspd does; check the address"
+    fallback: type[GraspdError] = InputError if answer.is_client_error else UnavailableError
+    raise ERRORS.get(slug, fallback)(detail)

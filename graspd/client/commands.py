@@ -1,0 +1,383 @@
+"""Commands that talk to the API over HTTP, and the ones that run it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from graspd.api.formatting import count, minute, percent, size
+from graspd.api.uploads import MAIN_SUFFIXES, name_of_upload
+from graspd.client import access_commands, tag_commands
+from graspd.client.add_commands import add_hand, add_network, add_object
+from graspd.client.client import Client, path_of
+from graspd.client.job_options import pairs, validated
+from graspd.client.reports import (
+    UrlOption,
+    YesOption,
+    confirm,
+    open_client,
+    restore,
+    say_deleted,
+    show_asset,
+    show_job,
+    watch,
+)
+from graspd.service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
+from graspd.service.model.domain import AUDITS, NETWORK_METHODS, JobRequest
+from graspd.service.model.errors import InputError
+from graspd.service.model.metrics import MIN_DISTANCE_M
+from graspd.service.model.scene_spec import scene_option
+from graspd.service.model.states import AssetKind, State
+from graspd.service.store.asset_options import (
+    DensityOption,
+    MassOption,
+    MinPayloadOption,
+    ObjectFrictionOption,
+    PayloadOption,
+    ShakeOption,
+)
+from graspd.service.store.asset_summary import hand_line, self_test_line
+
+app = typer.Typer(no_args_is_help=True)
+
+JobArgument = Annotated[str, typer.Argument(help="Job id, or the beginning of one.")]
+
+
+@app.command(epilog="graspd submit --hand allegro --object mug.stl --grasps 320 --scenes 2 --views 3 --wait")
+@reporting_errors
+def submit(
+    hand: Annotated[str, typer.Option(help="Name of a hand, or a URDF or ZIP to upload.")],
+    object: Annotated[str, typer.Option(help="Name of an object, or a mesh file to upload.")],
+    grasps: Annotated[int, typer.Option("--grasps", "-n", help="Number of grasps.")] = 32,
+    want: Annotated[str, typer.Option(help="valid: that many valid grasps; raw: that many of any kind.")] = "valid",
+    budget: Annotated[float, typer.Option(help="Tries for each valid grasp, at most.")] = 4.0,
+    min_distance: Annotated[
+        float, typer.Option(help="No two grasps of a batch are nearer [m], by the mean distance of the hand's points.")
+    ] = MIN_DISTANCE_M,
+    referee: Annotated[str, typer.Option(help="letter, certificate, screen or none.")] = "certificate",
+    audits: Annotated[
+        int, typer.Option(help="Valid grasps judged again by the letter; 8 are spread over the job, one of 64.")
+    ] = AUDITS,
+    robustness: Annotated[int, typer.Option(help="Verdicts under noise for each valid grasp.")] = 0,
+    robust: Annotated[
+        float, typer.Option(help="Share of models around the nominal one that a grasp must hold in.")
+    ] = 0.0,
+    robust_models: Annotated[int, typer.Option(help="Models each valid grasp is judged in; 0: 8 with --robust.")] = 0,
+    method: Annotated[str, typer.Option(help="Planner.")] = "fast_graspd",
+    option: Annotated[
+        list[str] | None, typer.Option(help="An option of the planner, such as steps=20000; several times.")
+    ] = None,
+    fidelity: Annotated[str, typer.Option(help="draft, standard, fine, or auto with --target.")] = "standard",
+    target: Annotated[
+        str, typer.Option(help="With auto: gsr>=0.6 or pd_mm<=1, in a scene lift>=0.9; the cheapest that meets it.")
+    ] = "",
+    seed: Annotated[int, typer.Option(help="The same seed gives the same grasps.")] = 0,
+    scene: Annotated[
+        str, typer.Option(help="Where the grasps are used: free, table, bin, shelf, or a JSON or YAML file.")
+    ] = "free",
+    faces: Annotated[str, typer.Option(help="drawn: as drops fall; all: a scene for each stable face.")] = "drawn",
+    with_: Annotated[
+        list[str] | None,
+        typer.Option("--with", help="Another object in the scene: a name, or a mesh to upload; up to eight."),
+    ] = None,
+    touch: Annotated[
+        float, typer.Option(help="mm that fingertips keep from supports: 2 as the hand; 0: they touch; to -1: press.")
+    ] = 0.0,
+    scenes: Annotated[int, typer.Option(help="Scenes per batch of grasps; 4 where a scene is named.")] = 0,
+    views: Annotated[int, typer.Option(help="Camera placements per scene.")] = 0,
+    stereo: Annotated[bool, typer.Option("--stereo", help="A left and a right picture per placement.")] = False,
+    width: Annotated[int, typer.Option(help="Picture width [px].")] = 320,
+    height: Annotated[int, typer.Option(help="Picture height [px].")] = 240,
+    channels: Annotated[list[str] | None, typer.Option(help="distance, normals or occlusion; several times.")] = None,
+    friction: Annotated[float, typer.Option(help="Coulomb coefficient of the metrics.")] = 1.0,
+    mass: MassOption = None,
+    density: DensityOption = None,
+    object_friction: ObjectFrictionOption = None,
+    payload: PayloadOption = False,
+    min_payload: MinPayloadOption = 0.0,
+    shake: ShakeOption = False,
+    wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Submit a job: one hand on one object."""
+    options = pairs(option or [])
+    with open_client(url) as client:
+        as_object = partial(_uploaded, client, AssetKind.OBJECT)
+        if method in NETWORK_METHODS and "network" in options:
+            options["network"] = _uploaded(client, AssetKind.NETWORK, str(options["network"]))
+        request = validated(
+            JobRequest,
+            {
+                "hand": _uploaded(client, AssetKind.HAND, hand),
+                "object": as_object(object),
+                "grasps": grasps,
+                "want": want,
+                "budget": budget,
+                "min_distance": min_distance,
+                "referee": referee,
+                "audits": audits,
+                "robustness": robustness,
+                "robust": robust,
+                "robust_models": robust_models,
+                "method": method,
+                "options": options,
+                "fidelity": fidelity,
+                "target": target,
+                "seed": seed,
+                "scene": scene_option(scene, named=as_object),
+                "faces": faces,
+                "touch": touch,
+                "neighbours": [as_object(one) for one in with_ or []],
+                "scenes": scenes,
+                "views": views,
+                "stereo": stereo,
+                "width": width,
+                "height": height,
+                "channels": channels or [],
+                "friction": friction,
+                "mass": mass,
+                "density": density,
+                "object_friction": object_friction,
+                "payload": payload,
+                "min_payload": min_payload,
+                "shake": shake,
+            },
+        )
+        job = client.submit(request)
+        if wait:
+            job = watch(client, job.id)
+        show_job(job, json=json, url=client.url)
+
+
+@app.command(epilog="graspd jobs --state running")
+@reporting_errors
+def jobs(
+    state: Annotated[State | None, typer.Option(help="Only jobs in this state.")] = None,
+    limit: Annotated[int, typer.Option(min=1, max=200, help="At most this many.")] = 20,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """List jobs, the newest first."""
+    with open_client(url) as client:
+        page = client.jobs(state=state, limit=limit)
+    if json:
+        emit({"jobs": [job.model_dump(mode="json") for job in page.items], "next": page.next})
+        return
+    names = ("job", "state", "hand", "object", "progress", "grasps", "created")
+    table = plain_table(*names, whole=("job", "state", "created"))
+    for job in page.items:
+        made = job.valid if job.standing == "valid" else job.grasps
+        done = f"{count(made)} of {count(job.requested)} {job.standing}"
+        pair, last = (job.hand, job.object), (percent(job.progress), done, minute(job.created))
+        table.add_row(job.id[:12], job.state, *pair, *last)
+    plain_console().print(table if page.items else "no job yet; `graspd submit --hand allegro --object mug` makes one")
+
+
+@app.command(epilog="graspd status 3f2a --json")
+@reporting_errors
+def status(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Stages, progress and quality of a job."""
+    with open_client(url) as client:
+        show_job(client.job(_full_id(client, job_id)), json=json, url=client.url, must_succeed=False)
+
+
+@app.command(epilog="graspd cancel 3f2a")
+@reporting_errors
+def cancel(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Stop a job; what is written stays."""
+    with open_client(url) as client:
+        show_job(client.cancel(_full_id(client, job_id)), json=json, url=client.url, must_succeed=False)
+
+
+@app.command(epilog="graspd delete 3f2a")
+@reporting_errors
+def delete(job_id: JobArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Take away a job that has ended; its shards follow after a grace time, unless another job needs them."""
+    with open_client(url) as client:
+        job = client.job(_full_id(client, job_id))
+        asked = f"Delete job {job.id[:12]}, {job.hand} on {job.object}, with its {count(job.grasps)} grasps?"
+        confirm(asked, f"job {job.id[:12]}", yes=yes)
+        client.delete(path_of("jobs", job.id))
+    say_deleted("job", job.id, json=json, undo=f"graspd restore {job.id[:12]}")
+
+
+@app.command("restore", epilog="graspd restore 3f2a")
+@reporting_errors
+def restore_job(
+    job_id: Annotated[str, typer.Argument(help="Id of a deleted job, or the beginning of one.")],
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Bring back a job that was deleted, within the grace time."""
+    with open_client(url) as client:
+        gone = [one["id"] for one in client.send("GET", "/v1/deletions").json() if one["what"] == "job"]
+    restore(url, "job", _only_one(gone, job_id), json=json)
+
+
+@app.command(epilog="graspd retry 3f2a --wait")
+@reporting_errors
+def retry(
+    job_id: JobArgument,
+    wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Run again what failed or was cancelled; what is written is not made twice."""
+    with open_client(url) as client:
+        job = client.retry(_full_id(client, job_id))
+        if wait:
+            job = watch(client, job.id)
+        show_job(job, json=json, url=client.url)
+
+
+@app.command(epilog="graspd logs 3f2a")
+@reporting_errors
+def logs(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Failed attempts of a job, with their reasons."""
+    with open_client(url) as client:
+        job = client.job(_full_id(client, job_id))
+    if json:
+        emit({"job": job.id, "attempts": [attempt.model_dump(mode="json") for attempt in job.attempts]})
+        return
+    console = plain_console()
+    if not job.attempts:
+        console.print("no attempt has failed")
+    for attempt in job.attempts:
+        console.print(f"{attempt.ended}  task {attempt.task_id[:8]}  attempt {attempt.number}  {attempt.worker}")
+        console.print(f"    {attempt.kind}: {attempt.reason}")
+        if attempt.trace:
+            console.print("\n".join("    " + line for line in attempt.trace.splitlines()), style="dim")
+
+
+def asset_commands(kind: AssetKind) -> typer.Typer:
+    """`graspd hands ...`, `graspd objects ...` or `graspd networks ...`."""
+    verbs = "Add, list, show and delete" if kind is AssetKind.NETWORK else "Check, add, list, show and delete"
+    group = typer.Typer(no_args_is_help=True, help=f"{verbs} {kind.value}s.")
+
+    @group.command("list")
+    @reporting_errors
+    def list_assets(
+        refused: Annotated[bool, typer.Option("--refused", help="Also those that the check refused.")] = False,
+        url: UrlOption = None,
+        json: JsonFlag = False,
+    ) -> None:
+        """All of them."""
+        with open_client(url) as client:
+            assets = list(client.assets(kind, refused=refused))
+        if json:
+            emit({f"{kind.value}s": [asset.model_dump(mode="json") for asset in assets]})
+            return
+        # Files of networks have one name.
+        second = "hand" if kind is AssetKind.NETWORK else "file"
+        table = plain_table("name", second, "size", "check", "digest", whole=("size", "digest"))
+        for asset in assets:
+            origin = "built-in" if asset.builtin else (asset.verdict or "waiting")
+            if says := self_test_line(asset.facts):
+                origin += f"; {says}"
+            named = hand_line(asset.facts) if kind is AssetKind.NETWORK else asset.filename
+            table.add_row(asset.name, named, size(asset.size_bytes), origin, asset.digest[:12])
+        plain_console().print(table)
+
+    @group.command("show")
+    @reporting_errors
+    def show(
+        name: Annotated[str, typer.Argument(help="Its name.")],
+        url: UrlOption = None,
+        json: JsonFlag = False,
+    ) -> None:
+        """One of them, with what the check found."""
+        with open_client(url) as client:
+            asset = client.asset(kind, name)
+        show_asset(asset.model_dump(mode="json"), json=json)
+
+    @group.command("delete", epilog=f"graspd {kind.value}s delete my_{kind.value}")
+    @reporting_errors
+    def delete_asset(
+        name: Annotated[str, typer.Argument(help="Its name or digest.")],
+        yes: YesOption = False,
+        url: UrlOption = None,
+        json: JsonFlag = False,
+    ) -> None:
+        """Take one away that no job, dataset or set of objects needs."""
+        with open_client(url) as client:
+            client.asset(kind, name)
+            confirm(f"Delete the {kind.value} {name}?", f"the {kind.value} {name}", yes=yes)
+            client.delete(path_of(f"{kind.value}s", name))
+        say_deleted(kind.value, name, json=json, undo=f"graspd {kind.value}s restore {name}")
+
+    @group.command("restore", epilog=f"graspd {kind.value}s restore my_{kind.value}")
+    @reporting_errors
+    def restore_asset(
+        name: Annotated[str, typer.Argument(help="Its name or digest.")],
+        url: UrlOption = None,
+        json: JsonFlag = False,
+    ) -> None:
+        """Bring back one that was deleted, within the grace time."""
+        restore(url, kind.value, name, json=json)
+
+    return group
+
+
+hands_app, objects_app, networks_app = map(asset_commands, AssetKind)
+hands_app.command("add", epilog="graspd hands add my_hand.zip --palm base_link --approach 0,0,1")(add_hand)
+objects_app.command("add", epilog="graspd objects add banana.stl --units mm --density 950")(add_object)
+networks_app.command("add", epilog="graspd networks add barrett.npz")(add_network)
+
+
+@objects_app.command("sets", epilog="graspd objects sets")
+@reporting_errors
+def sets(url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Sets of objects; `graspd objects add FOLDER` makes one."""
+    with open_client(url) as client:
+        found = client.object_sets()
+    if json:
+        emit({"sets": [one.model_dump(mode="json") for one in found]})
+        return
+    table = plain_table("set", "objects", "")
+    for one in found:
+        table.add_row(
+            one.name, count(len(one.objects)), ", ".join(one.objects[:5]) + (", ..." * (len(one.objects) > 5))
+        )
+    plain_console().print(table if found else "no set yet; `graspd objects add FOLDER` makes one")
+
+
+app.add_typer(hands_app, name="hands")
+app.add_typer(objects_app, name="objects")
+app.add_typer(networks_app, name="networks")
+app.add_typer(access_commands.keys_app, name="keys")
+app.add_typer(access_commands.projects_app, name="projects")
+app.add_typer(access_commands.webhooks_app, name="webhooks")
+app.add_typer(tag_commands.app, name="tags")
+
+
+def _uploaded(client: Client, kind: AssetKind, value: str) -> str:
+    """The name of a hand, object or network; a path that exists is uploaded and checked first."""
+    path = Path(value)
+    is_file_name = "/" in value or path.suffix.lower() in (*MAIN_SUFFIXES[kind], ".zip")
+    if not is_file_name:
+        return value
+    if not path.is_file():
+        raise InputError(f"there is no file {value}; give a path that exists, or the name of a known {kind.value}")
+    asset = client.upload(kind, path, name=name_of_upload(path.name))
+    if not asset.builtin and (asset := client.wait_checked(kind, asset.digest)).verdict == "refuse":
+        raise InputError(f"refused: {asset.message}")
+    return asset.name
+
+
+def _full_id(client: Client, prefix: str) -> str:
+    """The id of the one job that begins so, among the latest."""
+    if len(prefix) >= 32:
+        return prefix
+    return _only_one([job.id for job in client.jobs(limit=200).items], prefix)
+
+
+def _only_one(ids: Iterable[str], prefix: str) -> str:
+    found = {id for id in ids if id.startswith(prefix)}
+    if len(found) > 1:
+        raise InputError(f"{len(found)} jobs begin with {prefix!r}; give more letters")
+    return found.pop() if found else prefix

@@ -1,0 +1,339 @@
+"""`graspd datasets`: hands x objects as one dataset, from its cost to its files."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+
+from graspd.api.formatting import count, minute, percent, size
+from graspd.client.add_commands import name_of_set, upload_set
+from graspd.client.client import Client, path_of
+from graspd.client.job_options import SpecOption, Wanted, validated, wanted, with_job_options
+from graspd.client.reports import (
+    UrlOption,
+    YesOption,
+    confirm,
+    open_client,
+    print_cells,
+    print_dataset,
+    print_estimate,
+    restore,
+    say_deleted,
+    watch_dataset,
+)
+from graspd.service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
+from graspd.service.index.views import DatasetView
+from graspd.service.model.errors import InputError, TaskError, did_you_mean, one_of
+from graspd.service.model.states import AssetKind, State
+from graspd.service.pipeline.datasets.estimate import Estimate
+from graspd.service.pipeline.datasets.export import FORMATS
+from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix
+from graspd.service.store.object_sets import Objects, files_of_set
+
+app = typer.Typer(no_args_is_help=True)
+group = typer.Typer(no_args_is_help=True, help="Hands x objects as one dataset: cost, status, snapshots, files.")
+app.add_typer(group, name="datasets")
+
+NameArgument = Annotated[str, typer.Argument(help="Name of the dataset.")]
+HandsOption = Annotated[str | None, typer.Option("--hands", help="Names of hands: allegro,shadow.")]
+ObjectsOption = Annotated[
+    str | None,
+    typer.Option("--objects", help="Objects or sets by name: mug,ycb; or a folder or ZIP, which becomes a set."),
+]
+WaitOption = Annotated[bool, typer.Option("--wait", help="Show progress until the dataset ends.")]
+
+
+@group.command(epilog="graspd datasets create kitchen --hands allegro,shadow --objects ./ycb --grasps 1000")
+@with_job_options
+@reporting_errors
+def create(
+    options: dict[str, Any],
+    name: Annotated[str | None, typer.Argument(help="Name of the dataset; a spec may say it.")] = None,
+    hands: HandsOption = None,
+    objects: ObjectsOption = None,
+    spec: SpecOption = None,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Start without asking.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what it would cost, and stop.")] = False,
+    wait: WaitOption = False,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Make a dataset: a job for each hand and object. The same command again goes on where it was."""
+    console = plain_console(stderr=json)
+    asked = wanted(spec, name=name, hands=hands, objects=objects, options=options)
+    if not asked.name:
+        raise InputError("say a name: graspd datasets create NAME, or name in the file of --spec")
+    with open_client(url) as client:
+        files, matrix = _matrix(client, asked)
+        request = validated(DatasetRequest, {"name": asked.name, **matrix})
+        found = _estimate(client, matrix, files)
+        print_estimate(found, console)
+        if dry_run:
+            _emit(json, estimate=found)
+            return
+        if not yes and not _confirmed():
+            raise InputError("nothing was started")
+        refused: list[str] = []
+        if files is not None:
+            refused = _upload(client, files, name_of_set(Path(asked.objects)), console)
+            matrix = asked.shared_out(matrix, len(files) - len(refused))
+            request = validated(DatasetRequest, {"name": asked.name, **matrix, "objects": []})
+        dataset = client.create_dataset(request)
+        if wait:
+            dataset = watch_dataset(client, asked.name, plain_console(stderr=True))
+    _emit(json, estimate=found, dataset=dataset, refused=refused)
+    if not json:
+        if refused:
+            console.print(f"left out, because refused: {', '.join(refused)}", soft_wrap=True)
+        print_dataset(dataset, console)
+        console.print(f"`graspd datasets status {asked.name}` shows each cell", style="dim")
+    _must_succeed(dataset, asked=wait)
+
+
+@group.command(epilog="graspd datasets estimate --hands allegro --objects mug --grasps 1000000 --scenes 2 --views 3")
+@with_job_options
+@reporting_errors
+def estimate(
+    options: dict[str, Any],
+    hands: HandsOption = None,
+    objects: ObjectsOption = None,
+    spec: SpecOption = None,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """What a dataset would cost: time for 1, 8 and 64 workers, storage, network."""
+    asked = wanted(spec, name=None, hands=hands, objects=objects, options=options)
+    with open_client(url) as client:
+        files, matrix = _matrix(client, asked)
+        found = _estimate(client, matrix, files)
+    if json:
+        emit(found)
+    else:
+        print_estimate(found, plain_console())
+
+
+@group.command("list", epilog="graspd datasets list")
+@reporting_errors
+def list_datasets(
+    limit: Annotated[int, typer.Option(min=1, max=200, help="At most this many.")] = 20,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Datasets, the newest first."""
+    with open_client(url) as client:
+        page = client.datasets(limit=limit)
+    if json:
+        emit({"datasets": [dataset.model_dump(mode="json") for dataset in page.items], "next": page.next})
+        return
+    table = plain_table(
+        "dataset", "state", "cells", "progress", "grasps", "size", "created", whole=("state", "size", "created")
+    )
+    for one in page.items:
+        made = f"{count(one.counted)} {one.options.standing} of {count(one.asked)}"
+        cells = count(one.cells)
+        table.add_row(
+            one.name,
+            one.state,
+            cells,
+            percent(one.progress),
+            made,
+            size(one.size_bytes),
+            minute(one.created),
+        )
+    empty = "no dataset yet; `graspd datasets create NAME --hands allegro --objects mug,bottle` makes one"
+    plain_console().print(table if page.items else empty)
+
+
+@group.command(epilog="graspd datasets status kitchen --state failed")
+@reporting_errors
+def status(
+    name: NameArgument,
+    state: Annotated[State | None, typer.Option(help="Only cells in this state.")] = None,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """The matrix: each hand and object with its state, yield and failures."""
+    with open_client(url) as client:
+        dataset, cells = client.dataset(name), list(client.cells(name, state=state))
+    if json:
+        emit({**dataset.model_dump(mode="json"), "matrix": [cell.model_dump(mode="json") for cell in cells]})
+        return
+    print_dataset(dataset, plain_console())
+    print_cells(dataset, cells, plain_console())
+
+
+@group.command(epilog="graspd datasets cancel kitchen")
+@reporting_errors
+def cancel(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Stop a dataset; what is written stays."""
+    with open_client(url) as client:
+        _show(client.cancel_dataset(name), json=json)
+
+
+@group.command(epilog="graspd datasets delete kitchen")
+@reporting_errors
+def delete(
+    name: NameArgument,
+    yes: YesOption = False,
+    with_snapshots: Annotated[
+        bool, typer.Option("--with-snapshots", help="Its snapshots may go too; else they protect it.")
+    ] = False,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Take away a dataset that has ended, and the jobs that were planned for it alone."""
+    with open_client(url) as client:
+        found = client.dataset(name)
+        goes = f"{count(found.cells)} cell{'s' * (found.cells != 1)}, {count(found.grasps)} grasps"
+        goes += f" ({size(found.size_bytes)})" + ", its snapshots" * with_snapshots
+        confirm(f"Delete dataset {name} with {goes}?", f"dataset {name}", yes=yes)
+        client.delete(path_of("datasets", name), with_snapshots=with_snapshots)
+    say_deleted("dataset", name, json=json, undo=f"graspd datasets restore {name}")
+
+
+@group.command("restore", epilog="graspd datasets restore kitchen")
+@reporting_errors
+def restore_dataset(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Bring back a dataset that was deleted, with its jobs and snapshots, within the grace time."""
+    restore(url, "dataset", name, json=json)
+
+
+@group.command(epilog="graspd datasets retry kitchen --wait")
+@reporting_errors
+def retry(name: NameArgument, wait: WaitOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Start again what failed or was cancelled; what is written is not made twice."""
+    with open_client(url) as client:
+        dataset = client.retry_dataset(name)
+        if wait:
+            dataset = watch_dataset(client, name, plain_console(stderr=True))
+    _show(dataset, json=json)
+    _must_succeed(dataset, asked=wait)
+
+
+@group.command(epilog="graspd datasets snapshot kitchen")
+@reporting_errors
+def snapshot(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Write down which shards the dataset holds now; that list never changes."""
+    with open_client(url) as client:
+        taken = client.take_snapshot(name)
+    if json:
+        emit(taken)
+        return
+    whole = "complete" if taken.complete else "the dataset is not complete"
+    typer.echo(
+        f"{taken.digest}  {count(taken.shards)} shards, {count(taken.grasps)} grasps of which {count(taken.valid)} "
+        f"are valid, {size(taken.size_bytes)}; {whole}"
+    )
+
+
+@group.command(epilog="graspd datasets export kitchen -o kitchen-v1 --snapshot 3f2a...")
+@reporting_errors
+def export(
+    name: NameArgument,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write; an earlier export there is gone on with.")],
+    snapshot: Annotated[str | None, typer.Option(help="Digest of a snapshot; default: what there is now.")] = None,
+    format: Annotated[str, typer.Option(help=f"{', '.join(FORMATS)}.")] = "shards",
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Write a snapshot's files into a folder, each checked against its checksum."""
+    if format not in FORMATS:
+        raise InputError(f"there is no format {format!r}; there are: {one_of(format, FORMATS)}")
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TextColumn("{task.fields[files]}"),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+        TimeRemainingColumn(),
+    )
+    with open_client(url) as client:
+        taken = client.snapshot(name, snapshot or client.take_snapshot(name).digest)
+        console = plain_console(stderr=True)
+        with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+            bar = progress.add_task(name, total=taken.size_bytes, files="")
+
+            def show(done: int, files: int, fetched: int) -> None:
+                progress.update(bar, completed=fetched, files=f"{done}/{files}")
+
+            fetched = FORMATS[format](taken, out, lambda shard: client.fetch(path_of("shards", shard.id, "file")), show)
+    told = {"dataset": name, "snapshot": taken.digest, "out": str(out), "files": len(taken.shards), "fetched": fetched}
+    if json:
+        emit({**told, "bytes": taken.size_bytes, "complete": taken.complete})
+    else:
+        typer.echo(f"{out}: {count(len(taken.shards))} files, {size(taken.size_bytes)}, snapshot {taken.digest}")
+
+
+def _matrix(client: Client, asked: Wanted) -> tuple[Objects | None, dict[str, Any]]:
+    """Files of a set that is still to be uploaded, and the matrix that was asked for."""
+    objects = asked.objects
+    names = [word.strip() for word in objects.split(",") if word.strip()]
+    matrix: dict[str, Any] = {"hands": [w.strip() for w in asked.hands.split(",") if w.strip()], **asked.options}
+    known = {found.name: found.objects for found in client.object_sets()}
+    path = Path(objects)
+    # A set goes by its name also where the folder lies that it was added from; ./NAME is the folder.
+    if objects not in known and (files := files_of_set(path)):
+        matrix |= {"objects": sorted(files), "sets": [name_of_set(path)]}
+        return files, asked.shared_out(matrix, len(files))
+    if objects not in known and path.is_file():
+        raise InputError(f"{objects} is one object; `graspd objects add {objects}`, then name it here")
+    if "/" in objects:
+        raise InputError(f"there is no folder {objects}; give one that exists, or names of objects and sets")
+    single = [name for name in names if name not in known]
+    matrix |= {"objects": single, "sets": [name for name in names if name in known]}
+    members = {*single, *(member for name in names for member in known.get(name, ()))}
+    return None, asked.shared_out(matrix, len(members))
+
+
+def _estimate(client: Client, matrix: dict[str, Any], files: Objects | None) -> Estimate:
+    """The cost; InputError for a name that nobody knows and that is not about to be uploaded."""
+    asked = matrix | {"sets": []} if files is not None else matrix
+    found = client.estimate(validated(Matrix, asked))
+    unknown = [name for name in found.unknown if name not in (files or {})]
+    if unknown:
+        known = [one.name for kind in (AssetKind.HAND, AssetKind.OBJECT) for one in client.assets(kind)]
+        raise InputError(
+            f"there is no hand or object {', '.join(map(repr, unknown[:5]))}; `graspd hands list` and `graspd objects "
+            f"list` show what there is{did_you_mean(unknown[0], known)}"
+        )
+    return found
+
+
+def _upload(client: Client, files: Objects, set_name: str, console: Console) -> list[str]:
+    """Send the objects of a folder and make them a set; returns those that are refused and so left out."""
+    told = upload_set(client, files, say=lambda line: console.print(line, soft_wrap=True))
+    taken = [one["name"] for one in told if one["verdict"] != "refuse"]
+    if not taken:
+        raise InputError(f"none of the {len(told)} objects can be used; see above why")
+    client.add_object_set(set_name, taken)
+    return [one["name"] for one in told if one["verdict"] == "refuse"]
+
+
+def _confirmed() -> bool:
+    if not sys.stdin.isatty():
+        raise InputError("say --yes to start it, or --dry-run to see only what it would cost")
+    return typer.confirm("Start it?")
+
+
+def _emit(json: bool, **parts: Estimate | DatasetView | list[str]) -> None:
+    if json:
+        emit({k: part if isinstance(part, list) else part.model_dump(mode="json") for k, part in parts.items()})
+
+
+def _show(dataset: DatasetView, *, json: bool) -> None:
+    if json:
+        emit(dataset)
+    else:
+        print_dataset(dataset, plain_console())
+
+
+def _must_succeed(dataset: DatasetView, *, asked: bool) -> None:
+    if asked and dataset.state in (State.FAILED, State.CANCELLED):
+        raise TaskError(
+            f"dataset {dataset.name} is {dataset.state.value}; `graspd datasets retry {dataset.name}` runs it again"
+        )

@@ -1,0 +1,401 @@
+"""Reports of the commands: the client of the settings, progress, jobs, assets, estimates and datasets on a terminal.
+
+Progress of a job: in a terminal one bar a stage with its rate and the time left, elsewhere plain lines.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Annotated, Any, Final, Self
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+from graspd.api.formatting import count, duration, metric, percent, size, valid_yield, worker_time
+from graspd.api.models import Diversity, Job, JobDetail, StageStatus
+from graspd.client.client import Client, path_of
+from graspd.service.cli import emit, load_settings, plain_console, plain_table
+from graspd.service.index.views import CellView, DatasetView, Judged
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import InputError, TaskError
+from graspd.service.model.states import AssetKind, Stage, State
+from graspd.service.pipeline.datasets.estimate import Estimate
+from graspd.service.run.address import recorded_address
+from graspd.service.store.asset_summary import summary
+
+UrlOption = Annotated[
+    str | None,
+    typer.Option("--url", help="Where the API answers; default GRASPD_API_URL, or the service of the data folder."),
+]
+
+
+def open_client(url: str | None, *, key: str | None = None) -> Client:
+    """A client of the API that the option or the settings name, or else that serves the data folder; with their key,
+    unless one is given."""
+    settings = load_settings()
+    if key is None and settings.api_key:
+        key = settings.api_key.get_secret_value()
+    if url is None and "api_url" not in settings.model_fields_set:
+        url = recorded_address(settings.data_dir)
+    return Client(url or settings.api_url, key=key)
+
+
+YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Delete it without asking.")]
+
+
+def confirm(question: str, what: str, *, yes: bool) -> None:
+    """Ask before something is destroyed; InputError where the answer is no, or nobody is there to answer."""
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise InputError(f"{what} is not deleted: there is no terminal to ask at; --yes deletes it without asking")
+    if not typer.confirm(question):
+        raise InputError("nothing was deleted")
+
+
+def say_deleted(what: str, name: str, *, json: bool, undo: str = "") -> None:
+    """Tell that a thing is gone, and the command that brings it back."""
+    if json:
+        emit({"deleted": name, "kind": what})
+        return
+    typer.echo(f"{what} {name} is deleted")
+    if undo:
+        typer.echo(f"`{undo}` brings it back for a while (GRASPD_SHARD_GRACE_S)", err=True)
+
+
+def restore(url: str | None, what: str, name: str, *, json: bool) -> None:
+    """Bring back what was deleted, and say so."""
+    with open_client(url) as client:
+        found = client.send("POST", path_of(f"{what}s", name, "restore")).json()
+    if json:
+        emit({"restored": found["id"], "kind": what})
+    else:
+        typer.echo(f"{what} {name} is restored")
+
+
+def watch(client: Client, job_id: str) -> JobDetail:
+    """The job in its final state, with progress on standard error meanwhile."""
+    with JobDisplay(plain_console(stderr=True)) as display:
+        return client.wait(job_id, display.update)
+
+
+def show_job(job: JobDetail, *, json: bool, url: str, must_succeed: bool = True) -> None:
+    """Say what became of a job; TaskError if it failed or was cancelled and should not have been."""
+    if json:
+        emit(job_summary(job))
+    else:
+        _print_job(job, url)
+    if must_succeed and job.state in (State.FAILED, State.CANCELLED):
+        why = f": {job.reason}" if job.reason else ""
+        raise TaskError(f"job {job.id[:12]} is {job.state}{why}; `graspd retry {job.id[:12]}` runs it again")
+
+
+def job_summary(job: JobDetail) -> dict[str, Any]:
+    """The keys that scripts rely on (DESIGN.md §5): job, state, grasps, valid, stages, mean, shards; and more."""
+    return {
+        "job": job.id,
+        "state": job.state.value,
+        "hand": job.hand,
+        "object": job.object,
+        "fidelity": job.fidelity,
+        "choice": job.choice and job.choice.model_dump(),
+        "grasps": job.grasps,
+        "valid": job.valid,
+        "tried": job.tried,
+        "judged": job.judged,
+        "valid_yield": job.valid_yield,
+        "audited": job.audited,
+        "audit_held": job.audit_held,
+        "note": job.note,
+        "progress": job.progress,
+        "reason": job.reason,
+        "outcomes": job.outcomes,
+        "stages": {stage.stage.value: {"tasks": stage.tasks, "seconds": stage.seconds} for stage in job.stages},
+        "mean": {
+            name: value
+            for name, value in job.mean.model_dump().items()
+            if name in ("epsilon", "contact_area_cm2", "intersection_volume_cm3")
+        },
+        "shards": [shard.id for shard in job.shards],
+    }
+
+
+def show_asset(asset: dict[str, Any], *, json: bool) -> None:
+    """Say what is known of a hand or object."""
+    if json:
+        emit(asset)
+        return
+    console = plain_console()
+    # A built-in one came with the service: its time is that of the release.
+    times = () if asset.get("builtin") else ("created",)
+    for name in ("name", "kind", "filename", "size_bytes", "digest", *times, "verdict", "message"):
+        if asset.get(name) is not None:
+            console.print(f"{name:<18} {asset[name]}", soft_wrap=True)
+    for line in asset.get("repairs", []):
+        console.print(f"{'repair':<18} {line}", soft_wrap=True)
+    facts = asset.get("facts", {})
+    for line in summary(AssetKind(asset["kind"]), facts) or [f"{name:<18} {value}" for name, value in facts.items()]:
+        console.print(line, soft_wrap=True)
+
+
+def yield_of(job: JobDetail) -> str:
+    """What was found among how many tries, and what the audit says, in a line."""
+    level = job.request.referee
+    if level == "none":
+        return f"{count(job.grasps)} grasps kept in {count(job.tried)} tries; nobody judged them"
+    audit = f"; {job.audit_held} of {job.audited} audited hold by the letter" if job.audited else ""
+    return f"{count(job.valid)} valid grasps in {count(job.tried)} tries, {level} level{audit}"
+
+
+def means_of(job: JobDetail) -> str:
+    """Means over the valid grasps, in a line."""
+    mean = job.mean
+    return (
+        f"mean ε {metric(mean.epsilon)}, contact {metric(mean.contact_area_cm2)} cm², "
+        f"intersection {metric(mean.intersection_volume_cm3)} cm³"
+    )
+
+
+def diversity_of(found: Diversity) -> str:
+    """Types and directions, in a line."""
+    types = ", ".join(f"{count(number)} {name}" for name, number in found.types.items())
+    return (
+        f"{types} ({found.type_entropy_bits:.2f} bit); {found.directions_used} of {found.directions} directions "
+        f"({found.direction_entropy_bits:.2f} bit)"
+    )
+
+
+def _print_job(job: JobDetail, url: str) -> None:
+    console = plain_console()
+    console.print(f"{job.hand} × {job.object}  {job.state.value}  {url}/jobs/{job.id}", soft_wrap=True)
+    if job.choice:
+        console.print(f"fidelity: {job.fidelity}, {job.choice}", soft_wrap=True)
+    if job.reason:
+        console.print(f"reason: {job.reason}", soft_wrap=True)
+    if job.note and job.note != job.reason:
+        console.print(f"note: {job.note}")
+    table = plain_table("stage", "state", "tasks", "progress", "worker time", "left")
+    for stage in job.stages:
+        done = f"{stage.succeeded} of {stage.tasks}"
+        table.add_row(
+            stage.stage, stage.state, done, percent(stage.progress), worker_time(stage), duration(stage.eta_s)
+        )
+    console.print(table)
+    if job.grasps:
+        console.print(f"{yield_of(job)}; {means_of(job)}")
+        if job.diversity:
+            console.print(diversity_of(job.diversity))
+
+
+_LINE_EVERY_S: Final = 2.0
+
+
+class _Rate(ProgressColumn):
+    """Speed in the unit of the stage."""
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        if not speed:
+            return Text("", style="dim")
+        return Text(f"{metric(speed * task.fields['scale'])} {task.fields['unit']}/s", style="cyan")
+
+
+class JobDisplay:
+    """Shows each new state of one job. Usable as a context manager."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._progress = Progress(
+            TextColumn("{task.description:<11}"),
+            BarColumn(bar_width=32),
+            TextColumn("{task.percentage:>3.0f} %"),
+            _Rate(),
+            TimeRemainingColumn(compact=True, elapsed_when_finished=True),
+            TextColumn("{task.fields[message]}", style="dim", markup=False),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._bars: dict[Stage, TaskID] = {}
+        self._said: dict[Stage, tuple[float, State]] = {}
+        self._started: dict[Stage, float] = {}
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def update(self, job: Job) -> None:
+        """Show a state of the job."""
+        for stage in job.stages:
+            if stage.state is not State.QUEUED:
+                self._started.setdefault(stage.stage, time.monotonic())
+            if self._console.is_terminal:
+                self._draw(stage, job)
+            else:
+                self._say(stage, job)
+
+    def _draw(self, stage: StageStatus, job: Job) -> None:
+        if stage.stage not in self._bars:
+            scale, unit = (job.requested / stage.tasks, "grasps") if stage.stage is Stage.SYNTHESIZE else (1, "tasks")
+            self._bars[stage.stage] = self._progress.add_task(
+                stage.stage.value, total=stage.tasks, start=False, message="", scale=scale, unit=unit
+            )
+        bar = self._bars[stage.stage]
+        if stage.state is not State.QUEUED and not self._progress.tasks[bar].started:
+            self._progress.start_task(bar)
+        message = stage.message if stage.state is State.RUNNING else stage.state.value
+        self._progress.update(bar, completed=stage.done, message=message)
+
+    def _say(self, stage: StageStatus, job: Job) -> None:
+        now = time.monotonic()
+        at, state = self._said.get(stage.stage, (0.0, State.QUEUED))
+        if stage.state is state and (state is not State.RUNNING or now - at < _LINE_EVERY_S):
+            return
+        self._said[stage.stage] = (now, stage.state)
+        self._console.print(self._line(stage, job, now))
+
+    def _line(self, stage: StageStatus, job: Job, now: float) -> str:
+        elapsed = now - self._started.get(stage.stage, now)
+        words = f"{stage.stage.value:<11} {stage.state.value:<10} {100 * stage.progress:3.0f} %"
+        if stage.state is State.SUCCEEDED:
+            seconds = stage.seconds or elapsed
+            return f"{words}  {_rate_words(stage, job, 1 / seconds)}  in {duration(seconds)}" if seconds else words
+        if stage.state is State.RUNNING and elapsed > 1 and 0 < stage.progress < 1:
+            pace = stage.progress / elapsed
+            return f"{words}  {_rate_words(stage, job, pace)}  {duration((1 - stage.progress) / pace)} left"
+        return words
+
+
+def _rate_words(stage: StageStatus, job: Job, pace: float) -> str:
+    """Speed in the unit of the stage; `pace` is the share of the stage per second."""
+    if stage.stage is Stage.SYNTHESIZE:
+        return f"{metric(job.requested * pace)} grasps/s"
+    return f"{metric(stage.tasks * pace)} tasks/s"
+
+
+#: A table with more hands does not fit a terminal: then each cell has a line.
+_MOST_COLUMNS: Final = 6
+_SHOWN_RATES: Final = 8
+_STYLES: Final = {
+    State.SUCCEEDED: "green",
+    State.RUNNING: "cyan",
+    State.QUEUED: "dim",
+    State.FAILED: "red",
+    State.CANCELLED: "yellow",
+}
+
+
+def print_estimate(found: Estimate, console: Console) -> None:
+    """Time for some numbers of workers, storage, network, and what the rates are known from."""
+    console.print(
+        f"{count(found.cells)} cells, {count(found.asked)} grasps asked for: about {count(found.tried)} tries, "
+        f"{count(found.valid)} {found.counted}, {count(found.tasks)} tasks",
+        soft_wrap=True,
+    )
+    table = plain_table("workers", "time", "from", "to", "network", "on average")
+    for plan in found.plans:
+        rate = f"{size(round(plan.network_bytes_per_s))}/s"
+        times = (plan.seconds, plan.seconds_low, plan.seconds_high)
+        table.add_row(str(plan.workers), *map(duration, times), size(plan.network_bytes), rate)
+    console.print(table)
+    kinds = ", ".join(f"{kind} {size(stored)}" for kind, stored in found.storage_by_kind.items())
+    console.print(f"storage {size(found.storage_bytes)} ({kinds})")
+    width = max(len(used.hand) for used in found.rates[:_SHOWN_RATES])
+    for used in found.rates[:_SHOWN_RATES]:
+        each = f"no {found.counted} grasp" if used.seconds_per_valid is None else f"{metric(used.seconds_per_valid)} s"
+        batches = f", {count(used.batches)} batches" if used.batches else ""
+        console.print(
+            f"  {used.hand:<{width}} {each} per {found.counted} grasp, yield {percent(used.valid_yield)} "
+            f"({used.origin}{batches}) for {count(used.cells)} cells",
+            soft_wrap=True,
+        )
+    if len(found.rates) > _SHOWN_RATES:
+        console.print(f"  and {len(found.rates) - _SHOWN_RATES} more rates; --json shows them", style="dim")
+
+
+def print_dataset(dataset: DatasetView, console: Console) -> None:
+    """A dataset in three lines."""
+    states = ", ".join(f"{count(n)} {state.value}" for state, n in dataset.states.items() if n)
+    left = f", {duration(dataset.eta_s)} left" if dataset.eta_s is not None else ""
+    console.print(f"{dataset.name}  {dataset.state.value}  {percent(dataset.progress)}{left}")
+    console.print(f"cells: {states}")
+    tried = f" of {count(dataset.tried)} tried ({_yield(dataset)})" if dataset.tried else ""
+    console.print(
+        f"grasps: {count(dataset.counted)} {dataset.options.standing}{tried}, {count(dataset.asked)} asked for; "
+        f"{count(dataset.shards)} shards, {size(dataset.size_bytes)}; worker time {duration(dataset.seconds)}",
+        soft_wrap=True,
+    )
+    if dataset.reason:
+        console.print(f"reason: {dataset.reason}", soft_wrap=True)
+
+
+def print_cells(dataset: DatasetView, cells: Sequence[CellView], console: Console) -> None:
+    """Objects as rows and hands as columns, each cell with its state, yield and failures."""
+    if len(dataset.hands) > _MOST_COLUMNS:
+        table = plain_table("hand", "object", "job", "", whole=("job",))
+        for cell in cells:
+            table.add_row(
+                cell.hand, cell.object, cell.job_id[:12], _words(cell, dataset.options), style=_STYLES[cell.state]
+            )
+    else:
+        table = plain_table("", *dataset.hands)
+        at = {(cell.hand, cell.object): cell for cell in cells}
+        for obj in dataset.objects:
+            found = [at.get((hand, obj)) for hand in dataset.hands]
+            table.add_row(obj, *(_styled(cell, dataset.options) if cell else "" for cell in found))
+    console.print(table)
+    for cell in [cell for cell in cells if cell.reason][:5]:
+        console.print(f"{cell.hand} on {cell.object}: {cell.reason}", soft_wrap=True)
+
+
+def watch_dataset(client: Client, name: str, console: Console) -> DatasetView:
+    """The dataset in its final state, with a bar of its tasks meanwhile."""
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=32),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TextColumn("{task.fields[rate]}", style="cyan"),
+        TextColumn("{task.fields[left]}"),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        bar = progress.add_task(name, total=1.0, rate="", left="")
+        said = -1.0
+        for dataset in client.watch_dataset(name):
+            pace = metric(dataset.counted / dataset.seconds) if dataset.seconds else None
+            rate = f"{pace} {dataset.options.standing}/s per worker" if pace is not None else ""
+            left = f"{duration(dataset.eta_s)} left" if dataset.eta_s is not None else ""
+            progress.update(bar, completed=dataset.progress, rate=rate, left=left)
+            if not console.is_terminal and dataset.progress - said >= 0.05:
+                said = dataset.progress
+                console.print(f"{name} {percent(dataset.progress)} {rate} {left}")
+    return dataset
+
+
+def _yield(made: Judged) -> str:
+    """`at 94 % of the judged`, in short."""
+    return f"at {valid_yield(made)}" if made.judged else "not judged"
+
+
+def _styled(cell: CellView, options: JobOptions) -> Text:
+    return Text(_words(cell, options), style=_STYLES[cell.state])
+
+
+def _words(cell: CellView, options: JobOptions) -> str:
+    words = [cell.state.value]
+    if cell.state is State.RUNNING:
+        words.append(percent(cell.progress))
+    if cell.tried:
+        made = cell.counted(options)
+        words.append(f"{count(made)}/{count(cell.asked)} {_yield(cell)}")
+    if cell.tasks_failed:
+        words.append(f"{cell.tasks_failed} failed")
+    return " ".join(words)

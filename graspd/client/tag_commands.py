@@ -1,0 +1,146 @@
+"""`graspd tags`: names for grasps of the service, and what has them as a file."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+
+from graspd.api.formatting import count, minute
+from graspd.client.client import path_of
+from graspd.client.reports import UrlOption, YesOption, confirm, open_client, restore, say_deleted
+from graspd.service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
+from graspd.service.model.errors import InputError
+
+app = typer.Typer(no_args_is_help=True, help="Names for grasps of the service, to find them and take them home.")
+
+#: How long the service may write a file before its first byte comes [s].
+_PATIENCE_S: Final = 600.0
+
+NameArgument = Annotated[str, typer.Argument(metavar="TAG", help="Name of the tag: `graspd tags list`.")]
+GraspsArgument = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="[SHARD:ROW]...", help="Grasps by shard and row."),
+]
+WhereOption = Annotated[
+    str | None, typer.Option(help="All of which this is true: epsilon > 0.3 and lift and robust >= 0.75.")
+]
+JobOption = Annotated[str | None, typer.Option(help="Of these only those of a job.")]
+DatasetOption = Annotated[str | None, typer.Option(help="Of these only those of a dataset.")]
+
+
+@app.command("list", epilog="graspd tags list")
+@reporting_errors
+def list_tags(url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Tags by name, with how many grasps have each."""
+    with open_client(url) as client:
+        found = client.send("GET", "/v1/tags").json()
+    if json:
+        emit({"tags": found})
+        return
+    table = plain_table("tag", "grasps", "changed", whole=("grasps", "changed"))
+    for one in found:
+        table.add_row(one["name"], count(one["grasps"]), minute(one["changed"]))
+    plain_console().print(
+        table if found else "no tag yet; `graspd tags add TAG --where EXPRESSION` gives one to grasps"
+    )
+
+
+@app.command("add", epilog='graspd tags add good --dataset kitchen --where "epsilon > 0.3 and lift"')
+@reporting_errors
+def add_tag(
+    tag: NameArgument,
+    grasps: GraspsArgument = None,
+    where: WhereOption = None,
+    job: JobOption = None,
+    dataset: DatasetOption = None,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Give a tag to grasps; it is made if it is not there."""
+    body = {"name": tag, **_selection(grasps, where=where, job=job, dataset=dataset)}
+    with open_client(url) as client:
+        _tell(client.send("POST", "/v1/tags", json=body).json(), "more with", json=json)
+
+
+@app.command("remove", epilog='graspd tags remove good --where "penetration_depth_mm > 1"')
+@reporting_errors
+def remove_tag(
+    tag: NameArgument,
+    grasps: GraspsArgument = None,
+    where: WhereOption = None,
+    job: JobOption = None,
+    dataset: DatasetOption = None,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Take a tag off grasps."""
+    body = _selection(grasps, where=where, job=job, dataset=dataset)
+    if "filter" in body:
+        body["filter"]["tag"] = tag
+    with open_client(url) as client:
+        _tell(client.send("POST", path_of("tags", tag, "remove"), json=body).json(), "fewer with", json=json)
+
+
+@app.command("delete", epilog="graspd tags delete good")
+@reporting_errors
+def delete_tag(tag: NameArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Take a tag away; its grasps stay."""
+    path = path_of("tags", tag)
+    with open_client(url) as client:
+        has = client.send("GET", path).json()["grasps"]
+        confirm(f"Delete the tag {tag}, which {count(has)} grasps have?", f"the tag {tag}", yes=yes)
+        client.delete(path)
+    say_deleted("tag", tag, json=json, undo=f"graspd tags restore {shlex.quote(tag)}")
+
+
+@app.command("restore", epilog="graspd tags restore good")
+@reporting_errors
+def restore_tag(tag: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Bring back a tag that was deleted, on its grasps, within the grace time."""
+    restore(url, "tag", tag, json=json)
+
+
+@app.command("export", epilog="graspd tags export good -o good.zip")
+@reporting_errors
+def export_tag(
+    tag: NameArgument,
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write: .zip (base shards), .csv or .json (rows).")],
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """The grasps that have a tag, as a file."""
+    format = out.suffix.removeprefix(".").lower()
+    if format not in ("zip", "csv", "json"):
+        raise InputError(f"{out}: the name of the file says its format; end it in .zip, .csv or .json")
+    with open_client(url) as client:
+        client.save("/v1/grasps/export", out, params={"tag": tag, "format": format}, patience_s=_PATIENCE_S)
+    if json:
+        emit({"tag": tag, "file": str(out), "bytes": out.stat().st_size})
+    else:
+        typer.echo(str(out))
+
+
+def _selection(grasps: list[str] | None, **filters: str | None) -> dict[str, Any]:
+    """Body of a request: named grasps, or a filter."""
+    given = {name: value for name, value in filters.items() if value is not None}
+    if grasps and given:
+        raise InputError("name grasps, or say which by --where, --job and --dataset: one of both")
+    if not grasps:
+        if not given:
+            raise InputError("say which grasps: SHARD:ROW, or --where, --job, --dataset")
+        return {"filter": given}
+    places = [one.partition(":") for one in grasps]
+    if wrong := next((one for one, (_, _, row) in zip(grasps, places, strict=True) if not row.isdigit()), None):
+        raise InputError(f"{wrong!r} names no grasp; write SHARD:ROW")
+    return {"grasps": [{"shard_id": shard, "row": int(row)} for shard, _, row in places]}
+
+
+def _tell(change: dict[str, Any], words: str, *, json: bool) -> None:
+    if json:
+        emit(change)
+        return
+    tag = change["tag"]
+    typer.echo(f"{count(change['changed'])} {words} the tag {tag['name']}, which {count(tag['grasps'])} grasps have")

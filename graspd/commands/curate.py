@@ -1,0 +1,180 @@
+"""Command line: `graspd grasps where`, `graspd datasets balance`, `diff`, and `graspd clouds`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from graspd.service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
+from graspd.service.model.errors import InputError
+from graspd.service.readers import Pictures
+from graspd.service.readers.clouds import Frame
+from graspd.service.readers.depth_noise import NOISES
+from graspd.service.readers.where import parse
+from graspd.worker.files.clouds import hand_surface, write_clouds
+from graspd.worker.files.curation import KINDS, Balance, difference
+from graspd.worker.files.subsets import Subset, shards_of, write_subset
+
+app = typer.Typer(no_args_is_help=True, add_completion=False)
+group = typer.Typer(no_args_is_help=True, help="Grasps of files and datasets, chosen by their numbers.")
+app.add_typer(group, name="grasps")
+
+SourceArgument = Annotated[
+    str, typer.Argument(help="A file, a folder of shards, or a dataset of the store by its name.")
+]
+OutOption = Annotated[Path, typer.Option("--out", "-o", help="The folder to write; it must not be there.")]
+
+
+@group.callback()
+def grasps() -> None:
+    """Grasps of files and datasets, chosen by their numbers."""
+
+
+@group.command(epilog='graspd grasps where "epsilon > 0.3 and lift and robust >= 0.75" --from kitchen -o subset')
+@reporting_errors
+def where(
+    expression: Annotated[str, typer.Argument(help="Metrics by name, valid, sound, held, lift; and, or, not.")],
+    out: OutOption,
+    source: Annotated[
+        str, typer.Option("--from", help="A file, a folder of shards, or a dataset of the store by its name.")
+    ] = ".",
+    json: JsonFlag = False,
+) -> None:
+    """Write the grasps for which an expression is true as base shards of their own."""
+    test = parse(expression)
+    shards = shards_of(source)
+    said = {"where": expression, "from": source}
+    found = write_subset(
+        shards, lambda together: [test(shard.arrays, shard.attributes) for shard in together], out, said=said
+    )
+    _tell(found, out, json=json)
+
+
+@app.command(epilog="graspd datasets balance kitchen --by type,direction -o even")
+@reporting_errors
+def balance(
+    source: SourceArgument,
+    out: OutOption,
+    by: Annotated[str, typer.Option(help=f"Of {', '.join(KINDS)}; several with commas.")] = "type,direction",
+    at_most: Annotated[
+        int, typer.Option(min=0, help="Grasps of each kind, for each hand and object; 0: as the median kind has.")
+    ] = 0,
+    min_distance: Annotated[
+        float,
+        typer.Option(min=0, max=0.1, help="No two of a hand on an object are nearer [m], in all batches; 0: any."),
+    ] = 0.0,
+    hand: Annotated[
+        str | None, typer.Option(help="The hand's file, where distances need it and it is not found.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Which of a kind are drawn.")] = 0,
+    json: JsonFlag = False,
+) -> None:
+    """Write a part of a dataset in which no kind of valid grasps is more frequent than others."""
+    kinds = [one.strip() for one in by.split(",") if one.strip()]
+    chooser = Balance(kinds, at_most, min_distance, seed, hand)
+    said = {"balance": kinds, "from": source, "at_most": at_most, "min_distance": min_distance, "seed": seed}
+    _tell(write_subset(shards_of(source), chooser, out, said=said), out, json=json)
+
+
+@app.command(epilog="graspd datasets diff kitchen-v1 kitchen-v2 --json")
+@reporting_errors
+def diff(
+    first: SourceArgument,
+    second: SourceArgument,
+    json: JsonFlag = False,
+) -> None:
+    """What two datasets, or two versions of one, do not have in common: NAME@SNAPSHOT is a version."""
+    found = difference(*(shards_of(*_version(one)) for one in (first, second)))
+    if json:
+        emit({"a": first, "b": second, **found})
+        return
+    console = plain_console()
+    if not found["cells"] and not found["settings"]:
+        console.print(f"the same grasps in {found['same_cells']} cells")
+        return
+    table = plain_table("hand", "object", "grasps", "valid", "in both")
+    for one in found["cells"]:
+        counts = (f"{one['first']} | {one['second']}", f"{one['valid_first']} | {one['valid_second']}")
+        table.add_row(one["hand"], one["object"], *counts, str(one["common"]))
+    console.print(table if found["cells"] else "the same grasps")
+    for name, values in found["settings"].items():
+        console.print(f"{name}: {_listed(values['first'])} | {_listed(values['second'])}")
+    console.print(f"{found['same_cells']} cells have the same grasps")
+
+
+def _version(source: str) -> tuple[str, str | None]:
+    if "/" in source or "@" not in source or Path(source).exists():
+        return source, None
+    name, _, snapshot = source.partition("@")
+    if not snapshot:
+        raise InputError(f"{source}: write the digest of a snapshot after @")
+    return name, snapshot
+
+
+def _listed(values: list[str]) -> str:
+    shown = ", ".join(value[:40] for value in values[:4])
+    return (shown + (f" and {len(values) - 4} more" if len(values) > 4 else "")) or "-"
+
+
+def _tell(found: Subset, out: Path, *, json: bool) -> None:
+    told: dict[str, Any] = {"folder": str(out), "looked_at": found.looked_at, "kept": found.kept}
+    told["shards"] = len(found.files)
+    if json:
+        emit(told | {"passed_over": found.passed_over})
+        return
+    typer.echo(f"{out}: {found.kept} of {found.looked_at} grasps in {len(found.files)} shards")
+    if found.passed_over:
+        typer.echo(f"{found.passed_over} shards of scenes and pictures are not carried over", err=True)
+
+
+@app.command(epilog="graspd clouds kitchen --points 1024 --noise stereo -o clouds")
+@reporting_errors
+def clouds(
+    source: Annotated[str, typer.Argument(help="A folder of shards with pictures, or a dataset of the store.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write; it must be new or empty.")],
+    points: Annotated[int, typer.Option(min=1, max=10_000_000, help="Points of each cloud.")] = 1024,
+    noise: Annotated[str, typer.Option(help=f"A depth camera: {', '.join(NOISES)}; none.")] = "none",
+    frame: Annotated[
+        Frame | None, typer.Option(help="camera, table or object; default: the camera's, of fused views the table's.")
+    ] = None,
+    fuse: Annotated[bool, typer.Option("--fuse", help="One cloud of all views of a scene.")] = False,
+    scene: Annotated[bool, typer.Option("--scene", help="Table and neighbours too.")] = False,
+    voxel: Annotated[float, typer.Option(min=0.0, help="One point of each cube with this edge [m]; 0: all.")] = 0.0,
+    graspness: Annotated[
+        bool, typer.Option("--graspness", help="Of each point the share of grasps whose hand touches it.")
+    ] = False,
+    unjudged: Annotated[bool, typer.Option("--unjudged", help="Grasps that are sound and that nobody judged.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same clouds.")] = 0,
+    json: JsonFlag = False,
+) -> None:
+    """Write the pictures of a dataset as point clouds with their grasps: docs/how-to/clouds.md.
+
+    Who reads with graspd needs no files: `Pictures(shards).clouds()` makes the same when it is asked for.
+    """
+    pictures = Pictures(shards_of(source), unjudged=unjudged)
+    if not len(pictures):
+        raise InputError(f"{source} has no pictures; take some: graspd render")
+    camera = None if noise == "none" else noise
+    surface = hand_surface if graspness else None
+    found = pictures.clouds(
+        points, noise=camera, frame=frame, fuse=fuse, scene=scene, voxel_m=voxel, hand_surface=surface, seed=seed
+    )
+    said = {
+        "source": source,
+        "points": points,
+        "noise": noise,
+        "frame": found.frame,
+        "fuse": fuse,
+        "scene": scene,
+        "voxel_m": voxel,
+        "graspness": graspness,
+        "unjudged": unjudged,
+        "seed": seed,
+    }
+    done = write_clouds(found, out, said)
+    if json:
+        emit({"folder": str(out), **done})
+        return
+    typer.echo(f"{out}: {done['clouds']} clouds in {done['files']} files, {done['empty']} of them empty")

@@ -1,0 +1,274 @@
+"""Command line: `graspd evaluate`."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Final, get_args
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from graspd.exchange.cases import expand, load_case
+from graspd.service.cli import JsonFlag, emit, plain_console, reporting_errors
+from graspd.service.model.errors import InputError, one_of
+from graspd.service.model.metrics import AXIS_MEANINGS, MOST_ROBUST_MODELS
+from graspd.service.store.shards import carried, json_attribute, read_shard, write_shard
+from graspd.studies.evaluation import Protocol, combine, evaluate
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.same_hand import TOLERANCE_M, same_hand
+from graspd.worker.run import Run
+from graspd.worker.validation.key import Level
+from graspd.worker.validation.lifting import LiftLevel
+from graspd.worker.validation.robust import Robustness
+
+app = typer.Typer(add_completion=False)
+
+#: Columns of the printed table: key, heading, digits.
+_COLUMNS: Final = (
+    ("n", "n", 0),
+    ("gsr", "GSR", 2),
+    ("sgs", "SGS", 2),
+    ("pd_mm", "PD", 2),
+    ("spd_mm", "SPD", 2),
+    ("ca_cm2", "CA", 1),
+    ("iv_cm3", "IV", 2),
+    ("epsilon", "ε", 2),
+    ("wrench_volume", "Vol", 2),
+    ("sd_cm", "SD", 2),
+    ("diversity", "D", 2),
+)
+
+
+@app.command(name="evaluate", epilog="graspd evaluate grasps.h5 --level letter")
+@reporting_errors
+def evaluate_command(
+    files: Annotated[
+        list[Path],
+        typer.Argument(help="Base shards, reference-grasp JSON files, folders of either, DexGraspBench folders."),
+    ],
+    protocol: Annotated[
+        str,
+        typer.Option(
+            help="dexgraspbench: six pushes; lift: out of the scene the grasps were planned in; displacement: only the "
+            "slip in 0.15 s."
+        ),
+    ] = "dexgraspbench",
+    level: Annotated[
+        str, typer.Option(help="What a verdict costs: letter, certificate or screen; of a lift: letter or lift.")
+    ] = "",
+    hard: Annotated[bool, typer.Option("--hard", help="Half the friction, a tenth of the torsional.")] = False,
+    hand: Annotated[
+        str | None, typer.Option(help="The hand's file; default: what the file says, found by its digest.")
+    ] = None,
+    object: Annotated[
+        str | None, typer.Option(help="The object's file; default: what the file says, found by its digest.")
+    ] = None,
+    robust: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            max=MOST_ROBUST_MODELS,
+            help="Models around the nominal one in which what holds is judged again, such as 8.",
+        ),
+    ] = 0,
+    friction: Annotated[
+        float | None, typer.Option(min=0.01, max=3.0, help="Coulomb coefficient of ε; default: the file's.")
+    ] = None,
+    judge_hand: Annotated[
+        str | None, typer.Option(help="Another model of the same hand, URDF or MJCF, that judges the grasps as well.")
+    ] = None,
+    joint_map: Annotated[
+        str | None, typer.Option(help="OURS=THEIRS,...: joints of the same meaning, where their names do not tell.")
+    ] = None,
+    judge_tolerance: Annotated[
+        float, typer.Option(min=0.0, help="Fingertips of the two models that differ by more are refused [mm].")
+    ] = 1e3 * TOLERANCE_M,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "-o",
+            "--out",
+            help="With --robust: a copy of the shard, or folder of copies, with the shares of its grasps.",
+        ),
+    ] = None,
+    threads: Annotated[int, typer.Option(min=0, help="CPU threads, 0: one per core.")] = 0,
+    json: JsonFlag = False,
+) -> None:
+    """Measure grasps and let an independent engine judge them. Numbers are medians, ε and areas at 5 mm."""
+    level = _checked_level(protocol, level)
+    if robust and protocol == "displacement":
+        raise InputError("--robust judges pushes or lifts in other models: choose --protocol dexgraspbench or lift")
+    if judge_hand is None and joint_map:
+        raise InputError("--joint-map says which joints of --judge-hand are ours; name that hand")
+    if judge_hand is not None and protocol != "dexgraspbench":
+        raise InputError(f"--judge-hand judges by protocol dexgraspbench, not by {protocol}")
+    other = None if judge_hand is None else hand_from_path(judge_hand, drag=True)
+    twins = _joint_map(joint_map)
+    rows: list[dict[str, Any]] = []
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=plain_console(stderr=True), disable=json, transient=True) as bar:
+        task = bar.add_task("reading", total=1)
+        listed = [one for path in files for one in expand(path)]
+        copies = _copies(files, listed, out, robust=robust, hard=hard)
+        for file in listed:
+            case = load_case(file, hand=hand, obj=object)
+            if copies and (case.placed is None) == (protocol == "lift"):
+                raise InputError(f"{file} keeps shares of its own test: of a lift in scenes, else of six pushes")
+            row = evaluate(
+                case,
+                protocol=protocol,  # type: ignore[arg-type]
+                level=level,  # type: ignore[arg-type]
+                hard=hard,
+                friction=friction,
+                models=robust,
+                judge_hand=None
+                if other is None
+                else same_hand(case.hand, other, twins, tolerance_m=judge_tolerance / 1e3),
+                tell=partial(write_copy, file, copies[file]) if copies else lambda found: None,
+                run=Run(threads=threads, progress=partial(_show, bar, task, case.name)),
+            )
+            rows.append({"file": str(file), **row})
+    _tell(rows, other.name if other else "", json=json)
+
+
+def _checked_level(protocol: str, level: str) -> str:
+    """The level of a protocol, its own default where none is said; InputError for what is neither's."""
+    if protocol not in get_args(Protocol):
+        raise InputError(f"unknown protocol {protocol!r}; choose {one_of(protocol, get_args(Protocol))}")
+    levels = get_args(LiftLevel if protocol == "lift" else Level)
+    level = level or ("lift" if protocol == "lift" else "certificate")
+    if level not in levels:
+        raise InputError(f"unknown level {level!r} of protocol {protocol}; choose one of {one_of(level, levels)}")
+    return level
+
+
+def _tell(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
+    """The rows of all files and what they are together, for people or for machines."""
+    whole = combine([{key: value for key, value in row.items() if key != "file"} for row in rows])
+    if json:
+        verdicts = [{"file": row["file"], **one} for row in rows for one in row.pop("verdicts", [])]
+        emit({key: value for key, value in whole.items() if key != "verdicts"} | {"verdicts": verdicts, "files": rows})
+    else:
+        plain_console().print(_table(rows, whole))
+        if whole.get("robust_share") is not None:
+            typer.echo(_said_of_models(whole))
+        if "foreign_held" in whole:
+            typer.echo(_foreign(whole, foreign))
+        for row in rows:
+            if "note" in row:
+                typer.echo(row["note"], err=True)
+
+
+def _copies(paths: list[Path], files: list[Path], out: Path | None, *, robust: int, hard: bool) -> dict[Path, Path]:
+    """Where the copy of each file goes; nowhere without --out."""
+    if out is None:
+        return {}
+    if not robust or hard or len(paths) != 1:
+        raise InputError("-o keeps what --robust N finds, without --hard, of one file or folder")
+    return dict(zip(files, copy_paths(paths[0], files, out), strict=True))
+
+
+def _said_of_models(whole: dict[str, Any]) -> str:
+    """How far the verdicts can be trusted, the axis that costs most first."""
+    words = {axis.word: name for axis, name in AXIS_MEANINGS.items()}
+    axes = sorted(whole["robust_axes"].items(), key=lambda pair: pair[1]["share"])
+    each = ", ".join(f"{words[axis]} {one['share']:.2f}" for axis, one in axes)
+    return (
+        f"robust: the {whole['robust_n']} that hold do so in {whole['robust_share']:.2f} of {whole['robust_models']} "
+        f"models around the nominal one\nby what differs: {each}"
+    )
+
+
+def _joint_map(text: str | None) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for pair in (text or "").split(",") if text else []:
+        ours, equals, theirs = (part.strip() for part in pair.partition("="))
+        if not (ours and equals and theirs) or ours in found:
+            raise InputError(f"--joint-map {pair!r} must be OURS=THEIRS, once for each joint")
+        found[ours] = theirs
+    return found
+
+
+def _show(bar: Progress, task: TaskID, name: str, done: float, total: float, what: str) -> None:
+    bar.update(task, completed=done, total=total, description=f"{name}: {what}")
+
+
+def _table(rows: list[dict[str, Any]], whole: dict[str, Any]) -> Table:
+    stated = f"{whole['protocol']}, {whole['level'] or 'not judged'}{', hard' if whole['hard'] else ''}"
+    friction = " ".join(sorted({f"{row['mu']:g}" for row in rows}))
+    table = Table(
+        title=f"{stated}; ε at μ = {friction}, contact at 5 mm; medians",
+        caption="GSR share held; SGS held per s; PD, SPD mm; CA cm²; IV cm³; SD cm; D share of the first component",
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
+    )
+    table.add_column("grasps", max_width=16, overflow="fold")
+    for _, heading, _ in _COLUMNS:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(Path(row["file"]).stem, *(_cell(row[key], digits) for key, _, digits in _COLUMNS))
+    if len(rows) > 1:
+        table.add_section()
+        table.add_row("all", *(_cell(whole[key], digits) for key, _, digits in _COLUMNS))
+    return table
+
+
+def _foreign(whole: dict[str, Any], name: str) -> str:
+    held = whole["foreign_held"]
+    share = _cell(whole["foreign_share"], 2)
+    return (
+        f"judged with {name}, fingertips within {whole['fingertips_mm']:.2f} mm: GSR {_cell(whole['foreign_gsr'], 2)}; "
+        f"of {held['both'] + held['nominal']} that hold nominally {held['both']} hold there ({share}); "
+        f"agreement {_cell(whole['agreement'], 2)}"
+    )
+
+
+def _cell(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def copy_paths(source: Path, files: list[Path], out: Path) -> list[Path]:
+    """Where the copies go: of a file, `out`; of a folder's, the same places in `out`, which must be new or empty.
+
+    Raises:
+        InputError: a file is no shard, would be written over, or lies in no folder.
+    """
+    if other := next((file for file in files if file.suffix != ".h5"), None):
+        raise InputError(f"{other} is no shard of graspd: only these have columns for the shares")
+    if source.is_dir():
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise InputError(f"{out} is there already; choose a folder that is not")
+        return [out / file.relative_to(source) for file in files]
+    if not out.parent.is_dir() or out.is_dir():
+        raise InputError(f"{out} is no file that can be written: choose one in a folder that is there")
+    return [out]
+
+
+def write_copy(source: Path, out: Path, found: Robustness) -> None:
+    """A base shard with the shares of its grasps; all else, its id too, is as it was.
+
+    Raises:
+        InputError: it is no base shard, or cannot be written there.
+    """
+    shard = read_shard(source, kind="base")
+    said = json_attribute({"models": found.held.shape[1], "wanted": found.wanted})
+    data = write_shard("base", {**shard.arrays, **found.columns}, {**carried(shard), "robust": said})
+    part = out.with_name(f".{out.name}.part")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(data)
+        part.replace(out)
+    except OSError as error:
+        raise InputError(f"{out} cannot be written: {error.strerror}") from None

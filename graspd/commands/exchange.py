@@ -1,0 +1,291 @@
+"""Command line: `graspd export`, `graspd import` and `graspd datasets card`."""
+
+from __future__ import annotations
+
+import json as jsonlib
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import numpy as np
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from graspd.exchange.opening import opened
+from graspd.service.cli import JsonFlag, emit, load_settings, plain_console, reporting_errors
+from graspd.service.model.errors import InputError, one_of
+from graspd.service.store import validity
+from graspd.service.store.shards import read_shard
+from graspd.service.store.store import open_store
+from graspd.worker.files.subsets import EveryOption, UnjudgedOption, choose
+from graspd.worker.run import Run
+
+app = typer.Typer(no_args_is_help=True)
+
+#: Formats of robots and their simulators; the first of them goes by two names.
+ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "usd", "glb", "isaac", "csv")
+#: Formats that a network is trained on: they take a folder of shards.
+TRAINING: Final = ("dexlearn", "dexgraspnet2", "graspgen", "huggingface", "lerobot")
+EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *TRAINING, *ROBOTS)
+#: Imports of one object, which `--name` names in the file.
+NAMED: Final = ("graspgen", "huggingface", "lerobot")
+IMPORTS: Final = ("dexgraspbench", "dexlearn", *NAMED, "dexgraspnet", "dexgraspnet2", "multidex", "ddgc", "reference")
+
+
+@app.command(epilog="graspd export grasps.h5 --format dexgraspbench -o bench")
+@reporting_errors
+def export(
+    source: Annotated[Path, typer.Argument(help="A shard, or for webdataset and training a folder of shards.")],
+    format_: Annotated[str, typer.Option("--format", help=", ".join(EXPORTS) + ".")] = "images",
+    hand: Annotated[str | None, typer.Option(help="The shard's hand; default: found by its digest.")] = None,
+    object_: Annotated[
+        str | None, typer.Option("--object", help="The shard's object; default: found by its digest.")
+    ] = None,
+    unjudged: UnjudgedOption = False,
+    every: EveryOption = False,
+    depth: Annotated[str, typer.Option(help="exr: metres as floats; png: 16 bits, steps of 0.1 mm.")] = "exr",
+    best: Annotated[int, typer.Option(min=0, help="For robots: at most so many, the best by epsilon; 0: all.")] = 0,
+    tool: Annotated[
+        str | None,
+        typer.Option("--tool-frame", help="For robots: a link of the hand, or x y z qw qx qy qz in its root link."),
+    ] = None,
+    speed: Annotated[float, typer.Option(help="For robots: share of the velocity limits that is used.")] = 0.5,
+    arm: Annotated[
+        str | None, typer.Option(help="For robots: an arm's URDF; only grasps it can carry out are written.")
+    ] = None,
+    mount: Annotated[str | None, typer.Option(help="The arm's link that the hand is mounted on.")] = None,
+    base: Annotated[
+        str | None, typer.Option(help="The arm's base in the scene, or seen from a free object: x y z qw qx qy qz.")
+    ] = None,
+    mount_pose: Annotated[
+        str | None, typer.Option(help="The hand's root link in the mount: x y z qw qx qy qz.")
+    ] = None,
+    held_out: Annotated[float, typer.Option(help="For training: share of the objects that are held out.")] = 0.2,
+    noise: Annotated[str, typer.Option(help="For training: a depth camera, stereo or structured_light.")] = "",
+    output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("export"),
+    json: JsonFlag = False,
+) -> None:
+    """Write grasps or pictures as others read them."""
+    if format_ not in EXPORTS:
+        raise InputError(f"there is no export format {format_!r}; choose one of {one_of(format_, EXPORTS)}")
+    if depth not in ("exr", "png"):
+        raise InputError(f"there is no depth format {depth!r}; use exr or png")
+    notes: list[str] = []
+    with opened(output):
+        if format_ in ROBOTS:
+            from graspd.exchange.robot_export import Wishes, export_grasps
+
+            wishes = Wishes(hand, object_, unjudged, every, best, tool, speed, arm, mount, base, mount_pose)
+            done = export_grasps(source, format_, wishes, output)
+            written, notes = done.counts, done.notes
+        elif format_ in TRAINING:
+            from graspd.exchange.training_export import TrainingWishes, export_training
+
+            training = TrainingWishes(hand, object_, unjudged, every, held_out, noise)
+            done = export_training(source, format_, training, output)
+            written, notes = done.counts, done.notes
+        elif format_ == "webdataset":
+            written = _webdataset(source, output, unjudged=unjudged, every=every)
+        elif format_ == "dexgraspbench":
+            written = _bench(source, hand, object_, output, unjudged=unjudged, every=every)
+        else:
+            written = _pictures(source, format_, depth, output)
+    if json:
+        emit({"folder": str(output), "format": format_, **written, **({"notes": notes} if notes else {})})
+        return
+    typer.echo(f"{output}: " + ", ".join(f"{n} {what}" for what, n in written.items() if isinstance(n, int)))
+    for note in notes:
+        typer.echo(note, err=True)
+
+
+@app.command(
+    "import", epilog="graspd import grasps.npy --format dexgraspnet --hand shadow --object mug.obj -o imported"
+)
+@reporting_errors
+def import_(
+    source: Annotated[Path, typer.Argument(help="The file or folder of grasps.")],
+    format_: Annotated[str, typer.Option("--format", help=", ".join(IMPORTS) + ".")],
+    licence: Annotated[str, typer.Option(help="On which terms the grasps may be used; goes into every file.")],
+    origin: Annotated[str, typer.Option("--source", help="Where they come from: an address or a citation.")],
+    hand: Annotated[str | None, typer.Option(help="The hand: a URDF or a built-in.")] = None,
+    object_: Annotated[str | None, typer.Option("--object", help="The object's mesh, at the source's scale 1.")] = None,
+    robot: Annotated[str, typer.Option(help="multidex: name of the robot in the file.")] = "",
+    name: Annotated[str, typer.Option(help="multidex, graspgen, huggingface, lerobot: name of the object.")] = "",
+    number: Annotated[int, typer.Option(help="ddgc, dexgraspnet2: which object of the scene.")] = 0,
+    referee: Annotated[str, typer.Option(help="letter, certificate, screen or none.")] = "certificate",
+    friction: Annotated[float, typer.Option(help="Coulomb coefficient of the metrics.")] = 1.0,
+    threads: Annotated[int, typer.Option(help="CPU threads; 0: all cores.")] = 0,
+    output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("imported"),
+    json: JsonFlag = False,
+) -> None:
+    """Read grasps of others, let the referee judge them, measure them, and write base shards.
+
+    Nothing in the files is executed. The meshes go beside the shards, at the scale the grasps were made for.
+    """
+    from graspd.worker.engines import backend
+
+    backend.start()
+    from graspd.exchange.imported import Origin
+    from graspd.exchange.scoring import write_scored
+
+    options: dict[str, Any] = {"robot": robot, "object_name": name, "number": number}
+    sets = read_sets(format_, source, hand, object_, options)
+    said = Origin(format_, origin, licence)
+    files = [
+        write_scored(one, said, output, referee=referee, friction=friction, ordinal=k, run=Run(threads=threads))
+        for k, one in enumerate(sets)
+    ]
+    (output / "source.json").write_text(jsonlib.dumps(vars(said), indent=1) + "\n")
+    found = [_summary(file) for file in files]
+    if json:
+        emit({"folder": str(output), "shards": found})
+        return
+    for one in found:
+        judged = "nobody judged them" if referee == "none" else f"{one['valid']} valid at level {referee}"
+        typer.echo(f"{one['file']}: {one['grasps']} grasps, {one['sound']} sound, {judged}{_compared(one)}")
+
+
+def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, options: dict[str, Any]) -> list[Any]:
+    """The sets of grasps in a file of that format.
+
+    Raises:
+        InputError: unknown format, something that it needs is not given, or not such a file.
+    """
+    from graspd.exchange import dexgraspbench, dexgraspnet2, published
+
+    if format_ not in IMPORTS:
+        raise InputError(f"there is no import format {format_!r}; choose one of {one_of(format_, IMPORTS)}")
+    if not source.exists():
+        raise InputError(f"{source} does not exist")
+    if format_ == "reference":
+        return published.read_reference(source, hand=hand, obj=obj)
+    if hand is None or obj is None:
+        raise InputError(f"{format_} files do not hold the hand and the object; name both: --hand and --object")
+    if format_ in ("dexgraspbench", "dexlearn"):
+        return dexgraspbench.read(source, hand=hand, obj=obj)
+    if format_ in NAMED:
+        return _named(format_, source, hand, obj, str(options["object_name"]))
+    if format_ == "dexgraspnet":
+        return published.read_dexgraspnet(source, hand=hand, obj=obj)
+    if format_ == "dexgraspnet2":
+        return dexgraspnet2.read(source, hand=hand, obj=obj, number=int(options["number"]))
+    if format_ == "ddgc":
+        return published.read_ddgc(source, hand=hand, obj=obj, number=int(options["number"]))
+    if not options["robot"] or not options["object_name"]:
+        raise InputError("a multidex file holds many robots and objects; name one of each: --robot and --name")
+    return published.read_multidex(
+        source, hand=hand, obj=obj, robot=options["robot"], object_name=options["object_name"]
+    )
+
+
+def _named(format_: str, source: Path, hand: str, obj: str, name: str) -> list[Any]:
+    from graspd.exchange import graspgen, huggingface, lerobot
+
+    read = {"graspgen": graspgen.read, "huggingface": huggingface.read, "lerobot": lerobot.read}[format_]
+    return list(read(source, hand=hand, obj=obj, object_name=name))
+
+
+def _pictures(source: Path, format_: str, depth: str, output: Path) -> dict[str, int]:
+    from graspd.exchange import replicator
+    from graspd.worker.rendering.export import export_images
+
+    views = read_shard(source, kind="views")
+    if format_ == "replicator":
+        written = replicator.write(views, output)
+    else:
+        written = export_images(views, output, depth="exr" if depth == "exr" else "png")
+    return {"pictures": len(views["camera/eye"]), "files": len(written)}
+
+
+def _webdataset(source: Path, output: Path, *, unjudged: bool, every: bool) -> dict[str, int]:
+    from graspd.exchange import webdataset
+    from graspd.service.readers import Pictures, open_shards
+
+    shards = open_shards(source)
+    written = webdataset.write(shards, output, valid=not every, unjudged=unjudged)
+    return {"pictures": len(Pictures(shards)), "files": len(written)}
+
+
+def _bench(
+    source: Path, hand: str | None, obj: str | None, output: Path, *, unjudged: bool, every: bool
+) -> dict[str, int]:
+    from graspd.exchange import dexgraspbench
+    from graspd.exchange.cases import load_case
+
+    case = load_case(source, hand=hand, obj=obj)
+    mask, _ = choose(read_shard(source, kind="base"), unjudged=unjudged, every=every)
+    rows = np.flatnonzero(mask)
+    written = dexgraspbench.write(case.hand, case.obj, case.grasps, rows.tolist(), output, case.placed)
+    return {"grasps": len(written), "files": len(written)}
+
+
+def _compared(one: dict[str, Any]) -> str:
+    """How the verdicts that came with imported grasps agree with ours."""
+    if not one["published"]:
+        return ""
+    words = f"; {one['published']} came with a verdict"
+    return words if one["agreement_published"] is None else f"{words}, {one['agreement_published']:.0%} of them as ours"
+
+
+def _summary(file: Path) -> dict[str, Any]:
+    shard = read_shard(file, kind="base")
+    valid, sound = validity.valid(shard.arrays), validity.sound(shard.arrays)
+    said = np.asarray(shard.arrays.get("quality/published", np.full(len(valid), -1)))
+    both = (said >= 0) & validity.judged(shard.arrays)
+    agree = float((said == shard.arrays["quality/success"])[both].mean()) if both.any() else None
+    return {
+        "file": str(file),
+        "object": shard.attributes["object"],
+        "grasps": len(valid),
+        "valid": int(valid.sum()),
+        "sound": int(sound.sum()),
+        "published": int((said >= 0).sum()),
+        "agreement_published": agree,
+    }
+
+
+@app.command(epilog="graspd datasets card kitchen -o kitchen-v1 --licence CC-BY-4.0")
+@reporting_errors
+def card(
+    source: Annotated[
+        str, typer.Argument(metavar="NAME", help="A dataset of the store; or a folder of shards: ./kitchen-v1.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write the card into.")],
+    snapshot: Annotated[str | None, typer.Option(help="Digest of a snapshot; default: the newest.")] = None,
+    licence: Annotated[str, typer.Option(help="Licence of the grasps and pictures, as SPDX names it: CC-BY-4.0.")] = "",
+    text: Annotated[str, typer.Option("--source", help="A sentence on where it comes from, or whom to ask.")] = "",
+    assets: Annotated[
+        Path | None, typer.Option(help="JSON with licence and source of hands and objects that were added without.")
+    ] = None,
+    data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Folder of graspd; GRASPD_DATA_DIR.")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Write a dataset's card: what it holds, how it was made, how good and biased it is; with plots and checksums."""
+    from graspd.studies.cards.card import write_card
+    from graspd.studies.cards.contents import contents_of_folder, contents_of_store, with_provenance
+
+    if "/" in source or source in (".", ".."):
+        if snapshot is not None:
+            raise InputError(f"{source} is a folder; --snapshot goes with the name of a dataset")
+        contents = contents_of_folder(Path(source))
+    else:
+        contents = contents_of_store(
+            open_store(load_settings(data_dir=data_dir).resolved_store_url, make=False), source, snapshot
+        )
+    if assets is not None:
+        contents = with_provenance(contents, assets)
+    columns = (TextColumn("shards"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    console = plain_console(stderr=True)
+    with Progress(*columns, console=console, disable=json or not console.is_terminal, transient=True) as bar:
+        task = bar.add_task("", total=len(contents.shards))
+        found = write_card(
+            contents, out, licence=licence, source=text, progress=lambda done, total: bar.update(task, completed=done)
+        )
+    made = found["composition"]
+    told = {"out": str(out), "dataset": found["name"], "snapshot": (found["snapshot"] or {}).get("digest")}
+    told |= {"grasps": made["grasps"], "valid": made["valid"], "pictures": made["pictures"], "plots": found["plots"]}
+    if json:
+        emit(told)
+    else:
+        typer.echo(
+            f"{out}/README.md: {made['valid']:,} valid grasps, {len(found['plots'])} plots, checksums, card.json"
+        )

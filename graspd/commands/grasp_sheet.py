@@ -1,0 +1,221 @@
+"""Sheets and films of the grasps of a base shard: hand and object, in their scene, alone or along their trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from graspd.exchange.robots.execution import (
+    STEP_S,
+    Executions,
+    Trajectory,
+    executions,
+    hand_limits,
+    straight_paths,
+    timed,
+    tool_frame,
+)
+from graspd.service.model.scene_spec import SceneSpec, supports_in
+from graspd.service.model.transforms import compose, invert
+from graspd.service.readers.ways import Waypoint, scene_spec_of, way_of, wrists_of
+from graspd.service.store.shards import Shard
+from graspd.worker.files.provenance import neighbours_of_shard, placed_of_shard
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.rendering.pictures import SAMPLES, THREE_SIDES, grasp_pictures
+from graspd.worker.rendering.sheets import contact_sheet, figures, label_page, three_sides_sheet
+from graspd.worker.rendering.way_pictures import FREE_STRIP, STRIP, Around, animation, animation_kind, way_pictures
+from graspd.worker.run import Run
+
+Kind = Literal["one side", "three sides", "way"]
+#: Edge of a grasp's picture [px] and rays a pixel. Tracing costs what goes with both: three sides half of one alone.
+LOOKS: Final[dict[Kind, tuple[int, int]]] = {"one side": (300, SAMPLES), "three sides": (160, 8), "way": (300, SAMPLES)}
+
+
+@dataclass(frozen=True)
+class GraspSheet:
+    """Some rows of a shard, drawn."""
+
+    shard: Shard
+    hand: HandModel
+    obj: ObjectModel
+    rows: NDArray[np.intp]
+    kind: Kind
+    run: Run
+    edge: int | None = None
+    """Of one picture [px]; None: as `LOOKS` says."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of one picture [px]."""
+        edge = self.edge or LOOKS[self.kind][0]
+        return edge, edge
+
+    @property
+    def scene(self) -> str:
+        """Kind of the scenes that the grasps were planned in; empty: none."""
+        spec = _scene_of(self.shard)
+        return "" if spec is None else spec.kind
+
+    def png(self, *, subtitle: str) -> bytes:
+        """The sheet."""
+        said = self.shard.attributes
+        title = f"{said.get('hand', self.hand.name)} on {said.get('object', self.obj.name)}"
+        title += f", {self.scene}" if self.scene else ""
+        captions = figures(self.shard.arrays, self.rows)
+        if self.kind == "way":
+            names, drawn = self._ways()
+            below = [[f"{k + 1}   " + ",  ".join(" ".join(pair) for pair in one)] for k, one in enumerate(captions)]
+            cells = [[Image.fromarray(picture) for picture in strip] for strip in drawn]
+            return label_page(cells, names, below, title=title, subtitle=subtitle)
+        drawn = self._alone()
+        if self.kind == "three sides":
+            return three_sides_sheet(drawn, captions, title=title, subtitle=subtitle)
+        return contact_sheet(drawn[:, 0], captions, title=title, subtitle=subtitle)
+
+    def _ways(self) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
+        """Names of the postures, and the pictures (N, F, H, W, 3)."""
+        ways = [way_of(self.shard, int(row)) for row in self.rows]
+        names = STRIP if any(point.name == "lift" for point in ways[0]) else FREE_STRIP
+        drawn = self._drawn([[_named(way, name) for name in names] for way in ways], 1)
+        return names, drawn[:, 0]
+
+    def _alone(self) -> NDArray[np.uint8]:
+        """Pictures at the grasp (N, A, H, W, 3)."""
+        sides = 3 if self.kind == "three sides" else 1
+        if self.scene:
+            return self._drawn([[_named(way_of(self.shard, int(row)), "grasp")] for row in self.rows], sides)[:, :, 0]
+        shown = Posture.from_columns(self.shard.arrays).take(self.rows)
+        return grasp_pictures(
+            self.hand,
+            self.obj,
+            shown.hand_pose,
+            shown.joint_positions,
+            self.size,
+            THREE_SIDES[:sides],
+            run=self.run,
+            samples=LOOKS[self.kind][1],
+        )
+
+    def _drawn(self, frames: list[list[Waypoint]], sides: int) -> NDArray[np.uint8]:
+        return way_pictures(
+            self.hand,
+            self.obj,
+            frames,
+            around_of(self.shard, self.rows),
+            self.size,
+            sides=sides,
+            run=self.run,
+            samples=LOOKS[self.kind][1],
+        )
+
+
+def around_of(shard: Shard, rows: NDArray[np.intp]) -> Around:
+    """Where grasps of a base shard are: in the scenes that they were planned in, or around a free object."""
+    if (spec := _scene_of(shard)) is None:
+        return Around()
+    poses = np.asarray(shard["scene/object_pose"], float)
+    index = np.asarray(shard["grasp/scene_index"], np.intp)[rows]
+    return Around(supports_in(spec), poses, index, neighbours_of_shard(shard, []), wrists_of(shard, rows))
+
+
+def _scene_of(shard: Shard) -> SceneSpec | None:
+    spec = scene_spec_of(shard)
+    return None if spec is None or spec.kind == "free" or "grasp/scene_index" not in shard.arrays else spec
+
+
+def _named(way: list[Waypoint], name: str) -> Waypoint:
+    return next(point for point in way if point.name == name)
+
+
+#: Width of the film [px], and its height as a share of that.
+WIDTH: Final = 480
+HIGH: Final = 0.75
+
+#: Rays a pixel: shadows that move show what is coarse in them.
+FILM_SAMPLES: Final = 24
+#: Share of the velocity limits of joints and hand that is used.
+SPEED: Final = 0.5
+#: The open hand is shown for so long before it sets out, and the lifted object before all begins anew [s].
+BEFORE_S: Final = 0.4
+AFTER_S: Final = 1.4
+
+
+@dataclass(frozen=True)
+class GraspAnimation:
+    """Grasps of a shard on their way, one after the other."""
+
+    shard: Shard
+    hand: HandModel
+    obj: ObjectModel
+    rows: NDArray[np.intp]
+    run: Run
+    width: int | None = None
+    """[px]; None: `WIDTH`."""
+    samples: int = FILM_SAMPLES
+
+    def file(self, suffix: str) -> bytes:
+        """The film as GIF, WebP or animated PNG.
+
+        Raises:
+            InputError: another suffix, or a grasp has no way that is free of the object.
+        """
+        animation_kind(suffix)
+        pictures: list[NDArray[np.uint8]] = []
+        seconds: list[float] = []
+        for row in self.rows:
+            found = self._executed(row)
+            way = _timed(found)
+            pictures.append(self._drawn(row, waypoints(found, way)))
+            seconds += _shown(way)
+        return animation(np.concatenate(pictures), seconds, suffix)
+
+    def _executed(self, row: np.intp) -> Executions:
+        one, placed = np.array([row]), placed_of_shard(self.shard)
+        grasps = GraspSet.from_columns(self.shard.arrays).take(one)
+        return executions(
+            self.hand,
+            self.obj,
+            grasps,
+            rows=one,
+            placed=None if placed is None else placed.take(one),
+            tool=tool_frame(None, self.hand.root_link, {}),
+            quality={},
+        )
+
+    def _drawn(self, row: np.intp, way: Sequence[Waypoint]) -> NDArray[np.uint8]:
+        width = self.width or WIDTH
+        around = around_of(self.shard, np.array([row]))
+        size = (width, round(HIGH * width))
+        (sides,) = way_pictures(
+            self.hand, self.obj, [way], around, size, whole=True, run=self.run, samples=self.samples
+        )
+        return np.asarray(sides[0])
+
+
+def waypoints(found: Executions, way: Trajectory) -> list[Waypoint]:
+    """The points of the trajectory of the first grasp, in the frame of the object at rest."""
+    rest = found.object_pose[0]
+    poses = compose(invert(rest), way.hand_pose)
+    held = way.phase.index("lift")
+    carried = np.where(np.arange(len(poses))[:, None] < held, 0.0, poses[:, :3] - poses[held - 1, :3])
+    closed = way.phase.index("squeeze") - 1
+    return [Waypoint("grasp" if k == closed else "", pose, way.joints[k], carried[k]) for k, pose in enumerate(poses)]
+
+
+def _timed(found: Executions) -> Trajectory:
+    limits = hand_limits(found.hand)
+    return timed(straight_paths(found, 0), found.hand.joint_names, limits.velocity, speed=SPEED)
+
+
+def _shown(way: Trajectory) -> list[float]:
+    seconds = [STEP_S, *np.diff(way.time).tolist()]
+    seconds[0] += BEFORE_S
+    seconds[-1] += AFTER_S
+    return seconds

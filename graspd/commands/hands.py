@@ -1,0 +1,153 @@
+"""Command line: `graspd hands check`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from json import dumps
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any
+
+import typer
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from graspd.service.cli import JsonFlag, emit, plain_console, reporting_errors
+from graspd.service.model.errors import GraspdError, InputError
+from graspd.service.model.states import AssetKind
+from graspd.service.store.asset_options import (
+    ApproachOption,
+    ClosingOption,
+    DropOption,
+    FingertipsOption,
+    FixOption,
+    PalmOption,
+    PreShapeOption,
+    RootOption,
+    UrdfOption,
+    XacroOption,
+    hand_options,
+)
+from graspd.service.store.asset_summary import say_check, self_test_lines
+from graspd.service.store.descriptions import described
+from graspd.worker.hands.check import check_hand
+from graspd.worker.hands.load import files_from_path, hand_from_path, main_file
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.options import parse_options
+from graspd.worker.run import ALONE, Run
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command("check", epilog="graspd hands check my_hand.urdf --palm base_link --approach 0,0,1 --picture my_hand.png")
+@reporting_errors
+def check(
+    file: Annotated[
+        str, typer.Argument(help="A URDF, xacro or MJCF, its folder, a ZIP of that, or the name of a built-in hand.")
+    ],
+    urdf: UrdfOption = None,
+    xacro: XacroOption = None,
+    palm: PalmOption = None,
+    approach: ApproachOption = None,
+    root: RootOption = None,
+    pre_shape: PreShapeOption = None,
+    closing: ClosingOption = None,
+    fingertips: FingertipsOption = None,
+    fix: FixOption = None,
+    drop: DropOption = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Draw the hand open, on approach, closing, and from three sides: a PNG.")
+    ] = None,
+    collision: Annotated[
+        bool, typer.Option("--collision", help="Draw collision shapes where the hand has visual meshes.")
+    ] = False,
+    write: Annotated[
+        Path | None, typer.Option(help="Write all that was said and guessed into a file: asset.json, to be corrected.")
+    ] = None,
+    self_test: Annotated[
+        bool, typer.Option("--self-test/--no-self-test", help="Try 64 grasps of plain objects, and 16 off a table.")
+    ] = True,
+    json: JsonFlag = False,
+) -> None:
+    """Say whether a hand can be used, what was guessed, and what it holds of plain objects. Needs no server."""
+    options = hand_options(
+        urdf=urdf,
+        xacro=xacro,
+        palm=palm,
+        approach=approach,
+        root=root,
+        pre_shape=pre_shape,
+        closing=closing,
+        fingertips=fingertips,
+        fix=fix,
+        drop=drop,
+    )
+    with _bar("reading     ", quiet=json) as run:
+        report = report_hand(file, options, run)
+    if picture and report["verdict"] != "refuse":
+        _draw(hand_from_path(file, options), picture, collision=collision)
+    if write and report["verdict"] != "refuse":
+        _write(file, options, report, write)
+    if not json:
+        say_check(AssetKind.HAND, report)
+    if self_test and report["verdict"] != "refuse":
+        report["self_test"] = _tried(file, options, quiet=json)
+        if not json:
+            for label, says in self_test_lines(report):
+                typer.echo(f"  {label:<18} {says}")
+    if json:
+        emit(report | {"closing": report["facts"].get("closing", {})})
+    if report["verdict"] == "refuse":
+        raise typer.Exit(InputError.exit_code)
+
+
+def _tried(file: str, options: dict[str, Any], *, quiet: bool) -> dict[str, Any]:
+    """The facts of the self-test; a terminal sees how far it is."""
+    from graspd.worker.stages.hand_self_test import tried_softly
+
+    with _bar("self-test   ", "starting; the first one on a machine compiles its kernels", quiet=quiet) as run:
+        return tried_softly(lambda: hand_from_path(file, options), run)
+
+
+@contextmanager
+def _bar(what: str, first: str = "", *, quiet: bool) -> Iterator[Run]:
+    """A run that tells a terminal how far it is."""
+    columns = (TextColumn(f"  {what}       {{task.description}}", markup=False), BarColumn(), TimeElapsedColumn())
+    console = plain_console(stderr=True)
+    # Elsewhere than on a terminal its end would be an empty line.
+    with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
+        task = bar.add_task(first, total=1.0)
+
+        def tell(done: float, total: float, message: str) -> None:
+            bar.update(task, completed=done / total, description=message)
+
+        yield Run(progress=tell)
+
+
+def _draw(hand: HandModel, picture: Path, *, collision: bool) -> None:
+    from graspd.worker.rendering.hands import without_visuals
+    from graspd.worker.rendering.portraits import above, hand_portrait, hand_sides, write_png
+
+    shown = without_visuals(hand) if collision else hand
+    write_png(above(hand_portrait(shown), hand_sides(hand)), picture)
+
+
+def _write(file: str, options: dict[str, Any], report: dict[str, Any], target: Path) -> None:
+    """An asset.json that says what files, options and guesses say, so that nothing is left to guess."""
+    _, files, stated = files_from_path(file)
+    settings = parse_options(files, {**stated, **options})
+    said = settings.model_dump(mode="json", exclude_unset=True)
+    said["file"] = PurePosixPath(main_file(files, settings)).name
+    text = dumps({**said, **described(report["facts"])}, indent=2)
+    try:
+        target.write_text(text + "\n")
+    except OSError as error:
+        raise InputError(f"{target} cannot be written: {error.strerror}") from None
+
+
+def report_hand(file: str, options: dict[str, Any] | None = None, run: Run = ALONE) -> dict[str, Any]:
+    """`check_hand` of a path; what cannot even be read is refused in the same form."""
+    try:
+        name, files, stated = files_from_path(file)
+    except GraspdError as error:
+        return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": {}}
+    return check_hand(files, name, {**stated, **(options or {})}, run)

@@ -1,0 +1,112 @@
+"""Command line: `graspd objects check`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from graspd.service.cli import JsonFlag, emit, reporting_errors
+from graspd.service.model.errors import GraspdError, InputError
+from graspd.service.model.states import AssetKind
+from graspd.service.store.asset_options import (
+    AllowOpenOption,
+    CompoundOption,
+    DensityOption,
+    FrictionOption,
+    KeepLargestOption,
+    MassOption,
+    ScaleToOption,
+    UnitsOption,
+    object_options,
+)
+from graspd.service.store.asset_summary import say_check, verdict_line
+from graspd.service.store.assets import builtin_names
+from graspd.service.store.object_sets import Objects, files_of_set
+from graspd.worker.objects.check import check_object
+from graspd.worker.objects.prepare import files_from_path, object_from_path
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command("check", epilog="graspd objects check banana.stl --units mm --picture banana.png")
+@reporting_errors
+def check(
+    file: Annotated[
+        str, typer.Argument(help="A mesh (STL, OBJ, PLY, OFF, GLB), a built-in; or a folder or ZIP of one or many.")
+    ],
+    units: UnitsOption = None,
+    scale_to: ScaleToOption = None,
+    keep_largest: KeepLargestOption = False,
+    compound: CompoundOption = False,
+    allow_open: AllowOpenOption = False,
+    density: DensityOption = None,
+    mass: MassOption = None,
+    friction: FrictionOption = None,
+    picture: Annotated[Path | None, typer.Option(help="Draw the prepared mesh: a PNG.")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Say whether a mesh can be used, what was repaired, and how large it is. Needs no server."""
+    options = object_options(
+        units=units,
+        scale_to=scale_to,
+        keep_largest=keep_largest,
+        compound=compound,
+        allow_open=allow_open,
+        density=density,
+        mass=mass,
+        friction=friction,
+    )
+    if several := _several(file):
+        if picture:
+            raise InputError(f"--picture draws one object; {file} holds {len(several)}")
+        _check_set(several, options, json=json)
+        return
+    report = report_object(file, options)
+    if picture and report["verdict"] != "refuse":
+        from graspd.worker.rendering.portraits import object_portrait, write_png
+
+        write_png(object_portrait(object_from_path(file, options=options)), picture)
+    if json:
+        emit(report)
+    else:
+        say_check(AssetKind.OBJECT, report)
+    if report["verdict"] == "refuse":
+        raise typer.Exit(InputError.exit_code)
+
+
+def _several(file: str) -> Objects | None:
+    """The objects of a folder or of a ZIP of several; None for one object, readable or not."""
+    if file in builtin_names(AssetKind.OBJECT) and not Path(file).is_file():
+        return None
+    try:
+        return files_of_set(Path(file))
+    except InputError:
+        if Path(file).is_dir():
+            raise
+        return None
+
+
+def _check_set(objects: Objects, options: dict[str, Any], *, json: bool) -> None:
+    """A line for each object; what is refused does not stop the others."""
+    reports = []
+    for name, files in objects.items():
+        reports.append({"name": name, **check_object(files, name, **options)})
+        if not json:
+            typer.echo(verdict_line(reports[-1]))
+    refused = [str(one["name"]) for one in reports if one["verdict"] == "refuse"]
+    if json:
+        emit({"objects": reports, "refused": refused})
+    if refused:
+        raise InputError(f"{len(refused)} of {len(reports)} objects were refused: {', '.join(refused[:5])}")
+
+
+def report_object(file: str, options: dict[str, Any] | None = None) -> dict[str, Any]:
+    """`check_object` of a path; what cannot even be read is refused in the same form."""
+    try:
+        name, files, stated = files_from_path(file)
+    except GraspdError as error:
+        return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": {}}
+    given = {key: value for key, value in (options or {}).items() if value is not None}
+    return check_object(files, name, **{**stated, **given})

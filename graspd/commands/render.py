@@ -1,0 +1,292 @@
+"""Command line: `graspd render`, `graspd pictures` and `graspd view`."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import signal
+import socket
+import threading
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from graspd.commands.grasp_sheet import GraspAnimation, GraspSheet
+from graspd.service.cli import JsonFlag, emit, plain_console, reporting_errors, write_output
+from graspd.service.model.errors import InputError
+from graspd.service.model.scene_spec import supports_in
+from graspd.service.model.transforms import compose
+from graspd.service.readers.ways import scene_spec_of, wrists_of
+from graspd.service.store import validity
+from graspd.service.store.shards import Shard, read_shard, write_shard
+from graspd.worker.engines.devices import Device
+from graspd.worker.files.provenance import (
+    INHERITED,
+    hand_of_shard,
+    id_of_columns,
+    made_of,
+    neighbours_of_shard,
+    object_of_shard,
+)
+from graspd.worker.files.subsets import EveryOption, UnjudgedOption, choose
+from graspd.worker.rendering.annotate import parse_channels
+from graspd.worker.rendering.cameras import BASELINE_M, SAMPLED, read_cameras
+from graspd.worker.rendering.hands import DrawnHand
+from graspd.worker.rendering.scenery import TABLE
+from graspd.worker.rendering.sheets import best, best_in_scenes, best_kept, views_page, with_palette
+from graspd.worker.rendering.views import Extras
+from graspd.worker.rendering.views import render as render_views
+from graspd.worker.rendering.way_pictures import animation_kind
+from graspd.worker.run import Run
+
+app = typer.Typer(add_completion=False)
+
+_Device = Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")]
+_Object = Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")]
+
+
+@app.command(epilog="graspd render scenes.h5 --views 3 --stereo -o views.h5 --page views.png")
+@reporting_errors
+def render(
+    scenes: Annotated[Path, typer.Argument(help="A scene shard, or a base shard of grasps in scenes.")],
+    views: Annotated[int, typer.Option(min=1, max=4096, help="Camera placements per scene.")] = 3,
+    stereo: Annotated[bool, typer.Option("--stereo", help="A left and a right picture per placement.")] = False,
+    baseline: Annotated[float, typer.Option(help="Distance of the eyes [m].")] = BASELINE_M,
+    width: Annotated[int | None, typer.Option(min=16, max=4096, help="Picture width [px]; 320.")] = None,
+    height: Annotated[int | None, typer.Option(min=16, max=4096, help="Picture height [px]; 240.")] = None,
+    channels: Annotated[
+        str, typer.Option(help="Besides rgb, depth and segmentation: distance, normals, occlusion, or all.")
+    ] = "",
+    cameras: Annotated[
+        Path | None, typer.Option(help="JSON with intrinsics, places, or both, instead of sampled cameras.")
+    ] = None,
+    with_hand: Annotated[
+        Path | None, typer.Option(help="The base shard: also pictures with each scene's best grasp.")
+    ] = None,
+    hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
+    with_: Annotated[
+        list[str] | None, typer.Option("--with", help="A neighbour's file; default: the built-in of that name.")
+    ] = None,
+    object: _Object = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Default: the seed of the scenes.")] = None,
+    device: _Device = "auto",
+    output: Annotated[Path, typer.Option("--output", "-o", help="The views shard to write.")] = Path("views.h5"),
+    page: Annotated[Path | None, typer.Option(help="Also write a page that shows the views (PNG).")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Take pictures of scenes: colour, depth, segmentation, boxes, and what `--channels` asks for."""
+    started = perf_counter()
+    scene = _scenes(scenes)
+    obj = object_of_shard(scene, object)
+    number = int(scene.attributes.get("seed", 0)) if seed is None else seed  # type: ignore[arg-type]
+    used = Device(device).resolve()
+    given = read_cameras(cameras) if cameras is not None else SAMPLED
+    size = (width or given.width or 320, height or given.height or 240)
+    spec = scene_spec_of(scene)
+    extras = Extras(
+        channels=parse_channels(channels.split(",")),
+        cameras=given,
+        neighbours=neighbours_of_shard(scene, with_ or []),
+        drawn=_drawn_in(scene, hand) if scene.kind == "base" else _drawn(scene, with_hand, hand),
+        supports=TABLE if spec is None else supports_in(spec),
+    )
+    with _progress(json) as bar:
+        task = bar.add_task("rendering", total=None)
+        result = render_views(
+            obj,
+            np.asarray(scene["scene/object_pose"], float),
+            views=views,
+            stereo=stereo,
+            width=size[0],
+            height=size[1],
+            seed=number,
+            baseline_m=baseline,
+            extras=extras,
+            run=Run(used, progress=partial(_show, bar, task)),
+        )
+    seconds = perf_counter() - started
+    inherited = (*INHERITED, "neighbours", "neighbour_digests", "neighbour_sources")
+    kept = {key: scene.attributes[key] for key in (*inherited, "scene") if key in scene.attributes}
+    kept |= made_of(scene) | {"seed": number, "device": used, "seconds": round(seconds, 4)}
+    write_output(output, write_shard("views", result, {**kept, "shard_id": id_of_columns(result)}))
+    count = len(result["image/rgb"])
+    if page is not None:
+        title = f"Views of {scene.attributes.get('object', 'the object')}"
+        subtitle = f"{count} pictures, {size[0]} x {size[1]} pixels"
+        write_output(page, views_page(result, title=title, subtitle=subtitle))
+    if json:
+        emit({"file": str(output), "pictures": count, "seconds": round(seconds, 2), "device": used})
+    else:
+        typer.echo(f"{output}: {count} pictures, {seconds:.1f} s on {used}")
+
+
+@app.command(epilog="graspd pictures grasps.h5 -o sheet.png --three-sides")
+@reporting_errors
+def pictures(
+    grasps: Annotated[Path, typer.Argument(help="A base shard, as `graspd synth` writes it.")],
+    count: Annotated[
+        int | None,
+        typer.Option("--count", "-n", min=1, max=400, help="How many of the best; 12, of ways 4, of a film 1."),
+    ] = None,
+    three: Annotated[bool, typer.Option("--three-sides", help="Each grasp from three sides.")] = False,
+    way: Annotated[bool, typer.Option("--way", help="Each grasp on its way: standoff, pregrasp, grasp, lift.")] = False,
+    animate: Annotated[
+        bool, typer.Option("--animate", help="A film as a robot runs it: come, close, lift; .gif, .webp or .png.")
+    ] = False,
+    row: Annotated[
+        list[int] | None, typer.Option("--row", min=0, help="This grasp, by its row in the file; several times.")
+    ] = None,
+    palette: Annotated[bool, typer.Option("--palette", help="256 colours: a third of the bytes.")] = False,
+    size: Annotated[
+        int | None,
+        typer.Option(min=32, max=2048, help="Edge of a picture [px]; 300, with --three-sides 160, a film 480."),
+    ] = None,
+    hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
+    object: _Object = None,
+    unjudged: UnjudgedOption = False,
+    every: EveryOption = False,
+    device: _Device = "auto",
+    output: Annotated[Path, typer.Option("--output", "-o", help="The PNG or film to write.")] = Path("grasps.png"),
+    json: JsonFlag = False,
+) -> None:
+    """Draw the best valid grasps by epsilon with their figures on one sheet, in their scenes where they have any."""
+    if way + three + animate > 1:
+        raise InputError("--way, --three-sides and --animate exclude one another")
+    if animate:
+        animation_kind(output.suffix)
+    base = read_shard(grasps, kind="base")
+    chosen, word = choose(base, unjudged=unjudged, every=every)
+    if row:
+        rows = _named_rows(base, row, chosen, word)
+    else:
+        rows = best(base.arrays, count or (1 if animate else 4 if way else 12), chosen)
+    among = int(chosen.sum())
+    models = (hand_of_shard(base, hand), object_of_shard(base, object), rows)
+    run = Run(Device(device).resolve())
+    if animate:
+        page = GraspAnimation(base, *models, run, size).file(output.suffix)
+    else:
+        sheet = GraspSheet(base, *models, "way" if way else "three sides" if three else "one side", run, size)
+        page = sheet.png(subtitle=f"{len(rows)} of {among} {word}{'' if row else ', by epsilon at 5 mm'}")
+    write_output(output, with_palette(page) if palette and not animate else page)
+    if json:
+        emit({"file": str(output), "grasps": len(rows), "of": among, "kind": word, "rows": rows.tolist()})
+    else:
+        typer.echo(f"{output}: {'' if row else 'the best '}{len(rows)} of {among} {word}")
+
+
+def _named_rows(base: Shard, rows: list[int], chosen: NDArray[np.bool_], word: str) -> NDArray[np.intp]:
+    for row in rows:
+        if row >= len(chosen):
+            raise InputError(f"{base.path} has the rows 0 to {len(chosen) - 1}: there is no row {row}")
+        if not chosen[row]:
+            raise InputError(f"row {row} of {base.path} is none of its {word}; --all takes any")
+    return np.array(rows, np.intp)
+
+
+def _scenes(path: Path) -> Shard:
+    """A scene shard, or a base shard whose grasps were planned in scenes."""
+    shard = read_shard(path)
+    if shard.kind == "base" and "scene/object_pose" not in shard.arrays:
+        raise InputError(
+            f"{path} has grasps around a free object: a scene shard is needed here; make one: graspd scene"
+        )
+    if shard.kind == "views":
+        raise InputError(f"{path} is a views shard; a scene shard is needed here")
+    return shard
+
+
+def _drawn_in(base: Shard, hand: str | None) -> DrawnHand | None:
+    """The best valid grasp of each scene that grasps were planned in; where nobody judged, the best sound one."""
+    judged = validity.valid(base.arrays).any()
+    rows = best_in_scenes(base.arrays, validity.chosen(base.arrays, unjudged=not judged))
+    if not len(base["grasp/hand_pose"]):
+        return None
+    poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
+    return DrawnHand(
+        hand_of_shard(base, hand),
+        rows,
+        compose(np.asarray(base["scene/object_pose"], float), poses),
+        joints,
+        wrists_of(base, rows),
+    )
+
+
+def _drawn(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand | None:
+    """The best grasp that each scene kept, by epsilon, for `--with-hand`."""
+    if base_file is None:
+        return None
+    base = read_shard(base_file, kind="base")
+    model = hand_of_shard(scene, hand)
+    hand_of_shard(base, hand)
+    rows = best_kept(scene.arrays, base.arrays)
+    source = np.asarray(scene["grasp/base_index"])[rows]
+    if len(source) and source.max() >= len(base["grasp/joint_positions"]):
+        raise InputError(
+            f"{base_file} has fewer grasps than the scenes were made of; give the base shard they come from"
+        )
+    joints = np.asarray(base["grasp/joint_positions"], float)[source]
+    poses = np.asarray(scene["grasp/hand_pose"], float)[rows]
+    return DrawnHand(model, rows, poses, joints, wrists_of(scene, rows))
+
+
+def _show(bar: Progress, task: TaskID, done: float, total: float, message: str) -> None:
+    bar.update(task, completed=done, total=total, description=message)
+
+
+def _progress(quiet: bool) -> Progress:
+    return Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=plain_console(stderr=True),
+        disable=quiet,
+        transient=True,
+    )
+
+
+@app.command(epilog="graspd view grasps.h5")
+@reporting_errors
+def view(
+    grasps: Annotated[Path, typer.Argument(help="A base shard, as `graspd synth` writes it.")],
+    host: Annotated[str, typer.Option(help="Address to serve on; whoever reaches it sees the grasps.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="The first port tried; 0: any free one.")] = 8080,
+    hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
+    object: Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")] = None,
+) -> None:
+    """Show grasps in 3D in the browser: hand, object, scene, contacts, and the way as a slider. Ends with Ctrl-C."""
+    from graspd.worker.viewing import Shown, Viewer, missing
+
+    if said := missing():
+        raise InputError(said)
+    from graspd.worker.files.provenance import hand_of_shard, neighbours_of_shard, object_of_shard
+
+    base = read_shard(grasps, kind="base")
+    shown = Shown(base, hand_of_shard(base, hand), object_of_shard(base, object), neighbours_of_shard(base, []))
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    viewer = Viewer(shown, host=host, port=port)
+    try:
+        typer.echo(f"{grasps}: {viewer.url}")
+        typer.echo(
+            f"from another machine: {forwarding(viewer.server.get_port())}, then the same address; Ctrl-C ends it"
+        )
+        ended.wait()
+    finally:
+        viewer.close()
+
+
+def forwarding(port: int) -> str:
+    """The command that brings a port of this machine's loopback to the machine that one sits at."""
+    # sshd says the address under which it was reached.
+    reached = os.environ.get("SSH_CONNECTION", "").split()
+    host = reached[2] if len(reached) == 4 else socket.gethostname()
+    return f"ssh -L {port}:127.0.0.1:{port} {getpass.getuser()}@{host}"

@@ -1,0 +1,81 @@
+"""Command line: `graspd scene`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any
+
+import typer
+
+from graspd.service.cli import JsonFlag, emit, reporting_errors, write_output
+from graspd.service.store.columns import Attribute
+from graspd.service.store.shards import read_shard, write_shard
+from graspd.worker.files.provenance import (
+    INHERITED,
+    NEIGHBOUR_FACE_ERROR_M,
+    beside_attributes,
+    hand_of_shard,
+    id_of_columns,
+    made_of,
+    object_of_shard,
+    wrist_attributes,
+)
+from graspd.worker.grasps import Posture
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.scenes.clearance import count_rejections, transfer
+from graspd.worker.scenes.neighbours import Neighbours, drop_together
+from graspd.worker.scenes.rest import rolling_note, rolling_poses
+from graspd.worker.scenes.simulate import drop
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command(epilog="graspd scene grasps.h5 --scenes 4 -o scenes.h5")
+@reporting_errors
+def scene(
+    grasps: Annotated[Path, typer.Argument(help="A base shard, as `graspd synth` writes it.")],
+    scenes: Annotated[int, typer.Option(min=1, max=4096, help="Number of scenes.")] = 2,
+    hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
+    object: Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")] = None,
+    with_: Annotated[
+        list[str] | None, typer.Option("--with", help="Another object on the table: file or built-in; several times.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Default: the seed of the grasps.")] = None,
+    output: Annotated[Path, typer.Option("--output", "-o", help="The scene shard to write.")] = Path("scenes.h5"),
+    json: JsonFlag = False,
+) -> None:
+    """Drop the object onto a table and keep the grasps that the hand can reach there."""
+    started = perf_counter()
+    base = read_shard(grasps, kind="base")
+    model, obj = hand_of_shard(base, hand), object_of_shard(base, object)
+    number = int(base.attributes.get("seed", 0)) if seed is None else seed  # type: ignore[arg-type]
+    others = [object_from_path(name, face_error_m=NEIGHBOUR_FACE_ERROR_M) for name in with_ or []]
+    result: dict[str, Any] = dict(
+        drop_together(obj, others, count=scenes, seed=number) if others else drop(obj, count=scenes, seed=number)
+    )
+    poses = result["scene/object_pose"]
+    beside = Neighbours(others, result["scene/neighbour_pose"]) if others else None
+    grasp, pregrasp = (Posture.from_columns(base.arrays, name) for name in ("grasp", "pregrasp"))
+    result |= transfer(model, grasp, pregrasp, poses, beside)
+    seconds = perf_counter() - started
+    attributes: dict[str, Attribute] = {key: base.attributes[key] for key in INHERITED if key in base.attributes}
+    attributes |= {"seed": number, "device": "cpu", "seconds": round(seconds, 4)}
+    attributes |= wrist_attributes(model) | beside_attributes(others, with_ or [])
+    attributes |= made_of(base) | {"shard_id": id_of_columns(result)}
+    write_output(output, write_shard("scene", result, attributes))
+    clear, total = int(result["grasp/valid"].sum()), len(result["grasp/valid"])
+    rolling = rolling_poses(obj, poses)
+    reasons = count_rejections(result["grasp/rejection"])
+    if json:
+        emit(
+            {"file": str(output), "scenes": scenes, "grasps": total, "clear": clear, "rejected": reasons}
+            | {"rolling_scenes": rolling}
+            | {"seconds": round(seconds, 2)}
+        )
+        return
+    typer.echo(f"{output}: {scenes} scenes, {clear} of {total} grasps stay clear, {seconds:.1f} s")
+    if any(reasons.values()):
+        typer.echo("too near: " + ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in reasons.items() if n))
+    if (note := rolling_note(rolling, scenes)) is not None:
+        typer.echo(note)

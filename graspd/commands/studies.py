@@ -1,0 +1,381 @@
+"""Command line: `graspd bench`, `graspd stability` and `graspd chart`."""
+
+from __future__ import annotations
+
+import json as json_
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from importlib import import_module
+from json import loads
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any, Final
+
+import typer
+
+from graspd.service.cli import JsonFlag, emit, load_settings, reporting_errors
+from graspd.service.model.clock import timestamp
+from graspd.service.model.cores import available_cores
+from graspd.service.model.errors import InputError, one_of
+from graspd.service.model.fidelity import FIDELITIES, OFFERED, Fidelity
+from graspd.service.model.metrics import ROBUST_MODELS
+from graspd.service.model.scene_spec import SceneSpec, parse_scene
+from graspd.service.model.studies import Stability, from_json
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.worker.engines.devices import Device
+from graspd.worker.run import Run
+
+app = typer.Typer()
+
+
+@app.command(epilog="graspd bench --hand allegro --object mug --batch 1 --batch 32 --out bench")
+@reporting_errors
+def bench(
+    hand: Annotated[str, typer.Option(help="A URDF, a ZIP with one, or a built-in hand.")] = "allegro",
+    object_: Annotated[str, typer.Option("--object", help="A mesh or a built-in object.")] = "mug",
+    fidelity: Annotated[list[str] | None, typer.Option(help="Fidelity; several times. Default: all offered.")] = None,
+    batch: Annotated[list[int] | None, typer.Option(min=1, help="Grasps per call; several times.")] = None,
+    join: Annotated[list[int] | None, typer.Option(min=1, help="Batches in one launch; several times.")] = None,
+    threads: Annotated[list[int] | None, typer.Option(min=1, help="CPU threads; several times.")] = None,
+    points: Annotated[list[int] | None, typer.Option(min=16, help="Also sweep the fine phase's hand points.")] = None,
+    face_error: Annotated[list[float] | None, typer.Option(min=0, help="Also sweep the face error bound [m].")] = None,
+    device: Annotated[str, typer.Option(help="cpu, cuda:0 or auto.")] = "auto",
+    repeats: Annotated[int, typer.Option(min=1, help="Timed calls per run; the median counts.")] = 3,
+    out: Annotated[Path | None, typer.Option(help="Folder for bench.json, bench.md and bench.png.")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Grasps per second of the planner, without the quality table, and where the time goes."""
+    from graspd.studies.bench import bench as measure
+    from graspd.studies.bench import table, write
+    from graspd.worker.hands.load import hand_from_path
+    from graspd.worker.objects.prepare import object_from_path
+
+    resolved = Device(device).resolve()
+    result = measure(
+        hand_from_path(hand),
+        lambda error: object_from_path(object_, face_error_m=error),
+        fidelities=_fidelities(fidelity, points, face_error),
+        batches=batch or [1, 8, 32, 256],
+        threads=threads or ([1] if resolved != "cpu" else sorted({1, available_cores()})),
+        device=resolved,
+        repeats=repeats,
+        joins=join or [1],
+        say=lambda line: typer.echo(line, err=True),
+    )
+    if out is not None:
+        write(result, out)
+    if json:
+        emit(result)
+    else:
+        typer.echo(table(result))
+
+
+def _fidelities(names: list[str] | None, points: list[int] | None, errors: list[float] | None) -> list[Fidelity]:
+    """The named fidelities, then the first of them with one knob changed at a time."""
+    chosen = names or list(OFFERED)
+    if unknown := [name for name in chosen if name not in FIDELITIES]:
+        raise InputError(f"unknown fidelity {unknown[0]!r}; choose one of {one_of(unknown[0], FIDELITIES)}")
+    found = [FIDELITIES[name] for name in chosen]
+    changes: list[dict[str, Any]] = [{"fine_points": n, "name": f"{chosen[0]}/points={n}"} for n in points or []]
+    changes += [{"face_error_m": e, "name": f"{chosen[0]}/error={json_.dumps(e)}"} for e in errors or []]
+    return found + [Fidelity(**(found[0].model_dump() | change)) for change in changes]
+
+
+STUDIES: Final = (
+    "time_step",
+    "stiffness",
+    "contact_count",
+    "gradient",
+    "shapes",
+    "starts",
+    "rates",
+    "length",
+    "hands",
+    "model_errors",
+    "peers",
+    "scene_height",
+    "scene_wall",
+    "scene_neighbours",
+    "scene_size",
+)
+
+
+@app.command(epilog="graspd stability --only gradient --only starts --out stability --publish")
+@reporting_errors
+def stability(
+    only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(STUDIES)}; several times.")] = None,
+    hand: Annotated[str, typer.Option(help="A URDF or a built-in hand.")] = "allegro",
+    object_: Annotated[str, typer.Option("--object", help="A mesh or a built-in object.")] = "block",
+    quick: Annotated[bool, typer.Option("--quick", help="Few cells of each map: under a minute of CPU time.")] = False,
+    long: Annotated[bool, typer.Option("--long", help="Runs of 100,000 iterations as well.")] = False,
+    threads: Annotated[int, typer.Option(help="CPU threads; 0: all cores.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="Folder for stability.json, stability.md and the maps.")] = None,
+    source: Annotated[
+        list[Path] | None,
+        typer.Option("--from", help="A stability.json: draw and publish its maps, measure nothing; several times."),
+    ] = None,
+    publish: Annotated[bool, typer.Option("--publish", help="Also into the store, for the dashboard.")] = False,
+    data_dir: Annotated[Path | None, typer.Option(help="Folder of the store; GRASPD_DATA_DIR.")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Drive integrators and the planner to where they fail, and draw the maps."""
+    from graspd.studies.stability.report import markdown, write
+
+    if unknown := [name for name in only or [] if name not in STUDIES]:
+        raise InputError(f"there is no study {unknown[0]!r}; choose of {one_of(unknown[0], STUDIES)}")
+    if source:
+        found = _joined([_read_maps(path) for path in source])
+        found = replace(found, maps=[one for one in found.maps if not only or one.name in only])
+    else:
+        found = _measured(tuple(only or STUDIES), hand, object_, quick=quick, long=long, threads=threads)
+    if out is not None:
+        write(found, out)
+    key = _publish_maps(found, data_dir) if publish else None
+    if json:
+        good = {one.name: {panel: one.share(panel) for panel in one.panels} for one in found.maps}
+        still = {one.name: one.still_breaks() for one in found.maps}
+        emit({"good": good, "still_breaks": still, "out": None if out is None else str(out), "published": key})
+    else:
+        typer.echo(markdown(found))
+
+
+def _measured(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long: bool, threads: int) -> Stability:
+    from graspd.worker.engines import backend
+
+    backend.start()
+    import warp as wp
+
+    from graspd.studies.stability.studies import run
+    from graspd.worker.run import Run
+
+    maps = run(names, hand, obj, quick=quick, long=long, work=Run(threads=threads), say=_say)
+    command = shlex.join(["graspd", *(Path(word).name if "/" in word else word for word in sys.argv[1:])])
+    return Stability(timestamp(), command, {"graspd": PACKAGE_VERSION, "warp": wp.__version__}, maps)
+
+
+def _read_maps(path: Path) -> Stability:
+    try:
+        return from_json(loads(path.read_text()))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError):
+        raise InputError(f"{path} is no stability.json; `graspd stability --out FOLDER` writes one") from None
+
+
+def _joined(parts: list[Stability]) -> Stability:
+    """Several runs as one: the later one's map where both have it."""
+    maps = {one.name: one for part in parts for one in part.maps}
+    commands = "; ".join(dict.fromkeys(part.command for part in parts))
+    return replace(parts[-1], command=commands, maps=list(maps.values()))
+
+
+def _publish_maps(found: Stability, data_dir: Path | None) -> str:
+    from graspd.service.store.records import STABILITY, publish
+    from graspd.service.store.store import open_store
+
+    store = open_store(load_settings(data_dir=data_dir).resolved_store_url)
+    key = publish(store, STABILITY, found.as_json())
+    _say(f"published as {key}")
+    return key
+
+
+def _say(line: str) -> None:
+    typer.echo(line, err=True)
+
+
+#: What is compared where nothing is named.
+PEERS = ("fast_graspd", "graspit", "graspd2022", "dfc", "autograsp")
+
+
+@app.command(epilog="graspd chart --methods fast_graspd,autograsp --hands allegro --objects mug,bottle --out chart")
+@reporting_errors
+def chart(
+    methods: Annotated[
+        str, typer.Option(help="Planners, with commas between; also as NAME:OPTION=VALUE@GRASPS_PER_CALL.")
+    ] = ",".join(PEERS),
+    hands: Annotated[str, typer.Option(help="URDFs or built-in hands, with commas between.")] = "allegro,barrett",
+    objects: Annotated[str, typer.Option(help="Meshes or built-in objects, with commas between.")] = "mug,bottle",
+    fidelities: Annotated[str, typer.Option(help="Of methods that have them, with commas between.")] = ",".join(
+        OFFERED
+    ),
+    batch: Annotated[str, typer.Option(help="Grasps per call, with commas between; each is run.")] = "32",
+    peer_batch: Annotated[int, typer.Option(min=1, help="Grasps per call of methods with a budget of steps.")] = 8,
+    repeats: Annotated[int, typer.Option(min=1, help="Timed calls of each setting on each hand and object.")] = 2,
+    option: Annotated[
+        list[str] | None, typer.Option(help="METHOD:NAME=VALUE, such as graspit:steps=40000; several times.")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Little of everything: seconds instead of an hour.")] = False,
+    sweep: Annotated[bool, typer.Option("--sweep", help="Also turn fast_graspd's knobs one at a time.")] = False,
+    knob: Annotated[
+        list[str] | None, typer.Option(help="With --sweep: only this knob, such as 'contact solver'; several times.")
+    ] = None,
+    threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0: one per core.")] = 0,
+    device: Annotated[str, typer.Option(help="cpu, cuda:0 or auto.")] = "auto",
+    out: Annotated[Path | None, typer.Option(help="Folder for chart.json, .csv, .md, .png and .svg.")] = None,
+    remark: Annotated[str, typer.Option(help="A sentence on the conditions, for the report.")] = "",
+    scene: Annotated[
+        str,
+        typer.Option(help="Other than free: planned in table, bin, shelf or a file, against free ones put there."),
+    ] = "free",
+    work: Annotated[
+        Path | None, typer.Option(help="With --scene: folder that keeps each result; a stopped run goes on there.")
+    ] = None,
+    source: Annotated[
+        Path | None, typer.Option("--from", help="A chart.json: draw and publish it, measure nothing.")
+    ] = None,
+    publish: Annotated[
+        bool, typer.Option("--publish", help="Also into the store, for the dashboard and `fidelity: auto`.")
+    ] = False,
+    data_dir: Annotated[Path | None, typer.Option(help="Folder of the store; GRASPD_DATA_DIR.")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Speed against accuracy: every method and fidelity on the same hands and objects, judged by MuJoCo."""
+    from graspd.studies.chart.chart import settings_of
+    from graspd.studies.chart.sweeps import sweep as turn
+    from graspd.studies.chart.sweeps import turns
+    from graspd.worker.hands.load import hand_from_path
+
+    if source is not None:
+        _finish(_read_chart(source), out, data_dir, publish=publish, json=json)
+        return
+    turns(knobs=knob or ())  # a wrong name is told before an hour of work
+    if scene != "free" and sweep:
+        raise InputError("--sweep is of free objects' charts; leave out --scene")
+    place = _place(scene)
+    on = Run(Device(device).resolve(), threads)
+    batches, models_around = [_number(part) for part in _parts(batch)], ROBUST_MODELS
+    if quick:
+        hands, objects, fidelities = (_first(text) for text in (hands, objects, fidelities))
+        batches, peer_batch, repeats, models_around = [4], 2, 1, 2
+    chosen = settings_of(
+        _parts(methods),
+        known_fidelities(_parts(fidelities)),
+        batches=batches,
+        peer_batch=peer_batch,
+        options=option or [],
+        quick=quick,
+        run=on,
+    )
+    models, things = [hand_from_path(part) for part in _parts(hands)], _things(_parts(objects))
+    said = {"command": shlex.join(["graspd", *(_short(word) for word in sys.argv[1:])]), "remark": remark}
+
+    def keep(so_far: dict[str, Any]) -> None:
+        if out is not None:
+            _write(so_far | said, out)
+
+    if place is None:
+        from graspd.studies.chart.chart import chart as run
+
+        result = run(models, things, chosen, repeats=repeats, models=models_around, say=_say, keep=keep) | said
+    else:
+        from graspd.studies.chart.scenes import scene_chart
+
+        result = scene_chart(models, things, chosen, place, models=models_around, work=work, say=_say, keep=keep) | said
+    if sweep:
+        result["sweeps"] = turn(
+            models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, run=on, knobs=knob or (), say=_say
+        )
+    _finish(result, out, data_dir, publish=publish, json=json)
+
+
+def _finish(result: dict[str, Any], out: Path | None, data_dir: Path | None, *, publish: bool, json: bool) -> None:
+    if out is not None:
+        _write(result, out)
+    if publish:
+        _publish_chart(result, data_dir)
+    if json:
+        emit(result)
+    else:
+        typer.echo(_report(result).markdown(result))
+
+
+def _report(chart: dict[str, Any]) -> ModuleType:
+    """The module that writes it: a chart in scenes has other columns."""
+    return import_module(f"graspd.studies.chart.{'scene_report' if 'scene' in chart else 'report'}")
+
+
+def _write(chart: dict[str, Any], out: Path) -> None:
+    _report(chart).write(chart, out)
+
+
+def _read_chart(path: Path) -> dict[str, Any]:
+    try:
+        found = loads(path.read_text())
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from None
+    except ValueError:
+        found = None
+    if not isinstance(found, dict) or not {"created", "runs"} <= found.keys():
+        raise InputError(f"{path} is no chart.json; `graspd chart --out FOLDER` writes one")
+    if missing := [key for key in ("summary", "by_hand", "models") if key not in found]:
+        raise InputError(f"{path} has no {missing[0]}: an earlier graspd measured it, measure again")
+    return found
+
+
+def _place(scene: str) -> SceneSpec | None:
+    """The scene of a chart; None: around free objects."""
+    if scene == "free":
+        return None
+    spec = parse_scene(scene)
+    if spec.neighbours:
+        raise InputError(f"{scene} has neighbours; the chart compares methods among supports alone: leave them out")
+    # Every stable face of an object, where it is dropped.
+    return spec if spec.target is not None else parse_scene(scene, faces="all")
+
+
+def _short(word: str) -> str:
+    """A word of the command line without the folders of this machine that everybody else calls otherwise."""
+
+    def one(part: str) -> str:
+        if "/data/" in part:
+            return "DATA/" + part.split("/data/", 1)[1]
+        return Path(part).name if part.startswith("/") else part
+
+    return ",".join(one(part) for part in word.split(","))
+
+
+def _parts(text: str) -> list[str]:
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    if not parts:
+        raise InputError("an option is empty: name at least one method, hand, object and fidelity")
+    return parts
+
+
+def _first(text: str) -> str:
+    return _parts(text)[0]
+
+
+def _number(text: str) -> int:
+    if not text.isdigit() or not 1 <= int(text) <= 4096:
+        raise InputError(f"--batch {text!r} is no number of grasps from 1 to 4096")
+    return int(text)
+
+
+def known_fidelities(names: Sequence[str]) -> list[str]:
+    """The names, if all are known; raises InputError."""
+    if unknown := [name for name in names if name not in FIDELITIES]:
+        raise InputError(f"unknown fidelity {unknown[0]!r}; choose of {one_of(unknown[0], FIDELITIES)}")
+    return list(names)
+
+
+def _things(objects: Sequence[str]) -> list[Any]:
+    from graspd.studies.chart.chart import Thing
+    from graspd.worker.objects.prepare import name_of, object_from_path
+
+    def load(text: str, error: float) -> Any:
+        return object_from_path(text, face_error_m=error)
+
+    for text in objects:
+        load(text, 1e-3)  # a wrong file is told before an hour of work
+    return [Thing(name_of(Path(text)), partial(load, text)) for text in objects]
+
+
+def _publish_chart(result: dict[str, Any], data_dir: Path | None) -> None:
+    from graspd.service.store.records import kind_of, publish
+    from graspd.service.store.store import open_store
+
+    key = publish(open_store(load_settings(data_dir=data_dir).resolved_store_url), kind_of(result), result)
+    _say(f"published as {key}")

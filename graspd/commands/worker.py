@@ -1,0 +1,125 @@
+"""Commands of workers."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from graspd.service.cli import keep_private, load_settings, log_to_stderr, reporting_errors
+from graspd.service.model.errors import InputError, UnavailableError
+from graspd.service.model.libraries import imports
+from graspd.service.model.states import Stage
+from graspd.service.settings import Settings
+
+app = typer.Typer(no_args_is_help=True)
+
+
+@app.command(epilog="graspd worker --workers 4 --stages synthesize,render")
+@reporting_errors
+def worker(
+    device: Annotated[str | None, typer.Option(help="cpu, cuda:0, ... or auto; GRASPD_DEVICE.")] = None,
+    stages: Annotated[str | None, typer.Option(help="Stages to serve, with commas between; default: all.")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes; with device auto each takes the next GPU.")] = 1,
+    threads: Annotated[int | None, typer.Option(min=0, help="CPU threads, 0: one per core; GRASPD_THREADS.")] = None,
+    join: Annotated[
+        str | None, typer.Option(help="Batches of one pair that are planned in one launch, or auto; GRASPD_JOIN.")
+    ] = None,
+    processes: Annotated[
+        int | None,
+        typer.Option(min=0, help="Processes that judge and measure, 0: with a GPU one a core; GRASPD_PROCESSES."),
+    ] = None,
+    burst: Annotated[bool, typer.Option("--burst", help="End when no task waits.")] = False,
+    idle: Annotated[int, typer.Option(min=0, help="With --burst: end when none came for so long [s].")] = 0,
+    once: Annotated[bool, typer.Option("--once", help="End after one task.")] = False,
+    max_tasks: Annotated[int | None, typer.Option(min=1, help="End after this many tasks.")] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Start none; exit code 1 says that none lives on this host.")
+    ] = False,
+    data_dir: Annotated[Path | None, typer.Option(help="Folder of everything graspd keeps; GRASPD_DATA_DIR.")] = None,
+) -> None:
+    """A worker on one device, or several: takes tasks from the queue until it is told to stop."""
+    settings = load_settings(device=device, threads=threads, join=join, processes=processes, data_dir=data_dir)
+    log_to_stderr(settings, "worker")
+    keep_private(settings)
+    if check:
+        check_worker(settings)
+        return
+    if workers > 1:
+        if burst or once or max_tasks is not None:
+            raise InputError("--burst, --once and --max-tasks are for a single worker")
+        _run_several(workers, settings, stages)
+        return
+    with imports():
+        from graspd.worker.process.main import run_worker
+
+    ended_well = run_worker(
+        settings,
+        stages=_parse_stages(stages),
+        burst=burst or once,
+        idle_s=idle,
+        max_tasks=1 if once else max_tasks,
+    )
+    raise typer.Exit(0 if ended_well else 1)
+
+
+def _run_several(count: int, settings: Settings, stages: str | None) -> None:
+    from graspd.service.run.commands import stop_on_signals
+
+    _parse_stages(stages)
+    arguments = ["worker", "--device", settings.device, "--threads", str(settings.threads)]
+    arguments += ["--join", settings.join, "--processes", str(settings.processes)]
+    arguments += ["--data-dir", str(settings.data_dir), *(("--stages", stages) if stages else ())]
+    run_workers(count, arguments, settings, stop_on_signals())
+
+
+def run_workers(
+    count: int,
+    arguments: Sequence[str],
+    settings: Settings,
+    stop: threading.Event,
+    *,
+    program: Sequence[str] = (sys.executable, "-m", "graspd"),
+) -> None:
+    """Keep `count` processes alive until told to stop; number k of them takes the k-th GPU (`worker.engines.devices`).
+
+    Args:
+        arguments: command line of each; their settings come from the environment as well.
+        settings: how long a worker may take to stop.
+        stop: set by whoever ends it all.
+    """
+    from graspd.service.run.children import Child, keep_alive, stop_children
+
+    of_each = [{"GRASPD_WORKER_NUMBER": str(number), "GRASPD_WORKERS_HERE": str(count)} for number in range(count)]
+    children = [Child(f"worker-{number}", (*program, *arguments), own, None) for number, own in enumerate(of_each)]
+    try:
+        keep_alive(children, stop)
+    finally:
+        stop_children(children, settings.stop_grace_s)
+
+
+def check_worker(settings: Settings) -> None:
+    """UnavailableError if no worker of this host gave a sign of life within its lease."""
+    from graspd.service.queue.rq_queue import open_queue
+
+    host = socket.gethostname()
+    queue = open_queue(settings, patience=0)
+    try:
+        if not any(beat.host == host for beat in queue.workers()):
+            raise UnavailableError(f"no worker on {host} gave a sign of life lately; start `graspd worker`")
+    finally:
+        queue.close()
+
+
+def _parse_stages(text: str | None) -> tuple[Stage, ...]:
+    if text is None:
+        return tuple(Stage)
+    try:
+        return tuple(Stage(part.strip()) for part in text.split(","))
+    except ValueError:
+        raise InputError(f"unknown stages {text!r}; choose from {', '.join(Stage)}") from None

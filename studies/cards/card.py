@@ -1,0 +1,130 @@
+"""A card in a folder: README.md, card.json, checksums.sha256, plots, and pictures of some pairs of hand and object."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from graspd.service.model.errors import InputError
+from graspd.service.pipeline.datasets.export import path_of
+from graspd.service.readers import ShardFile, Shards
+from graspd.service.store.shards import open_shard
+from graspd.studies.cards.contents import Contents, Piece, pieces
+from graspd.studies.cards.numbers import numbers
+from graspd.studies.cards.page import page
+from graspd.studies.cards.plots import draw
+from graspd.studies.cards.tally import tally_of
+from graspd.worker.rendering import sheets
+
+#: Pictures out of the dataset.
+SHEET: Final = "samples.jpg"
+#: Told after each shard: how many are done, of how many.
+Progress = Callable[[int, int], None]
+MOST: Final = 12
+_COLUMNS: Final = 4
+_WIDTH: Final = 240
+_CAPTION: Final = 18
+_QUALITY: Final = 85
+
+
+def write_card(
+    contents: Contents,
+    folder: Path,
+    *,
+    licence: str = "",
+    source: str = "",
+    progress: Progress = lambda done, total: None,
+) -> dict[str, Any]:
+    """Read all shards and write the card; what an earlier card left there is written over.
+
+    Returns:
+        the figures, as in `card.json`, and under `plots` the names of the pictures.
+
+    Raises:
+        InputError: the folder cannot be made, the dataset holds no grasp, or a shard is not what its checksum says.
+        StoreUnavailable: the store does not answer.
+    """
+    if not contents.shards.of("base"):
+        raise InputError(f"{contents.name} holds no base shard: there is nothing to say of it yet")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"the folder {folder} cannot be made: {error.strerror}") from None
+    tally = tally_of(contents, _counted(pieces(contents), len(contents.shards), progress))
+    card = numbers(contents, tally, licence=licence, source=source)
+    plots = draw(card, tally, folder)
+    if write_samples(contents.shards, folder / SHEET):
+        plots[SHEET] = "Some of the pictures"
+    card["plots"] = list(plots)
+    (folder / "checksums.sha256").write_text("".join(checksums(contents)))
+    (folder / "card.json").write_text(json.dumps(card, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    (folder / "README.md").write_text(page(card, plots))
+    return card
+
+
+def checksums(contents: Contents) -> Iterator[str]:
+    """Lines as `sha256sum -c` reads them, in the folder of an export or in that of the shards."""
+    if contents.snapshot is not None:
+        yield from (f"{shard.sha256}  {path_of(shard)}\n" for shard in contents.snapshot.shards)
+        return
+    paths = sorted(contents.shards.path(file) for file in contents.shards)
+    root = contents.root or Path()
+    for path in paths:
+        with path.open("rb") as opened:
+            yield f"{hashlib.file_digest(opened, 'sha256').hexdigest()}  {path.relative_to(root)}\n"
+
+
+def _counted(found: Iterator[Piece], total: int, progress: Progress) -> Iterator[Piece]:
+    for number, piece in enumerate(found, start=1):
+        yield piece
+        progress(number, total)
+
+
+def write_samples(shards: Shards, file: Path) -> bool:
+    """Write a JPEG; False if the dataset has no pictures. Of each shard that is shown all is fetched."""
+    chosen = choose(shards.of("views"))
+    if not chosen:
+        return False
+    pictures = [Image.fromarray(_picture(shards.path(one))) for one in chosen]
+    heights = [round(one.height * _WIDTH / one.width) for one in pictures]
+    line = max(heights) + _CAPTION
+    columns = min(_COLUMNS, len(pictures))
+    sheet = Image.new("RGB", (_WIDTH * columns, line * -(-len(pictures) // columns)), sheets.PAPER)
+    draw = ImageDraw.Draw(sheet)
+    for number, (one, shown, height) in enumerate(zip(chosen, pictures, heights, strict=True)):
+        left, top = _WIDTH * (number % columns), line * (number // columns)
+        sheet.paste(shown.resize((_WIDTH, height), Image.Resampling.LANCZOS), (left, top))
+        caption = f"{one.object} ({one.hand})"
+        draw.text((left + 4, top + height + 2), caption, fill=sheets.INK, font=sheets.font(11))
+    sheet.save(file, quality=_QUALITY)
+    return True
+
+
+def choose(files: tuple[ShardFile, ...], most: int = MOST) -> list[ShardFile]:
+    """At most so many shards: of each object in turn one of another hand, spread over all objects."""
+    cells: dict[tuple[str, str], list[ShardFile]] = {}
+    for file in files:
+        cells.setdefault((file.hand, file.object), []).append(file)
+    hands = list(dict.fromkeys(hand for hand, _ in cells))
+    objects = list(dict.fromkeys(obj for _, obj in cells))
+    ranked = sorted(cells, key=lambda cell: (hands.index(cell[0]) - objects.index(cell[1])) % len(hands))
+    some = ranked[: max(most, len(objects))]
+    spread = some if len(some) <= most else [some[round(k)] for k in np.linspace(0, len(some) - 1, most)]
+    # Another batch of each: those of one number have materials and lamps in common.
+    chosen = (cells[cell] for cell in sorted(spread, key=lambda cell: objects.index(cell[1])))
+    return [batches[number % len(batches)] for number, batches in enumerate(chosen)]
+
+
+def _picture(path: Path) -> NDArray[np.uint8]:
+    """(H, W, 3) the picture of a shard in which the object's box is largest."""
+    with open_shard(path) as opened:
+        box = np.asarray(opened["box/bounding_box_2d_tight"], float)
+        area = np.nan_to_num((box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1]), nan=-1.0)
+        return np.asarray(opened["image/rgb"][int(np.argmax(area))], np.uint8)

@@ -1,0 +1,313 @@
+"""Contents of a card: a dataset's snapshot in a store or a folder of shards, read one after the other without
+pictures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic_core import from_json
+
+from graspd.service.model import names
+from graspd.service.model.errors import InputError, NotFoundError
+from graspd.service.model.metrics import GRASP_METRICS
+from graspd.service.model.planning import plan
+from graspd.service.model.records import DatasetRecord, Snapshot, job_of
+from graspd.service.model.states import AssetKind
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.service.readers import ShardFile, Shards, open_shards
+from graspd.service.store import validity
+from graspd.service.store.assets import builtin_asset, builtin_files, builtin_names
+from graspd.service.store.library import load_asset, load_asset_files, load_check
+from graspd.service.store.manifests import ShardManifest, load_manifest
+from graspd.service.store.records import load_dataset, newest_snapshot, parse_record, task_attempts
+from graspd.service.store.shards import json_attribute, open_shard, read_column
+from graspd.service.store.store import Store
+
+Pair = tuple[str, str]
+_BUILTIN_LICENCE: Final = "Apache-2.0"
+
+
+@dataclass(frozen=True)
+class AssetFacts:
+    """A hand or an object as the store knows it; what it does not know is empty."""
+
+    name: str
+    digest: str = ""
+    licence: str = ""
+    source: str = ""
+    description: str = ""
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    """What its check measured, SI units."""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Batches of a cell that the snapshot lacks, and why."""
+
+    tasks: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Contents:
+    """A dataset as a card sees it. `snapshot` and `record` are None where only files are there."""
+
+    name: str
+    shards: Shards
+    hands: Mapping[str, AssetFacts]
+    objects: Mapping[str, AssetFacts]
+    snapshot: Snapshot | None = None
+    record: DatasetRecord | None = None
+    gaps: Mapping[Pair, Gap] = field(default_factory=dict)
+    root: Path | None = None
+    """Folder of the shards, where they are files."""
+
+
+def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, cache: Path | None = None) -> Contents:
+    """A snapshot of a dataset, by default the newest.
+
+    Raises:
+        NotFoundError: no such dataset or snapshot.
+        StoreUnavailable: the store does not answer.
+    """
+    taken = newest_snapshot(store, dataset, snapshot)
+    record = load_dataset(store, dataset)
+    return Contents(
+        dataset,
+        open_shards(store, dataset=dataset, snapshot=taken.digest, cache=cache),
+        {hand.name: _stored(store, AssetKind.HAND, hand.name, hand.digest) for hand in record.hands},
+        {obj.name: _stored(store, AssetKind.OBJECT, obj.name, obj.digest) for obj in record.objects},
+        taken,
+        record,
+        _gaps(store, record, taken),
+    )
+
+
+def contents_of_folder(folder: Path, name: str | None = None) -> Contents:
+    """The shards of a folder, such as an export. Of hands and objects only those that come with graspd are known.
+
+    Raises:
+        NotFoundError: no shard in the folder.
+        InputError: a file is no shard, or `snapshot.json` is damaged.
+    """
+    shards = open_shards(folder)
+    listed = folder / "snapshot.json"
+    taken = parse_record(Snapshot, listed.read_bytes(), str(listed)) if listed.is_file() else None
+    hands, objects = (
+        {known: _builtin(kind, known, digest) for known, digest in sorted(_digests(shards, kind).items())}
+        for kind in (AssetKind.HAND, AssetKind.OBJECT)
+    )
+    known_as = name or (taken.dataset if taken else folder.resolve().name)
+    return Contents(known_as, shards, hands, objects, taken, root=folder)
+
+
+def with_provenance(contents: Contents, file: Path) -> Contents:
+    """The same with licences and sources from a JSON file, for hands and objects that were added without.
+
+    `{"hands": {"shadow": {"licence": "...", "source": "..."}}, "objects": {"*": {...}, "mug": {...}}}`; `*` stands for
+    all that are not named.
+
+    Raises:
+        InputError: no such JSON, or it names what the dataset does not hold.
+    """
+    try:
+        said = from_json(file.read_bytes())
+        groups = {kind: {str(k): dict(v) for k, v in said.get(kind, {}).items()} for kind in ("hands", "objects")}
+    except OSError as error:
+        raise InputError(f"{file} cannot be read: {error.strerror}") from None
+    except (ValueError, AttributeError, TypeError):
+        raise InputError(f'{file} is not as {{"objects": {{"mug": {{"licence": "...", "source": "..."}}}}}}') from None
+    return replace(
+        contents,
+        hands=_informed(contents.hands, groups["hands"], file),
+        objects=_informed(contents.objects, groups["objects"], file),
+    )
+
+
+def _informed(
+    assets: Mapping[str, AssetFacts], said: Mapping[str, Mapping[str, Any]], file: Path
+) -> dict[str, AssetFacts]:
+    if unknown := set(said) - set(assets) - {"*"}:
+        raise InputError(f"{file} names {sorted(unknown)[0]!r}, which the dataset does not hold")
+    informed = {}
+    for name, asset in assets.items():
+        own = said.get(name, said.get("*", {}))
+        if wrong := set(own) - {"licence", "source", "description"}:
+            raise InputError(f"{file}: {name} has {sorted(wrong)[0]!r}; there are licence, source and description")
+        words = {key: str(own.get(key, getattr(asset, key))) for key in ("licence", "source", "description")}
+        informed[name] = replace(asset, **words)  # type: ignore[arg-type]
+    return informed
+
+
+def _stored(store: Store, kind: AssetKind, name: str, digest: str) -> AssetFacts:
+    try:
+        files = load_asset_files(store, kind, digest)
+        builtin = load_asset(store, kind, digest).builtin
+    except NotFoundError:
+        return AssetFacts(name, digest)
+    check = load_check(store, kind, digest) or {}
+    facts = check.get("facts") or (_checked(kind, name) if builtin else {})
+    return _described(name, digest, files, facts, builtin=builtin)
+
+
+def _builtin(kind: AssetKind, name: str, digest: str) -> AssetFacts:
+    if name in builtin_names(kind):
+        asset, files = builtin_asset(kind, name)
+        if asset.digest == digest:
+            return _described(name, digest, files, _checked(kind, name), builtin=True)
+    return AssetFacts(name, digest)
+
+
+def _described(name: str, digest: str, files: Mapping[str, bytes], facts: Any, *, builtin: bool) -> AssetFacts:
+    stated = json.loads(files["asset.json"])
+    licence, source = str(stated.get("licence", "")), str(stated.get("source", ""))
+    if builtin:
+        licence, source = licence or _BUILTIN_LICENCE, source or f"built into graspd {PACKAGE_VERSION}"
+    return AssetFacts(name, digest, licence, source, str(stated.get("description", "")), dict(facts))
+
+
+@lru_cache
+def _checked(kind: AssetKind, name: str) -> dict[str, Any]:
+    """What is to be known of an asset that comes with graspd; it may be read in this process."""
+    files = builtin_files(kind, name)
+    if kind is AssetKind.HAND:
+        from graspd.worker.hands.check import check_hand
+
+        return dict(check_hand(files, name)["facts"])
+    from graspd.worker.objects.formats import read_mesh
+    from graspd.worker.objects.options import UNITS, parse_options
+
+    options = parse_options(files)
+    vertices = read_mesh(options.file, files[options.file]).vertices * UNITS[options.units]
+    return {"extents_m": [float(extent) for extent in np.ptp(vertices, axis=0)]}
+
+
+def _digests(shards: Shards, kind: AssetKind) -> dict[str, str]:
+    """Names and digests, as the first shard of each says."""
+    found: dict[str, str] = {}
+    for file in shards:
+        name = file.hand if kind is AssetKind.HAND else file.object
+        if name not in found:
+            with open_shard(shards.path(file)) as opened:
+                found[name] = str(opened.attrs.get(f"{kind.value}_digest", ""))
+    return found
+
+
+def _gaps(store: Store, record: DatasetRecord, taken: Snapshot) -> dict[Pair, Gap]:
+    """What the record plans and the snapshot does not hold."""
+    there = {shard.id for shard in taken.shards}
+    gaps: dict[Pair, Gap] = {}
+    for cell in record.cells():
+        missing = [task for task in plan(job_of(cell, record.options, record.revisions)) if task.output not in there]
+        if missing:
+            reasons = (attempts[-1].reason for task in missing if (attempts := task_attempts(store, task.id)))
+            gaps[cell.hand.name, cell.object.name] = Gap(len(missing), next(reasons, "not made yet, or cancelled"))
+    return gaps
+
+
+#: Columns of which a card is made; those that a shard lacks are left out.
+COLUMNS: Final[dict[str, tuple[str, ...]]] = {
+    "base": (
+        "grasp/hand_pose",
+        "grasp/joint_positions",
+        "quality/thresholds_m",
+        *(metric.path for metric in GRASP_METRICS),
+        *validity.COLUMNS,
+        "quality/audit",
+        "quality/lift_hard",
+    ),
+    "scene": ("grasp/base_index", "grasp/hand_pose", "grasp/valid", "grasp/rejection", "scene/object_pose"),
+    "views": (),
+}
+_STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
+_AT_ONCE: Final = 64
+_THREADS: Final = 8
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One shard: its columns, and what its attributes and its manifest say of it."""
+
+    file: ShardFile
+    columns: Mapping[str, NDArray[Any]]
+    said: Mapping[str, Any]
+    """Root attributes; of a shard that was not opened, those fields of its manifest that have their names."""
+    size_bytes: int
+    rows: int
+    """Grasps, pairs of grasp and scene, or pictures."""
+    info: Mapping[str, Any]
+    """Remarks of the stage: seconds of its parts, tries that came to nothing."""
+    revision: int | None = None
+
+
+def pieces(contents: Contents) -> Iterator[Piece]:
+    """Every shard, in the order of `Shards`; the next ones are fetched meanwhile, a bounded number at a time."""
+    sizes = {shard.id: shard.size_bytes for shard in contents.snapshot.shards} if contents.snapshot else {}
+    with ThreadPoolExecutor(_THREADS, thread_name_prefix="card") as pool:
+        files = iter(contents.shards)
+        while some := list(islice(files, _AT_ONCE)):
+            yield from pool.map(lambda file: _piece(contents, file, sizes.get(file.id)), some)
+
+
+def _piece(contents: Contents, file: ShardFile, size: int | None) -> Piece:
+    manifest = _manifest(contents, file)
+    if manifest is not None and file.kind == "views":
+        return _unopened(file, manifest)
+    path = contents.shards.path(file)
+    with open_shard(path) as opened:
+        said = {key: _plain(value) for key, value in opened.attrs.items()}
+        columns = {name: read_column(opened, name, str(path)) for name in COLUMNS[file.kind] if name in opened}
+        rows = len(opened[{"base": "quality/valid", "scene": "grasp/valid", "views": "camera/eye"}[file.kind]])
+    if manifest is not None:
+        said = {**_unopened(file, manifest).said, **said}
+    return Piece(
+        file,
+        columns,
+        said,
+        size or path.stat().st_size,
+        rows,
+        manifest.info if manifest else {},
+        manifest.stage_revision if manifest else None,
+    )
+
+
+def _manifest(contents: Contents, file: ShardFile) -> ShardManifest | None:
+    store = contents.shards.store
+    if store is None:
+        return None
+    try:
+        return load_manifest(store, _STAGES[file.kind], file.id)
+    except NotFoundError:
+        return None
+
+
+def _unopened(file: ShardFile, manifest: ShardManifest) -> Piece:
+    said: dict[str, Any] = {
+        "seconds": manifest.seconds,
+        "device": manifest.device,
+        "worker": manifest.worker,
+        "seed": manifest.seed,
+        "created": manifest.created,
+        "code_version": manifest.code_version,
+        "method": manifest.request.method,
+        "fidelity": json_attribute(manifest.request.knobs.model_dump(mode="json")),
+        "want": manifest.request.want,
+    }
+    if file.kind == "base":
+        said["tried"] = manifest.tried
+    return Piece(file, {}, said, manifest.size_bytes, manifest.count, manifest.info, manifest.stage_revision)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return [str(entry) for entry in value]
+    return value.item() if isinstance(value, np.generic) else value

@@ -1,0 +1,272 @@
+"""The figures of a card, computed from the shards: the content of `card.json`. None stands for what is not known."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic_core import from_json
+
+from graspd.service.model.clock import timestamp
+from graspd.service.model.metrics import DIRECTION_CELLS, GRASP_METRICS, GraspType, entropy_bits, evenness
+from graspd.service.model.states import AssetKind
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.studies.cards.contents import AssetFacts, Contents
+from graspd.studies.cards.tally import ELEVATION_BINS, ENOUGH, CellTally, Tally, cell_counts
+from graspd.worker.grasps import Posture
+from graspd.worker.quality.diversity import explained_variance
+from graspd.worker.quality.intervals import wilson
+
+Row = dict[str, Any]
+#: Codes of `grasp/rejection`: what the hand is too near to, and when.
+REJECTIONS: Final = {
+    1: "the table at contact",
+    2: "the table on the way in",
+    3: "a neighbour at contact",
+    4: "a neighbour on the way in",
+}
+_PERCENTILES: Final = {"p5": 5, "p25": 25, "median": 50, "p75": 75, "p95": 95}
+_KINDS: Final = ("base", "scene", "views")
+
+
+def numbers(contents: Contents, tally: Tally, *, licence: str = "", source: str = "") -> Row:
+    """Everything a card says, as JSON values."""
+    cells = list(tally.cells.values())
+    taken = contents.snapshot
+    return {
+        "schema": "graspd/card@1",
+        "name": contents.name,
+        "licence": licence or None,
+        "source": source or None,
+        "card_made": timestamp(),
+        "graspd": PACKAGE_VERSION,
+        "snapshot": taken and {"digest": taken.digest, "created": taken.created, "complete": taken.complete},
+        "composition": _composition(contents, tally),
+        "making": _making(contents, tally),
+        "validity": {**_validity(cells), "by_hand": {hand: _validity(tally.of_hand(hand)) for hand in contents.hands}},
+        "quality": {hand: _quality(tally.of_hand(hand)) for hand in contents.hands},
+        "contact_threshold_m": _most(tally.threshold_m),
+        "table": {**_table(cells), "by_object": {obj: _table(tally.of_object(obj)) for obj in contents.objects}},
+        "elevation": {
+            hand: {name: counts.tolist() for name, counts in sums.items()} for hand, sums in tally.elevation.items()
+        },
+        "elevation_bins": ELEVATION_BINS,
+        "directions": {
+            "cells": DIRECTION_CELLS,
+            "enough": ENOUGH,
+            "by_object": {obj: _directions(tally.of_object(obj)) for obj in contents.objects},
+            "by_hand": {hand: _directions(tally.of_hand(hand)) for hand in contents.hands},
+        },
+        "joints": {hand: use.shares() for hand, use in tally.joints.items()},
+        "repeated": sum(_repeated(cell) for cell in cells),
+        "cells": _cells(contents, tally),
+    }
+
+
+def share(part: int, whole: int) -> Row | None:
+    """A share with its 95 % interval (Wilson 1927); None of nothing."""
+    if not whole:
+        return None
+    low, high = wilson(part, whole)
+    return {"share": part / whole, "low": low, "high": high}
+
+
+def _composition(contents: Contents, tally: Tally) -> Row:
+    cells = tally.cells.values()
+    return {
+        "hands": [_asset(asset, tally.of_hand(name), AssetKind.HAND) for name, asset in contents.hands.items()],
+        "objects": [_asset(asset, tally.of_object(name), AssetKind.OBJECT) for name, asset in contents.objects.items()],
+        "cells": len(contents.hands) * len(contents.objects) if contents.record else len(tally.cells),
+        "grasps": sum(cell.grasps for cell in cells),
+        "valid": sum(cell.valid for cell in cells),
+        "scenes": sum(cell.scenes for cell in cells),
+        "pairs": sum(cell.pairs for cell in cells),
+        "pictures": sum(cell.pictures for cell in cells),
+        "shards": {kind: tally.shards[kind] for kind in _KINDS},
+        "bytes": {kind: tally.bytes[kind] for kind in _KINDS},
+    }
+
+
+def _asset(asset: AssetFacts, cells: Sequence[CellTally], kind: AssetKind) -> Row:
+    facts = asset.facts
+    known = {"name": asset.name, "digest": asset.digest or None, "licence": asset.licence or None}
+    known |= {"source": asset.source or None, "description": asset.description or None}
+    counts = {"grasps": sum(cell.grasps for cell in cells), "valid": sum(cell.valid for cell in cells)}
+    if kind is AssetKind.HAND:
+        sizes = {key: len(facts[key]) if key in facts else None for key in ("dofs", "joints", "fingertips")}
+        return {**known, **sizes, **counts}
+    return {**known, **{key: facts.get(key) for key in ("extents_m", "volume_m3", "mass_kg", "faces")}, **counts}
+
+
+def _making(contents: Contents, tally: Tally) -> Row:
+    valid = sum(cell.valid for cell in tally.cells.values())
+    total = sum(tally.seconds.values())
+    return {
+        "methods": _said(tally, "method"),
+        "fidelities": [_knobs(text) for text in _said(tally, "fidelity")],
+        "levels": _said(tally, "verdict_level"),
+        "verdict_keys": len(tally.values.get("verdict_key", {})),
+        "scenes": sorted({str(_knobs(text).get("kind", "")) for text in _said(tally, "scene")} - {"", "free"}),
+        "neighbours": sorted(
+            {
+                str(one.get("object", ""))
+                for text in _said(tally, "scene")
+                for one in _knobs(text).get("neighbours") or ()
+            }
+        ),
+        "wants": _said(tally, "want"),
+        "seeds": _said(tally, "seed"),
+        "friction": _said(tally, "mu"),
+        "devices": _said(tally, "device"),
+        "workers": len(tally.values.get("worker", {})) or None,
+        "code_versions": _said(tally, "code_version"),
+        "revisions": {kind: sorted(counts) for kind, counts in tally.revisions.items()},
+        "imported_from": _said(tally, "source"),
+        "options": contents.record.options.model_dump(mode="json") if contents.record else None,
+        "first_shard": tally.created[0] if tally.created else None,
+        "last_shard": tally.created[-1] if tally.created else None,
+        "seconds": {kind: round(tally.seconds[kind], 3) for kind in _KINDS if kind in tally.seconds},
+        "synthesis_parts": {name: round(value, 3) for name, value in tally.parts.items()},
+        "seconds_per_1000_valid": 1000 * total / valid if valid and total else None,
+    }
+
+
+def _said(tally: Tally, name: str) -> list[Any]:
+    return sorted(tally.values.get(name, {}))
+
+
+def _knobs(text: str) -> Any:
+    try:
+        return from_json(text)
+    except ValueError:
+        return {"name": text}
+
+
+def _validity(cells: Iterable[CellTally]) -> Row:
+    cells = list(cells)
+    tried, valid = sum(cell.tried for cell in cells), sum(cell.valid for cell in cells)
+    judged = sum(cell.judged for cell in cells)
+    audited, held = sum(cell.audited for cell in cells), sum(cell.audit_held for cell in cells)
+    rejected: Counter[str] = Counter()
+    for cell in cells:
+        rejected.update(cell.rejected)
+    return {
+        "tried": tried,
+        "valid": valid,
+        "judged": judged,
+        "of_judged": share(min(valid, judged), judged),
+        "rejected": dict(rejected) or None,
+        "audited": audited,
+        "audit_dropped": audited - held,
+        "false_valid": share(audited - held, audited),
+        "lift_hard": share(sum(cell.lift_hard for cell in cells), sum(cell.lift_tested for cell in cells)),
+        "seconds": round(sum(cell.seconds for cell in cells), 3),
+    }
+
+
+def _quality(cells: Sequence[CellTally]) -> dict[str, Row]:
+    """Distribution of each quality over the valid grasps of some cells; a quality that no shard has is left out."""
+    found = {}
+    for metric in GRASP_METRICS:
+        values = np.concatenate([np.empty(0, np.float32), *(cell.column(metric.name) for cell in cells)])
+        values = values[np.isfinite(values)].astype(float)
+        if len(values) and not metric.code:
+            found[metric.name] = {
+                "n": len(values),
+                "mean": _six(values.mean()),
+                **{key: _six(np.percentile(values, at)) for key, at in _PERCENTILES.items()},
+                "max": _six(values.max()),
+                "zero": _six(np.mean(values == 0)),
+            }
+    return found
+
+
+def _table(cells: Iterable[CellTally]) -> Row:
+    cells = list(cells)
+    placed, clear = sum(cell.placed for cell in cells), sum(cell.clear for cell in cells)
+    pairs, clear_pairs = sum(cell.pairs for cell in cells), sum(cell.clear_pairs for cell in cells)
+    refused: Counter[int] = Counter()
+    for cell in cells:
+        refused.update(cell.refused)
+    return {
+        "grasps": placed,
+        "clear": clear,
+        "of_grasps": share(clear, placed),
+        "pairs": pairs,
+        "clear_pairs": clear_pairs,
+        "of_pairs": share(clear_pairs, pairs),
+        "too_near": {REJECTIONS[code]: count for code, count in sorted(refused.items()) if code in REJECTIONS},
+    }
+
+
+def _directions(cells: Iterable[CellTally]) -> Row | None:
+    """How widely the palms come from, object frame; None if the palms are not known."""
+    vectors = np.concatenate([np.empty((0, 3), np.float32), *(cell.directions() for cell in cells)])
+    if not len(vectors):
+        return None
+    counts = cell_counts(vectors)
+    return {
+        "grasps": len(vectors),
+        "empty": int((counts == 0).sum()),
+        "evenness": _six(evenness(counts.ravel().tolist(), DIRECTION_CELLS)),
+        "entropy_bits": _six(entropy_bits(counts.ravel().tolist())),
+    }
+
+
+def _types(cell: CellTally) -> Row | None:
+    """How many of each type; None if no shard tells."""
+    told = cell.column("grasp_type")
+    if not len(told):
+        return None
+    counts = {kind.name.lower(): int((told == kind).sum()) for kind in GraspType}
+    return {**{name: n for name, n in counts.items() if n}, "entropy_bits": _six(entropy_bits(counts.values()))}
+
+
+def _cells(contents: Contents, tally: Tally) -> list[Row]:
+    """A row for each hand x object: those of the matrix, made or not, or else those that have shards."""
+    asked = contents.record.options.grasps if contents.record else None
+    pairs = [(hand, obj) for hand in contents.hands for obj in contents.objects] if contents.record else [*tally.cells]
+    rows = []
+    for pair in pairs:
+        cell, gap = tally.cells.get(pair, CellTally()), contents.gaps.get(pair)
+        valid = _validity([cell])
+        row: Row = {"hand": pair[0], "object": pair[1], "asked": asked, "grasps": cell.grasps}
+        row |= {
+            key: valid[key] for key in ("tried", "judged", "valid", "rejected", "audited", "audit_dropped", "seconds")
+        }
+        row["of_judged"] = valid["of_judged"] and valid["of_judged"]["share"]
+        row |= {"missing_tasks": gap.tasks if gap else 0, "missing_because": gap.reason if gap else None}
+        row["median"] = {name: found["median"] for name, found in _quality([cell]).items()}
+        row["clear_of_table"] = (_table([cell])["of_grasps"] or {}).get("share")
+        row["directions"] = _directions([cell])
+        row["types"] = _types(cell)
+        row["diversity"] = _diversity(cell)
+        rows.append(row)
+    return rows
+
+
+def _diversity(cell: CellTally) -> float | None:
+    """Variance that the first principal component explains; lower is more diverse."""
+    if not cell.sample:
+        return None
+    parts = [np.concatenate([getattr(part, name) for part in cell.sample]) for name in ("hand_pose", "joint_positions")]
+    explained = explained_variance(Posture(*parts))
+    return _six(explained[0]) if len(explained) else None
+
+
+def _repeated(cell: CellTally) -> int:
+    """Valid grasps that equal an earlier one of the same cell."""
+    prints = np.concatenate([np.empty(0, np.int64), *cell.prints])
+    return len(prints) - len(np.unique(prints))
+
+
+def _most(counts: Mapping[Any, int]) -> Any:
+    return max(counts, key=lambda key: counts[key]) if counts else None
+
+
+def _six(value: float | np.floating[Any] | NDArray[Any]) -> float:
+    """Six significant digits, as JSON shows them."""
+    return float(f"{float(value):.6g}")

@@ -1,0 +1,247 @@
+"""The pictures of a card."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from graspd.service.model.metrics import GRASP_METRICS
+from graspd.studies.cards.tally import Tally, cell_counts
+
+Row = Mapping[str, Any]
+COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
+INK: Final = "#1f2937"
+#: A matrix with more objects is drawn without names and numbers.
+_NAMED: Final = 40
+#: Of more hands only the first get a panel of their own.
+_PANELS: Final = 6
+#: Title, column, and whether a long tail is cut at its 99th percentile.
+_QUALITIES: Final = tuple(
+    (metric.heading, metric.name, metric.plot == "cut") for metric in GRASP_METRICS if metric.plot != "no"
+)
+_DPI: Final = 110
+
+
+def draw(card: Row, tally: Tally, folder: Path) -> dict[str, str]:
+    """Write the plots there is data for.
+
+    Returns:
+        file name -> what it shows, in the order of the card.
+    """
+    plots: tuple[tuple[str, str, Callable[[Row, Tally], Any]], ...] = (
+        ("yield.png", "Valid share of the judged grasps, by hand and object", _yields),
+        ("quality.png", "Distribution of each quality over the valid grasps, by hand", _qualities),
+        ("directions.png", "From where the palm comes, by hand", _directions),
+        ("table.png", "Share of the valid grasps that are clear of the table in one scene at least", _table),
+        ("joints.png", "Range that each joint uses between its limits", _joints),
+        ("sizes.png", "Valid share of the tries against the size of the object", _sizes),
+    )
+    written = {}
+    for name, shows, make in plots:
+        figure = make(card, tally)
+        (folder / name).unlink(missing_ok=True)
+        if figure is not None:
+            figure.savefig(folder / name, dpi=_DPI)
+            written[name] = shows
+    return written
+
+
+def _figure(width: float, height: float) -> Any:
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _hands(card: Row) -> list[str]:
+    return [hand["name"] for hand in card["composition"]["hands"]]
+
+
+def _objects(card: Row) -> list[str]:
+    return [obj["name"] for obj in card["composition"]["objects"]]
+
+
+def _plain(axes: Any, *, grid: str = "both") -> None:
+    axes.grid(alpha=0.25, axis=grid)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _yields(card: Row, tally: Tally) -> Any:
+    hands, objects = _hands(card), _objects(card)
+    shares = np.full((len(objects), len(hands)), np.nan)
+    rows = {(cell["hand"], cell["object"]): cell for cell in card["cells"] if cell["of_judged"] is not None}
+    for (hand, obj), cell in rows.items():
+        shares[objects.index(obj), hands.index(hand)] = cell["of_judged"]
+    if not rows:
+        return None
+    named = len(objects) <= _NAMED
+    figure = _figure(2.6 + 1.25 * len(hands), 1.2 + (0.3 * len(objects) if named else 8))
+    axes = figure.add_subplot()
+    image = axes.imshow(shares, cmap="YlGnBu", vmin=0, vmax=1, aspect="auto", interpolation="nearest")
+    axes.set_xticks(range(len(hands)), hands)
+    axes.set_yticks(range(len(objects)) if named else [], objects if named else [])
+    axes.set_title(f"{card['name']}: valid of judged (grasps)", loc="left", fontsize=10)
+    for (hand, obj), cell in rows.items() if named else ():
+        x, y = hands.index(hand), objects.index(obj)
+        text = f"{100 * cell['of_judged']:.0f} %  ({cell['valid']})"
+        axes.text(x, y, text, ha="center", va="center", fontsize=8, color="white" if cell["of_judged"] > 0.6 else INK)
+    axes.spines[:].set_visible(False)
+    axes.tick_params(length=0)
+    figure.colorbar(image, ax=axes, label="valid of judged", shrink=0.8)
+    return figure
+
+
+def _qualities(card: Row, tally: Tally) -> Any:
+    hands = _hands(card)
+    shown = [entry for entry in _QUALITIES if any(entry[1] in card["quality"][hand] for hand in hands)]
+    if not shown:
+        return None
+    lines = -(-len(shown) // 3)
+    figure = _figure(10, 2.7 * lines + 0.4)
+    panels = list(figure.subplots(lines, 3, squeeze=False).flat)
+    for axes, (title, name, cut) in zip(panels, shown, strict=False):
+        columns = {
+            hand: np.concatenate([np.empty(0, np.float32), *(cell.column(name) for cell in tally.of_hand(hand))])
+            for hand in hands
+        }
+        columns = {hand: values[np.isfinite(values)] for hand, values in columns.items()}
+        every = np.concatenate(list(columns.values()))
+        top = float(np.percentile(every, 99) if cut else every.max()) or 1.0
+        bins = np.linspace(0, top, 41)
+        for number, (hand, values) in enumerate(columns.items()):
+            if len(values):
+                weights = np.full(len(values), 100 / len(values))
+                style = {"color": COLOURS[number % len(COLOURS)], "histtype": "step", "linewidth": 1.5}
+                axes.hist(np.minimum(values, top), bins, weights=weights, label=hand, **style)
+        axes.set_xlabel(f"{title} (last bin: all above)" if cut else title, fontsize=9)
+        axes.tick_params(labelsize=8)
+        _plain(axes)
+    for axes in panels[len(shown) :]:
+        axes.set_visible(False)
+    figure.supylabel("% of the hand's valid grasps", fontsize=9)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=8, frameon=False)
+    return figure
+
+
+def _directions(card: Row, tally: Tally) -> Any:
+    """Above, where palms come from in the object's frame; below, over the table."""
+    hands = [hand for hand in _hands(card) if card["directions"]["by_hand"][hand]][:_PANELS]
+    if not hands:
+        return None
+    with_table = bool(card["elevation"])
+    figure = _figure(max(4.0, 3.6 * len(hands)), 4.9 if with_table else 2.6)
+    grid = figure.add_gridspec(2 if with_table else 1, len(hands), height_ratios=[1, 1.1] if with_table else [1])
+    bands, sectors = 12, 24
+    latitudes = np.arcsin(np.linspace(-1, 1, bands + 1))
+    longitudes = np.linspace(-np.pi, np.pi, sectors + 1)
+    below = None
+    for column, hand in enumerate(hands):
+        axes = figure.add_subplot(grid[0, column], projection="mollweide")
+        vectors = np.concatenate([cell.directions() for cell in tally.of_hand(hand)])
+        density = cell_counts(vectors, bands, sectors) * bands * sectors / len(vectors)
+        mesh = axes.pcolormesh(longitudes, latitudes, density, cmap="magma", vmin=0, vmax=3, rasterized=True)
+        axes.set_xticklabels([])
+        axes.set_yticklabels([])
+        axes.grid(alpha=0.2)
+        axes.set_title(hand, fontsize=10)
+        if with_table and hand in card["elevation"]:
+            below = figure.add_subplot(grid[1, column], sharey=below)
+            _elevations(below, card["elevation"][hand], first=column == 0)
+    figure.colorbar(mesh, ax=figure.axes[-1 if not with_table else -2], shrink=0.7, label="1: even", extend="max")
+    figure.suptitle(
+        "above: in the object's frame, z up; below: over the table", fontsize=9, color=INK, x=0.01, ha="left"
+    )
+    return figure
+
+
+def _elevations(axes: Any, sums: Mapping[str, Sequence[int]], *, first: bool) -> None:
+    edges = np.linspace(-90, 90, len(sums["all"]) + 1)
+    for name, colour, label in (("all", "#cbd5e1", "all pairs"), ("clear", COLOURS[0], "clear of the table")):
+        axes.stairs(sums[name], edges, fill=True, color=colour, label=label)
+    # Of directions drawn evenly on the sphere as many would fall into each bin:
+    even = np.diff(np.sin(np.radians(edges))) / 2 * sum(sums["all"])
+    axes.stairs(even, edges, color=INK, linestyle="--", linewidth=1, label="if even")
+    axes.set_xticks([-90, -45, 0, 45, 90], ["below", "-45°", "side", "45°", "above"], fontsize=8)
+    axes.tick_params(labelsize=8)
+    _plain(axes)
+    if first:
+        axes.set_ylabel("pairs of grasp and scene", fontsize=9)
+        axes.figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=8)
+
+
+def _table(card: Row, tally: Tally) -> Any:
+    hands, objects = _hands(card), _objects(card)
+    rows = [cell for cell in card["cells"] if cell["clear_of_table"] is not None]
+    if not rows:
+        return None
+    order = sorted(objects, key=lambda obj: (card["table"]["by_object"][obj]["of_grasps"] or {"share": 0})["share"])
+    named = len(objects) <= _NAMED
+    figure = _figure(7.5, 1.3 + (0.28 * len(objects) if named else 7))
+    axes = figure.add_subplot()
+    for number, hand in enumerate(hands):
+        own = [cell for cell in rows if cell["hand"] == hand]
+        places = [order.index(cell["object"]) for cell in own]
+        colour = COLOURS[number % len(COLOURS)]
+        axes.scatter([100 * cell["clear_of_table"] for cell in own], places, s=28, color=colour, label=hand, zorder=3)
+    axes.set_yticks(range(len(order)) if named else [], order if named else [], fontsize=8)
+    axes.set_xlim(-0.02 * axes.get_xlim()[1], None)
+    axes.set_xlabel("% of the valid grasps that are clear in one scene at least", fontsize=9)
+    _plain(axes)
+    figure.legend(loc="outside upper right", ncols=8, frameon=False)
+    return figure
+
+
+def _joints(card: Row, tally: Tally) -> Any:
+    hands = [hand for hand in _hands(card) if card["joints"].get(hand)][:_PANELS]
+    if not hands:
+        return None
+    most = max(len(card["joints"][hand]) for hand in hands)
+    figure = _figure(max(5.0, 3.4 * len(hands)), 0.9 + 0.21 * most)
+    panels = figure.subplots(1, len(hands), squeeze=False)[0]
+    for number, (axes, hand) in enumerate(zip(panels, hands, strict=True)):
+        joints = card["joints"][hand]
+        colour = COLOURS[_hands(card).index(hand) % len(COLOURS)]
+        for row, use in enumerate(joints.values()):
+            axes.plot([0, 1], [row, row], color="#e2e8f0", linewidth=5, solid_capstyle="butt")
+            axes.plot([use["p5"], use["p95"]], [row, row], color=colour, linewidth=5, solid_capstyle="butt")
+            axes.plot(use["median"], row, marker="|", color="white", markersize=8, markeredgewidth=2)
+        axes.set_yticks(range(len(joints)), joints, fontsize=7)
+        axes.set_ylim(most - 0.4, -0.6)
+        axes.set_xticks([0, 1], ["lower", "upper"], fontsize=8)
+        axes.set_title(hand, fontsize=10)
+        axes.spines[:].set_visible(False)
+        axes.tick_params(length=0)
+        if number == 0:
+            axes.set_xlabel("90 % of the grasps, with the median", fontsize=8)
+    return figure
+
+
+def _sizes(card: Row, tally: Tally) -> Any:
+    sizes = {obj["name"]: sorted(obj["extents_m"]) for obj in card["composition"]["objects"] if obj["extents_m"]}
+    rows = [cell for cell in card["cells"] if cell["object"] in sizes and cell["of_judged"] is not None]
+    if not rows:
+        return None
+    figure = _figure(9, 3.2)
+    panels = figure.subplots(1, 3, sharey=True)
+    for axes, place, what in zip(panels, range(3), ("smallest", "middle", "largest"), strict=True):
+        for number, hand in enumerate(_hands(card)):
+            own = [cell for cell in rows if cell["hand"] == hand]
+            axes.scatter(
+                [1e3 * sizes[cell["object"]][place] for cell in own],
+                [100 * cell["of_judged"] for cell in own],
+                s=22,
+                color=COLOURS[number % len(COLOURS)],
+                label=hand,
+                alpha=0.85,
+            )
+        axes.set_xlabel(f"{what} extent of the object, mm", fontsize=9)
+        axes.tick_params(labelsize=8)
+        axes.set_xlim(0, None)
+        axes.set_ylim(0, 103)
+        _plain(axes)
+    panels[0].set_ylabel("valid share of the judged, %", fontsize=9)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=8, frameon=False)
+    return figure

@@ -1,0 +1,313 @@
+"""Sums over the shards of a dataset, and directions of approach in cells of equal area. Grasps become a few float32
+columns of a cell, so that millions fit in memory."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.service.model.metrics import BANDS, DIRECTION_CELLS, GRASP_METRICS, SECTORS
+from graspd.service.model.transforms import Floats, quat_rotate
+from graspd.service.store import validity
+from graspd.service.store.manifests import INDEX_THRESHOLD_M
+from graspd.studies.cards.contents import AssetFacts, Contents, Pair, Piece
+from graspd.worker.grasps import Posture
+from graspd.worker.quality.diversity import cells_of
+
+#: Bins between a joint's limits.
+BINS: Final = 200
+
+#: A joint is at a limit where it is nearer than this share of its range.
+_AT: Final = 0.01
+
+
+@dataclass
+class JointUse:
+    """Histograms of the joints of one hand between their limits; joints without known limits are left out."""
+
+    names: tuple[str, ...]
+    lower: Floats
+    upper: Floats
+    counts: NDArray[np.int64]
+    """(J, BINS) grasps."""
+
+    @classmethod
+    def of(cls, names: tuple[str, ...], facts: Mapping[str, Any]) -> JointUse:
+        """Nothing yet, for those joints that the facts of the hand give limits for."""
+        lower, upper = dict(facts.get("lower", {})), dict(facts.get("upper", {}))
+        known = tuple(name for name in names if name in lower and upper[name] > lower[name])
+        return cls(
+            known,
+            np.array([lower[name] for name in known]),
+            np.array([upper[name] for name in known]),
+            np.zeros((len(known), BINS), np.int64),
+        )
+
+    def add(self, names: tuple[str, ...], positions: Floats) -> None:
+        """Grasps (N, joints) of these names; a position outside the limits counts at the limit."""
+        for row, name in enumerate(self.names):
+            if name not in names:
+                continue
+            share = (positions[:, names.index(name)] - self.lower[row]) / (self.upper[row] - self.lower[row])
+            places = np.clip((share * BINS).astype(np.int64), 0, BINS - 1)
+            self.counts[row] += np.bincount(places, minlength=BINS)
+
+    def shares(self) -> dict[str, dict[str, float]]:
+        """Of each joint, as shares of its range: 5, 50 and 95 percentile, what lies between 1 and 99 percent of the
+        grasps (`used`); and the shares of grasps at its lower and upper limit."""
+        found = {}
+        near = max(1, round(_AT * BINS))
+        for name, counts in zip(self.names, self.counts, strict=True):
+            if not (total := int(counts.sum())):
+                continue
+            below = np.cumsum(counts) / total
+            low, p5, middle, p95, high = (
+                (np.searchsorted(below, q) + 0.5) / BINS for q in (0.01, 0.05, 0.5, 0.95, 0.99)
+            )
+            found[name] = {
+                "p5": float(p5),
+                "median": float(middle),
+                "p95": float(p95),
+                "used": float(high - low),
+                "at_lower": float(counts[:near].sum() / total),
+                "at_upper": float(counts[-near:].sum() / total),
+            }
+        return found
+
+
+Array = NDArray[Any]
+Floats32 = NDArray[np.float32]
+#: Grasps of a cell on which its diversity is measured, the first ones.
+SAMPLED: Final = 512
+#: So many arrays of a cell are packed into one.
+_UNPACKED: Final = 16
+#: Grasps that agree in all numbers to so many digits (metres, radians) are counted as one.
+_DIGITS: Final = 6
+
+
+@dataclass
+class CellTally:
+    """Sums of one hand x object. Qualities and directions are of its valid grasps."""
+
+    grasps: int = 0
+    valid: int = 0
+    tried: int = 0
+    judged: int = 0
+    """Tries of shards that a referee judged."""
+    audited: int = 0
+    audit_held: int = 0
+    scenes: int = 0
+    pairs: int = 0
+    clear_pairs: int = 0
+    placed: int = 0
+    """Valid grasps that were carried into scenes."""
+    clear: int = 0
+    """Of these, grasps that are clear of what is around in one scene at least."""
+    pictures: int = 0
+    lift_tested: int = 0
+    """Valid grasps of scenes that were lifted at half the friction too."""
+    lift_hard: int = 0
+    """Of these, grasps that held."""
+    seconds: float = 0.0
+    """Of workers, over all stages."""
+    rejected: Counter[str] = field(default_factory=Counter)
+    """Tries that came to nothing, by reason."""
+    refused: Counter[int] = field(default_factory=Counter)
+    """Pairs by the codes of `grasp/rejection`."""
+    columns: dict[str, list[Floats32]] = field(default_factory=dict)
+    towards: list[Floats32] = field(default_factory=list)
+    """Unit vectors from the object to where the palm comes from, object frame."""
+    prints: list[NDArray[np.int64]] = field(default_factory=list)
+    sample: list[Posture] = field(default_factory=list)
+
+    def pack(self) -> None:
+        """Make one array of those of all shards: thousands of small ones take ten times the memory."""
+        every: list[list[Any]] = [*self.columns.values(), self.towards, self.prints]
+        for parts in every:
+            if len(parts) > _UNPACKED:
+                parts[:] = [np.concatenate(parts)]
+
+    def column(self, name: str) -> Floats32:
+        """All values of a quality; empty if no shard has it."""
+        return np.concatenate(self.columns[name]) if self.columns.get(name) else np.empty(0, np.float32)
+
+    def directions(self) -> Floats32:
+        """(valid, 3) see `towards`; empty if the hand's palm is not known."""
+        return np.concatenate(self.towards) if self.towards else np.empty((0, 3), np.float32)
+
+
+@dataclass
+class Tally:
+    """Sums of a whole dataset."""
+
+    cells: dict[Pair, CellTally] = field(default_factory=dict)
+    joints: dict[str, JointUse] = field(default_factory=dict)
+    elevation: dict[str, dict[str, NDArray[np.int64]]] = field(default_factory=dict)
+    """Of each hand: pairs of all, and those that are clear, by elevation of the palm over the table."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Worker seconds of each kind of shard."""
+    parts: Counter[str] = field(default_factory=Counter)
+    bytes: Counter[str] = field(default_factory=Counter)
+    shards: Counter[str] = field(default_factory=Counter)
+    values: dict[str, Counter[Any]] = field(default_factory=dict)
+    """How many shards say what, of attributes such as method, device, seed."""
+    revisions: dict[str, Counter[int]] = field(default_factory=dict)
+    created: list[str] = field(default_factory=list)
+    """First and last time of a shard, RFC 3339."""
+    threshold_m: Counter[float] = field(default_factory=Counter)
+
+    def of_hand(self, hand: str) -> list[CellTally]:
+        return [cell for (name, _), cell in self.cells.items() if name == hand]
+
+    def of_object(self, obj: str) -> list[CellTally]:
+        return [cell for (_, name), cell in self.cells.items() if name == obj]
+
+
+_ATTRIBUTES: Final = (
+    "method",
+    "fidelity",
+    "seed",
+    "want",
+    "device",
+    "worker",
+    "code_version",
+    "verdict_level",
+    "mu",
+    "source",
+    "verdict_key",
+    "scene",
+)
+
+
+def tally_of(contents: Contents, pieces: Iterable[Piece]) -> Tally:
+    """Add up all pieces; those of a batch must come in the order base, scene, views, as `pieces` gives them."""
+    tally = Tally()
+    valid: dict[str, Array] = {}
+    batch_now: tuple[Pair, int] | None = None
+    for piece in pieces:
+        pair = (piece.file.hand, piece.file.object)
+        if (pair, piece.file.batch) != batch_now:
+            batch_now, valid = (pair, piece.file.batch), {}
+        cell = tally.cells.setdefault(pair, CellTally())
+        _note(tally, cell, piece)
+        hand = contents.hands.get(piece.file.hand, AssetFacts(piece.file.hand))
+        if piece.file.kind == "base":
+            valid[piece.file.id] = _add_base(tally, cell, piece, hand)
+        elif piece.file.kind == "scene":
+            _add_scene(tally, cell, piece, hand, valid)
+        else:
+            cell.pictures += piece.rows
+    return tally
+
+
+def _note(tally: Tally, cell: CellTally, piece: Piece) -> None:
+    """What does not depend on the kind of shard."""
+    kind = piece.file.kind
+    tally.shards[kind] += 1
+    tally.bytes[kind] += piece.size_bytes
+    if "seconds" in piece.said:
+        tally.seconds[kind] = tally.seconds.get(kind, 0.0) + float(piece.said["seconds"])
+        cell.seconds += float(piece.said["seconds"])
+    for name in _ATTRIBUTES:
+        if (value := piece.said.get(name)) not in (None, ""):
+            tally.values.setdefault(name, Counter())[value] += 1
+    if piece.revision is not None:
+        tally.revisions.setdefault(kind, Counter())[piece.revision] += 1
+    if created := piece.said.get("created"):
+        tally.created = [min([*tally.created[:1], created]), max([*tally.created[1:], created])]
+    for name, value in piece.info.items():
+        if name.endswith("_seconds"):
+            tally.parts[name.removesuffix("_seconds")] += value
+
+
+def _add_base(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts) -> Array:
+    """Add a base shard; returns its mask (N,) of valid grasps."""
+    columns = piece.columns
+    valid = validity.valid(columns)
+    cell.grasps += piece.rows
+    cell.valid += int(valid.sum())
+    tried = int(piece.said.get("tried", piece.rows))
+    cell.tried += tried
+    if validity.judged(columns).any() or (not piece.rows and piece.said.get("verdict_level", "none") != "none"):
+        cell.judged += tried
+    cell.rejected.update({str(why): int(count) for why, count in dict(piece.info.get("rejected", {})).items()})
+    if (audit := columns.get("quality/audit")) is not None:
+        cell.audited += int(np.count_nonzero(audit[valid] >= 0))
+        cell.audit_held += int(np.count_nonzero(audit[valid] == 1))
+    if (hard := columns.get("quality/lift_hard")) is not None:
+        cell.lift_tested += int(np.count_nonzero(hard[valid] >= 0))
+        cell.lift_hard += int(np.count_nonzero(hard[valid] == 1))
+    thresholds = np.asarray(columns["quality/thresholds_m"], float)
+    at = int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))
+    tally.threshold_m[float(thresholds[at])] += 1
+    for metric in GRASP_METRICS:
+        if (values := columns.get(metric.path)) is not None:
+            kept = (values[:, at] if metric.swept else values)[valid].astype(np.float32)
+            cell.columns.setdefault(metric.name, []).append(kept)
+    _add_postures(tally, cell, piece, hand, valid)
+    cell.pack()
+    return valid
+
+
+def _add_postures(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts, valid: Array) -> None:
+    pose = np.asarray(piece.columns["grasp/hand_pose"], float)[valid]
+    joints = np.asarray(piece.columns["grasp/joint_positions"], float)[valid]
+    if (approach := hand.facts.get("palm_approach")) is not None:
+        cell.towards.append(-quat_rotate(pose[:, 3:], np.asarray(approach, float)).astype(np.float32))
+    rounded = np.round(np.hstack([pose, joints]), _DIGITS) + 0.0  # no minus zero
+    cell.prints.append(np.fromiter((hash(row.tobytes()) for row in rounded), np.int64, len(rounded)))
+    held = sum(len(part) for part in cell.sample)
+    if held < SAMPLED and len(pose):
+        cell.sample.append(Posture(pose[: SAMPLED - held], joints[: SAMPLED - held]))
+    if names := piece.said.get("joint_names"):
+        use = tally.joints.setdefault(piece.file.hand, JointUse.of(tuple(names), hand.facts))
+        use.add(tuple(names), joints)
+
+
+def _add_scene(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts, valid: Mapping[str, Array]) -> None:
+    columns = piece.columns
+    cell.scenes += len(columns["scene/object_pose"])
+    index = np.asarray(columns["grasp/base_index"])
+    mask = valid.get(str(piece.said.get("base_shard", "")))
+    good = np.ones(len(index), bool) if mask is None else mask[index]
+    clear = (columns["grasp/valid"] == 1) & good
+    cell.pairs += int(good.sum())
+    cell.clear_pairs += int(clear.sum())
+    cell.placed += len(np.unique(index[good]))
+    cell.clear += len(np.unique(index[clear]))
+    if (why := columns.get("grasp/rejection")) is not None:
+        codes, counts = np.unique(why[good], return_counts=True)
+        cell.refused.update({int(code): int(count) for code, count in zip(codes, counts, strict=True)})
+    if (approach := hand.facts.get("palm_approach")) is None:
+        return
+    quaternions = np.asarray(columns["grasp/hand_pose"], float)[:, 3:]
+    towards = -quat_rotate(quaternions, np.asarray(approach, float))
+    sums = tally.elevation.setdefault(
+        piece.file.hand, {name: np.zeros(ELEVATION_BINS, np.int64) for name in ("all", "clear")}
+    )
+    sums["all"] += elevations(towards[good])
+    sums["clear"] += elevations(towards[clear])
+
+
+#: Fewer grasps leave cells empty by chance: with this many uniform ones e^-5 of a cell, 0.3 of all 48.
+ENOUGH: Final = 5 * DIRECTION_CELLS
+#: Elevations from -90 to 90 degrees.
+ELEVATION_BINS: Final = 36
+
+
+def cell_counts(directions: NDArray[Any], bands: int = BANDS, sectors: int = SECTORS) -> NDArray[np.int64]:
+    """(bands, sectors) how many unit vectors (N, 3) point into each cell; band 0 is the lowest, sector 0 begins at
+    azimuth -180 degrees."""
+    cells = cells_of(np.asarray(directions).reshape(-1, 3), bands, sectors)
+    return np.bincount(cells, minlength=bands * sectors).reshape(bands, sectors)
+
+
+def elevations(directions: NDArray[Any]) -> NDArray[np.int64]:
+    """(ELEVATION_BINS,) unit vectors (N, 3) by their angle over the horizontal."""
+    degrees = np.degrees(np.arcsin(np.clip(directions[:, 2], -1.0, 1.0)))
+    return np.histogram(degrees, bins=ELEVATION_BINS, range=(-90, 90))[0].astype(np.int64)

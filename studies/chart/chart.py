@@ -1,0 +1,184 @@
+"""The run of a chart: settings from names on the command line, each on every pair, repeats in turn."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import warp as wp
+
+from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import InputError
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.studies.bench import device_name
+from graspd.studies.chart.statistics import figures, plain, summed
+from graspd.studies.chart.trials import FRICTION, THRESHOLD_M, Setting, Trial
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners import method, planner
+from graspd.worker.run import Run
+from graspd.worker.validation.decomposition import decompose
+
+Say = Callable[[str], None]
+
+#: Error bound of the object that all settings are measured and judged on [m]: what a coarser mesh costs is seen.
+TRUE_ERROR_M: Final = FIDELITIES["standard"].face_error_m
+
+
+@dataclass(frozen=True)
+class Thing:
+    """An object to be loaded at the error bound [m] that a fidelity asks for."""
+
+    name: str
+    load: Callable[[float], ObjectModel]
+
+
+def chart(
+    hands: Sequence[HandModel],
+    things: Sequence[Thing],
+    settings: Sequence[Setting],
+    *,
+    repeats: int,
+    models: int,
+    say: Say = lambda line: None,
+    keep: Callable[[dict[str, Any]], None] = lambda result: None,
+) -> dict[str, Any]:
+    """Run everything.
+
+    Args:
+        hands: the hands.
+        things: the objects.
+        settings: what to compare.
+        repeats: timed calls of each setting on each pair.
+        models: around the nominal one, in which each grasp that holds is judged.
+        say: told of each cell as it ends.
+        keep: given the result so far after each pair.
+
+    Returns:
+        `runs[]` with the keys of the command line's contract, `summary[]` over hands and objects, `by_hand` over each
+        hand's objects, `device`, `created`.
+    """
+    runs: list[dict[str, Any]] = []
+    for thing in things:
+        for hand in hands:
+            true = thing.load(TRUE_ERROR_M)
+            pieces = decompose(true)
+            cells = [Trial(s, hand, thing.load(s.knobs.face_error_m), true, pieces) for s in settings]
+            for cell in cells:
+                cell.warm_up()
+            for _ in range(repeats):
+                for cell in cells:
+                    cell.repeat()
+                    cell.time_first(cell.setting.run.cores)
+            for cell in cells:
+                cell.scrutinise(models)
+                runs.append(_row(cell, hand, thing))
+                say(_line(runs[-1]))
+            keep(_result(runs, settings, models))
+    return _result(runs, settings, models)
+
+
+def _result(runs: Sequence[dict[str, Any]], settings: Sequence[Setting], models: int) -> dict[str, Any]:
+    return {
+        "created": timestamp(),
+        "device": device_name(settings[0].run.device),
+        "versions": {"graspd": PACKAGE_VERSION, "warp": wp.config.version},
+        "threads": settings[0].run.cores,
+        "referee": {"protocol": "dexgraspbench", "level": "certificate"},
+        "models": models,
+        "friction": FRICTION,
+        "threshold_m": THRESHOLD_M,
+        "runs": list(runs),
+        "summary": summed(runs),
+        "by_hand": {hand: summed(own) for hand, own in _of_hands(runs).items()},
+    }
+
+
+def _of_hands(runs: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    return {hand: [run for run in runs if run["hand"] == hand] for hand in dict.fromkeys(run["hand"] for run in runs)}
+
+
+def _row(cell: Trial, hand: HandModel, thing: Thing) -> dict[str, Any]:
+    setting = cell.setting
+    return {
+        "method": setting.method,
+        "fidelity": setting.fidelity,
+        "hand": hand.name,
+        "object": thing.name,
+        "options": dict(setting.options),
+        **figures(cell),
+        "best": {key: plain(value) for key, value in cell.best().items()},
+    }
+
+
+def _line(run: dict[str, Any]) -> str:
+    return (
+        f"{run['method']:11s} {run['fidelity']:13s} {run['hand']:18s} {run['object']:20s} "
+        f"{run['end_to_end_per_second']:8.3f} valid/s  letter {run['letter']:.2f}  hard {run['hard']:.2f}  "
+        f"eps {run['epsilon']:.3f}  PD {run['pd_mm']:.2f} mm"
+    )
+
+
+#: Label of methods that know no fidelities: they run as their source has them.
+LABEL: Final = "as published"
+
+_VARIANT: Final = re.compile(r"([^:@]+)(?::([\w.]+=[\w.]+(?:\+[\w.]+=[\w.]+)*))?(?:@([1-9]\d{0,3}))?")
+
+
+def settings_of(
+    methods: Sequence[str],
+    fidelities: Sequence[str],
+    *,
+    batches: Sequence[int],
+    peer_batch: int,
+    options: Sequence[str],
+    quick: bool,
+    run: Run,
+) -> list[Setting]:
+    """A setting for every method, fidelity and batch; methods without fidelities have one each.
+
+    Those with a budget of steps take seconds a grasp and get `peer_batch` grasps per call, the others the first batch.
+
+    Raises:
+        InputError: unknown method, or an option that is not of one of them.
+    """
+    variants = [_variant(text) for text in methods]
+    given = _options_of(options, [name for name, _, _ in variants])
+    found: list[Setting] = []
+    for name, changes, size_given in variants:
+        known = method(name)
+        own = {**(known.quick if quick else {}), **given.get(name, {}), **changes}
+        planner(name, own)
+        common: dict[str, Any] = {"options": own, "warm": known.quick, "run": run}
+        if known.has_fidelities:
+            found += [Setting(name, f, FIDELITIES[f], batch=b, **common) for f in fidelities for b in batches]
+        else:
+            size = peer_batch if "steps" in known.options.model_fields else batches[0]
+            label = " ".join(f"{key}={value}" for key, value in changes.items()) or LABEL
+            found.append(Setting(name, label, FIDELITIES["standard"], batch=size_given or size, **common))
+    return found
+
+
+def _variant(text: str) -> tuple[str, dict[str, str], int | None]:
+    """`graspit:keep=20@40` as name, options and grasps per call; a plain name has neither of the last two."""
+    found = _VARIANT.fullmatch(text)
+    if found is None:
+        raise InputError(f"{text!r} is no method; write NAME, NAME:OPTION=VALUE or NAME:OPTION=VALUE@GRASPS_PER_CALL")
+    name, options, size = found.groups()
+    changes = dict(part.split("=", 1) for part in options.split("+")) if options else {}
+    return name, changes, int(size) if size else None
+
+
+def _options_of(texts: Sequence[str], methods: Sequence[str]) -> Mapping[str, dict[str, str]]:
+    """`METHOD:NAME=VALUE` by method."""
+    found: dict[str, dict[str, str]] = {}
+    for text in texts:
+        name, colon, rest = text.partition(":")
+        option, equals, value = rest.partition("=")
+        if not colon or not equals or name not in methods:
+            raise InputError(f"--option {text!r}: write METHOD:NAME=VALUE with one of {', '.join(methods)}")
+        found.setdefault(name, {})[option] = value
+    return found

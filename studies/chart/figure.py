@@ -1,0 +1,452 @@
+"""The chart's pictures: accuracy over speed with bars, labels and Pareto front, over all and for each hand; knobs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.studies.chart.statistics import most_valid
+
+Row = Mapping[str, Any]
+
+#: Title and key of the accuracies over speed.
+PANELS: Final = (
+    ("Success by the letter", "letter"),
+    ("Success at half the friction", "hard"),
+    ("Robust share of those that hold", "robust"),
+    ("ε (median)", "epsilon"),
+    ("Penetration, mm (median; less is better)", "pd_mm"),
+)
+IN_SCENES: Final = (
+    ("Lifted, share of all tries", "lift"),
+    ("Lifted by the letter", "lift_letter"),
+    ("Lifted at half the friction", "lift_hard"),
+    ("Robust share of those lifted", "robust"),
+)
+SPEED: Final = "end_to_end_per_second"
+#: Shares.
+OF_ONE: Final = frozenset({"letter", "hard", "robust", "lift", "lift_letter", "lift_hard"})
+COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
+MARKERS: Final = ("o", "s", "D", "^", "v", "P", "X", "<")
+INK: Final = "#1f2937"
+
+
+def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
+    """Accuracies over valid grasps per second, and success over the seconds to the first valid grasp."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(15.5, 8.6), layout="constrained")
+    panels = figure.subplots(2, 3)
+    styles, words = _styles(rows), "valid grasps per second, end to end"
+    labels = []
+    for axes, (title, key) in zip(panels.flat[:5], PANELS, strict=True):
+        labels += _over_speed(axes, rows, styles, key, title, words, SPEED)
+    last, timed = panels.flat[5], [row for row in rows if row["seconds_to_first_valid"]]
+    labels += _panel(last, timed, styles, x="seconds_to_first_valid", y="letter")
+    last.set_xlabel("seconds to the first valid grasp, end to end (less is better)")
+    last.set_title("Success by the letter", loc="left", fontsize=11)
+    last.set_ylim(-0.07, 1.04)
+    figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
+    _save(figure, labels, files)
+
+
+def draw_hands(
+    by_hand: Mapping[str, Sequence[Row]],
+    files: Sequence[Path],
+    *,
+    key: str,
+    speed: str,
+    words: tuple[str, str],
+    label: Callable[[Row, Sequence[Row]], str] | None = None,
+) -> None:
+    """A panel for each hand: one accuracy over speed, both in words; `label` gives a point's word."""
+    from matplotlib.figure import Figure
+
+    columns = min(3, len(by_hand))
+    lines = -(-len(by_hand) // columns)
+    figure = Figure(figsize=(5.4 * max(columns, 2), 4.6 * lines), layout="constrained")
+    panels = figure.subplots(lines, columns, squeeze=False)
+    styles = _styles([row for rows in by_hand.values() for row in rows])
+    labels = []
+    for axes, (hand, rows) in zip(panels.flat, by_hand.items(), strict=False):
+        labels += _over_speed(axes, rows, styles, key, hand, words[1], speed, label=label)
+    for axes in panels.flat[len(by_hand) :]:
+        axes.set_visible(False)
+    figure.supylabel(words[0], fontsize=10)
+    figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    _save(figure, labels, files)
+
+
+def _save(figure: Any, labels: Sequence[Label], files: Sequence[Path]) -> None:
+    place(figure, labels)
+    for file in files:
+        figure.savefig(file, dpi=150)
+
+
+def _over_speed(
+    axes: Any,
+    rows: Sequence[Row],
+    styles: Mapping[str, tuple[str, str]],
+    key: str,
+    title: str,
+    words: str,
+    speed: str,
+    label: Callable[[Row, Sequence[Row]], str] | None = None,
+) -> list[Label]:
+    """One accuracy over a speed, with the front; the words that belong to it."""
+    known = [row for row in rows if row[key] is not None]
+    labels = _panel(axes, known, styles, x=speed, y=key, label=label)
+    _front(axes, known, key, speed)
+    axes.set_xlabel(words)
+    axes.set_title(title, loc="left", fontsize=11)
+    if key in OF_ONE:
+        axes.set_ylim(-0.07, 1.07)
+    return labels
+
+
+def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> None:
+    """Shares of tries over lifted grasps per second, and what is lifted over the seconds to the first.
+
+    Args:
+        second: what a second is called.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(15.5, 8.6), layout="constrained")
+    panels = figure.subplots(2, 3)
+    styles = _styles(rows)
+    words = f"lifted grasps per {second}, end to end"
+    labels = []
+    for axes, (title, key) in zip(panels.flat[:4], IN_SCENES, strict=True):
+        labels += _over_speed(axes, rows, styles, key, title, words, SPEED, label=one_of_several)
+    timed = [row for row in rows if row["seconds_to_first"]]
+    last = panels.flat[4]
+    labels += _panel(last, timed, styles, x="seconds_to_first", y="lift", label=one_of_several)
+    last.set_xlabel(f"{second}s to the first that is lifted (less is better)")
+    last.set_title("Lifted; of those that lift in every pair", loc="left", fontsize=11)
+    last.set_ylim(-0.07, 1.07)
+    panels.flat[5].set_visible(False)
+    figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    _save(figure, labels, files)
+
+
+def _styles(rows: Sequence[Row]) -> dict[str, tuple[str, str]]:
+    """Colour and marker of each method; its fidelities share them."""
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    return {m: (COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]) for i, m in enumerate(methods)}
+
+
+def _panel(
+    axes: Any,
+    rows: Sequence[Row],
+    styles: Mapping[str, tuple[str, str]],
+    *,
+    x: str,
+    y: str,
+    label: Callable[[Row, Sequence[Row]], str] | None = None,
+) -> list[Label]:
+    """The points; the words that belong to them."""
+    shown: set[str] = set()
+    labels = []
+    for row in rows:
+        colour, marker = styles[row["method"]]
+        # None valid: at the most there can be, hollow, with an arrow to where it may lie.
+        none = not row[x]
+        at = most_valid(row) if none else row[x]
+        bars: dict[str, Any] = {
+            f"{axis}err": _error(row, key) for axis, key in (("x", x), ("y", y)) if f"{key}_low" in row
+        }
+        if none:
+            bars |= {"xerr": [[0.55 * at], [0.0]], "xuplims": True}
+        axes.errorbar(
+            at,
+            row[y],
+            **bars,
+            fmt=marker,
+            color=colour,
+            ecolor=colour,
+            elinewidth=1,
+            capsize=2,
+            markersize=7,
+            markeredgecolor=colour if none else "white",
+            markerfacecolor="white" if none else colour,
+            label=None if row["method"] in shown else row["method"],
+            zorder=3,
+        )
+        shown.add(row["method"])
+        text = (label or _label)(row, rows)
+        words = ", ".join(filter(None, (text, f"0 of {row['grasps']}" * none)))
+        ends = {f"{axis}_bar": _ends(row, key) for axis, key in (("x", x), ("y", y)) if not (none and axis == "x")}
+        labels.append(Label(axes, at, row[y], words, colour, **({"x_bar": (0.45 * at, at)} if none else {}), **ends))
+    _logarithmic(axes, [label.x * (0.5 if "0 of" in label.text else 1.0) for label in labels])
+    top = max([row[f"{y}_high"] for row in rows] or [1.0])
+    axes.set_ylim(-0.09 * top, 1.08 * top)
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+    return labels
+
+
+def _ends(row: Row, key: str) -> tuple[float, float] | None:
+    return (row[f"{key}_low"], row[f"{key}_high"]) if f"{key}_low" in row else None
+
+
+def _logarithmic(axes: Any, values: Sequence[float]) -> None:
+    """A logarithmic axis of at least a decade, with plain numbers, and room for a label on the right."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.set_xscale("log")
+    low, high = min(values, default=1.0), max(values, default=1.0)
+    wider = max(1.0, (10 / (high / low)) ** 0.5)
+    axes.set_xlim(low / wider / 1.4, high * wider * 2.2)
+    # Over four decades the numbers between would stand on each other.
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 1e3 * low else (1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _error(row: Row, key: str) -> list[list[float]]:
+    return [[max(0.0, row[key] - row[f"{key}_low"])], [max(0.0, row[f"{key}_high"] - row[key])]]
+
+
+def _label(row: Row, rows: Sequence[Row]) -> str:
+    """The fidelity, with the batch where there are several; the method's own name where it has one setting."""
+    own = [r for r in rows if r["method"] == row["method"]]
+    if len(own) == 1:
+        return str(row["method"])
+    several = len({r["batch"] for r in own}) > 1
+    return f"{row['fidelity']}, {row['batch']}" if several else str(row["fidelity"])
+
+
+def one_of_several(row: Row, rows: Sequence[Row]) -> str:
+    """The fidelity where a method has several; the legend names the others."""
+    return str(row["fidelity"]) if sum(r["method"] == row["method"] for r in rows) > 1 else ""
+
+
+def _front(axes: Any, rows: Sequence[Row], key: str, speed: str) -> None:
+    front = sorted((r for r in rows if key in r["front"] and r[speed]), key=lambda r: r[speed])
+    axes.step(
+        [r[speed] for r in front],
+        [r[key] for r in front],
+        where="pre",
+        color=INK,
+        linewidth=1,
+        linestyle="--",
+        alpha=0.6,
+        zorder=1,
+        label="Pareto front",
+    )
+
+
+def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
+    """A panel per knob: success over speed, a point per value."""
+    from matplotlib.figure import Figure
+
+    knobs = list(dict.fromkeys(row["knob"] for row in rows))
+    columns = 3
+    lines = -(-len(knobs) // columns)
+    figure = Figure(figsize=(11, 3.1 * lines), layout="constrained")
+    panels = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
+    labels = []
+    for axes, knob in zip(panels.flat, knobs, strict=False):
+        own = sorted((r for r in rows if r["knob"] == knob), key=lambda r: r["speedup"])
+        axes.plot([r["speedup"] for r in own], [r["gsr"] for r in own], color=COLOURS[0], alpha=0.4)
+        for row in own:
+            axes.errorbar(
+                row["speedup"],
+                row["gsr"],
+                yerr=_error(row, "gsr"),
+                fmt="o",
+                color=COLOURS[0],
+                capsize=2,
+                elinewidth=1,
+                markerfacecolor=COLOURS[0] if row["default"] else "white",
+                markersize=6,
+            )
+            labels.append(Label(axes, row["speedup"], row["gsr"], str(row["value"]), INK, y_bar=_ends(row, "gsr")))
+        axes.set_title(knob, loc="left", fontsize=10)
+        axes.set_ylim(0, 1.05)
+        axes.grid(alpha=0.25)
+        axes.spines[["top", "right"]].set_visible(False)
+    for axes in panels.flat[len(knobs) :]:
+        axes.set_visible(False)
+    # From zero, and alike in all panels: a difference looks as large as it is.
+    panels.flat[0].set_xlim(0, 1.35 * max(row["speedup"] for row in rows))
+    for axes in panels.flat[len(knobs) - columns : len(knobs)]:
+        axes.tick_params(labelbottom=True)
+    figure.supxlabel("speed against the default (full marker)", fontsize=10)
+    figure.supylabel("success in MuJoCo", fontsize=10)
+    _save(figure, labels, [file])
+
+
+Boxes = NDArray[np.float64]
+
+SIZE_PT: Final = 8
+#: Distances of a word from its point [pt], the wanted one first: from the third on a line leads to it.
+_REACHES_PT: Final = (8.0, 15.0, 26.0, 38.0, 52.0)
+#: Directions from the point, the wanted ones first [degrees].
+_TURNS: Final = (30, -30, 150, -150, 90, -90, 0, 180, 60, -60, 120, -120)
+#: Half of a marker's width [pt], and half of a bar's.
+_MARKER_PT: Final = 5.5
+_BAR_PT: Final = 1.5
+#: What a covered share of a word costs: by another word or a point, by a bar, outside of the panel.
+_COVERED, _CROSSED, _OUTSIDE = 100.0, 8.0, 200.0
+#: What it costs to be farther away by a reach, to be nearer to another point, and to take the next direction.
+_FARTHER, _TAKEN, _TURNED = 1.0, 2.5, 0.05
+_ROUNDS: Final = 6
+
+
+@dataclass(frozen=True)
+class Label:
+    """A word at a point of a panel."""
+
+    axes: Any
+    x: float
+    y: float
+    text: str
+    colour: str
+    x_bar: tuple[float, float] | None = None
+    """Ends of the point's bars."""
+    y_bar: tuple[float, float] | None = None
+
+
+def place(figure: Any, labels: Sequence[Label]) -> list[Any]:
+    """Put the words of all panels into a figure that has everything else; the annotations that it got."""
+    figure.draw_without_rendering()
+    made = []
+    for axes in dict.fromkeys(label.axes for label in labels):
+        made += _place(axes, figure.dpi / 72.0, [label for label in labels if label.axes is axes])
+    return made
+
+
+def _place(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
+    points = axes.transData.transform([(label.x, label.y) for label in labels])
+    markers = np.hstack([points - _MARKER_PT * pixels, points + _MARKER_PT * pixels])
+    bars = _bars(axes, labels, _BAR_PT * pixels)
+    panel = axes.get_window_extent()
+    inside = np.array([panel.x0, panel.y0, panel.x1, panel.y1])
+    worded = [index for index, label in enumerate(labels) if label.text]
+    offered = {index: _candidates(points[index], _size(axes, labels[index].text), pixels) for index in worded}
+    fixed = {index: _fixed_costs(offered[index], points, index, bars, inside) for index in worded}
+    chosen = dict.fromkeys(worded, 0)
+    # Each in turn takes the best place beside the present ones of the others, until none moves.
+    for _ in range(_ROUNDS):
+        before = dict(chosen)
+        for index in worded:
+            solid = np.vstack([markers, *(offered[other][chosen[other]] for other in worded if other != index)])
+            costs = [_COVERED * _share(box, solid) for box in offered[index]]
+            chosen[index] = int(np.argmin(np.array(costs) + fixed[index]))
+        if chosen == before:
+            break
+    return [
+        _write(
+            axes,
+            labels[index],
+            points[index],
+            offered[index][at],
+            pixels,
+            led=_is_led(offered[index][at], points, index, at),
+        )
+        for index, at in chosen.items()
+    ]
+
+
+def _fixed_costs(boxes: Sequence[Boxes], points: Boxes, own: int, bars: Boxes, inside: Boxes) -> Boxes:
+    """What the places of a word cost wherever the other words stand."""
+    return np.array(
+        [
+            _CROSSED * _share(box, bars)
+            + _OUTSIDE * (1.0 - _share(box, inside[None]))
+            + _FARTHER * (at // len(_TURNS))
+            + _TURNED * (at % len(_TURNS))
+            + _TAKEN * _is_nearer_to_another(box, points, own)
+            for at, box in enumerate(boxes)
+        ]
+    )
+
+
+def _is_nearer_to_another(box: Boxes, points: Boxes, own: int) -> bool:
+    away = np.linalg.norm(points - np.clip(points, box[:2], box[2:]), axis=1)
+    return bool(np.any(np.delete(away, own) < away[own]))
+
+
+def _is_led(box: Boxes, points: Boxes, own: int, at: int) -> bool:
+    """Whether a line leads to a word: without it nobody would know whose it is."""
+    return at // len(_TURNS) > 1 or _is_nearer_to_another(box, points, own)
+
+
+def _write(axes: Any, label: Label, point: Boxes, box: Boxes, pixels: float, *, led: bool) -> Any:
+    from matplotlib.patheffects import withStroke
+
+    offset = (box[:2] - point) / pixels
+    line = {"arrowstyle": "-", "color": label.colour, "linewidth": 0.6, "alpha": 0.7, "shrinkA": 0, "shrinkB": 4}
+    note = axes.annotate(
+        label.text,
+        (label.x, label.y),
+        xytext=offset,
+        textcoords="offset points",
+        fontsize=SIZE_PT,
+        color=label.colour,
+        ha="left",
+        va="bottom",
+        zorder=4,
+        arrowprops=line if led else None,
+        annotation_clip=False,
+        path_effects=[withStroke(linewidth=2, foreground="white")],
+    )
+    # The layout was made without it: a word must not move the panels under the others.
+    note.set_in_layout(False)
+    return note
+
+
+def _size(axes: Any, text: str) -> tuple[float, float]:
+    """Width and height of a word [px]."""
+    sample = axes.annotate(text, (0.5, 0.5), xycoords="axes fraction", fontsize=SIZE_PT)
+    extent = sample.get_window_extent()
+    sample.remove()
+    return float(extent.width), float(extent.height)
+
+
+def _candidates(point: Boxes, size: tuple[float, float], pixels: float) -> list[Boxes]:
+    """Boxes around the point, (4,) each: left, bottom, right, top [px]; the wanted ones first."""
+    found = []
+    for reach, turn in product(_REACHES_PT, _TURNS):
+        across, up = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+        corner = point + reach * pixels * np.array([across, up])
+        # The word's nearest corner or side is at that place.
+        left = corner[0] - size[0] * (0.5 - 0.5 * _side(across))
+        bottom = corner[1] - size[1] * (0.5 - 0.5 * _side(up))
+        found.append(np.array([left, bottom, left + size[0], bottom + size[1]]))
+    return found
+
+
+def _side(part: float) -> float:
+    return 0.0 if abs(part) < 0.2 else math.copysign(1.0, part)
+
+
+def _bars(axes: Any, labels: Sequence[Label], half: float) -> Boxes:
+    """The bars of the points as boxes (N, 4) [px]."""
+    ends = [((low, label.y), (high, label.y)) for label in labels if label.x_bar for low, high in [label.x_bar]]
+    ends += [((label.x, low), (label.x, high)) for label in labels if label.y_bar for low, high in [label.y_bar]]
+    if not ends:
+        return np.empty((0, 4))
+    least = axes.get_xlim()[0]
+    seen = [[(max(x, least), y) for x, y in pair] for pair in ends]
+    corners = axes.transData.transform(np.reshape(seen, (-1, 2))).reshape(-1, 4)
+    return np.hstack([corners[:, :2] - half, corners[:, 2:] + half])
+
+
+def _share(box: Boxes, boxes: Boxes) -> float:
+    """How much of a box others cover; where they overlap it counts for each of them."""
+    if not len(boxes):
+        return 0.0
+    across = np.minimum(box[2], boxes[:, 2]) - np.maximum(box[0], boxes[:, 0])
+    up = np.minimum(box[3], boxes[:, 3]) - np.maximum(box[1], boxes[:, 1])
+    area = (box[2] - box[0]) * (box[3] - box[1])
+    return float((np.clip(across, 0, None) * np.clip(up, 0, None)).sum() / area)

@@ -1,0 +1,330 @@
+"""Grasps planned in a scene against grasps planned around a free object, put into the same scene and filtered.
+
+A setting of a method that plans in scenes is run both ways, others only the second. Grasp i is tried in scene i of the
+object's stable faces in turn, whichever way it was planned, and judged alike: clear on its way, lifted, lifted by the
+letter, at half the friction, and in models around the nominal one. Speed is lifted grasps over seconds, on a CPU those
+of all cores together, which do not follow what else the machine does: of planner and postures alone, and end to end,
+with way, referee and the metrics of what is lifted.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.service.model.clock import timestamp
+from graspd.service.model.digests import digest_json
+from graspd.service.model.errors import InputError
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.studies import FILTERED, IN_SCENE
+from graspd.service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
+from graspd.studies.bench import device_name
+from graspd.studies.chart.chart import TRUE_ERROR_M, Thing
+from graspd.studies.chart.statistics import first_valid, pareto, plain
+from graspd.studies.chart.trials import FRICTION, MODELS_SEED, SEED, WARM_SEED, Setting
+from graspd.studies.clock import clock_of
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners import Trial, Wanted, method, synthesize
+from graspd.worker.quality.intervals import wilson, wilson_of_mean
+from graspd.worker.quality.table import measure
+from graspd.worker.scenes.kinds import rest_poses, supports_of
+from graspd.worker.scenes.trial import lift_trial
+from graspd.worker.scenes.way import plan_way
+from graspd.worker.simulation.surroundings import Placed, Scenes
+from graspd.worker.validation.decomposition import ConvexPieces, decompose
+from graspd.worker.validation.lifting import judge_lifts
+from graspd.worker.validation.robust import robust
+
+Row = dict[str, Any]
+Say = Callable[[str], None]
+
+#: Shares of all tries, by their column.
+SHARES: Final = ("clear", "lift", "lift_letter", "lift_hard")
+#: Accuracies that have a front.
+ACCURACIES: Final = ("lift", "lift_letter", "lift_hard", "robust")
+SPEEDS: Final = (("valid_per_second", "seconds"), ("end_to_end_per_second", "end_seconds"))
+#: Raise when a row has other columns: what is kept then begins anew.
+FORM: Final = 2
+#: Raw grasps per second, by the speed that counts those lifted.
+RAW: Final = {"valid_per_second": "grasps_per_second", "end_to_end_per_second": "raw_end_to_end_per_second"}
+#: A grasp that takes longer is not made once more to time the first one [s].
+_SHORT_S: Final = 1.0
+_NOTHING: Final = {**{f"{name}_count": 0 for name in SHARES}, "robust_sum": 0.0, "first_seconds": 0.0}
+
+
+@dataclass
+class Place:
+    """An object in its scenes, which are made when the first setting that is not kept is tried."""
+
+    thing: Thing
+    spec: SceneSpec
+
+    @cached_property
+    def true(self) -> ObjectModel:
+        """As the judge sees it: the same for all settings."""
+        return self.thing.load(TRUE_ERROR_M)
+
+    @cached_property
+    def pieces(self) -> ConvexPieces:
+        return decompose(self.true)
+
+    @cached_property
+    def scenes(self) -> Scenes:
+        poses = rest_poses(self.spec, self.true, count=4, seed=SEED)["scene/object_pose"]
+        return Scenes(supports_of(self.spec), poses)
+
+
+def scene_chart(
+    hands: Sequence[HandModel],
+    things: Sequence[Thing],
+    settings: Sequence[Setting],
+    spec: SceneSpec,
+    *,
+    models: int,
+    work: Path | None = None,
+    say: Say = lambda line: None,
+    keep: Callable[[Row], None] = lambda result: None,
+) -> Row:
+    """Run everything.
+
+    Args:
+        hands: the hands.
+        things: the objects.
+        settings: what to compare; a setting's `batch` is the number of its grasps on each pair.
+        spec: the scene.
+        models: around the nominal one, in which each grasp that is lifted is lifted again.
+        work: folder that keeps what each setting found on each pair; a run that was stopped goes on there.
+        say: told of each cell as it ends.
+        keep: given the result so far after each pair.
+
+    Returns:
+        `runs[]` of one setting on one pair each, `summary[]` over the pairs, `by_hand`, `device`, `created`.
+    """
+    runs: list[Row] = []
+    for thing in things:
+        place = Place(thing, spec)
+        for hand in hands:
+            for setting, way in _ways(settings):
+                runs.append(_kept(setting, way, hand, place, models, work))
+                say(_line(runs[-1]))
+            keep(_result(runs, settings, spec, models))
+    return _result(runs, settings, spec, models)
+
+
+def _ways(settings: Sequence[Setting]) -> list[tuple[Setting, str]]:
+    """Each setting with the ways in which it plans."""
+    found = []
+    for setting in settings:
+        able = method(setting.method).in_scenes
+        found += [(setting, way) for way in (IN_SCENE, FILTERED) if able or way == FILTERED]
+    return found
+
+
+def _kept(setting: Setting, way: str, hand: HandModel, place: Place, models: int, work: Path | None) -> Row:
+    """What the setting finds on the pair, from its file where it was found before."""
+    said = {
+        "way": way,
+        "method": setting.method,
+        "fidelity": setting.fidelity,
+        "hand": hand.name,
+        "object": place.thing.name,
+        "batch": setting.batch,
+        "options": dict(setting.options),
+    }
+    if work is None:
+        return said | _tried(setting, way, hand, place, models)
+    told = place.spec.model_dump(mode="json")
+    terms = [FORM, models, said, setting.knobs.model_dump(mode="json"), told, hand.digest, place.true.digest]
+    # What is found follows from the code of planners too: another revision begins anew, and so does another device.
+    device = [] if setting.run.device == "cpu" else [setting.run.device]
+    file = work / f"{digest_json([*terms, STAGE_REVISIONS['synthesize'], *device])}.json"
+    if not file.is_file():
+        work.mkdir(parents=True, exist_ok=True)
+        partial = file.with_suffix(".tmp")
+        partial.write_text(
+            json.dumps(said | _tried(setting, way, hand, place, models), indent=1, allow_nan=False) + "\n"
+        )
+        partial.replace(file)
+    found: Row = json.loads(file.read_text())
+    return found
+
+
+def _tried(setting: Setting, way: str, hand: HandModel, place: Place, models: int) -> Row:
+    """Counts, shares and speed of one setting on one pair."""
+    obj = place.thing.load(setting.knobs.face_error_m)
+    placed = place.scenes.placed(np.arange(setting.batch) % len(place.scenes.object_pose))
+    row: Row = {"grasps": setting.batch, "seconds": 0.0, "end_seconds": 0.0, **_NOTHING}
+    note, few = "", min(setting.run.cores, setting.batch)
+    clock = clock_of(setting.run.device)
+    try:
+        trial = lift_trial(hand, obj, lambda: place.pieces) if way == IN_SCENE else None
+        _planned(setting, hand, obj, _first(placed), trial, warm=True)
+        began = clock()
+        grasps = _planned(setting, hand, obj, placed, trial)
+        row["seconds"] = clock() - began
+        judged = Judged(hand, place, grasps, placed)
+        row["end_seconds"] = clock() - began
+        each = row["end_seconds"] / setting.batch
+        row["first_seconds"] = each * few
+        if each < _SHORT_S:
+            began = clock()
+            start = placed.take(slice(0, few))
+            Judged(hand, place, _planned(setting, hand, obj, start, trial), start)
+            row["first_seconds"] = clock() - began
+        row |= judged.counts(models)
+    except InputError as error:
+        # A scene that leaves no way in, or a pair that the method refuses.
+        note = str(error)
+    row["first_grasps"] = few
+    told = figures([row])
+    told["seconds_to_first"] = first_valid(told["lift"], [row["first_seconds"]], few)
+    return {**row, **told, "scenes": len(place.scenes.object_pose), "note": note}
+
+
+def _first(placed: Placed) -> Placed:
+    return placed.take(slice(0, 1))
+
+
+def _planned(
+    setting: Setting, hand: HandModel, obj: ObjectModel, placed: Placed, trial: Trial | None, *, warm: bool = False
+) -> GraspSet:
+    """Grasps that are planned in the scenes with a trial, or around a free object without."""
+    options = {**setting.options, **(setting.warm if warm else {})}
+    wanted = Wanted(
+        len(placed.index), setting.knobs, WARM_SEED if warm else SEED, placed=placed if trial else None, trial=trial
+    )
+    return synthesize(hand, obj, wanted, setting.run, method=setting.method, options=options)
+
+
+class Judged:
+    """Grasps with their way and the verdict of the lift, and measured where that is one."""
+
+    def __init__(self, hand: HandModel, place: Place, grasps: GraspSet, placed: Placed) -> None:
+        way = plan_way(hand, place.true, grasps, placed)
+        self.grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
+        self.hand, self.place, self.placed = hand, place, placed
+        self.clear = np.flatnonzero(way.clear)
+        self.lifted = self._lifting(self.clear)
+        measure(hand, place.true, self.grasps.take(self.lifted), friction=FRICTION)
+
+    def _lifting(self, rows: NDArray[np.intp], **options: Any) -> NDArray[np.intp]:
+        if not len(rows):
+            return rows
+        success = judge_lifts(
+            self.hand,
+            self.place.true,
+            self.grasps.take(rows),
+            self.placed.take(rows),
+            pieces=self.place.pieces,
+            **options,
+        ).success
+        return rows[success == 1]
+
+    def counts(self, models: int) -> Row:
+        """How many are clear on their way, lifted besides, by the letter, at half the friction besides; and of those
+        lifted the sum of the shares of models in which they are."""
+        lifted = self.lifted
+        shares = robust(
+            self.hand,
+            self.place.true,
+            self.grasps.take(lifted),
+            placed=self.placed.take(lifted),
+            models=models,
+            seed=MODELS_SEED,
+            pieces=self.place.pieces,
+        ).share
+        return {
+            "clear_count": len(self.clear),
+            "lift_count": len(lifted),
+            "lift_letter_count": len(self._lifting(self.clear, level="letter")),
+            "lift_hard_count": len(self._lifting(lifted, hard=True)),
+            "robust_sum": float(shares.sum()),
+        }
+
+
+def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
+    """Shares of all tries with their 95 % (Wilson), and lifted grasps per second, over some cells.
+
+    `robust` is the mean share of models over the grasps that are lifted. Where several cells are summed, each grasp
+    counts alike. A cell that was refused took no time that is known.
+    """
+    grasps = sum(row["grasps"] for row in rows)
+    found: Row = {"grasps": grasps}
+    for name in SHARES:
+        count = sum(row[f"{name}_count"] for row in rows)
+        low, high = wilson(count, grasps)
+        found |= {f"{name}_count": count, name: count / grasps, f"{name}_low": low, f"{name}_high": high}
+    planned = sum(row["grasps"] for row in rows if row["seconds"])
+    for speed, key in SPEEDS:
+        found[key] = seconds = sum(row[key] for row in rows)
+        found[RAW[speed]] = planned / seconds if seconds else 0.0
+        for end in ("", "_low", "_high"):
+            found[f"{speed}{end}"] = found[f"lift{end}"] * grasps / seconds if seconds else 0.0
+    total, lifted = sum(row["robust_sum"] for row in rows), found["lift_count"]
+    bar = wilson_of_mean(total, lifted) if lifted else (None, None)
+    mean = total / lifted if lifted else None
+    found |= {"robust_sum": total, "robust": mean, "robust_low": bar[0], "robust_high": bar[1]}
+    return {key: plain(value) for key, value in found.items()}
+
+
+def summed(runs: Sequence[Row]) -> list[Row]:
+    """A row for each way, method and fidelity over all pairs; `gain` over the same fidelity filtered, the median of the
+    pairs in which that found any; `front` names the accuracies in which nobody faster, end to end, is better."""
+    groups: dict[tuple[str, str, str, int], list[Row]] = {}
+    for run in runs:
+        groups.setdefault((run["way"], run["method"], run["fidelity"], run["batch"]), []).append(run)
+    rows = []
+    for (way, name, fidelity, batch), own in groups.items():
+        row: Row = {"way": way, "method": name, "fidelity": fidelity, "batch": batch, "pairs": len(own)}
+        row |= figures(own)
+        firsts = [run["seconds_to_first"] for run in own]
+        # Of pairs without a lift nobody knows how long they take.
+        row["seconds_to_first"] = None if None in firsts else plain(float(np.mean(firsts)))
+        row["pairs_with_one"] = sum(run["lift_count"] > 0 for run in own)
+        row["gain"] = _gain(own, groups.get((FILTERED, name, fidelity, batch), [])) if way == IN_SCENE else None
+        rows.append(row)
+    for row in rows:
+        row["front"] = []
+    for key in ACCURACIES:
+        able = [row for row in rows if row["end_to_end_per_second"] and row[key] is not None]
+        for index in pareto([(row["end_to_end_per_second"], row[key]) for row in able]):
+            able[index]["front"].append(key)
+    return rows
+
+
+def _gain(own: Sequence[Row], filtered: Sequence[Row]) -> float | None:
+    there = {(run["hand"], run["object"]): run["valid_per_second"] for run in filtered}
+    ratios = [run["valid_per_second"] / there[pair] for run in own if there.get(pair := (run["hand"], run["object"]))]
+    return plain(float(np.median(ratios))) if ratios else None
+
+
+def _result(runs: Sequence[Row], settings: Sequence[Setting], spec: SceneSpec, models: int) -> Row:
+    hands = dict.fromkeys(run["hand"] for run in runs)
+    return {
+        "created": timestamp(),
+        "device": device_name(settings[0].run.device),
+        "versions": {"graspd": PACKAGE_VERSION},
+        "scene": spec.model_dump(mode="json"),
+        "referee": {"protocol": "lift", "level": "lift"},
+        "runs": list(runs),
+        "models": models,
+        "summary": summed(runs),
+        "by_hand": {hand: summed([run for run in runs if run["hand"] == hand]) for hand in hands},
+    }
+
+
+def _line(run: Row) -> str:
+    return (
+        f"{run['way']:14s} {run['method']:11s} {run['fidelity']:13s} {run['hand']:18s} {run['object']:20s} "
+        f"{run['end_to_end_per_second']:8.3f} lifted/s  clear {run['clear']:.2f}  lift {run['lift']:.2f}  "
+        f"half friction {run['lift_hard']:.2f} {run['note']}"
+    )

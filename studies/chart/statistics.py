@@ -1,0 +1,192 @@
+"""Figures of a cell with their error bars, sums over cells, and the Pareto front."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from graspd.service.model.transforms import Floats
+from graspd.studies.chart.trials import Trial
+from graspd.worker.quality.intervals import wilson, wilson_of_mean
+
+#: Bootstrap draws; error bars are their 2.5 and 97.5 percentiles.
+DRAWS: Final = 400
+BAR: Final = (2.5, 97.5)
+#: Accuracies: whether more is better. The first three are not of sweeps.
+METRICS: Final = {"letter": True, "hard": True, "robust": True, "gsr": True, "epsilon": True, "pd_mm": False}
+#: What is drawn against accuracies.
+SPEEDS: Final = ("valid_per_second", "end_to_end_per_second")
+#: Of these the median of a cell's grasps counts; of `gsr` the mean.
+MEDIANS: Final = ("epsilon", "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "wrench_volume")
+
+
+def figures(cell: Trial) -> dict[str, Any]:
+    """The keys of a run: speed, accuracy, and `KEY_low`, `KEY_high` of each."""
+    held, kept = (np.concatenate(rows).astype(float) for rows in (cell.success, cell.kept))
+    seconds, batch = np.array(cell.seconds), cell.setting.batch
+    draws = _draws(cell)
+    row: dict[str, Any] = {
+        "seconds": [round(s, 6) for s in cell.seconds],
+        "grasps": len(held),
+        "valid": int(held.sum()),
+        "grasps_per_second": len(held) / seconds.sum(),
+        "end_seconds": [round(s, 6) for s in cell.end_seconds],
+        "kept": int(kept.sum()),
+        "end_to_end_per_second": kept.sum() / sum(cell.end_seconds),
+        "seconds_to_first_valid": first_valid(float(kept.mean()), cell.first_calls, cell.first_grasps),
+        "valid_per_second": held.sum() / seconds.sum(),
+        "gsr": held.mean(),
+        "batch": batch,
+        "repeats": len(seconds),
+    }
+    row |= {key: float(np.median(cell.values(key))) for key in MEDIANS}
+    for key, values in draws.items():
+        row[f"{key}_low"], row[f"{key}_high"] = np.percentile(values, BAR)
+    widen(row, int(held.sum()), len(held), len(held) / float(seconds.sum()))
+    widen_speed(row, "end_to_end_per_second", int(kept.sum()), len(kept), len(kept) / sum(cell.end_seconds))
+    row |= _scrutinised(cell) if cell.letter else {}
+    return {key: plain(value) for key, value in row.items()}
+
+
+def widen(row: dict[str, Any], valid: int, grasps: int, per_second: float) -> None:
+    """Bars of success, and of speed where it depends on it, from the counts; speed keeps the wider of both its bars."""
+    row["gsr_low"], row["gsr_high"] = wilson(valid, grasps)
+    widen_speed(row, "valid_per_second", valid, grasps, per_second)
+
+
+def widen_speed(row: dict[str, Any], key: str, valid: int, grasps: int, per_second: float) -> None:
+    """Bars of a speed, at least as wide as those of the share of grasps that count."""
+    low, high = wilson(valid, grasps)
+    row[f"{key}_low"] = min(row[f"{key}_low"], low * per_second)
+    row[f"{key}_high"] = max(row[f"{key}_high"], high * per_second)
+
+
+def _scrutinised(cell: Trial) -> dict[str, Any]:
+    """Success by the letter and at half the friction, and the mean share of other models that held ones hold in."""
+    row: dict[str, Any] = {}
+    for key, verdicts in (("letter", cell.letter), ("hard", cell.hard)):
+        held = np.concatenate(verdicts) == 1
+        row[key] = float(held.mean())
+        row[f"{key}_low"], row[f"{key}_high"] = wilson(int(held.sum()), len(held))
+    shares = np.concatenate(cell.shares)
+    known = shares[np.isfinite(shares)]
+    if not len(known):
+        return row | dict.fromkeys(("robust", "robust_low", "robust_high"))
+    low, high = wilson_of_mean(float(known.sum()), len(known))
+    return row | {"robust": float(known.mean()), "robust_low": low, "robust_high": high}
+
+
+def first_valid(share: float, seconds: Sequence[float], grasps: int) -> float | None:
+    """Expected seconds until a call of so many grasps, made again and again, has a valid one; None: never seen one.
+
+    Of the calls' `seconds` the median counts.
+    """
+    if share <= 0 or not seconds:
+        return None
+    return float(np.median(seconds)) / (1.0 - (1.0 - share) ** grasps)
+
+
+def _draws(cell: Trial) -> dict[str, Floats]:
+    """Bootstrap: repeats with replacement, then grasps within each."""
+    rng = np.random.default_rng(0)
+    repeats = len(cell.seconds)
+    out: dict[str, list[float]] = {key: [] for key in (*SPEEDS, "gsr", "epsilon", "pd_mm")}
+    for _ in range(DRAWS):
+        chosen = rng.integers(repeats, size=repeats)
+        rows = [rng.integers(len(cell.success[r]), size=len(cell.success[r])) for r in chosen]
+        held = np.concatenate([cell.success[r][i] for r, i in zip(chosen, rows, strict=True)])
+        out["gsr"].append(float(held.mean()))
+        out["valid_per_second"].append(float(held.sum() / sum(cell.seconds[r] for r in chosen)))
+        kept = sum(float(cell.kept[r][i].sum()) for r, i in zip(chosen, rows, strict=True))
+        out["end_to_end_per_second"].append(kept / sum(cell.end_seconds[r] for r in chosen))
+        for key in ("epsilon", "pd_mm"):
+            values = [cell.columns[r][key][i] for r, i in zip(chosen, rows, strict=True)]
+            out[key].append(float(np.median(np.concatenate(values))))
+    return {key: np.array(values) for key, values in out.items()}
+
+
+def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """One row per method, fidelity and batch, over all hands and objects.
+
+    Speed is all valid grasps over all seconds; accuracies are means over the pairs, whose bars shrink accordingly.
+    `front` names the accuracies in which nobody faster, end to end, is better.
+    """
+    groups: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
+    for run in runs:
+        groups.setdefault((run["method"], run["fidelity"], run["batch"]), []).append(run)
+    rows = []
+    for (method, fidelity, batch), own in groups.items():
+        valid, seconds = sum(r["valid"] for r in own), sum(sum(r["seconds"]) for r in own)
+        firsts = [r["seconds_to_first_valid"] for r in own]
+        row: dict[str, Any] = {"method": method, "fidelity": fidelity, "batch": batch, "pairs": len(own)}
+        row["grasps"] = sum(r["grasps"] for r in own)
+        row["grasps_per_second"] = row["grasps"] / seconds
+        # Of pairs without a valid grasp nobody knows how long they take: a mean without them would flatter.
+        row["seconds_to_first_valid"] = None if None in firsts else float(np.mean(firsts))
+        for key in METRICS:
+            # Of a pair on which nothing holds nobody knows in which other models it would.
+            known = [r for r in own if r[key] is not None]
+            row[key] = float(np.mean([r[key] for r in known])) if known else None
+            row[f"{key}_low"], row[f"{key}_high"] = _bar(known, key) if known else (None, None)
+        row["valid_per_second"] = valid / seconds
+        kept, end = sum(r["kept"] for r in own), sum(sum(r["end_seconds"]) for r in own)
+        row["end_to_end_per_second"] = kept / end
+        for key, times in zip(SPEEDS, ("seconds", "end_seconds"), strict=True):
+            row[f"{key}_low"], row[f"{key}_high"] = (_ratio_bar(own, key, times, side) for side in ("low", "high"))
+        widen(row, valid, row["grasps"], row["grasps_per_second"])
+        widen_speed(row, "end_to_end_per_second", kept, row["grasps"], row["grasps"] / end)
+        row["raw_end_to_end_per_second"] = row["grasps"] / end
+        rows.append({key: plain(value) for key, value in row.items()})
+    for key, more in METRICS.items():
+        # Who makes no valid grasp is on no front: a hand that touches nothing does not penetrate either.
+        able = [row for row in rows if row["end_to_end_per_second"] and row[key] is not None]
+        front = pareto([(row["end_to_end_per_second"], row[key] if more else -row[key]) for row in able])
+        for row in rows:
+            row.setdefault("front", [])
+        for index in front:
+            able[index]["front"].append(key)
+    return rows
+
+
+def _bar(runs: Sequence[dict[str, Any]], key: str) -> tuple[float, float]:
+    """Bar of a mean of independent cells: their half-widths added in quadrature."""
+    mean = float(np.mean([r[key] for r in runs]))
+    down = np.sqrt(np.sum([(r[key] - r[f"{key}_low"]) ** 2 for r in runs])) / len(runs)
+    up = np.sqrt(np.sum([(r[f"{key}_high"] - r[key]) ** 2 for r in runs])) / len(runs)
+    return mean - float(down), mean + float(up)
+
+
+def _ratio_bar(runs: Sequence[dict[str, Any]], key: str, seconds: str, side: str) -> float:
+    """Bar of valid grasps over seconds, each cell's weighed by its seconds."""
+    weight = np.array([sum(r[seconds]) for r in runs])
+    value = np.array([r[key] for r in runs])
+    off = np.array([r[f"{key}_{side}"] for r in runs]) - value
+    spread = float(np.sqrt(np.sum((weight * off) ** 2)) / weight.sum())
+    return float((weight * value).sum() / weight.sum()) + (spread if side == "high" else -spread)
+
+
+def most_valid(row: Mapping[str, Any]) -> float:
+    """Valid grasps per second, end to end, that a method has at most, with 95 %, of which none of n is: a share of
+    3 / n. In scenes, of those that are lifted."""
+    raw = row.get("raw_end_to_end_per_second", row["grasps_per_second"])
+    return float(raw) * min(1.0, 3.0 / row["grasps"])
+
+
+def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
+    """Indices of points (more, more) that no other point beats: as good in both and better in one."""
+    return {
+        index
+        for index, (x, y) in enumerate(points)
+        if not any((a >= x and b >= y) and (a > x or b > y) for a, b in points)
+    }
+
+
+def plain(value: Any) -> Any:
+    """A JSON value: six significant digits, None for what is no number."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if np.isfinite(value) else None
+    return value

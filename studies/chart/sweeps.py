@@ -1,0 +1,184 @@
+"""fast_graspd's knobs turned one at a time: what each costs in accuracy and gains in speed.
+
+Some knobs are no part of a fidelity: passes of the contact solver, culling by grid and band, and whether the M
+simulations share one closest-point query per hand point (as they do) or ask M times (as the paper's code does).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Final
+
+import warp as wp
+
+from graspd.service.model.errors import InputError
+from graspd.service.model.fidelity import FIDELITIES, Fidelity
+from graspd.studies.chart import kernels
+from graspd.studies.chart.chart import TRUE_ERROR_M, Thing
+from graspd.studies.chart.statistics import figures, plain
+from graspd.studies.chart.trials import Setting, Trial
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fast_graspd.pairs import Pair, pair_of
+from graspd.worker.planners.fast_graspd.planner import grasps_of, optimise_pair
+from graspd.worker.planners.port import Wanted
+from graspd.worker.run import Run
+from graspd.worker.simulation import record
+from graspd.worker.simulation.data import Data
+from graspd.worker.simulation.launches import Launches
+from graspd.worker.simulation.model import LossOptions, Model
+from graspd.worker.validation.decomposition import decompose
+
+Say = Callable[[str], None]
+Change = Callable[[Pair], Pair]
+DEFAULT: Final = FIDELITIES["standard"]
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One knob at one value."""
+
+    knob: str
+    value: str
+    fidelity: Fidelity = DEFAULT
+    change: Change | None = None
+
+    @property
+    def default(self) -> bool:
+        return self.fidelity == DEFAULT and self.change is None
+
+
+def _same(pair: Pair) -> Pair:
+    return pair
+
+
+def _options(**changes: Any) -> Change:
+    def change(pair: Pair) -> Pair:
+        return replace(pair, options=replace(pair.options, **changes))
+
+    return change
+
+
+def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[Turn]:
+    """All knobs, few of them, or the named ones; each has the default among its values.
+
+    Raises:
+        InputError: a name that is no knob's.
+    """
+
+    def knob(name: str, values: Sequence[tuple[str, dict[str, Any]]]) -> list[Turn]:
+        return [Turn(name, text, DEFAULT.model_copy(update=change)) for text, change in values]
+
+    def points(coarse: int, fine: int) -> tuple[str, dict[str, Any]]:
+        return f"{coarse}, {fine}", {"coarse_points": coarse, "fine_points": fine}
+
+    def iterations(coarse: int, fine: int) -> tuple[str, dict[str, Any]]:
+        return f"{coarse} + {fine}", {"coarse_iterations": coarse, "fine_iterations": fine}
+
+    def starts(count: int, finalists: int) -> tuple[str, dict[str, Any]]:
+        return f"{count}, {finalists}", {"starts": count, "finalists": finalists}
+
+    found = [
+        *knob("hand points", [points(64, 500), points(128, 1000), points(256, 2000), points(512, 4000)]),
+        *knob("face error bound, mm", [(f"{1e3 * e:g}", {"face_error_m": e}) for e in (0, 1e-4, 3e-4, 1e-3, 3e-3)]),
+        *knob("iterations", [iterations(25, 10), iterations(50, 20), iterations(100, 40), iterations(200, 80)]),
+        *knob("starts, finalists", [starts(1, 1), starts(2, 1), starts(4, 2), starts(8, 4)]),
+        *knob("contact solver", [(s, {"contact_solver": s}) for s in ("direct", "jacobi", "gauss_seidel")]),
+    ]
+    passes = LossOptions().passes
+    found += [Turn("solver passes", str(n), change=None if n == passes else _options(passes=n)) for n in (1, 2, 4, 8)]
+    found += [Turn("queries", "shared"), Turn("queries", "one per velocity", change=asking_each)]
+    found += [
+        Turn("culling", "grid and band"),
+        Turn("culling", "band", change=_options(exact_below=1.0)),
+        Turn("culling", "none", change=_options(exact_below=1.0, band=0.3)),
+    ]
+    known = list(dict.fromkeys(turn.knob for turn in found))
+    if unknown := [name for name in knobs if name not in known]:
+        raise InputError(f"there is no knob {unknown[0]!r}; choose of {', '.join(map(repr, known))}")
+    if knobs:
+        return [turn for turn in found if turn.knob in knobs]
+    return [*found[:2], *(turn for turn in found if turn.knob == "queries")] if quick else found
+
+
+def sweep(
+    hand: HandModel,
+    thing: Thing,
+    *,
+    batch: int,
+    repeats: int,
+    quick: bool,
+    run: Run,
+    knobs: Sequence[str] = (),
+    say: Say = lambda line: None,
+) -> list[dict[str, Any]]:
+    """One row per knob and value: `knob`, `value`, `default`, `speedup` and the figures of a run.
+
+    Values are run in turn, repeat by repeat. `speedup` is what the default costs over what the value costs: in
+    processor seconds on a CPU, which do not depend on what else the machine does, in seconds on a GPU.
+    """
+    wp.load_module(module=kernels, device=run.device)
+    default = Turn("", "default")
+    true = thing.load(TRUE_ERROR_M)
+    pieces = decompose(true)
+    cells: dict[tuple[str, str], Trial] = {}
+    for turn in [default, *turns(quick, knobs)]:
+        if turn is default or not turn.default:
+            cells[turn.knob, turn.value] = Trial(
+                _setting(turn, batch, run), hand, thing.load(turn.fidelity.face_error_m), true, pieces
+            )
+    for _ in range(repeats):
+        for cell in cells.values():
+            # More settings than are kept ready on the device: each is made ready just before it is timed.
+            cell.warm_up()
+            cell.repeat()
+    base = figures(cells[default.knob, default.value])
+    rows = []
+    for turn in turns(quick, knobs):
+        found = base if turn.default else figures(cells[turn.knob, turn.value])
+        faster = found["grasps_per_second"] / base["grasps_per_second"]
+        rows.append(
+            {"knob": turn.knob, "value": turn.value, "default": turn.default, "hand": hand.name, "object": thing.name}
+            | {"speedup": plain(faster), **found}
+        )
+        say(f"{turn.knob:22s} {turn.value:18s} x {faster:5.2f}  GSR {found['gsr']:.2f}  PD {found['pd_mm']:.2f} mm")
+    return rows
+
+
+def _setting(turn: Turn, batch: int, run: Run) -> Setting:
+    make = partial(_make, turn=turn, run=run)
+    return Setting("fast_graspd", turn.value, turn.fidelity, batch=batch, run=run, make=make)
+
+
+def _make(hand: HandModel, obj: ObjectModel, count: int, seed: int, *, turn: Turn, run: Run) -> GraspSet:
+    began = time.perf_counter()
+    pair = (turn.change or _same)(pair_of(hand, obj, turn.fidelity, run.device))
+    parts = optimise_pair(pair, Wanted(count, turn.fidelity, seed), run)
+    return grasps_of(hand, obj, parts, time.perf_counter() - began)
+
+
+class AskingEach(Pair):
+    """Every simulated velocity asks for the distances anew; the answers are the same."""
+
+    def iteration(self, model: Model, data: Data, optimizer: str, patience: int) -> Launches:
+        out = Launches(model.device)
+        record.add_poses(out, model, data)
+        record.add_distances(out, model, data)
+        for _ in range(model.options.velocities - 1):
+            counts = [data.contacts.count, data.contacts.near_count]
+            out.add(kernels.forget, data.capacity, inputs=[data.active], outputs=counts)
+            record.add_distances(out, model, data)
+        record.add_contact(out, model, data)
+        record.add_penalties(out, model, data)
+        record.add_gradient(out, model, data)
+        record.add_step(out, model, data, optimizer, patience=patience)
+        return out
+
+
+def asking_each(pair: Pair) -> Pair:
+    """The pair with a query for each velocity."""
+    return AskingEach(pair.coarse, pair.fine, pair.options, pair.hand)

@@ -1,0 +1,341 @@
+"""The numbers of a set of grasps in one row: success by the referee, and medians of every metric."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.exchange.cases import Case
+from graspd.service.model.errors import InputError, MeshError
+from graspd.service.model.metrics import axis_word
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.same_hand import SameHand
+from graspd.worker.quality.contact import contact_distance_consistency_mm
+from graspd.worker.quality.diversity import explained_variance, hand_points, nearest
+from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
+from graspd.worker.quality.table import DEFAULT_FRICTION, measure
+from graspd.worker.run import ALONE, Run
+from graspd.worker.scenes.way import plan_way
+from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.validation.decomposition import ConvexPieces, decompose
+from graspd.worker.validation.displacement import simulated_displacement_cm
+from graspd.worker.validation.foreign import foreign_verdicts, share_counts
+from graspd.worker.validation.key import Level
+from graspd.worker.validation.lift import LiftOutcome
+from graspd.worker.validation.lifting import LiftLevel, LiftVerdicts, judge_lifts
+from graspd.worker.validation.protocol import Outcome
+from graspd.worker.validation.robust import Robustness, robust
+from graspd.worker.validation.validator import Verdicts, judge
+
+Protocol = Literal["dexgraspbench", "displacement", "lift"]
+#: Judges grasps in models around the nominal one: `_in_others` but for its first argument.
+InOthers = Callable[..., dict[str, Any]]
+
+#: Contact threshold of the row's area, epsilon and volume: the paper's [m].
+THRESHOLD_M: Final = 0.005
+#: Of the models around the nominal one. No job has this seed: what a job chose grasps by does not confirm them.
+MODELS_SEED: Final = 2**31
+
+
+def evaluate(
+    case: Case,
+    *,
+    protocol: Protocol = "dexgraspbench",
+    level: Level | LiftLevel = "certificate",
+    hard: bool = False,
+    friction: float | None = None,
+    models: int = 0,
+    judge_hand: SameHand | None = None,
+    tell: Callable[[Robustness], None] = lambda found: None,
+    cache: Path | None = None,
+    run: Run = ALONE,
+) -> dict[str, Any]:
+    """One row of numbers, None where a number does not exist: too thin an object has no verdict.
+
+    Level letter has the protocol's own mass and friction, the others the object's.
+
+    Keys: n, protocol, level, hard, mu, mass_kg, object_friction; gsr (share that holds), osr (1 if any holds), sgs
+    (holding grasps per second of making and judging them; of making them alone: sgs_without_referee), pd_mm and spd_mm
+    (penetration, self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity: variance
+    explained by the first principal component; nearest_mm: distance of the two grasps that are most alike.
+    verdicts, where somebody judged: see `told`. Judged in `models` models around the nominal one, by the same protocol:
+    robust_share, the mean of those that hold in it, robust_n, how many, robust_axes, the share by axis; `tell` gets
+    what became of each grasp.
+    With protocol lift also clear_share (free of what stands in the scene, coming, closing and lifting). With another
+    model of the hand as `judge_hand` also what `ForeignVerdicts.facts` tells, and in the verdicts held_foreign and
+    reason_foreign.
+
+    Raises:
+        InputError: protocol lift on grasps that were planned around a free object, or a level that it does not have.
+    """
+    if protocol == "lift" and case.placed is None:
+        raise InputError(f"{case.name} has grasps around a free object: `graspd synth --scene` makes some to lift")
+    case = case.centred
+    if level == "letter":
+        case = replace(case, obj=case.obj.published)
+    mu = friction or case.friction or DEFAULT_FRICTION
+    table = measure(case.hand, case.obj, case.grasps, friction=mu, thresholds_m=[THRESHOLD_M], run=run)
+    row: dict[str, Any] = {
+        "n": len(case.grasps),
+        "protocol": protocol,
+        "level": None,
+        "hard": hard,
+        "mu": mu,
+        "mass_kg": case.obj.mass,
+        "object_friction": case.obj.friction,
+    }
+    row |= _success(case, None, 0.0)
+    try:
+        pieces = decompose(case.obj, cache=cache)
+    except MeshError as error:
+        row["note"] = str(error)
+        sd = None
+    else:
+        judged = partial(_in_others, case, models=models, hard=hard, pieces=pieces, tell=tell, run=run)
+        if protocol == "dexgraspbench":
+            row |= _pushed(case, cast(Level, level), judge_hand, judged, hard=hard, pieces=pieces, run=run)
+        if protocol == "lift" and case.placed is not None:
+            chosen: LiftLevel = "letter" if level == "letter" else "lift"
+            row |= _lifted_out(case, case.placed, chosen, judged, hard=hard, pieces=pieces, run=run)
+        sd = simulated_displacement_cm(case.hand, case.obj, case.grasps.grasp, pieces=pieces, run=run)
+        row |= pieces.facts
+    return row | _medians(case, table, sd)
+
+
+def _pushed(
+    case: Case,
+    level: Level,
+    judge_hand: SameHand | None,
+    in_others: InOthers,
+    *,
+    hard: bool,
+    pieces: ConvexPieces,
+    run: Run,
+) -> dict[str, Any]:
+    """What six pushes say, in the nominal model and in others."""
+    verdicts = judge(case.hand, case.obj, case.grasps, level=level, hard=hard, pieces=pieces, run=run)
+    row = _success(case, verdicts, verdicts.seconds)
+    row |= in_others(case.grasps, row.get("verdicts", []), held=verdicts.success)
+    if judge_hand is not None:
+        both = foreign_verdicts(judge_hand, case.obj, case.grasps, verdicts, pieces=pieces, run=run)
+        row |= both.facts()
+        for one, held, reason in zip(row["verdicts"], both.foreign.success, both.foreign.reasons, strict=True):
+            one |= {"held_foreign": bool(held), "reason_foreign": reason}
+    return row
+
+
+def _lifted_out(
+    case: Case, placed: Placed, level: LiftLevel, in_others: InOthers, *, hard: bool, pieces: ConvexPieces, run: Run
+) -> dict[str, Any]:
+    """What the lift out of their scenes says, in the nominal model and in others."""
+    grasps, clear = _with_ways(case, placed)
+    lifts = judge_lifts(case.hand, case.obj, grasps, placed, level=level, hard=hard, pieces=pieces, run=run)
+    row = _lifted(lifts, clear)
+    return row | in_others(grasps, row["verdicts"], held=lifts.success, placed=placed, level=level)
+
+
+def _in_others(
+    case: Case,
+    grasps: GraspSet,
+    verdicts: list[dict[str, Any]],
+    *,
+    models: int,
+    tell: Callable[[Robustness], None],
+    **given: Any,
+) -> dict[str, Any]:
+    """What models around the nominal one say, if any are asked; each verdict gets its share."""
+    if not models:
+        return {}
+    found = robust(case.hand, case.obj, grasps, models=models, seed=MODELS_SEED, **given)
+    tell(found)
+    return in_models(found, verdicts)
+
+
+def _success(case: Case, verdicts: Verdicts | None, seconds: float) -> dict[str, Any]:
+    if verdicts is None or not len(case.grasps):
+        return dict.fromkeys(("gsr", "osr", "sgs", "sgs_without_referee", "agreement_published"))
+    held = int(verdicts.success.sum())
+    made = case.seconds
+    whole = None if made is None else made + (0.0 if case.judged else seconds)
+    row: dict[str, Any] = {
+        "level": verdicts.level,
+        "gsr": _plain(held / len(case.grasps)),
+        "osr": float(held > 0),
+        "sgs": _plain(held / whole) if whole else None,
+        "sgs_without_referee": _plain(held / made) if made and not case.judged else None,
+        "referee_seconds": _plain(seconds),
+        "published": 0,
+        "reasons": dict(Counter(verdicts.reasons).most_common()),
+        "verdict_key": verdicts.terms,
+        "verdicts": told(verdicts),
+        "agreement_published": None,
+    }
+    if case.published is not None and (known := case.published >= 0).any():
+        row["published"] = int(known.sum())
+        row["agreement_published"] = _plain(float((case.published == verdicts.success)[known].mean()))
+    return row
+
+
+def _with_ways(case: Case, placed: Placed) -> tuple[GraspSet, NDArray[np.bool_]]:
+    """The grasps with their way, and (N,) whether it is clear."""
+    way, grasps = plan_way(case.hand, case.obj, case.grasps, placed), case.grasps
+    if grasps.approach is None or grasps.coming is None:
+        # Files of others say where a grasp is, seldom how the hand comes.
+        grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
+    return grasps, way.clear
+
+
+def _lifted(verdicts: LiftVerdicts, clear: NDArray[np.bool_]) -> dict[str, Any]:
+    count, held = len(clear), int(verdicts.success.sum())
+    rows = zip(verdicts.success, verdicts.outcome, verdicts.margin, verdicts.reasons, clear, strict=True)
+    return {
+        "level": verdicts.level,
+        "gsr": _plain(held / max(1, count)),
+        "osr": float(held > 0),
+        "clear_share": _plain(float(clear.mean())) if len(clear) else None,
+        "referee_seconds": _plain(verdicts.seconds),
+        "reasons": dict(Counter(verdicts.reasons).most_common()),
+        "verdict_key": verdicts.terms,
+        "verdicts": [
+            {
+                "row": row,
+                "held": bool(one),
+                "outcomes": [LiftOutcome(int(what)).name.lower()],
+                "margin": _plain(margin) if math.isfinite(margin) else None,
+                "reason": reason,
+                "clear": bool(free),
+            }
+            for row, (one, what, margin, reason, free) in enumerate(rows)
+        ],
+    }
+
+
+def in_models(found: Robustness, verdicts: list[dict[str, Any]]) -> dict[str, Any]:
+    """Shares of a row; each of its verdicts gets its own and what it fails of first, None where it was not tried."""
+    tried = np.isfinite(found.share)
+    for one, share, weakest in zip(verdicts, found.share, found.weakest, strict=True):
+        known = math.isfinite(share)
+        one |= {"robust_share": _plain(share) if known else None, "robust_weakest": axis_word(int(weakest))}
+    counts = found.by_axis()
+    return {
+        "robust_share": _plain(float(found.share[tried].mean())) if tried.any() else None,
+        "robust_models": found.held.shape[1],
+        "robust_n": int(tried.sum()),
+        "robust_seconds": _plain(found.seconds),
+        "robust_axes": {axis.word: {"share": _plain(held / n), "n": n} for axis, (held, n) in counts.items()},
+    }
+
+
+def told(verdicts: Verdicts) -> list[dict[str, Any]]:
+    """Of each grasp: row, held, outcomes of the six pushes, margin (None: it blew up), reason."""
+    rows = zip(verdicts.success, verdicts.outcome, verdicts.margin, verdicts.reasons, strict=True)
+    return [
+        {
+            "row": row,
+            "held": bool(held),
+            "outcomes": [Outcome(int(one)).name.lower() for one in outcomes],
+            "margin": _plain(margin) if math.isfinite(margin) else None,
+            "reason": reason,
+        }
+        for row, (held, outcomes, margin, reason) in enumerate(rows)
+    ]
+
+
+def _medians(case: Case, table: dict[str, NDArray[Any]], sd: NDArray[np.float64] | None) -> dict[str, Any]:
+    probe = probe_of(case.hand, case.obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
+    cdc = contact_distance_consistency_mm(case.hand, probe.body_distance(probe.measure(case.grasps.grasp)))
+    columns = {
+        "pd_mm": "penetration_depth_mm",
+        "spd_mm": "self_penetration_depth_mm",
+        "ca_cm2": "contact_area_cm2",
+        "iv_cm3": "intersection_volume_cm3",
+        "epsilon": "epsilon",
+        "wrench_volume": "wrench_volume",
+    }
+    row = {key: _median(table[f"quality/{name}"]) for key, name in columns.items()}
+    shares = explained_variance(case.grasps.grasp)
+    apart = nearest(hand_points(case.hand, case.grasps.grasp))
+    return row | {
+        "cdc_mm": _median(cdc),
+        "sd_cm": None if sd is None else _median(sd),
+        "diversity": _plain(float(shares[0])) if len(shares) else None,
+        "nearest_mm": None if apart is None else _plain(1e3 * apart),
+    }
+
+
+def _median(values: NDArray[Any]) -> float | None:
+    return _plain(float(np.median(values))) if values.size else None
+
+
+def _plain(value: float) -> float:
+    return round(float(value), 6)
+
+
+#: Numbers of a row that several rows have a median of.
+_MEDIANS: Final = ("pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "epsilon", "wrench_volume", "cdc_mm", "sd_cm", "diversity")
+
+
+def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """One row for several objects: rates over all grasps, osr over objects, medians of the objects' medians."""
+    if len(rows) == 1:
+        return dict(rows[0])
+    out: dict[str, Any] = {"n": sum(row["n"] for row in rows)}
+    for key in ("protocol", "level", "hard", "mu"):
+        # What the rows do not agree on has no one value.
+        out[key] = rows[0][key] if all(row[key] == rows[0][key] for row in rows) else None
+    judged = [row for row in rows if row["gsr"] is not None]
+    out["gsr"] = _rate(judged, "gsr", "n")
+    if any("clear_share" in row for row in rows):
+        out["clear_share"] = _rate([row for row in rows if row.get("clear_share") is not None], "clear_share", "n")
+    out["osr"] = _plain(float(np.mean([row["osr"] for row in judged]))) if judged else None
+    out["agreement_published"] = _rate(judged, "agreement_published", "published")
+    if any("robust_share" in row for row in rows):
+        out |= _models([row for row in rows if "robust_share" in row])
+    counted = [row["foreign_held"] for row in rows if "foreign_held" in row]
+    if counted:
+        out |= share_counts({key: sum(one[key] for one in counted) for key in counted[0]})
+        out["fingertips_mm"] = max(row["fingertips_mm"] for row in rows if "foreign_held" in row)
+    for key in ("sgs", "sgs_without_referee"):
+        # Held grasps over the seconds of all rows together.
+        timed = [row for row in judged if row[key]]
+        seconds = sum(row["gsr"] * row["n"] / row[key] for row in timed)
+        out[key] = _plain(sum(row["gsr"] * row["n"] for row in timed) / seconds) if timed else None
+    for key in _MEDIANS:
+        known = [row[key] for row in rows if row[key] is not None]
+        out[key] = _plain(float(np.median(known))) if known else None
+    near = [row["nearest_mm"] for row in rows if row.get("nearest_mm") is not None]
+    out["nearest_mm"] = min(near) if near else None
+    return out
+
+
+def _models(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Shares of several rows as those of all their grasps."""
+    axes: dict[str, list[tuple[float, int]]] = {}
+    for row in rows:
+        for axis, one in row["robust_axes"].items():
+            axes.setdefault(axis, []).append((one["share"], one["n"]))
+    total = {axis: sum(n for _, n in parts) for axis, parts in axes.items()}
+    return {
+        "robust_share": _rate(rows, "robust_share", "robust_n"),
+        "robust_models": rows[0]["robust_models"],
+        "robust_n": sum(row["robust_n"] for row in rows),
+        "robust_axes": {
+            axis: {"share": _plain(sum(share * n for share, n in parts) / total[axis]), "n": total[axis]}
+            for axis, parts in axes.items()
+        },
+    }
+
+
+def _rate(rows: list[dict[str, Any]], key: str, weight: str) -> float | None:
+    """Mean of the rows that have the key, weighed by the number of grasps it is a rate of."""
+    known = [row for row in rows if row[key] is not None]
+    total = sum(row[weight] for row in known)
+    return _plain(sum(row[key] * row[weight] for row in known) / total) if total else None

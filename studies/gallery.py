@@ -1,0 +1,185 @@
+"""Pages for people: what cameras see of objects at rest, hands in grasps that fit there, and crowded tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from PIL import Image
+
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.transforms import Floats, apply
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners import Wanted, synthesize
+from graspd.worker.rendering.cameras import FIELD_OF_VIEW, GivenCameras, distance_to_fill, look_at
+from graspd.worker.rendering.hands import DrawnHand
+from graspd.worker.rendering.sheets import label_page, scene_cells, with_palette
+from graspd.worker.rendering.views import Extras, render
+from graspd.worker.run import Run
+from graspd.worker.scenes import Neighbours, drop, drop_together, transfer
+
+Say = Callable[[str], None]
+#: Size of one picture [px].
+
+SIZE: Final = (300, 225)
+#: Rays per pixel: pages are looked at.
+SAMPLES: Final = 32
+#: Grasps tried in each of so many scenes, in so many rounds, until one stays clear of the table.
+GRASPS: Final = 32
+SCENES: Final = 24
+ROUNDS: Final = 4
+#: Cosine of the elevation of the camera that looks past a neighbour.
+_LEVEL: Final = 0.94
+_VIEW: Final[dict[str, Any]] = {"stereo": False, "width": SIZE[0], "height": SIZE[1], "samples": SAMPLES}
+
+
+def paint(
+    hands: Sequence[HandModel], objects: Sequence[ObjectModel], folder: Path, *, device: str, seed: int, say: Say
+) -> list[Path]:
+    """Writes `views.png`, `hands.png` and, for three objects or more, `neighbours.png`. Returns the files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    pages: dict[str, Callable[[], bytes]] = {
+        "views": lambda: _views(objects, device, seed),
+        "hands": lambda: _hands(hands, objects, device, seed, say),
+    }
+    if len(objects) > 2:
+        pages["neighbours"] = lambda: _neighbours(objects, device, seed)
+    written = []
+    for name, page in pages.items():
+        say(f"{name} ...")
+        path = folder / f"{name}.png"
+        path.write_bytes(with_palette(page()))
+        written.append(path)
+    return written
+
+
+def _views(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes:
+    rows, names = [], []
+    for k, obj in enumerate(objects):
+        poses = drop(obj, count=1, seed=seed + k)["scene/object_pose"]
+        options: dict[str, Any] = {**_VIEW, "stereo": True}
+        seen = render(
+            obj, poses, views=1, seed=seed + k, extras=Extras(channels=("normals",)), **options, run=Run(device=device)
+        )
+        rows.append(scene_cells(seen))
+        names.append([obj.name])
+    return label_page(
+        rows,
+        ["left", "right", "depth", "normals", "segmentation", "boxes"],
+        names,
+        title="What the cameras see",
+        subtitle="one scene per object; stereo pair with 60 mm baseline",
+    )
+
+
+def _hands(hands: Sequence[HandModel], objects: Sequence[ObjectModel], device: str, seed: int, say: Say) -> bytes:
+    rows, names = [], []
+    for k, obj in enumerate(objects):
+        cells, below = [], []
+        for hand in hands:
+            drawn, pose, kept, tried = _fitting(hand, obj, device, seed)
+            say(f"{hand.name} on {obj.name}: {kept} of {tried} grasps stay clear")
+            camera = _camera(drawn, obj, pose)
+            seen = render(
+                obj,
+                pose[None],
+                views=1,
+                seed=seed + k,
+                extras=Extras(cameras=GivenCameras(extrinsics=camera[None]), drawn=drawn),
+                **_VIEW,
+                run=Run(device=device),
+            )
+            cells.append(Image.fromarray(np.asarray(seen["image/rgb_hand"][0], np.uint8)))
+            below.append(f"{obj.name}: {kept} of {tried} fit")
+        rows.append(cells)
+        names.append(below)
+    return label_page(
+        rows,
+        [hand.name for hand in hands],
+        names,
+        title="Grasps on the table",
+        subtitle="a hand that stays clear of the table all the way; an object alone: none of those tried fits",
+    )
+
+
+def _fitting(hand: HandModel, obj: ObjectModel, device: str, seed: int) -> tuple[DrawnHand, Floats, int, int]:
+    """The grasp that stays farthest from the table, its scene's pose, and how many of how many were kept."""
+    scenes = drop(obj, count=SCENES, seed=seed)["scene/object_pose"]
+    kept, tried, best = 0, 0, -np.inf
+    for batch in range(ROUNDS):
+        found = synthesize(hand, obj, Wanted(GRASPS, FIDELITIES["draft"], seed, batch), Run(device))
+        placed = transfer(hand, found.grasp, found.pregrasp, scenes)
+        clearance = np.asarray(placed["grasp/table_clearance_m"], float)
+        kept, tried = kept + int(placed["grasp/valid"].sum()), tried + len(clearance)
+        row = int(np.argmax(clearance))
+        if clearance[row] > best:
+            best = float(clearance[row])
+            number = row if placed["grasp/valid"][row] else -1
+            posture = Posture(
+                np.asarray(placed["grasp/hand_pose"], float)[[row]],
+                np.asarray(found.grasp.joint_positions, float)[[int(placed["grasp/base_index"][row])]],
+            )
+            pose = scenes[int(placed["grasp/scene_index"][row])]
+        if kept:
+            break
+    drawn = DrawnHand(hand, np.array([number], np.int32), posture.hand_pose, posture.joint_positions)
+    return drawn, pose, kept, tried
+
+
+def _camera(drawn: DrawnHand, obj: ObjectModel, pose: Floats) -> Floats:
+    """Extrinsics of a camera that sees object and fingers, across the direction in which the palm approaches."""
+    hand = drawn.hand
+    (bodies,) = body_poses(hand, drawn.hand_pose, drawn.joint_positions)
+    points = np.concatenate([apply(bodies[p.body], p.vertices) for p in hand.pieces])
+    solid = apply(pose, obj.hull_vertices)
+    middle = 0.5 * (solid.min(axis=0) + solid.max(axis=0))
+    # A forearm may leave the picture.
+    near = points[np.linalg.norm(points - middle, axis=1) < obj.radius + 0.12] if drawn.grasp[0] >= 0 else points[:0]
+    near = np.concatenate([near, solid])
+    centre = 0.5 * (near.min(axis=0) + near.max(axis=0))
+    radius = float(np.linalg.norm(near - centre, axis=1).max())
+    palm = bodies[0, :2] - middle[:2]
+    azimuth = float(np.arctan2(palm[1], palm[0])) + np.radians(65.0)
+    rise = np.radians(24.0)
+    direction = np.array([np.cos(azimuth) * np.cos(rise), np.sin(azimuth) * np.cos(rise), np.sin(rise)])
+    return look_at(centre + distance_to_fill(radius, FIELD_OF_VIEW, 1.05) * direction, centre)
+
+
+def _neighbours(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes:
+    rows, names = [], []
+    for k in range(min(3, len(objects))):
+        first, *others = [objects[(k + j) % len(objects)] for j in range(min(4, len(objects)))]
+        scene = drop_together(first, others, count=1, seed=seed + k)
+        poses, beside = scene["scene/object_pose"], Neighbours(others, scene["scene/neighbour_pose"])
+        extras = Extras(channels=("normals", "occlusion"), cameras=_past(poses, first, beside), neighbours=beside)
+        options: dict[str, Any] = {**_VIEW, "stereo": True}
+        seen = render(first, poses, views=1, seed=seed + k, extras=extras, **options, run=Run(device=device))
+        rows.append(scene_cells(seen))
+        hidden = float(np.asarray(seen["box/occlusion_ratio"])[0])
+        names.append([f"{first.name}, {100 * hidden:.0f} % hidden"])
+    return label_page(
+        rows,
+        ["left", "right", "depth", "normals", "segmentation", "boxes"],
+        names,
+        title="Several objects",
+        subtitle="labels 3, 4, ... are the neighbours; boxes are the grasped object's",
+    )
+
+
+def _past(poses: Floats, obj: ObjectModel, beside: Neighbours) -> GivenCameras:
+    """A camera that looks past the nearest neighbour at the object, so that something is hidden."""
+    middles = np.stack([apply(pose, o.centre_of_mass) for o, pose in zip(beside.objects, beside.poses[0], strict=True)])
+    middle = apply(poses[0], obj.centre_of_mass)
+    nearest = int(np.argmin(np.linalg.norm(middles - middle, axis=1)))
+    across = (middles[nearest] - middle)[:2]
+    direction = np.append(_LEVEL * across / np.linalg.norm(across), np.sqrt(1 - _LEVEL**2))
+    centre = 0.5 * (middle + middles[nearest])
+    radius = 0.5 * float(np.linalg.norm(across)) + max(obj.radius, beside.objects[nearest].radius)
+    return GivenCameras(
+        extrinsics=look_at(centre + distance_to_fill(radius, FIELD_OF_VIEW, 1.0) * direction, centre)[None]
+    )

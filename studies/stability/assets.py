@@ -1,0 +1,320 @@
+"""Objects and hands that are hard: thin, sharp, open, tiny, huge; few fingers and many, coupled drives. They go
+through ingest.
+
+A family of hands stands for them: like fingers of three joints in a ring around a palm, which lean outward while they
+are open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, Final, Literal
+
+import numpy as np
+import trimesh
+
+from graspd.service.model.digests import digest_files
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import GraspdError
+from graspd.service.model.states import AssetKind
+from graspd.service.model.studies import MapCell, Outcome, StabilityMap, reachable
+from graspd.worker.certified import certified_grasps
+from graspd.worker.hands.load import load_hand
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import load_object
+from graspd.worker.run import ALONE, Run
+
+MILLIMETRES: Final = 1e-3
+#: What maps of raw grasps tell of a cell, from where on it is bad, and how a user sees it.
+MEASURE: Final = "share of tries that are valid: certified by the referee, and past the geometric gate"
+BOUNDS: Final = "weak: under a half; broken: none, or a number that is none"
+SHOWS: Final = "few or no valid grasps: a job ends with a note that its budget found fewer than asked for"
+
+
+def sheet(thickness_mm: float) -> Any:
+    """A plate of 80 x 60 mm."""
+    return trimesh.creation.box((0.08, 0.06, thickness_mm * MILLIMETRES))
+
+
+def wedge(angle_deg: float) -> Any:
+    """A prism of 80 mm with one sharp edge."""
+    half = 0.06 * np.tan(np.radians(angle_deg) / 2)
+    section = np.array([[0.0, 0.0], [0.06, -half], [0.06, half]])
+    ends = [np.column_stack([section, np.full(3, z)]) for z in (-0.04, 0.04)]
+    return trimesh.convex.convex_hull(np.concatenate(ends))
+
+
+def tunnel(diameter_mm: float) -> Any:
+    """A block's worth of ring: 30 mm of wall around a hole."""
+    inner = diameter_mm * MILLIMETRES / 2
+    return trimesh.creation.annulus(inner, inner + 0.015, 0.05, sections=48)
+
+
+def corner(depth_mm: float) -> Any:
+    """A cross of two bars: four concave corners, as deep as given."""
+    deep = depth_mm * MILLIMETRES
+    arms = [trimesh.creation.box((0.03 + 2 * deep, 0.03, 0.05)), trimesh.creation.box((0.03, 0.03 + 2 * deep, 0.05))]
+    return trimesh.boolean.union(arms, engine="manifold")
+
+
+def cube(side_mm: float) -> Any:
+    return trimesh.creation.box(3 * (side_mm * MILLIMETRES,))
+
+
+def _opened() -> Any:
+    mesh = trimesh.creation.box((0.07, 0.06, 0.05))
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[2:], process=False)
+
+
+def _inverted() -> Any:
+    mesh = trimesh.creation.box((0.07, 0.06, 0.05))
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False)
+
+
+def _half_inverted() -> Any:
+    mesh = trimesh.creation.box((0.07, 0.06, 0.05))
+    faces = mesh.faces.copy()
+    faces[::2] = faces[::2, ::-1]
+    return trimesh.Trimesh(mesh.vertices, faces, process=False)
+
+
+#: Family -> unit of its parameter, how to make it, parameters.
+FAMILIES: Final[dict[str, tuple[str, Callable[[float], Any], tuple[float, ...]]]] = {
+    "plate": ("thickness [mm]", sheet, (0.2, 0.5, 1, 2, 5, 10)),
+    "wedge": ("angle of the edge [deg]", wedge, (5, 10, 20, 40, 80)),
+    "ring": ("diameter of the hole [mm]", tunnel, (4, 8, 16, 32, 64)),
+    "cross": ("depth of the corners [mm]", corner, (2, 5, 10, 20)),
+    "cube": ("side [mm]", cube, (1, 3, 10, 30, 60, 100, 200, 500, 1000)),
+}
+#: Meshes with a defect, and the options they are given with.
+DEFECTS: Final[dict[str, tuple[Callable[[], Any], dict[str, Any]]]] = {
+    "a side is missing": (_opened, {}),
+    "a side is missing, --allow-open": (_opened, {"allow_open": True}),
+    "inside out": (_inverted, {}),
+    "every other face inside out": (_half_inverted, {}),
+}
+#: Those that ingest refuses or closes.
+CLOSED: Final = tuple(name for name, (_, options) in DEFECTS.items() if not options)
+
+
+def shape_map(
+    hand: HandModel,
+    *,
+    fidelities: Sequence[str] = ("draft", "standard", "fine"),
+    count: int = 8,
+    run: Run = ALONE,
+    families: Sequence[str] = tuple(FAMILIES),
+    defects: Sequence[str] = tuple(DEFECTS),
+    say: Callable[[str], None] = lambda line: None,
+) -> StabilityMap:
+    """Valid grasps on each shape at each fidelity, or the reason why it was refused."""
+    jobs: list[tuple[str, float | str, Any, dict[str, Any]]] = [
+        (f"{family}: {FAMILIES[family][0]}", value, FAMILIES[family][1](value), {"units": "m"})
+        for family in families
+        for value in FAMILIES[family][2]
+    ]
+    jobs += [("mesh of a box", name, DEFECTS[name][0](), {"units": "m", **DEFECTS[name][1]}) for name in defects]
+    cells = []
+    for panel, value, mesh, options in jobs:
+        for fidelity in fidelities:
+            cell = shape_cell(hand, (panel, value, fidelity), mesh, options, {"fidelity": fidelity}, count, run)
+            say(f"{panel} {value} {fidelity}: {cell.outcome} {cell.value:.2f} {cell.note}")
+            cells.append(cell)
+    return StabilityMap(
+        "shapes",
+        f"{count} grasps of {hand.name} on shapes that are hard",
+        "the shape's parameter",
+        "fidelity",
+        MEASURE,
+        BOUNDS,
+        reachable(cells, lambda cell: True),
+        SHOWS,
+        "ingest refuses what has no inside and says `thin` where walls are; the gate and the referee flag grasps that "
+        "sink in; a job that finds too few says so",
+        "tests/studies/test_stability.py::test_a_shape_is_refused_or_its_grasps_are_sound",
+        reach="all: users bring such shapes",
+    )
+
+
+def prepared(mesh: Any, options: dict[str, Any], face_error_m: float) -> ObjectModel:
+    """The mesh through the same door as an upload; MeshError where it is refused."""
+    files = {"shape.ply": bytes(mesh.export(file_type="ply"))}
+    digest = digest_files(AssetKind.OBJECT, files)
+    return load_object(files, name="shape", digest=digest, face_error_m=face_error_m, options=options)
+
+
+def shape_cell(
+    hand: HandModel,
+    place: tuple[str, float | str, float | str],
+    mesh: Any,
+    options: dict[str, Any],
+    asked: dict[str, Any],
+    count: int,
+    run: Run,
+) -> MapCell:
+    """Raw grasps of a hand on a mesh, planned and judged as a job does.
+
+    Args:
+        hand: the hand.
+        place: panel, x and y of the cell.
+        mesh: comes in through the same door as an upload.
+        options: of the object, as an upload states them.
+        asked: fidelity or method of the job, and what else it asks for.
+        count: grasps.
+        run: its threads.
+    """
+    request = JobRequest(hand="hand", object="shape", grasps=count, want="raw", audits=0, **asked)
+    try:
+        obj = prepared(mesh, options, request.knobs.face_error_m)
+        found = certified_grasps(hand, obj, request, count=count, run=run)
+    except GraspdError as error:
+        return refused(*place, error)
+    valid = float(found.columns["quality/valid"].mean())
+    depth = float(np.median(found.columns["quality/penetration_depth_mm"]))
+    finite = bool(np.isfinite(found.grasps.grasp.hand_pose).all() and np.isfinite(depth))
+    outcome: Outcome = "broken" if not finite or valid == 0 else "weak" if valid < 0.5 else "good"
+    return MapCell(*place, valid, outcome, f"{valid:.0%} valid, {depth:.2f} mm deep (median)")
+
+
+def refused(panel: str, x: float | str, y: float | str, error: GraspdError) -> MapCell:
+    """The cell of what is turned away with an error."""
+    return MapCell(panel, x, y, float("nan"), "refused", str(error))
+
+
+Coupling = Literal["each joint", "distal follows", "a drive a finger", "one drive"]
+
+FINGERS: Final = (1, 2, 3, 4, 5, 6, 8)
+COUPLINGS: Final[tuple[Coupling, ...]] = ("each joint", "distal follows", "a drive a finger", "one drive")
+#: Size over that of a human hand, whose fingers are about 10 cm long.
+SIZES: Final = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
+#: Turn of the distal joint over that of the one before it.
+RATIOS: Final = (-0.5, 0.0, 0.5, 1.0, 1.5, 2.0)
+#: What they hold [mm].
+CUBE_MM: Final = 50.0
+
+#: Palm, links and their radius [m] of a hand of size 1, from the palm outward.
+_PALM_M, _LINKS_M, _RADIUS_M = (0.032, 0.02), (0.045, 0.035, 0.027), 0.009
+#: How far open fingers lean outward, and the ends of their joints [rad].
+_LEAN: Final = 0.45
+_ENDS: Final = (1.7, 1.6, 1.3)
+#: Torque of a joint of a hand of size 1 [N m].
+_EFFORT: Final = 1.0
+
+
+def ring_hand(fingers: int, *, coupling: Coupling = "each joint", size: float = 1.0, ratio: float = 0.8) -> HandModel:
+    """A hand of like fingers around a palm.
+
+    Args:
+        fingers: their number.
+        coupling: what a drive moves.
+        size: of the hand, over that of a human one.
+        ratio: turn of the distal joint over that of the middle one, where it follows.
+
+    Raises:
+        HandError: it is no usable hand.
+    """
+    urdf = ring_urdf(fingers, coupling=coupling, size=size, ratio=ratio)
+    files = {"ring.urdf": urdf.encode()}
+    return load_hand(files, name=f"ring of {fingers}", digest=digest_files(AssetKind.HAND, files))
+
+
+def ring_urdf(fingers: int, *, coupling: Coupling, size: float, ratio: float) -> str:
+    """The URDF of `ring_hand`."""
+    radius, height = (size * x for x in _PALM_M)
+    parts = [f'<robot name="ring"><link name="palm">{_solid("cylinder", -height / 2, radius, height)}</link>']
+    for k in range(fingers):
+        angle = 2 * np.pi * k / fingers
+        at = f"{radius * np.cos(angle):.6f} {radius * np.sin(angle):.6f} 0"
+        parts += _finger(k, f'<origin xyz="{at}" rpy="0 {_LEAN} {angle:.6f}"/>', coupling, size, ratio)
+    return "\n".join([*parts, "</robot>"])
+
+
+def _finger(k: int, base: str, coupling: Coupling, size: float, ratio: float) -> list[str]:
+    parts, before = [], "palm"
+    for j, (length, end) in enumerate(zip(_LINKS_M, _ENDS, strict=True)):
+        name, long = f"finger_{k}_{j}", size * length
+        solid = _solid("cylinder", long / 2, size * _RADIUS_M, long) + _solid("sphere", long, size * _RADIUS_M, 0)
+        origin = base if j == 0 else f'<origin xyz="0 0 {size * _LINKS_M[j - 1]:.6f}"/>'
+        low, high = sorted((0.0, end * ratio / 0.8)) if j == 2 and coupling == "distal follows" else (0.0, end)
+        parts += [
+            f'<link name="{name}">{solid}</link>',
+            f'<joint name="joint_{k}_{j}" type="revolute"><parent link="{before}"/><child link="{name}"/>{origin}'
+            f'<axis xyz="0 -1 0"/><limit lower="{low}" upper="{high}" effort="{_EFFORT * size}" velocity="3"/>'
+            f"{_mimic(k, j, coupling, ratio)}</joint>",
+        ]
+        before = name
+    return parts
+
+
+def _mimic(k: int, j: int, coupling: Coupling, ratio: float) -> str:
+    """What a joint follows, if it is no drive."""
+    leads = {"each joint": (k, j), "distal follows": (k, min(j, 1)), "a drive a finger": (k, 0), "one drive": (0, 0)}
+    lead = leads[coupling]
+    if lead == (k, j):
+        return ""
+    follows = ratio if coupling == "distal follows" else _ENDS[j] / _ENDS[0]
+    return f'<mimic joint="joint_{lead[0]}_{lead[1]}" multiplier="{follows:.6f}" offset="0"/>'
+
+
+def _solid(kind: str, height: float, radius: float, length: float) -> str:
+    size = f' length="{length:.6f}"' if kind == "cylinder" else ""
+    shape = f'<geometry><{kind} radius="{radius:.6f}"{size}/></geometry>'
+    return f'<collision><origin xyz="0 0 {height:.6f}"/>{shape}</collision>'
+
+
+def hand_map(
+    *,
+    fingers: Sequence[int] = FINGERS,
+    sizes: Sequence[float] = SIZES,
+    ratios: Sequence[float] = RATIOS,
+    couplings: Sequence[Coupling] = COUPLINGS,
+    fidelity: str = "standard",
+    count: int = 8,
+    run: Run = ALONE,
+    say: Callable[[str], None] = lambda line: None,
+) -> StabilityMap:
+    """Valid grasps of a cube in each hand, or why the hand is refused."""
+    makes: list[tuple[str, float, str, Callable[[], HandModel]]] = []
+    for way in couplings:
+        makes += [("fingers of a ring", n, way, partial(ring_hand, n, coupling=way)) for n in fingers]
+        makes += [("size, of three fingers", s, way, partial(ring_hand, 3, coupling=way, size=s)) for s in sizes]
+    for n in (2, 3, 4):
+        following = partial(ring_hand, n, coupling="distal follows")
+        makes += [("distal over middle joint", r, f"{n} fingers", partial(following, ratio=r)) for r in ratios]
+    cells = [_cell(panel, x, y, make, fidelity, count, run, say) for panel, x, y, make in makes]
+    return StabilityMap(
+        "hands",
+        f"{count} grasps of a cube of {CUBE_MM:g} mm in hands that are hard, {fidelity}",
+        "the hand's parameter",
+        "what a drive moves",
+        MEASURE,
+        BOUNDS,
+        reachable(cells, lambda cell: True),
+        "few or no valid grasps, and a low share in the hand's self-test",
+        "a hand without two parts that oppose each other is refused; the self-test of a new hand says which share "
+        "holds plain objects; a job that finds too few says so",
+        "tests/studies/test_stability_hands.py::test_a_palm_without_fingers_is_refused_and_three_of_them_hold",
+        reach="all: users bring such hands",
+    )
+
+
+def _cell(
+    panel: str,
+    x: float,
+    y: str,
+    make: Callable[[], HandModel],
+    fidelity: str,
+    count: int,
+    run: Run,
+    say: Callable[[str], None],
+) -> MapCell:
+    try:
+        hand = make()
+    except GraspdError as error:
+        cell = refused(panel, x, y, error)
+    else:
+        cell = shape_cell(hand, (panel, x, y), cube(CUBE_MM), {"units": "m"}, {"fidelity": fidelity}, count, run)
+    say(f"{panel} {x:g} {y}: {cell.outcome} {cell.value:.2f} {cell.note}")
+    return cell

@@ -1,0 +1,235 @@
+"""The descent itself: from starts too deep or too far, with rates and weights too small or too large, for too long."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from graspd.service.model.fidelity import FIDELITIES, Fidelity
+from graspd.service.model.studies import MapCell, StabilityMap, graded, reachable, short
+from graspd.service.model.transforms import Floats, quat_rotate
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fast_graspd.candidates import merits
+from graspd.worker.planners.fast_graspd.pairs import Pair, pair_of
+from graspd.worker.planners.fast_graspd.schedule import AROUND, coarse_schedule, fine_schedule
+from graspd.worker.planners.fast_graspd.starts import sample_starts
+from graspd.worker.simulation.data import Data, HandState, Schedule
+from graspd.worker.simulation.projection import Projection
+from graspd.worker.simulation.record import record_iteration
+
+Say = Callable[[str], None]
+
+#: How far the start is moved along the approach [m]: towards the object where negative is away from it.
+MOVES_M: Final = (-0.5, -0.2, -0.1, -0.05, 0.0, 0.03, 0.06, 0.1)
+#: Factors on the optimiser's rates, and on the weights of penetration.
+RATES: Final = (0.01, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)
+WEIGHTS: Final = (0.0, 0.01, 0.1, 1.0, 10.0, 100.0)
+#: Names of the panels: plain descent is driven with rates made for Adam, which is not what `optimizer: gd` does.
+_OPTIMIZERS: Final = {"adam": "Adam", "gd": "plain descent, Adam's rates"}
+LENGTHS: Final = (100, 1_000, 10_000)
+LONG: Final = 100_000
+#: Median penetration that is weak and broken [mm].
+DEPTH_MM: Final = (0.5, 2.0)
+#: Residual of the balance of contact forces that is weak and broken; 1: no balance at all.
+RESIDUAL: Final = (0.35, 0.9)
+
+
+@dataclass(frozen=True)
+class Descent:
+    """What became of n hands."""
+
+    state: HandState
+    depths: Floats
+    """Deepest penetration after the projection (n,) [m], as a job has it: hands that are pulled around the object stand
+    millimetres deep in it before."""
+    drift: float
+    """Largest departure of a quaternion's length from 1 before the projection, which makes them whole again."""
+
+
+def descend(
+    pair: Pair,
+    state: HandState,
+    fidelity: Fidelity,
+    *,
+    rates: float = 1.0,
+    weights: float = 1.0,
+    iterations: int | None = None,
+    optimizer: str = "adam",
+) -> Descent:
+    """Coarse and fine phase and projection from given hands.
+
+    Args:
+        pair: hand and object.
+        state: n hands.
+        fidelity: its schedules.
+        rates: factor on the rates.
+        weights: factor on the weights of penetration.
+        iterations: of the fine phase, whose last row is repeated; by default the fidelity's.
+        optimizer: adam or gd.
+    """
+    n = len(state.pivot)
+    for side, schedule in ((pair.coarse, coarse_schedule(fidelity)), (pair.fine, fine_schedule(fidelity))):
+        model = pair.model(side)
+        data = Data(model, n)
+        scaled = _scaled(schedule, rates, weights)
+        data.set_schedule(_lengthened(scaled, iterations) if side is pair.fine else scaled)
+        data.set_state(state)
+        record_iteration(model, data, optimizer).run(
+            len(schedule) if side is pair.coarse or iterations is None else iterations
+        )
+        state = data.state(n)
+    # The projection divides quaternions by their length: what the descent did to it is told before.
+    drift = float(np.abs(np.linalg.norm(state.rotation, axis=1) - 1.0).max())
+    state, depths = Projection(model, data, AROUND).run(state, fidelity.polish_iterations)
+    return Descent(state, depths, drift)
+
+
+def start_map(hand: HandModel, obj: ObjectModel, *, count: int = 8, say: Say = lambda line: None) -> StabilityMap:
+    """Starts moved along the approach, into the object and away from it."""
+    fidelity = FIDELITIES["standard"]
+    pair = pair_of(hand, obj, fidelity, "cpu")
+    state = starts_of(pair, count)
+    along = quat_rotate(state.rotation, hand.palm.approach)
+    cells = []
+    for move in MOVES_M:
+        moved = replace(state, pivot=state.pivot + move * along)
+        cells += _cells(pair, descend(pair, moved, fidelity), f"{hand.name} on {obj.name}", move, "standard")
+        say(f"start moved by {move * 1e3:.0f} mm: {cells[-1].outcome}")
+    return StabilityMap(
+        "starts",
+        f"{count} starts moved along the approach",
+        "way towards the object [m]",
+        "fidelity",
+        _MEASURE,
+        _BOUNDS,
+        reachable(cells, lambda cell: cell.x == 0.0),
+        "a hand that stays away has no contacts; one that begins inside stays tangled",
+        "the planner's own starts are drawn back until nothing touches; the merit drops hands that hold nothing, the "
+        "gate those that sink in",
+        "tests/studies/test_stability.py::test_a_start_that_is_too_far_is_flagged",
+        reach="0 m: the planner draws its starts itself",
+    )
+
+
+def rate_map(
+    hand: HandModel,
+    obj: ObjectModel,
+    *,
+    rates: Sequence[float] = RATES,
+    weights: Sequence[float] = WEIGHTS,
+    count: int = 8,
+    say: Say = lambda line: None,
+) -> StabilityMap:
+    """Learning rate x weight of penetration, for Adam and for plain descent."""
+    fidelity = FIDELITIES["draft"]
+    pair = pair_of(hand, obj, fidelity, "cpu")
+    state = starts_of(pair, count)
+    cells = []
+    for optimizer in _OPTIMIZERS:
+        for rate in rates:
+            for weight in weights:
+                found = descend(pair, state, fidelity, rates=rate, weights=weight, optimizer=optimizer)
+                cells += _cells(pair, found, _OPTIMIZERS[optimizer], rate, weight)
+            say(f"{optimizer} rate x {rate:g}: {[cell.outcome for cell in cells[-len(weights) :]]}")
+    return StabilityMap(
+        "rates",
+        f"Rates and weights of the descent, draft, {hand.name} on {obj.name}",
+        "factor on the rates",
+        "factor on the weights of penetration",
+        _MEASURE,
+        _BOUNDS,
+        reachable(cells, lambda cell: (cell.panel, cell.x, cell.y) == (_OPTIMIZERS["adam"], 1.0, 1.0)),
+        "hands jump past the object or sink into it",
+        "rates and weights are fixed by the schedule; hands that are no numbers are dropped, others judged",
+        "tests/worker/test_certified.py::test_hands_that_are_no_numbers_are_dropped_and_counted",
+        reach="Adam at 1 and 1: rates and weights are no options of a job; `optimizer: gd` brings the paper's own",
+    )
+
+
+def length_map(
+    hand: HandModel, obj: ObjectModel, *, lengths: Sequence[int] = LENGTHS, count: int = 4, say: Say = lambda line: None
+) -> StabilityMap:
+    """Fine phases far longer than any schedule: does anything drift?"""
+    fidelity = FIDELITIES["draft"]
+    pair = pair_of(hand, obj, fidelity, "cpu")
+    state = starts_of(pair, count)
+    cells = []
+    for length in lengths:
+        found = descend(pair, state, fidelity, iterations=length)
+        (cell,) = _cells(pair, found, "draft", length, "residual")
+        cells += [cell, MapCell("draft", length, "quaternion drift", found.drift, graded(found.drift, 1e-5, 1e-3))]
+        say(f"{length} iterations: {cell.outcome}, quaternions off by {found.drift:.1e}")
+    return StabilityMap(
+        "length",
+        f"Long runs of the fine phase, {hand.name} on {obj.name}",
+        "iterations",
+        "measure",
+        _MEASURE + "; the largest departure of a quaternion's length from 1",
+        _BOUNDS + "; drift: 1e-5, 1e-3",
+        reachable(cells, lambda cell: True),
+        "poses that are no rotations any more, hands that creep away",
+        "quaternions are normalised in each step; a grasp that does not improve is frozen after `patience` iterations",
+        "tests/studies/test_stability.py::test_a_long_run_does_not_drift",
+        reach="all: a fidelity of one's own may ask for 100,000 iterations",
+    )
+
+
+_ORDER: Final = ("good", "weak", "broken")
+_MEASURE: Final = (
+    "median residual of balanced contact forces (1: nothing holds); ↓ how deep the hands are [mm], where that is worse"
+)
+_BOUNDS: Final = (
+    f"weak: residual {RESIDUAL[0]:g} or {DEPTH_MM[0]:g} mm deep; "
+    f"broken: {RESIDUAL[1]:g}, {DEPTH_MM[1]:g} mm, or no number"
+)
+
+
+def starts_of(pair: Pair, count: int) -> HandState:
+    """Starts as the planner draws them."""
+    return sample_starts(pair.model(pair.coarse), seed=11, batch=0, indices=range(count), each=1)
+
+
+def _cells(pair: Pair, found: Descent, panel: str, x: float | str, y: float | str) -> list[MapCell]:
+    state = found.state
+    finite = bool(np.isfinite(state.pivot).all() and np.isfinite(state.q).all() and np.isfinite(state.rotation).all())
+    if not finite:
+        return [MapCell(panel, x, y, float("nan"), "broken", "hands are no numbers")]
+    residual = float(np.median(merits(pair.hand.model, pair.fine.obj.model, state, np.zeros(len(found.depths)))))
+    depth = float(np.median(found.depths)) * 1e3
+    held, deep = graded(residual, *RESIDUAL), graded(depth, *DEPTH_MM)
+    is_deep = _ORDER.index(deep) > _ORDER.index(held)
+    # What makes the cell bad is what stands on it.
+    label = f"↓{short(depth)}" if is_deep else ""
+    said = f"residual {residual:.2g}, {depth:.2g} mm deep"
+    return [MapCell(panel, x, y, residual, deep if is_deep else held, said, label)]
+
+
+def _scaled(schedule: Schedule, rates: float, weights: float) -> Schedule:
+    return replace(
+        schedule,
+        rates=rates * schedule.rates,
+        penetration=weights * schedule.penetration,
+        object_penetration=weights * schedule.object_penetration,
+    )
+
+
+def _lengthened(schedule: Schedule, iterations: int | None) -> Schedule:
+    """The schedule with its last row repeated."""
+    if iterations is None or iterations <= len(schedule):
+        return schedule
+    more = iterations - len(schedule)
+
+    def longer(values: Floats) -> Floats:
+        return np.concatenate([values, np.repeat(values[-1:], more, axis=0)])
+
+    return Schedule(
+        longer(schedule.dilation),
+        longer(schedule.penetration),
+        longer(schedule.object_penetration),
+        longer(schedule.self_penetration),
+        longer(schedule.rates),
+    )

@@ -1,0 +1,136 @@
+"""The kernels' gradients in float32 against central differences of the float64 reference, along each axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+
+from graspd.service.model.studies import MapCell, StabilityMap, graded, reachable
+from graspd.service.model.transforms import Floats
+from graspd.worker.simulation import reference
+from graspd.worker.simulation.kernels import contact
+from graspd.worker.simulation.model import initial_motions
+from graspd.worker.simulation.reference import Contacts, World
+
+PASSES: Final = 12
+#: Sizes of the ball that is held [m], and how deep or far its contacts are at most, over the step of 1 mm.
+SIZES_M: Final = (0.0005, 0.002, 0.01, 0.04, 0.15, 0.5)
+GAPS: Final = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
+STEP_M: Final = 1e-3
+#: Sine of the angle between the two gradients, weak and broken.
+ANGLE: Final = (0.25, 0.7)
+_KERNELS: Final = {"direct": contact.direct, "gauss_seidel": contact.gauss_seidel, "jacobi": contact.jacobi}
+
+
+def solve64(name: str, contacts: Contacts, s0: Floats, world: World) -> Floats:
+    """The reference's step of a solver."""
+    if name == "direct":
+        return reference.direct(contacts, s0, world, PASSES)
+    if name == "gauss_seidel":
+        return reference.gauss_seidel(contacts, s0, world)[0]
+    return reference.jacobi(contacts, s0, world, PASSES)
+
+
+def kernel_gradient(name: str, contacts: Contacts, world: World) -> Floats:
+    """dL/drho (N,) by a kernel, without leak, on the CPU."""
+    motions = initial_motions(7, world.step, world.gyration)
+    n, m = len(contacts.points), len(motions)
+    with wp.ScopedDevice("cpu"):
+        loss, end = wp.zeros((1, m), dtype=wp.float32), wp.zeros((1, m), dtype=contact.vec6)
+        gradient = wp.zeros((1, n), dtype=wp.float32)
+        physics = _physics(world)
+        given = [
+            wp.ones(1, dtype=wp.int32),
+            wp.zeros(1, dtype=wp.int32),
+            wp.array([world.dilation], dtype=wp.float32),
+            wp.ones(1, dtype=wp.float32),
+            wp.array([n], dtype=wp.int32),
+            wp.array(contacts.points[None], dtype=wp.vec3),
+            wp.array(contacts.normals[None], dtype=wp.vec3),
+            wp.array(contacts.distances[None], dtype=wp.float32),
+            wp.array(contacts.weights[None], dtype=wp.float32),
+        ]
+        inputs = [physics, wp.array(motions, dtype=contact.vec6), PASSES, *given]
+        if name == "direct":
+            near = [wp.array([n], dtype=wp.int32), wp.array(np.arange(n)[None], dtype=wp.int32)]
+            adjoint = wp.zeros((1, m), dtype=contact.vec6)
+            wp.launch(contact.direct, dim=(1, m), inputs=[*inputs, *near], outputs=[loss, end, adjoint])
+            wp.launch(
+                contact.direct_gradient, dim=(1, 1), inputs=[physics, n, *given, end, adjoint], outputs=[gradient]
+            )
+        else:
+            states = wp.zeros((1, m, max(n, PASSES)), dtype=contact.vec6)
+            wp.launch(_KERNELS[name], dim=(1, m), inputs=inputs, outputs=[states, loss, end, gradient])
+        return gradient.numpy()[0].astype(float)
+
+
+def reference_gradient(name: str, contacts: Contacts, world: World) -> Floats:
+    """dL/drho (N,) by central differences in float64."""
+    motions = initial_motions(7, world.step, world.gyration)
+    step = 1e-6 * world.step
+    steps = step * np.eye(len(contacts.points))[:, None]
+
+    def losses(distances: Floats) -> Floats:
+        ends = solve64(name, replace(contacts, distances=distances), motions, world)
+        return np.asarray(np.mean(reference.loss(ends, world), axis=-1))
+
+    return (losses(contacts.distances + steps) - losses(contacts.distances - steps)) / (2 * step)
+
+
+def gradient_map(
+    sizes: Sequence[float] = SIZES_M, gaps: Sequence[float] = GAPS, *, repeats: int = 3, count: int = 8
+) -> StabilityMap:
+    """Angle between the two gradients over the object's size and the spread of gaps."""
+    cells = []
+    for name in _KERNELS:
+        for size in sizes:
+            for gap in gaps:
+                angles = [_angle(name, size, gap, count, seed) for seed in range(repeats)]
+                worst = float(np.median(angles))
+                cells.append(MapCell(name, size, gap, worst, graded(worst, *ANGLE)))
+    return StabilityMap(
+        "gradient",
+        "Gradient of the float32 kernels against float64 differences",
+        "radius of the object [m]",
+        "spread of the gaps over the step",
+        "sine of the angle between the gradients, median of some contact sets",
+        f"weak: {ANGLE[0]:g}; broken: {ANGLE[1]:g}",
+        reachable(cells, lambda cell: True),
+        "the descent wanders: losses stay where they were however many iterations are run",
+        "a descent that does not improve stops after `patience` iterations; of several starts the best is kept, judged "
+        "by the balance of forces and not by the loss",
+        "tests/studies/test_stability.py::test_gradients_agree_at_the_sizes_of_hands_and_their_objects",
+        reach="all: `contact_solver` offers each, and objects have every size",
+    )
+
+
+def _physics(world: World) -> Any:
+    out = contact.Physics()
+    out.mass = contact.mat66(*world.mass.ravel().tolist())
+    out.inverse_mass = contact.mat66(*np.linalg.inv(world.mass).ravel().tolist())
+    out.gyration, out.friction, out.stiffness = world.gyration, world.friction, world.stiffness
+    out.leak, out.leak_length, out.one_sided, out.step = 0.0, 0.02, 1, world.step
+    out.radius = 10.0
+    out.near_gap = 100.0
+    return out
+
+
+def _angle(name: str, size: float, gap: float, count: int, seed: int) -> float:
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    distances = STEP_M * gap * (rng.uniform(-1.0, 0.5, count))
+    contacts = Contacts(size * normals, normals, distances, np.ones(count))
+    inertia = 0.4 * size**2 * np.eye(3)
+    world = World(inertia=inertia, gyration=float(np.sqrt(0.4)) * size, step=STEP_M)
+    ours, expected = kernel_gradient(name, contacts, world), reference_gradient(name, contacts, world)
+    lengths = float(np.linalg.norm(ours) * np.linalg.norm(expected))
+    if lengths == 0.0:
+        return 0.0 if np.linalg.norm(ours) == np.linalg.norm(expected) else 1.0
+    cosine = float(ours @ expected) / lengths
+    # Opposite gradients are worse than ones at a right angle.
+    return float(np.sqrt(max(0.0, 1.0 - cosine**2))) if cosine > 0 else 1.0

@@ -1,0 +1,284 @@
+"""Integrators on their own: a ball thrown into a cage of contact points, one step after another, in float64.
+
+The cage stands still, the ball flies inside it. A sound integrator gives it no more energy than it had, keeps it in
+the cage and lets nothing sink in. The position-based ones are those of `worker.simulation.reference`, which the
+kernels are tested against; the force-based one is the penalty force of Grasp'D (2022) under semi-implicit Euler.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+
+from graspd.service.model.studies import MapCell, StabilityMap, graded, reachable, short
+from graspd.service.model.transforms import Floats
+from graspd.worker.simulation import reference
+from graspd.worker.simulation.model import LossOptions
+from graspd.worker.simulation.reference import Contacts, World
+
+#: From contacts (of which the distances are the present ones), free motion and world to the motion that is allowed.
+Solver = Callable[[Contacts, Floats, World], Floats]
+
+RADIUS_M: Final = 0.035
+#: Gap between ball and cage at the start [m], or as far as the ball flies in so many steps if that is less: it has to
+#: arrive.
+GAP_M: Final = 2e-3
+FLIGHT_STEPS: Final = 10
+STEPS: Final = 60
+#: Most that a ball of 1 kg may sink in, weak and broken [m].
+SINK_M: Final = (5e-4, 5e-3)
+#: Most energy over that at the start, weak and broken.
+ENERGY: Final = (1.02, 2.0)
+#: Sliding friction of the cage, and the viscous coefficient of the force-based contact [N s/m].
+FRICTION: Final = 0.8
+VISCOUS: Final = 10.0
+
+#: On cells of balls stands the worse of the two.
+_BALL_MEASURE: Final = "× largest kinetic energy over the first (∞: it blew up), else how deep it sank [mm]"
+
+TIME_STEPS: Final = (1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
+SPEEDS: Final = (0.01, 0.1, 0.3, 1.0, 3.0, 10.0)
+STIFFNESSES: Final = (1e2, 1e3, 1e4, 1e5, 1e6, 1e7)
+MASSES: Final = (0.01, 0.1, 1.0, 10.0)
+COUNTS: Final = (1, 2, 4, 8, 16, 64, 256)
+
+
+def cage(count: int) -> Floats:
+    """(count, 3) unit directions, evenly spread (Fibonacci)."""
+    k = np.arange(count) + 0.5
+    polar, turn = np.arccos(1 - 2 * k / count), np.pi * (1 + 5**0.5) * k
+    return np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
+
+
+def _cage_around(count: int, dt: float, speed: float) -> Floats:
+    return cage(count) * (RADIUS_M + min(GAP_M, FLIGHT_STEPS * dt * speed))
+
+
+def contacts_of(points: Floats, centre: Floats) -> Contacts:
+    """Contacts of the ball at `centre` with the cage's points (N, 3) [m]."""
+    arms = points - centre
+    length = np.linalg.norm(arms, axis=1)
+    normals = arms / length[:, None]
+    return Contacts(RADIUS_M * normals, normals, length - RADIUS_M, np.ones(len(points)))
+
+
+def ball_world(dt: float, speed: float) -> World:
+    inertia = 0.4 * RADIUS_M**2 * np.eye(3)
+    return World(
+        inertia=inertia,
+        gyration=math.sqrt(0.4) * RADIUS_M,
+        friction=FRICTION,
+        stiffness=1.0,
+        step=max(dt * speed, 1e-9),
+    )
+
+
+def position_based(solver: Solver, *, dt: float, speed: float, count: int = 24) -> tuple[float, float]:
+    """Largest energy over the first, and deepest sink [m], of a ball under a position-based integrator."""
+    points = _cage_around(count, dt, speed)
+    world = ball_world(dt, speed)
+    centre, velocity = np.zeros(3), np.array([0.8, 0.36, 0.48, 0, 0, 0]) * speed
+    first, most, deepest = world.mass @ velocity @ velocity, 1.0, 0.0
+    for _ in range(STEPS):
+        contacts = contacts_of(points, centre)
+        motion = solver(contacts, velocity * dt, world)
+        centre = centre + motion[:3]
+        velocity = motion / dt
+        most = max(most, float(world.mass @ velocity @ velocity / first))
+        deepest = max(deepest, _sunk(points, centre))
+        if not np.isfinite(most) or most > 1e6:
+            return math.inf, deepest
+    return most, deepest
+
+
+def force_based(
+    *, dt: float, speed: float, stiffness: float, mass: float = 1.0, count: int = 24
+) -> tuple[float, float]:
+    """The same under penalty forces -k c n and friction, semi-implicit Euler; `stiffness` in N/m, `mass` in kg."""
+    points = _cage_around(count, dt, speed)
+    inertia = 0.4 * mass * RADIUS_M**2
+    centre, v, w = np.zeros(3), np.array([0.8, 0.36, 0.48]) * speed, np.zeros(3)
+    first, most, deepest = mass * float(v @ v), 1.0, 0.0
+    for _ in range(STEPS):
+        contacts = contacts_of(points, centre)
+        force, torque = _penalty(contacts, v, w, stiffness)
+        v, w = v + dt * force / mass, w + dt * torque / inertia
+        centre = centre + dt * v
+        most = max(most, (mass * float(v @ v) + inertia * float(w @ w)) / first)
+        deepest = max(deepest, _sunk(points, centre))
+        if not np.isfinite(most) or most > 1e6:
+            return math.inf, deepest
+    return most, deepest
+
+
+def _penalty(contacts: Contacts, v: Floats, w: Floats, stiffness: float) -> tuple[Floats, Floats]:
+    c = np.maximum(-contacts.distances, 0.0)
+    motion = v + np.cross(w, contacts.points)
+    tangent = motion - np.einsum("ij,ij->i", motion, contacts.normals)[:, None] * contacts.normals
+    slip = np.linalg.norm(tangent, axis=1)
+    size = np.minimum(VISCOUS * slip * (c > 0), FRICTION * stiffness * c) / np.maximum(slip, 1e-12)
+    forces = -stiffness * c[:, None] * contacts.normals - size[:, None] * tangent
+    return forces.sum(axis=0), np.cross(contacts.points, forces).sum(axis=0)
+
+
+def _sunk(points: Floats, centre: Floats) -> float:
+    """How deep the deepest cage point is in the ball; all of the ball's size once it has left the cage [m]."""
+    if float(np.linalg.norm(centre)) > 2 * RADIUS_M:
+        return 2 * RADIUS_M
+    return max(0.0, RADIUS_M - float(np.linalg.norm(points - centre, axis=1).min()))
+
+
+def _direct(contacts: Contacts, s0: Floats, world: World) -> Floats:
+    return reference.direct(contacts, s0, world, passes=6)
+
+
+def _sweep(contacts: Contacts, s0: Floats, world: World) -> Floats:
+    return reference.gauss_seidel(contacts, s0, world)[0]
+
+
+def _averaged(contacts: Contacts, s0: Floats, world: World) -> Floats:
+    return reference.jacobi(contacts, s0, world, passes=8)
+
+
+def summed_jacobi(contacts: Contacts, s0: Floats, world: World) -> Floats:
+    """All contacts' corrections at once, added and not averaged: the form that graspd does not offer."""
+    inverse = np.linalg.inv(world.mass)
+    s = s0.copy()
+    for _ in range(8):
+        total = np.zeros(6)
+        for p, n, rho in zip(contacts.points, contacts.normals, contacts.distances, strict=True):
+            j = reference.row(n, p)
+            c = world.dilation - rho + j @ s
+            if c > 0:
+                total -= c / (j @ inverse @ j) * (inverse @ j)
+        s = s + total
+    return s
+
+
+SOLVERS: Final[dict[str, Solver]] = {
+    "direct (default)": _direct,
+    "Gauss-Seidel, one sweep": _sweep,
+    "Jacobi, averaged": _averaged,
+    "Jacobi, summed": summed_jacobi,
+}
+#: What `contact_solver` offers.
+_OFFERED: Final = tuple(SOLVERS)[:3]
+
+
+def time_step_map(time_steps: Sequence[float] = TIME_STEPS, speeds: Sequence[float] = SPEEDS) -> StabilityMap:
+    """Every integrator over time step and speed."""
+    grid = [(dt, speed) for dt in time_steps for speed in speeds]
+    cells = [
+        _ball_cell(name, dt, speed, position_based(solver, dt=dt, speed=speed))
+        for name, solver in SOLVERS.items()
+        for dt, speed in grid
+    ]
+    cells += [
+        _ball_cell(f"penalty force, {name} N/m", dt, speed, force_based(dt=dt, speed=speed, stiffness=k))
+        for name, k in (("1e4", 1e4), ("1e6", 1e6))
+        for dt, speed in grid
+    ]
+    step = LossOptions().step
+    # The grid comes no nearer to the planner's step than a tenth of it.
+    cells = reachable(cells, lambda c: c.panel in _OFFERED and abs(float(c.x) * float(c.y) / step - 1) < 0.15)
+    return StabilityMap(
+        "time_step",
+        "A ball of 1 kg in a cage of 24 points, 60 steps",
+        "time step [s]",
+        "speed [m/s]",
+        _BALL_MEASURE,
+        f"weak: energy × {ENERGY[0]:g} or {SINK_M[0] * 1e3:g} mm deep; broken: energy × {ENERGY[1]:g} or "
+        f"{SINK_M[1] * 1e3:g} mm deep",
+        cells,
+        "an object that is thrown out of the hand, or hands that sink into it",
+        "the planner takes one step of 1 mm (time step x speed), where its integrators are good; the referee steps "
+        "MuJoCo's implicit solver",
+        "tests/studies/test_stability.py::test_the_planners_own_step_lies_where_its_integrators_are_good",
+        reach=f"the offered solvers at a step of {1e3 * step:g} mm; the step is no option of a job",
+    )
+
+
+def _ball_cell(name: str, dt: float, speed: float, found: tuple[float, float]) -> MapCell:
+    energy, deep = found
+    worst = max(graded(energy, *ENERGY), graded(deep, *SINK_M), key=("good", "weak", "broken").index)
+    said = f"energy × {energy:.3g}, {deep * 1e3:.2g} mm deep"
+    # What makes the cell bad is what stands on it.
+    ratio = f"{energy:.2f}" if energy < 2 else short(energy)
+    label = f"×{ratio}" if energy >= ENERGY[0] else short(round(deep * 1e3, 2))
+    return MapCell(name, dt, speed, energy, worst, said, label)
+
+
+def stiffness_map(
+    stiffnesses: Sequence[float] = STIFFNESSES,
+    masses: Sequence[float] = MASSES,
+    time_steps: Sequence[float] = TIME_STEPS,
+) -> StabilityMap:
+    """The force-based integrator over stiffness, mass and time step, with the bound that theory gives."""
+    cells = []
+    lines = {}
+    for mass in masses:
+        panel = f"penalty force, {mass:g} kg"
+        for stiffness in stiffnesses:
+            for dt in time_steps:
+                found = force_based(dt=dt, speed=0.3, stiffness=stiffness, mass=mass)
+                cells.append(_ball_cell(panel, stiffness, dt, found))
+        # Semi-implicit Euler on m x'' = -k x is stable for dt < 2 sqrt(m / k).
+        lines[panel] = [(k, 2 * math.sqrt(mass / k)) for k in stiffnesses]
+    cells += [
+        _ball_cell("direct (has no such knob)", k, dt, position_based(_direct, dt=dt, speed=0.3))
+        for k in stiffnesses
+        for dt in time_steps
+    ]
+    return StabilityMap(
+        "stiffness",
+        "Penalty stiffness against the position-based step, 0.3 m/s",
+        "contact stiffness [N/m]",
+        "time step [s]",
+        _BALL_MEASURE,
+        "as in time_step; the line is dt = 2 sqrt(m / k), above which one contact alone is unstable",
+        cells,
+        "soft contacts let the hand sink in, stiff ones throw the object; the band between them narrows with dt",
+        "only `graspd2022` uses penalty forces, and only for a static balance without time steps",
+        "tests/studies/test_stability.py::test_a_penalty_force_blows_up_above_the_bound_of_theory",
+        lines,
+        reach="none: no planner integrates penalty forces over time, and the planner's own stiffness is fixed",
+    )
+
+
+def contact_count_map(counts: Sequence[int] = COUNTS) -> StabilityMap:
+    """One step against a wall seen by ever more contact points: what is left of the motion into it."""
+    cells = [
+        _wall_cell(name, solver, count, depth, 1e-3)
+        for name, solver in SOLVERS.items()
+        for count in counts
+        for depth in (0.0, 1e-4, 1e-3)
+    ]
+    cells = reachable(cells, lambda cell: cell.panel in _OFFERED)
+    return StabilityMap(
+        "contact_count",
+        "A step of 1 mm into a wall of contact points",
+        "contact points",
+        "initial depth [m]",
+        "motion left into or out of the wall, over the step",
+        "weak: 0.25 of the step; broken: 1, more than came in",
+        cells,
+        "more points on the same finger push harder; losses and gradients grow with the sampling",
+        "summed Jacobi is not offered; the direct solver weighs points by the area they stand for",
+        "tests/studies/test_stability.py::test_summed_jacobi_overshoots_with_the_number_of_contacts",
+        reach="the offered solvers, with any number of contacts: it is the number of hand points that touch",
+    )
+
+
+def _wall_cell(name: str, solver: Solver, count: int, depth: float, step: float) -> MapCell:
+    rng = np.random.default_rng(count)
+    points = np.concatenate([0.005 * rng.normal(size=(count, 2)), np.full((count, 1), RADIUS_M)], axis=1)
+    normals = np.tile([0.0, 0, 1], (count, 1))
+    # The compliant solver sees a finger of one stiffness, however many points it is sampled with.
+    contacts = Contacts(points, normals, np.full(count, -depth), np.full(count, 24.0 / count))
+    world = ball_world(1.0, step)
+    end = solver(contacts, np.array([0, 0, step, 0, 0, 0]), world)
+    left = abs(float(end[2]) + depth) / step
+    return MapCell(name, count, depth, left, graded(left, 0.25, 1.0))

@@ -1,0 +1,168 @@
+"""Models that are wrong: grasps that hold in the referee's model, judged in one of which a single thing is off.
+
+Amounts go from what `--robust` draws (`worker.validation.variant`) to where little holds. Places and turns are off
+in a direction of each grasp's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.studies import MapCell, Outcome, StabilityMap
+from graspd.worker.certified import certified_grasps
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.run import ALONE, Run
+from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.model import MujocoOptions
+from graspd.worker.validation.variant import (
+    ARMATURE,
+    CENTRE_M,
+    DRY_FRICTION,
+    FACTOR,
+    FRICTIONS,
+    GROWTH_M,
+    LATEST,
+    SHIFT_M,
+    TURN,
+    Variant,
+    Vector,
+)
+from graspd.worker.validation.varied import Models
+
+Direction = NDArray[np.float64]
+Make = Callable[[HandModel, float, Direction], Variant]
+
+#: Shares of grasps below which a cell is weak, and broken.
+WEAK: Final = 0.75
+BROKEN: Final = 0.25
+_MM: Final = 1e-3
+_ROUNDING: Final = 1e-9
+
+
+@dataclass(frozen=True)
+class _Error:
+    """One thing that may be off."""
+
+    amounts: tuple[float, ...]
+    drawn: tuple[float, float]
+    """Least and largest amount that `--robust` draws."""
+    variant: Make
+
+
+def _along(direction: Direction, length: float) -> Vector:
+    x, y, z = (length * direction).tolist()
+    return x, y, z
+
+
+def _lags(hand: HandModel, latest: float) -> tuple[float, ...]:
+    fingers = len(hand.fingertips)
+    return tuple((latest * np.arange(fingers) / max(1, fingers - 1)).tolist())
+
+
+ERRORS: Final[dict[str, _Error]] = {
+    "shapes of the hand stand out [mm]": _Error(
+        (-4, -2, -1, -0.5, 0.5, 1, 2, 4), (-GROWTH_M / _MM, GROWTH_M / _MM), lambda h, x, d: Variant(grown_m=x * _MM)
+    ),
+    "friction over the model's": _Error(
+        (0.25, 0.5, 0.67, 0.8, 1.33, 2), FRICTIONS, lambda h, x, d: Variant(friction=x)
+    ),
+    "mass over the model's": _Error((0.25, 0.5, 2, 4, 8), (1 / FACTOR, FACTOR), lambda h, x, d: Variant(mass=x)),
+    "gains over the model's": _Error((0.12, 0.25, 0.5, 2, 4, 8), (1 / FACTOR, FACTOR), lambda h, x, d: Variant(gain=x)),
+    "armature [1e-4 kg m²]": _Error(
+        (1, 2, 4, 16, 64), (0.0, 1e4 * ARMATURE * FACTOR), lambda h, x, d: Variant(armature=1e-4 * x)
+    ),
+    "dry friction of joints [N m]": _Error(
+        (0.005, 0.01, 0.02, 0.05, 0.1, 0.2), (0.0, DRY_FRICTION * FACTOR), lambda h, x, d: Variant(dry_friction=x)
+    ),
+    "object stands off by [mm]": _Error(
+        (1, 2, 4, 8, 16), (0.0, SHIFT_M / _MM), lambda h, x, d: Variant(object_shift_m=_along(d, x * _MM))
+    ),
+    "object is turned by [°]": _Error(
+        (1, 2, 5, 10, 20),
+        (0.0, float(np.degrees(TURN))),
+        lambda h, x, d: Variant(object_turn=_along(d, float(np.radians(x)))),
+    ),
+    "hand stands off by [mm]": _Error(
+        (1, 2, 4, 8, 16), (0.0, SHIFT_M / _MM), lambda h, x, d: Variant(hand_shift_m=_along(d, x * _MM))
+    ),
+    "centre of mass is off by [mm]": _Error(
+        (2, 5, 10, 20, 40), (0.0, CENTRE_M / _MM), lambda h, x, d: Variant(centre_m=_along(d, x * _MM))
+    ),
+    "last finger begins later by [share of closing]": _Error(
+        (0.1, 0.25, 0.5, 0.75), (0.0, LATEST), lambda h, x, d: Variant(lags=_lags(h, x))
+    ),
+}
+
+
+def model_error_map(
+    hands: Sequence[HandModel],
+    obj: ObjectModel,
+    *,
+    errors: Sequence[str] = tuple(ERRORS),
+    every: int = 1,
+    fidelity: str = "standard",
+    count: int = 16,
+    run: Run = ALONE,
+    say: Callable[[str], None] = lambda line: None,
+) -> StabilityMap:
+    """Share of valid grasps that still hold where one thing is off; of each amount's every so many-th."""
+    cells = [cell for hand in hands for cell in _cells(hand, obj, errors, every, fidelity, count, run, say)]
+    return StabilityMap(
+        "model_errors",
+        f"{count} valid grasps of {obj.name}, judged in models that are wrong",
+        "by how much",
+        "hand",
+        "share of the grasps that hold there, too",
+        f"weak: under {WEAK:g}; broken: under {BROKEN:g}",
+        cells,
+        "a grasp that is valid here fails on a robot that is another one",
+        "`--robust` keeps what holds in the wanted share of models that are off by so much; `robust_share` and "
+        "`robust_weakest` are stored. What is farther off is another hand: `graspd evaluate --judge-hand` judges in it",
+        "tests/studies/test_stability_model_errors.py::test_amounts_within_reach_are_those_that_robust_draws",
+        reach="amounts that `--robust` draws: a job that asks for it is judged there",
+    )
+
+
+def _cells(
+    hand: HandModel,
+    obj: ObjectModel,
+    errors: Sequence[str],
+    every: int,
+    fidelity: str,
+    count: int,
+    run: Run,
+    say: Callable[[str], None],
+) -> list[MapCell]:
+    request = JobRequest(hand="hand", object="object", grasps=count, fidelity=fidelity, audits=0)
+    grasps = certified_grasps(hand, obj, request, count=count, run=run).grasps
+    models = Models(hand, obj, decompose(obj), MujocoOptions())
+    ways = np.random.default_rng(11).normal(size=(count, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+
+    def share(error: _Error, amount: float) -> float:
+        with ThreadPoolExecutor(run.cores, thread_name_prefix="model-errors") as pool:
+            judged = pool.map(
+                lambda row: models.certificate(grasps, row, error.variant(hand, amount, ways[row])).success,
+                range(len(grasps)),
+            )
+            return float(np.mean(list(judged))) if len(grasps) else float("nan")
+
+    cells = []
+    for name in errors:
+        error = ERRORS[name]
+        low, high = error.drawn
+        for amount in error.amounts[every - 1 :: every]:
+            held = share(error, amount)
+            outcome: Outcome = "good" if held >= WEAK else "weak" if held >= BROKEN else "broken"
+            cell = MapCell(name, amount, hand.name, held, outcome, f"{held:.0%} of {len(grasps)} hold")
+            cells.append(replace(cell, reached=low - _ROUNDING <= amount <= high + _ROUNDING))
+            say(f"{hand.name}: {name} {amount:g}: {cell.outcome} {cell.note}")
+    return cells

@@ -1,0 +1,147 @@
+"""Maps of failure as JSON, Markdown and pictures."""
+
+from __future__ import annotations
+
+import json
+import math
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from graspd.service.model.studies import OUTCOMES, MapCell, Stability, StabilityMap, between, counts, tick
+
+#: Told apart by lightness alone too, from calm to alarming: (fill, text).
+COLOURS: Final = {
+    "good": ("#bfe0dc", "#14403a"),
+    "weak": ("#eeb544", "#3b2a00"),
+    "broken": ("#96261c", "#ffffff"),
+    "refused": ("#e7e9ec", "#4b565e"),
+}
+#: Widest row of panels.
+_COLUMNS: Final = 3
+#: Sizes of the numbers on cells [pt], largest first; where not even the last fits, the cell says nothing.
+_FONT_SIZES: Final = (7.0, 6.0, 5.0)
+#: Longer names of ticks are broken into lines.
+_TICK_LETTERS: Final = 14
+
+
+def write(found: Stability, folder: Path) -> list[Path]:
+    """`stability.json`, `stability.md` and a picture for each map."""
+    folder.mkdir(parents=True, exist_ok=True)
+    written = [folder / "stability.json", folder / "stability.md"]
+    written[0].write_text(json.dumps(found.as_json(), indent=1, allow_nan=False) + "\n")
+    written[1].write_text(markdown(found))
+    for one in found.maps:
+        written.append(folder / f"stability-{one.name}.png")
+        draw(one, written[-1])
+    return written
+
+
+def markdown(found: Stability) -> str:
+    """What was driven where, where it broke, how that shows, what guards against it, and what still breaks."""
+    said = ", ".join(f"{name} {value}" for name, value in found.versions.items())
+    lines = ["# Where it breaks", "", f"`{found.command}`; {said}.", "", *_still_breaks(found.maps)]
+    for one in found.maps:
+        lines += [f"## {one.title}", "", f"![{one.title}](stability-{one.name}.png)", ""]
+        lines += [f"On the cells: {one.measure}. {one.bounds[0].upper()}{one.bounds[1:]}.", ""]
+        lines += ["| panel | good | weak | broken | refused |", "| --- | --: | --: | --: | --: |"]
+        lines += [f"| {panel} | {_row(one.of(panel))} |" for panel in one.panels]
+        lines += ["", f"- shows as: {one.shows}", f"- guard: {one.guard}"]
+        if one.guard_test:
+            lines.append(f"- test of the guard: `{one.guard_test}`")
+        lines += [f"- within reach of a job: {one.reach}", ""]
+    return "\n".join(lines)
+
+
+def _still_breaks(maps: Sequence[StabilityMap]) -> list[str]:
+    """The cells that a job can come to, and what of them is broken: what no guard keeps a user from."""
+    lines = ["## What still breaks", ""]
+    lines += ["Only the cells that a job can come to, whatever it asks for. The other cells of the maps need settings"]
+    lines += ["that no job has: there the guard is that they cannot be asked for.", ""]
+    lines += ["| map | good | weak | broken | refused | what still breaks | how a user sees it |"]
+    lines += ["| --- | --: | --: | --: | --: | --- | --- |"]
+    for one in maps:
+        broken = one.still_breaks()
+        seen = one.shows if broken else "–"
+        lines.append(f"| {one.title} | {_row(one.reached())} | {'<br>'.join(broken) or 'nothing'} | {seen} |")
+    return [*lines, ""]
+
+
+def _row(cells: Sequence[MapCell]) -> str:
+    return " | ".join(str(number) for number in counts(cells).values())
+
+
+def draw(one: StabilityMap, path: Path) -> None:
+    """A panel for each method or family, a square for each cell."""
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+
+    panels = one.panels
+    columns = min(_COLUMNS, len(panels))
+    rows = math.ceil(len(panels) / columns)
+    tallest = max(len({cell.y for cell in one.of(panel)}) for panel in panels)
+    height = min(3.4, 1.0 + 0.5 * tallest)
+    figure = Figure(figsize=(max(4.4 * columns, 7.0), height * rows + 0.9), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for axes, panel in zip(grid.flat, panels, strict=False):
+        _panel(axes, one, panel)
+    for axes in list(grid.flat)[len(panels) :]:
+        axes.set_visible(False)
+    present = [outcome for outcome, number in counts(one.cells).items() if number]
+    handles = [Patch(color=COLOURS[outcome][0], label=outcome) for outcome in OUTCOMES if outcome in present]
+    if one.is_divided:
+        handles.append(Patch(facecolor="none", edgecolor="#14191d", linewidth=1.4, label="within reach of a job"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+    figure.suptitle(one.title, x=0.01, ha="left", fontsize=13, fontweight="bold")
+    figure.draw_without_rendering()
+    for axes in grid.flat:
+        _fit(axes)
+    figure.savefig(path, dpi=110)
+
+
+def _panel(axes: Any, one: StabilityMap, panel: str) -> None:
+    cells = one.of(panel)
+    xs, ys = (list(dict.fromkeys(getattr(cell, axis) for cell in cells)) for axis in ("x", "y"))
+    for cell in cells:
+        at = xs.index(cell.x), ys.index(cell.y)
+        fill, ink = COLOURS[cell.outcome]
+        axes.add_patch(_square(at, fill, framed=cell.reached and one.is_divided))
+        axes.text(*at, cell.text, ha="center", va="center", color=ink)
+    axes.set_xlim(-0.5, len(xs) - 0.5)
+    axes.set_ylim(-0.5, len(ys) - 0.5)
+    axes.set_xticks(range(len(xs)), [_wrapped(x) for x in xs], fontsize=8)
+    axes.set_yticks(range(len(ys)), [_wrapped(y) for y in ys], fontsize=8)
+    axes.set_xlabel(one.x, fontsize=9)
+    axes.set_ylabel(one.y, fontsize=9)
+    axes.set_title(panel, loc="left", fontsize=10)
+    axes.spines[:].set_visible(False)
+    axes.tick_params(length=0)
+    if line := one.lines.get(panel):
+        axes.plot(
+            [between(xs, x) for x, _ in line], [between(ys, y) for _, y in line], color="#1f2937", lw=1.6, ls="--"
+        )
+
+
+def _fit(axes: Any) -> None:
+    """Make the numbers as small as their cells want them, or leave them out."""
+    left, right = axes.get_xlim()
+    room = 0.88 * axes.get_window_extent().width / max(1.0, right - left)
+    for text in axes.texts:
+        for size in _FONT_SIZES:
+            text.set_fontsize(size)
+            if text.get_window_extent().width <= room:
+                break
+        else:
+            text.set_visible(False)
+
+
+def _square(at: tuple[int, int], fill: str, *, framed: bool) -> Any:
+    from matplotlib.patches import Rectangle
+
+    edge: dict[str, Any] = {"edgecolor": "#14191d", "linewidth": 1.4} if framed else {"linewidth": 0}
+    return Rectangle((at[0] - 0.46, at[1] - 0.46), 0.92, 0.92, facecolor=fill, **edge)
+
+
+def _wrapped(value: float | str) -> str:
+    return textwrap.fill(tick(value), _TICK_LETTERS, break_long_words=False)

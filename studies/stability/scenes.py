@@ -1,0 +1,296 @@
+"""Scenes that are hard: flat and tall things on a table, walls and neighbours nearby, things too small or too large."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Final
+
+import numpy as np
+import trimesh
+
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import GraspdError
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.scene_spec import Box, HalfSpace, SceneSpec
+from graspd.service.model.studies import MapCell, Outcome, StabilityMap, reachable
+from graspd.service.model.transforms import quat_rotate
+from graspd.studies.stability.assets import prepared, refused
+from graspd.worker.certified import Certified, certified_grasps
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.run import ALONE, Run
+from graspd.worker.scenes.kinds import rest_poses, supports_of
+from graspd.worker.simulation.surroundings import Scenes
+
+Say = Callable[[str], None]
+Support = HalfSpace | Box
+
+MILLIMETRES: Final = 1e-3
+#: Boxes on a table: heights, and sides of their square footprints [mm].
+HEIGHTS_MM: Final = (5, 10, 20, 40, 80, 140, 200)
+SIDES_MM: Final = (30, 60, 120)
+#: What stands beside walls and neighbours: sides and height [mm].
+TARGET_MM: Final = (50, 50, 80)
+GAPS_MM: Final = (5, 10, 20, 40, 80, 160)
+#: Walls by name: directions in which one stands, seen from the target.
+WALLS: Final[dict[str, tuple[tuple[int, int], ...]]] = {
+    "one": ((1, 0),),
+    "corner": ((1, 0), (0, 1)),
+    "two opposite": ((1, 0), (-1, 0)),
+    "four": ((1, 0), (-1, 0), (0, 1), (0, -1)),
+}
+#: Height and thickness of a wall [mm]: higher than any hand reaches down.
+WALL_MM: Final = (300, 20)
+#: Neighbours as large as the target, on the four sides of it and at its four corners.
+NEIGHBOURS: Final[dict[str, tuple[tuple[int, int], ...]]] = {
+    "one": ((1, 0),),
+    "four": ((1, 0), (-1, 0), (0, 1), (0, -1)),
+    "eight": ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)),
+}
+#: Side of a cube over the span of the hand.
+RATIOS: Final = (0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8)
+KINDS: Final = ("free", "table", "bin", "shelf")
+
+_TABLE: Final = HalfSpace()
+_MEASURE: Final = "share of tries that are lifted out of the scene; – where no hand came in clear"
+_BOUNDS: Final = "weak: under a half; broken: none"
+_SHOWS: Final = (
+    "few or no valid grasps: `clear_share` and `lift_share` of `graspd synth --json` say which of both is missing"
+)
+_FEWER: Final = (
+    "what is not clear on its way or not lifted is never valid; a run whose budget ends first says how many were "
+    "found; a scene that leaves no way to the object is refused in a line"
+)
+_TEST: Final = "tests/studies/test_stability_scenes.py::"
+
+
+def height_map(
+    hands: Sequence[HandModel],
+    *,
+    heights: Sequence[float] = HEIGHTS_MM,
+    sides: Sequence[float] = SIDES_MM,
+    fidelity: str = "draft",
+    count: int = 8,
+    run: Run = ALONE,
+    say: Say = lambda line: None,
+) -> StabilityMap:
+    """Boxes from a plate to a tower on a table."""
+    cells = [
+        _cell(hand, hand.name, height, side, _standing((side, side, height), ()), fidelity, count, run, say)
+        for hand in hands
+        for side in sides
+        for height in heights
+    ]
+    return StabilityMap(
+        "scene_height",
+        f"{count} grasps of boxes on a table, {fidelity}",
+        "height [mm]",
+        "side of the footprint [mm]",
+        _MEASURE,
+        _BOUNDS,
+        reachable(cells, lambda cell: True),
+        _SHOWS,
+        _FEWER,
+        _TEST + "test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so",
+        reach="all: users bring such things",
+    )
+
+
+def wall_map(
+    hands: Sequence[HandModel],
+    *,
+    gaps: Sequence[float] = GAPS_MM,
+    walls: Sequence[str] = tuple(WALLS),
+    fidelity: str = "draft",
+    count: int = 8,
+    run: Run = ALONE,
+    say: Say = lambda line: None,
+) -> StabilityMap:
+    """A box with walls at a distance from its sides."""
+    cells = [
+        _cell(hand, hand.name, gap, name, _standing(TARGET_MM, _walls(WALLS[name], gap)), fidelity, count, run, say)
+        for hand in hands
+        for name in walls
+        for gap in gaps
+    ]
+    return StabilityMap(
+        "scene_wall",
+        f"{count} grasps of a box of {_size(TARGET_MM)} mm beside walls, {fidelity}",
+        "distance from the walls [mm]",
+        "walls",
+        _MEASURE,
+        _BOUNDS,
+        reachable(cells, lambda cell: True),
+        _SHOWS,
+        _FEWER,
+        _TEST + "test_an_object_in_a_narrow_well_is_refused_or_comes_out_valid",
+        reach="all: bins, shelves and files bring such walls",
+    )
+
+
+def neighbour_map(
+    hands: Sequence[HandModel],
+    *,
+    gaps: Sequence[float] = GAPS_MM,
+    around: Sequence[str] = tuple(NEIGHBOURS),
+    fidelity: str = "draft",
+    count: int = 8,
+    run: Run = ALONE,
+    say: Say = lambda line: None,
+) -> StabilityMap:
+    """A box among boxes as large as itself."""
+    cells = [
+        _cell(
+            hand,
+            hand.name,
+            gap,
+            name,
+            _standing(TARGET_MM, _neighbours(NEIGHBOURS[name], gap)),
+            fidelity,
+            count,
+            run,
+            say,
+        )
+        for hand in hands
+        for name in around
+        for gap in gaps
+    ]
+    return StabilityMap(
+        "scene_neighbours",
+        f"{count} grasps of a box of {_size(TARGET_MM)} mm among its like, {fidelity}",
+        "gap between them [mm]",
+        "fixed boxes around it",
+        _MEASURE,
+        _BOUNDS,
+        reachable(cells, lambda cell: True),
+        _SHOWS,
+        _FEWER,
+        _TEST + "test_a_box_among_boxes_is_lifted_out_or_not_valid",
+        reach="all: clutter is like that",
+    )
+
+
+def size_map(
+    hands: Sequence[HandModel],
+    *,
+    ratios: Sequence[float] = RATIOS,
+    kinds: Sequence[str] = KINDS,
+    fidelity: str = "draft",
+    count: int = 8,
+    run: Run = ALONE,
+    say: Say = lambda line: None,
+) -> StabilityMap:
+    """Cubes from a crumb to as large as the hand, afloat and in scenes."""
+    cells = []
+    for hand in hands:
+        span = span_of(hand)
+        for kind in kinds:
+            for ratio in ratios:
+                sides = 3 * (1e3 * ratio * span,)
+                scene = (sides, SceneSpec(kind=kind))
+                cells.append(_cell(hand, hand.name, ratio, kind, scene, fidelity, count, run, say))
+    spans = ", ".join(f"{hand.name} {1e3 * span_of(hand):.0f} mm" for hand in hands)
+    return StabilityMap(
+        "scene_size",
+        f"{count} grasps of cubes as large as a part of the hand's span, {fidelity}",
+        "side of the cube over the hand's span",
+        "scene",
+        f"{_MEASURE}; free: that hold six pushes; span, between fingertips before the grasp: {spans}",
+        _BOUNDS,
+        reachable(cells, lambda cell: True),
+        _SHOWS,
+        _FEWER + "; an object larger than the bin or the shelf is refused in a line",
+        _TEST + "test_a_cube_that_does_not_fit_its_bin_is_refused",
+        reach="all: users bring such things",
+    )
+
+
+def span_of(hand: HandModel) -> float:
+    """Largest distance between two fingertips' middles in the preshape [m]."""
+    root = np.array([[0.0, 0, 0, 1, 0, 0, 0]])
+    poses = body_poses(hand, root, hand.expand(hand.preshape[None]))[0]
+    tips = [piece for piece in hand.pieces if piece.body in hand.fingertips]
+    places = np.array([poses[p.body, :3] + quat_rotate(poses[p.body, 3:], p.vertices.mean(axis=0)) for p in tips])
+    return float(np.linalg.norm(places[:, None] - places[None], axis=2).max())
+
+
+Placement = tuple[tuple[float, ...], SceneSpec]
+
+
+def _standing(sides_mm: tuple[float, ...], around: Iterable[Support]) -> Placement:
+    """A box of these sides [mm] upright on a table, with supports around it."""
+    height = sides_mm[2] * MILLIMETRES
+    target = (0.0, 0.0, height / 2, 1.0, 0.0, 0.0, 0.0)
+    return sides_mm, SceneSpec(kind="file", supports=(_TABLE, *around), target=target)
+
+
+def _walls(directions: Sequence[tuple[int, int]], gap_mm: float) -> list[Box]:
+    """Walls that end nowhere near: as long as three times their height."""
+    high, thick = (value * MILLIMETRES for value in WALL_MM)
+    found = []
+    for x, y in directions:
+        side = TARGET_MM[0 if x else 1] * MILLIMETRES / 2 + gap_mm * MILLIMETRES + thick / 2
+        size = (thick, 3 * high, high) if x else (3 * high, thick, high)
+        found.append(Box(size=size, pose=(x * side, y * side, high / 2, 1.0, 0.0, 0.0, 0.0)))
+    return found
+
+
+def _neighbours(directions: Sequence[tuple[int, int]], gap_mm: float) -> list[Box]:
+    size = tuple(side * MILLIMETRES for side in TARGET_MM)
+    step = [side + gap_mm * MILLIMETRES for side in size[:2]]
+    return [
+        Box(size=(size[0], size[1], size[2]), pose=(x * step[0], y * step[1], size[2] / 2, 1.0, 0.0, 0.0, 0.0))
+        for x, y in directions
+    ]
+
+
+def _size(sides_mm: Sequence[float]) -> str:
+    return " x ".join(f"{side:g}" for side in sides_mm)
+
+
+def _cell(
+    hand: HandModel,
+    panel: str,
+    x: float | str,
+    y: float | str,
+    placement: Placement,
+    fidelity: str,
+    count: int,
+    run: Run,
+    say: Say,
+) -> MapCell:
+    sides, spec = placement
+    try:
+        found = planned(hand, sides, spec, fidelity, count, run)
+    except GraspdError as error:
+        cell = refused(panel, x, y, error)
+    else:
+        cell = MapCell(panel, x, y, *_told(found))
+    say(f"{panel} {x} {y}: {cell.outcome} {cell.note}")
+    return cell
+
+
+def planned(
+    hand: HandModel, sides_mm: Sequence[float], spec: SceneSpec, fidelity: str, count: int, run: Run = ALONE
+) -> Certified:
+    """Raw grasps of a box of these sides [mm] in a scene, through the doors that a user's object and scene go through.
+
+    Raises:
+        GraspdError: the box or the scene is refused.
+    """
+    mesh: Any = trimesh.creation.box(np.asarray(sides_mm) * MILLIMETRES)
+    obj = prepared(mesh, {"units": "m"}, FIDELITIES[fidelity].face_error_m)
+    request = JobRequest(hand="hand", object="box", grasps=count, want="raw", fidelity=fidelity, audits=0)
+    scenes = None
+    if spec.kind != "free":
+        scenes = Scenes(supports_of(spec), rest_poses(spec, obj, count=2, seed=0)["scene/object_pose"])
+    return certified_grasps(hand, obj, request, count=count, scenes=scenes, run=run)
+
+
+def _told(found: Certified) -> tuple[float, Outcome, str, str]:
+    """Value, outcome, note and label of a cell."""
+    valid = float(found.columns["quality/valid"].mean())
+    clear = found.shares.get("clear_share", 1.0)
+    outcome: Outcome = "broken" if valid == 0 else "weak" if valid < 0.5 else "good"
+    said = f"{valid:.0%} valid" if not found.shares else f"{clear:.0%} clear, {valid:.0%} lifted"
+    return valid, outcome, said, "–" if clear == 0 else ""

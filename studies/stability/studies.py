@@ -1,0 +1,154 @@
+"""The stability studies by name, whole or quick; and the baselines on shapes that are hard."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+from graspd.service.model.studies import StabilityMap, reachable
+from graspd.studies.stability import assets, descents, gradients, integrators, model_errors, scenes
+from graspd.studies.stability.assets import BOUNDS, FAMILIES, MEASURE, SHOWS, shape_cell
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.run import ALONE, Run
+
+Say = Callable[[str], None]
+
+#: Hands beside the one that is named, for what depends on a hand's size and build.
+OTHER_HANDS: Final = ("barrett",)
+#: And for what depends on its drives.
+ALL_HANDS: Final = ("allegro", "barrett", "shadow")
+
+
+def run(
+    names: Sequence[str], hand: str, obj: str, *, quick: bool, long: bool, work: Run, say: Say
+) -> list[StabilityMap]:
+    """The maps of the named studies, in the order of the names."""
+    model, thing = hand_from_path(hand), object_from_path(obj)
+
+    def few(values: Sequence[float]) -> Sequence[float]:
+        return values[1::2] if quick else values
+
+    def beside(names: Sequence[str]) -> list[HandModel]:
+        return [model] if quick else [model, *(hand_from_path(name) for name in names if name != model.name)]
+
+    pair = beside(OTHER_HANDS)
+    gaps = (5, 80) if quick else scenes.GAPS_MM
+    place: dict[str, Any] = {"count": 2 if quick else 8, "run": work, "say": say}
+    lengths = descents.LENGTHS[:1] if quick else (*descents.LENGTHS, *((descents.LONG,) if long else ()))
+    studies: dict[str, Callable[[], StabilityMap]] = {
+        "time_step": lambda: integrators.time_step_map(few(integrators.TIME_STEPS), few(integrators.SPEEDS)),
+        "stiffness": lambda: integrators.stiffness_map(
+            few(integrators.STIFFNESSES), few(integrators.MASSES), few(integrators.TIME_STEPS)
+        ),
+        "contact_count": lambda: integrators.contact_count_map(integrators.COUNTS[:: 2 if quick else 1]),
+        "gradient": lambda: gradients.gradient_map(
+            few(gradients.SIZES_M), few(gradients.GAPS), repeats=1 if quick else 3
+        ),
+        "shapes": lambda: assets.shape_map(
+            model,
+            fidelities=("draft",) if quick else ("draft", "standard", "fine"),
+            count=4 if quick else 8,
+            families=("plate", "cube") if quick else tuple(assets.FAMILIES),
+            # Grasps on an open mesh cost more than all else of a quick run.
+            defects=assets.CLOSED if quick else tuple(assets.DEFECTS),
+            run=work,
+            say=say,
+        ),
+        "starts": lambda: descents.start_map(model, thing, count=4 if quick else 8, say=say),
+        "rates": lambda: descents.rate_map(
+            model, thing, rates=few(descents.RATES), weights=few(descents.WEIGHTS), count=4 if quick else 8, say=say
+        ),
+        "length": lambda: descents.length_map(model, thing, lengths=lengths, say=say),
+        "hands": lambda: assets.hand_map(
+            fingers=(1, 3) if quick else assets.FINGERS,
+            sizes=() if quick else assets.SIZES,
+            ratios=() if quick else assets.RATIOS,
+            couplings=("each joint",) if quick else assets.COUPLINGS,
+            fidelity="draft" if quick else "standard",
+            count=4 if quick else 8,
+            run=work,
+            say=say,
+        ),
+        "model_errors": lambda: model_errors.model_error_map(
+            beside(ALL_HANDS),
+            thing,
+            every=3 if quick else 1,
+            fidelity="draft" if quick else "standard",
+            count=2 if quick else 16,
+            run=work,
+            say=say,
+        ),
+        "peers": lambda: peer_map(
+            model,
+            methods=METHODS[:2] if quick else METHODS,
+            shapes={"cube": (60,)} if quick else SHAPES,
+            count=4 if quick else 8,
+            run=work,
+            say=say,
+        ),
+        "scene_height": lambda: scenes.height_map(
+            pair, heights=(10, 80) if quick else scenes.HEIGHTS_MM, sides=(60,) if quick else scenes.SIDES_MM, **place
+        ),
+        "scene_wall": lambda: scenes.wall_map(
+            pair, gaps=gaps, walls=("corner",) if quick else tuple(scenes.WALLS), **place
+        ),
+        "scene_neighbours": lambda: scenes.neighbour_map(
+            pair, gaps=gaps, around=("four",) if quick else tuple(scenes.NEIGHBOURS), **place
+        ),
+        "scene_size": lambda: scenes.size_map(
+            pair, ratios=(0.1, 0.3) if quick else scenes.RATIOS, kinds=("table",) if quick else scenes.KINDS, **place
+        ),
+    }
+    found = []
+    for name in names:
+        say(f"study {name}")
+        found.append(studies[name]())
+    return found
+
+
+#: Methods around a free object; the first is graspd's own.
+METHODS: Final = ("fast_graspd", "autograsp", "dfc", "graspit", "graspd2022")
+#: Parameters of each family: an easy one and hard ones.
+SHAPES: Final[dict[str, tuple[float, ...]]] = {
+    "plate": (1, 10),
+    "wedge": (10, 80),
+    "ring": (8, 64),
+    "cross": (20,),
+    "cube": (10, 30, 60, 100, 200),
+}
+
+
+def peer_map(
+    hand: HandModel,
+    *,
+    methods: Sequence[str] = METHODS,
+    shapes: dict[str, tuple[float, ...]] = SHAPES,
+    count: int = 8,
+    run: Run = ALONE,
+    say: Callable[[str], None] = lambda line: None,
+) -> StabilityMap:
+    """Valid grasps of each method on each shape, at the settings that it was published with."""
+    cells = []
+    for family, values in shapes.items():
+        unit, make, _ = FAMILIES[family]
+        for value in values:
+            for method in methods:
+                place = (f"{family}: {unit}", value, method)
+                cell = shape_cell(hand, place, make(value), {"units": "m"}, {"method": method}, count, run)
+                say(f"{family} {value:g} {method}: {cell.outcome} {cell.value:.2f} {cell.note}")
+                cells.append(cell)
+    return StabilityMap(
+        "peers",
+        f"{count} grasps of {hand.name} by each method on shapes that are hard",
+        "the shape's parameter",
+        "method",
+        MEASURE,
+        BOUNDS,
+        reachable(cells, lambda cell: True),
+        SHOWS,
+        "what a method leaves in the object or the referee drops is never valid; a job that finds too few says so",
+        "tests/studies/test_stability.py::test_a_job_whose_every_grasp_is_bad_ends_with_none",
+        reach="all: any job may name another method",
+    )

@@ -1,0 +1,188 @@
+"""fast_graspd sets out where the network says, and each grasp is its own whatever else is made."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graspd.baselines.learned.method import RETREATS, Seeds
+from graspd.baselines.learned.network import Proposals, encode, save
+from graspd.service.model.errors import InputError
+from graspd.service.model.fidelity import resolve_fidelity
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.transforms import compose, quat_from_matrix, quat_rotate
+from graspd.service.store.network_file import ProposalNetwork
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import Asked, Wanted, method, planner, synthesize
+from graspd.worker.planners.fast_graspd.pairs import Pair, pair_of
+from graspd.worker.planners.fast_graspd.scene_starts import ROOM, free_ways
+from graspd.worker.planners.fast_graspd.starts import CLEAR, Probe, start_generator
+from graspd.worker.planners.known_networks import keep_file
+from graspd.worker.planners.registry import of_this_machine
+from graspd.worker.run import Run
+from graspd.worker.scenes.kinds import rest_poses, supports_of
+from graspd.worker.simulation.data import HandState
+from graspd.worker.simulation.obstacles import DeviceObstacles
+from graspd.worker.simulation.surroundings import Obstacle, Placed
+from tests.networks import random_network
+
+QUICK = resolve_fidelity("draft").model_copy(
+    update={"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2}
+)
+TABLE = SceneSpec(kind="table")
+
+
+@pytest.fixture(scope="module")
+def hand() -> HandModel:
+    return hand_from_path("barrett")
+
+
+@pytest.fixture(scope="module")
+def block() -> ObjectModel:
+    return object_from_path("block", face_error_m=QUICK.face_error_m)
+
+
+@pytest.fixture(scope="module")
+def network(hand: HandModel) -> ProposalNetwork:
+    return random_network(hand.joint_names, hand=hand.name, digest=hand.digest)
+
+
+def on_table(obj: ObjectModel, count: int, seed: int = 0) -> Placed:
+    poses = rest_poses(TABLE, obj, count=2, seed=seed)["scene/object_pose"]
+    return Placed(supports_of(TABLE), poses, np.arange(count) % 2)
+
+
+def keep(network: ProposalNetwork) -> str:
+    """A network's digest, its file read by this process."""
+    with tempfile.TemporaryDirectory() as folder:
+        save(network, Path(folder) / "net.npz")
+        return keep_file(Path(folder) / "net.npz")
+
+
+def made(hand: HandModel, obj: ObjectModel, network: ProposalNetwork, count: int, **given: Any) -> GraspSet:
+    wanted = Wanted(count, QUICK, given.pop("seed", 1), placed=given.pop("placed", on_table(obj, count)))
+    options = {"network": keep(network), "starts": 2}
+    return synthesize(hand, obj, wanted, Run(threads=given.pop("threads", 1)), method="learned", options=options)
+
+
+def assert_same(one: GraspSet, other: GraspSet) -> None:
+    for name, values in one.to_columns().items():
+        np.testing.assert_array_equal(values, other.to_columns()[name], err_msg=name)
+
+
+@pytest.mark.slow
+def test_a_grasp_depends_on_seed_and_index_but_not_on_batch_or_threads(hand, block, network) -> None:
+    small, large = made(hand, block, network, 2), made(hand, block, network, 8, threads=2)
+    assert_same(small, large.take(slice(0, 2)))
+    other = made(hand, block, network, 2, seed=2)
+    assert not np.allclose(small.grasp.hand_pose, other.grasp.hand_pose)
+    q = hand.reduce(large.grasp.joint_positions)
+    assert (q >= hand.lower - 1e-5).all() and (q <= hand.upper + 1e-5).all()
+
+
+def test_joined_batches_are_those_of_separate_launches(hand, block, network) -> None:
+    options = {"network": keep(network), "starts": 2}
+    wanted = [Wanted(2, QUICK, 1, batch, placed=on_table(block, 2)) for batch in (0, 1)]
+    joins = method("learned").joined
+    assert joins is not None
+    found = joins(method("learned").options(**options))(hand, block, [Asked(one, Run(threads=1)) for one in wanted])
+    for one, alone in zip(found, wanted, strict=True):
+        assert isinstance(one, GraspSet)
+        assert_same(one, synthesize(hand, block, alone, Run(threads=1), method="learned", options=options))
+
+
+def proposing(network: ProposalNetwork, found: Proposals, anchor: np.ndarray) -> ProposalNetwork:
+    """A network that proposes one grasp, whatever it sees; its noise is a tenth of a millimetre or milliradian."""
+    rows = encode(found, anchor)[0].astype(np.float32)
+    weights = {
+        name: np.zeros_like(array) if name.startswith("flow.out") else array for name, array in network.weights.items()
+    }
+    return replace(network, weights=weights, mean=rows, std=np.full_like(rows, 1e-4))
+
+
+def started(pair: Pair, seeds: Seeds, placed: Placed, each: int) -> tuple[HandState, np.ndarray, Probe]:
+    hand, obj = pair.hand.model, pair.coarse.obj.model
+    obstacles = DeviceObstacles.create(hand, placed.scenes, obj.centre_of_mass, "cpu")
+    model = pair.model(pair.coarse, obstacles)
+    generators = [start_generator(0, 0, i, k) for i in range(len(placed.index)) for k in range(each)]
+    ways = [free_ways(scene, obj) for scene in placed.scenes]
+    state, depth = seeds(model, generators, each=each, placed=placed, ways=ways)
+    probe = Probe(model, len(generators), room=ROOM)
+    probe.data.set_scenes(np.repeat(placed.index, each))
+    return state, depth, probe
+
+
+def down(hand: HandModel, height: float) -> Proposals:
+    """A hand whose open palm looks down from a height above the origin [m]."""
+    z = hand.palm.approach
+    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
+    x /= np.linalg.norm(x)
+    own = np.stack([x, np.cross(z, x), z], axis=1)
+    turn = quat_from_matrix(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]) @ own.T)
+    root = np.array([0, 0, height]) - quat_rotate(turn, hand.palm.centre)
+    joints = hand.expand(hand.preshape)[None]
+    way = np.array([[0.0, 0, -1]])
+    return Proposals(np.concatenate([root, turn])[None], way, joints, joints, joints)
+
+
+def test_hands_set_out_as_proposed_backed_off_along_their_way_until_they_are_clear(hand, block, network) -> None:
+    pair, placed = pair_of(hand, block, QUICK, "cpu"), on_table(block, 2)
+    fixed = proposing(network, down(hand, 0.1), np.zeros(3))
+    state, depth, probe = started(pair, Seeds(fixed, 2), placed, 2)
+    assert (depth <= CLEAR).all() and (probe.depths(state) <= CLEAR).all()
+    for row, scene in enumerate(np.repeat(placed.index, 2)):
+        pose = placed.object_pose[scene]
+        palm = quat_rotate(pose[3:], state.pivot[row] + block.centre_of_mass) + pose[:3]
+        looks = quat_rotate(pose[3:], quat_rotate(state.rotation[row], hand.palm.approach))
+        np.testing.assert_allclose(looks, [0, 0, -1], atol=2e-3)
+        np.testing.assert_allclose(state.q[row], hand.preshape, atol=2e-3)
+        # The anchor is the mean of what is seen: within the block, above half of its height on the camera's side.
+        assert 0.1 < palm[2] < 0.1 + 2 * block.radius
+        assert np.linalg.norm(palm[:2] - compose(pose, np.array([*block.centre_of_mass, 1, 0, 0, 0]))[:2]) < 0.03
+    # From within the block it comes out the way it came, no farther than it must.
+    deeper, depth, probe = started(pair, Seeds(proposing(network, down(hand, 0.0), np.zeros(3)), 2), placed, 2)
+    assert (depth <= CLEAR).all() and (probe.depths(deeper) <= CLEAR).all()
+    up = np.array([s.up for s in placed.scenes])[np.repeat(placed.index, 2)]
+    lower = ((state.pivot - deeper.pivot) * up).sum(axis=1)
+    assert ((lower > 0.1 - max(RETREATS) - 1e-3) & (lower < 0.1)).all()
+    np.testing.assert_allclose(deeper.rotation, state.rotation, atol=2e-3)
+
+
+@pytest.mark.parametrize("height", [-0.5, 3.0, 1e30])
+def test_where_no_proposal_is_clear_and_near_hands_set_out_as_without_a_network(hand, block, network, height) -> None:
+    pair, placed = pair_of(hand, block, QUICK, "cpu"), on_table(block, 2)
+    state, depth, probe = started(pair, Seeds(proposing(network, down(hand, height), np.zeros(3)), 2), placed, 2)
+    assert (depth <= CLEAR).all() and (probe.depths(state) <= CLEAR).all()
+    assert (np.linalg.norm(state.pivot, axis=1) < block.radius + 0.15).all()
+
+
+def test_what_it_cannot_do_is_said_in_a_line(hand, block, network, tmp_path: Path) -> None:
+    def refused(words: str, **given: Any) -> None:
+        with pytest.raises(InputError, match=words) as error:
+            made(given.pop("hand", hand), block, given.pop("network", network), 1, **given)
+        assert "\n" not in str(error.value)
+
+    refused("in scenes only", placed=None)
+    refused("proposes grasps of barrett .*, not of allegro", hand=hand_from_path("allegro"))
+    refused("not of barrett", network=replace(network, hand_digest="f" * 32))
+    board = Obstacle.box([0, 0, -0.01, 1, 0, 0, 0], [1, 1, 0.02])
+    refused("has none, choose fast_graspd", placed=replace(on_table(block, 1), supports=(board,)))
+    with pytest.raises(InputError, match="not known here"):
+        planner("learned", {"network": "e" * 32}, in_scenes=True)(hand, block, Wanted(1, QUICK), Run())
+    # A worker that is told a path reads no file.
+    save(network, tmp_path / "net.npz")
+    with pytest.raises(InputError, match="option of learned: network"):
+        planner("learned", {"network": str(tmp_path / "net.npz")}, in_scenes=True)
+    assert of_this_machine("learned", {"network": str(tmp_path / "net.npz")}) == {"network": keep(network)}
+    assert of_this_machine("graspit", {"steps": "3"}) == {"steps": "3"}
+    with pytest.raises(InputError, match="cannot be read"):
+        of_this_machine("learned", {"network": str(tmp_path / "none.npz")})

@@ -1,0 +1,135 @@
+"""DexGraspNet's energies and annealing, against values that follow from their formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+
+from graspd.baselines.common import ground_of
+from graspd.baselines.dfc import kernels
+from graspd.baselines.dfc.method import DISTANCE, Descent, sample_starts
+from graspd.baselines.dfc.schedule import step_size, temperature
+from graspd.worker.planners.threads import Steps
+from graspd.worker.run import ALONE
+from graspd.worker.simulation.data import HandState
+from tests.worker.models import object_from_mesh, two_finger_hand
+
+BOX = object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05)))
+WEIGHTS = np.array([1.0, 100.0, 100.0, 10.0, 1.0])
+
+
+def descent(pivot: tuple[float, float, float] = (0.0, 0.0, -0.2), q: tuple[float, float] = (0.0, 0.0)) -> Descent:
+    pair = ground_of(two_finger_hand(), BOX, "cpu", kernels)
+    return Descent(pair, HandState(np.array([pivot]), np.array([[1.0, 0, 0, 0]]), np.array([q])), [[0, 0, 0]])
+
+
+def evaluated(found: Descent, pivot: tuple[float, float, float], q: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+    """The five energies of a hand; its gradient is in `found.proposal.gradient`."""
+    found.proposal.set_state(HandState(np.array([pivot]), np.array([[1.0, 0, 0, 0]]), np.array([q])))
+    found.new_terms.zero_()
+    for _, launch in found.launches.named()[1:-2]:
+        launch.launch()
+    return found.new_terms.numpy()[0].astype(float)
+
+
+def contacts_at(points: list[list[float]]) -> np.ndarray:
+    """Energies with the four contacts at these points of space, on the palm of a hand far away."""
+    pivot = (0.0, 0.0, -0.2)
+    found = descent(pivot)
+    found.candidate_body.zero_()
+    places = np.zeros((len(found.candidates), 3))
+    places[:4] = np.array(points) - pivot
+    found.candidate_position.assign(places)
+    found.new_contact.assign([[0, 1, 2, 3]])
+    return evaluated(found, pivot)
+
+
+def test_contacts_that_balance_have_no_force_closure_energy() -> None:
+    terms = contacts_at([[0.025, 0, 0], [-0.025, 0, 0], [0, 0.025, 0], [0, -0.025, 0]])
+    np.testing.assert_allclose(terms[:2], [0, 0], atol=1e-6)
+
+
+def test_contacts_on_one_face_push_with_all_their_normals() -> None:
+    """|4 n|^2 = 16, and no torque about the middle."""
+    terms = contacts_at([[0.025, 0.01, 0], [0.025, -0.01, 0], [0.025, 0, 0.01], [0.025, 0, -0.01]])
+    assert terms[0] == pytest.approx(16.0, rel=1e-4)
+
+
+def test_opposite_contacts_that_do_not_face_each_other_have_the_energy_of_their_torque() -> None:
+    """Two couples of arm 0.02 m about z: |2 * 0.02|^2."""
+    terms = contacts_at([[0.025, 0.01, 0], [-0.025, -0.01, 0], [0.025, 0.01, 0], [-0.025, -0.01, 0]])
+    assert terms[0] == pytest.approx(0.04**2, rel=1e-3)
+
+
+def test_distance_energy_is_the_sum_of_distances_on_either_side() -> None:
+    terms = contacts_at([[0.028, 0, 0], [-0.026, 0, 0], [0, 0.023, 0], [0, -0.025, 0]])
+    assert terms[1] == pytest.approx(0.003 + 0.001 + 0.002, abs=1e-6)
+
+
+@pytest.mark.parametrize("q", [(0.1, 0.3), (-0.35, 0.25), (1.3, 1.3)])
+def test_the_gradient_is_the_difference_quotient_of_the_energy(q: tuple[float, float]) -> None:
+    """Fingers in the box, once beyond a joint limit. Relative 3 %: samples enter pieces one by one.
+
+    Force closure is left out of the quotient: its gradient takes normals as constant, and its torques are small here.
+    """
+    found, pivot, step = descent(), (0.004, 0.003, -0.035), 2e-5
+    evaluated(found, pivot, q)
+    gradient = found.proposal.gradient.numpy()[0].astype(float)
+    quotient = []
+    for column in (0, 1, 2, 6, 7):
+        ends = []
+        for sign in (1, -1):
+            moved, turned = list(pivot), list(q)
+            (moved if column < 3 else turned)[column % 3] += sign * step
+            ends.append(evaluated(found, tuple(moved), tuple(turned))[1:] @ WEIGHTS[1:])  # type: ignore[arg-type]
+        quotient.append((ends[0] - ends[1]) / (2 * step))
+    np.testing.assert_allclose(gradient[[0, 1, 2, 6, 7]], quotient, rtol=0.03, atol=0.03 * np.abs(quotient).max())
+
+
+def probed(iteration: np.ndarray, rise: np.ndarray, uniform: np.ndarray) -> tuple[np.ndarray, ...]:
+    n = len(iteration)
+    given = [wp.array(iteration, dtype=wp.int32, device="cpu")]
+    given += [wp.array(values, dtype=wp.float32, device="cpu") for values in (rise, uniform)]
+    found = [wp.zeros(n, dtype=kind, device="cpu") for kind in (wp.float32, wp.float32, wp.int32)]
+    wp.launch(kernels.probe, n, inputs=given, outputs=found, device="cpu")
+    return tuple(array.numpy() for array in found)
+
+
+def test_steps_and_temperature_decay_by_a_twentieth_every_50_and_30_iterations() -> None:
+    np.testing.assert_allclose(step_size(np.array([0, 49, 50, 5999])), [5e-3, 5e-3, 4.75e-3, 5e-3 * 0.95**119])
+    np.testing.assert_allclose(temperature(np.array([0, 29, 30, 5999])), [18, 18, 17.1, 18 * 0.95**199])
+    iteration = np.array([0, 49, 50, 3000, 5999])
+    size, cold, _ = probed(iteration, np.zeros(5), np.zeros(5))
+    np.testing.assert_allclose(size, step_size(iteration), rtol=1e-4)
+    np.testing.assert_allclose(cold, temperature(iteration), rtol=1e-4)
+
+
+def test_a_fall_is_always_accepted_and_a_rise_with_its_boltzmann_factor() -> None:
+    """20,000 draws at a rise of T: a share of 1/e, standard error 0.3 points."""
+    n = 20_000
+    uniform = np.random.default_rng(5).random(n)
+    start = np.zeros(n, int)
+    assert probed(start, np.full(n, -1e-3), uniform)[2].all()
+    assert probed(start, np.full(n, 18.0), uniform)[2].mean() == pytest.approx(np.exp(-1), abs=0.015)
+    assert probed(np.full(n, 3000), np.full(n, 18.0), uniform)[2].mean() == 0
+
+
+def test_annealing_ends_at_a_lower_energy_than_it_began() -> None:
+    found = descent()
+    tell = Steps(1, ALONE)
+    found.run(1, tell)
+    before = found.energies()[0] @ WEIGHTS
+    found.run(1500, tell)
+    assert found.energies()[0] @ WEIGHTS < 0.3 * before
+    assert 0 < found.taken.numpy()[0] <= 1501
+
+
+def test_starts_look_at_the_hull_from_the_given_distance() -> None:
+    hand = two_finger_hand()
+    found = sample_starts(hand, BOX, seed=0, batch=0, indices=range(40))
+    signed = trimesh.proximity.signed_distance(trimesh.creation.box((0.05, 0.05, 0.05)), found.pivot)
+    assert np.all(-signed <= DISTANCE[1] + 1e-9)
+    # Tilted by 30 degrees, the palm is at least cos 30 of the least distance off the face.
+    assert np.all(-signed >= np.cos(np.pi / 6) * DISTANCE[0] - 1e-9)

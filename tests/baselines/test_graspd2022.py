@@ -1,0 +1,147 @@
+"""Grasp'D (2022): its distance grid, its contact forces, and what its relaxation relaxes."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+
+from graspd.baselines.common import ground_of
+from graspd.baselines.graspd2022 import kernels
+from graspd.baselines.graspd2022.method import (
+    FRICTION,
+    LEAK,
+    MISMATCH,
+    STIFFNESS,
+    VISCOUS,
+    Search,
+    _Batch,
+    distance_grid,
+    physics_of,
+)
+from graspd.worker.simulation.data import HandState
+from tests.worker.models import object_from_mesh, two_finger_hand
+
+RADIUS = 0.05
+SPHERE = object_from_mesh(trimesh.creation.icosphere(subdivisions=4, radius=RADIUS))
+BOX = object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05)))
+CELLS = 48
+#: Farthest that the sphere's flat faces lie inside the sphere [m].
+SAGITTA = RADIUS - float(np.linalg.norm(SPHERE.vertices[SPHERE.faces].mean(axis=1), axis=1).min())
+
+
+@cache
+def grid_of_sphere(cells: int) -> Any:
+    return distance_grid(ground_of(two_finger_hand(), SPHERE, "cpu", kernels).fine.obj, cells)
+
+
+def probed(
+    points: np.ndarray, velocity: tuple[float, float, float] = (0, 0, 0), grid: Any = None
+) -> tuple[np.ndarray, ...]:
+    """Distance, force and slope at points by a grid, by default of the sphere."""
+    grid = grid or grid_of_sphere(CELLS)
+    n = len(points)
+    found: list[Any] = [wp.zeros(n, dtype=kind, device="cpu") for kind in (wp.float32, wp.vec3, wp.vec3)]
+    given = wp.array(points, dtype=wp.vec3, device="cpu")
+    wp.launch(
+        kernels.probe,
+        n,
+        inputs=[physics_of(SPHERE.gyration_radius), grid, given, wp.vec3(*velocity)],
+        outputs=found,
+        device="cpu",
+    )
+    return tuple(f.numpy() for f in found)
+
+
+@pytest.mark.parametrize("cells", [16, 32, 48])
+def test_the_grid_tells_a_spheres_distance_with_an_error_of_second_order(cells: int) -> None:
+    """Trilinear interpolation of |x| - R is off by at most 3/8 h^2 max |d''|, and |d''| <= 2 / |x| in the cell."""
+    rng = np.random.default_rng(3)
+    direction = rng.normal(size=(2000, 3))
+    reach = rng.uniform(0.03, 0.12, size=2000)
+    points = direction / np.linalg.norm(direction, axis=1, keepdims=True) * reach[:, None]
+    cell = 2 * (RADIUS + 0.10) / cells
+    error = np.abs(probed(points, grid=grid_of_sphere(cells))[0] - (reach - RADIUS))
+    bound = 0.375 * 2 * cell**2 / np.maximum(reach - np.sqrt(3) * cell, 0.005)
+    assert np.all(error <= bound + SAGITTA + 1e-6)
+
+
+def ring(depth: float) -> np.ndarray:
+    return (RADIUS - depth) * np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -1]])
+
+
+def test_points_outside_press_with_nothing() -> None:
+    assert np.all(probed(ring(-0.002), (0.0, 0.0, 0.01))[1] == 0)
+
+
+def test_points_inside_push_the_object_away_and_rub_against_its_motion() -> None:
+    box = distance_grid(ground_of(two_finger_hand(), BOX, "cpu", kernels).fine.obj, CELLS)
+    faces = 0.024 * np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -1]])
+    distance, force, _ = probed(faces, (0.0, 0.0, 0.01), box)
+    depth = -distance
+    np.testing.assert_allclose(depth, 0.001, rtol=1e-3)
+    # At the two points whose normal is across the motion: k c inwards, and the lesser of kf v and mu k c against it.
+    rub = np.minimum(VISCOUS * 0.01, FRICTION * STIFFNESS * depth)
+    np.testing.assert_allclose(force[:2, 2], -rub[:2], rtol=1e-3)
+    np.testing.assert_allclose([-force[0, 0], -force[1, 1]], STIFFNESS * depth[:2], rtol=1e-3)
+    # Where the motion is along the normal there is no friction.
+    np.testing.assert_allclose(force[2], [0, 0, STIFFNESS * depth[2]], atol=0.1)
+
+
+@pytest.mark.parametrize("velocity", [(0.0, 0.0, 0.01), (0.005, 0.01, -0.01)])
+def test_the_slope_of_the_force_is_its_difference_quotient(velocity: tuple[float, float, float]) -> None:
+    """5 % of the stiffness: the normal turns and the grid's slope is not quite 1 over the 40 um of the quotient."""
+    step = 2e-5
+    slope = probed(ring(0.001), velocity)[2]
+    quotient = (probed(ring(0.001 + step), velocity)[1] - probed(ring(0.001 - step), velocity)[1]) / (2 * step)
+    np.testing.assert_allclose(slope, quotient, atol=0.05 * STIFFNESS)
+
+
+def test_points_outside_leak_a_share_of_the_slope_so_that_they_are_drawn_in() -> None:
+    outside, inside = (probed(ring(depth))[2] for depth in (-0.001, 0.001))
+    np.testing.assert_allclose(outside, LEAK * inside, atol=0.02 * STIFFNESS)
+
+
+def touching_batch() -> _Batch:
+    """The palm 0.02 mm inside a face of the box, the fingers clear of it, all standing still."""
+    pair = ground_of(two_finger_hand(), BOX, "cpu", kernels)
+    start = HandState(np.array([[0.0, 0, -0.025 + 2e-5]]), np.array([[1.0, 0, 0, 0]]), np.zeros((1, 2)))
+    batch = _Batch(Search(pair, CELLS), start, 10)
+    batch.data.pivot.assign([wp.vec3(*start.pivot[0])])
+    batch.data.schedule.dilation.zero_()
+    batch.data.iteration.fill_(9)
+    batch.physics.warmup = 1.0
+    return batch
+
+
+def settled(pull: float) -> tuple[np.ndarray, np.ndarray]:
+    """Relaxed forces (N, 3, 3) under a constant pull of the task on x, and the contact forces (N, 3, 3)."""
+    batch = touching_batch()
+    batch.pull.assign([[kernels.vec6(pull, 0, 0, 0, 0, 0)] * 3])
+    launches = dict(batch.launches.named())
+    launches["forward"].launch()
+    for _ in range(800):
+        launches["relax"].launch()
+    model, data = batch.model, batch.data
+    body, place = model.point_body.numpy(), data.body_p.numpy()[0]
+    points = place[body] + model.point_position.numpy()
+    forces = [probed(points, tuple(v), batch.grid)[1] for v in batch.velocity.numpy()]
+    return batch.force.numpy()[0], np.stack(forces, axis=1)
+
+
+def test_the_relaxation_is_hard_contact_when_nothing_pulls() -> None:
+    """Absolute 0.02 N: two steps of the rate with which forces move."""
+    relaxed, hard = settled(0.0)
+    assert np.abs(hard).max() > 0.5
+    np.testing.assert_allclose(relaxed, hard, atol=0.02)
+
+
+def test_the_relaxation_departs_from_hard_contact_in_proportion_to_its_weight() -> None:
+    for pull in (0.01, 0.04):
+        relaxed, hard = settled(pull)
+        apart = (relaxed - hard)[..., 0]
+        np.testing.assert_allclose(apart, -pull / (2 * MISMATCH), atol=0.02)

@@ -1,0 +1,149 @@
+"""`graspd hands check` and `graspd objects check` through the entry point: the JSON contract and the exit codes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from graspd.cli import build
+from graspd.worker.rendering import portraits
+
+#: Colours of the arrow on the palm and of the prepared mesh: red exceeds blue by at least this [of 255].
+WARM = 60
+
+
+def check(*arguments: str) -> tuple[int, dict[str, Any]]:
+    """Exit code and report of `graspd ... --json`."""
+    untried = ["--no-self-test"] if arguments[0] == "hands" else []
+    result = CliRunner().invoke(build(), [*arguments, *untried, "--json"])
+    return result.exit_code, json.loads(result.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [("hands", "allegro"), ("hands", "barrett"), ("hands", "shadow"), ("objects", "mug"), ("objects", "block")],
+)
+def test_a_built_in_is_accepted_with_exit_code_0(kind: str, name: str) -> None:
+    code, report = check(kind, "check", name)
+    assert code == 0
+    assert report["verdict"] == "accept" and report["repairs"] == [] and report["message"] and report["facts"]
+
+
+def test_a_folder_of_objects_gets_a_verdict_each_and_exit_code_2_if_one_is_refused(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    for source, name in (("quads_and_ngons.obj", "prism"), ("inverted_normals.stl", "mug"), ("garbage.stl", "noise")):
+        folder = tmp_path / "set" / name
+        folder.mkdir(parents=True)
+        (folder / source).write_bytes((shared_data / "bad" / source).read_bytes())
+    code, report = check("objects", "check", str(tmp_path / "set"))
+    assert code == 2 and report["refused"] == ["noise"]
+    said = {one["name"]: one["verdict"] for one in report["objects"]}
+    assert said == {"mug": "repair", "noise": "refuse", "prism": "accept"}
+    told = CliRunner().invoke(build(), ["objects", "check", str(tmp_path / "set")])
+    assert [line.split()[0] for line in told.stdout.splitlines()] == ["repair", "refuse", "accept"]
+    assert "1 of 3 objects were refused: noise" in told.stderr
+    (tmp_path / "set" / "noise" / "garbage.stl").unlink()
+    code, report = check("objects", "check", str(tmp_path / "set"))
+    assert code == 0 and report["refused"] == []
+
+
+def test_a_folder_without_a_mesh_is_a_mistake(tmp_path: Path) -> None:
+    told = CliRunner().invoke(build(), ["objects", "check", str(tmp_path)])
+    assert told.exit_code == 2 and "no mesh" in told.stderr
+
+
+@pytest.mark.parametrize(
+    ("file", "options", "verdict"),
+    [
+        ("mimic_chain.urdf", (), "accept"),
+        ("limits_reversed.urdf", (), "refuse"),
+        ("inverted_normals.stl", (), "repair"),
+        ("banana_in_millimetres.stl", (), "refuse"),
+        ("banana_in_millimetres.stl", ("--units", "mm"), "accept"),
+        ("open_shell.stl", ("--allow-open",), "accept"),
+        ("two_components.stl", ("--keep-largest",), "repair"),
+        ("lying_face_count.stl", (), "refuse"),
+    ],
+)
+def test_a_file_gets_its_verdict_and_exit_code(
+    shared_data: Path, file: str, options: tuple[str, ...], verdict: str
+) -> None:
+    kind = "hands" if file.endswith(".urdf") else "objects"
+    code, report = check(kind, "check", str(shared_data / "bad" / file), *options)
+    assert report["verdict"] == verdict, report["message"]
+    assert code == (2 if verdict == "refuse" else 0)
+    assert bool(report["repairs"]) == (verdict == "repair")
+
+
+@pytest.mark.parametrize("kind", ["hands", "objects"])
+def test_what_is_not_there_is_refused_and_the_built_ins_are_named(kind: str) -> None:
+    code, report = check(kind, "check", "nowhere")
+    assert code == 2
+    assert report["verdict"] == "refuse" and ("allegro" in report["message"]) == (kind == "hands")
+
+
+def test_without_json_a_refusal_is_one_line_on_stderr(tmp_path: Path) -> None:
+    (tmp_path / "o.stl").write_bytes(b"")
+    result = CliRunner().invoke(build(), ["objects", "check", str(tmp_path / "o.stl")])
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert len(result.stderr.splitlines()) == 1 and "o.stl" in result.stderr
+
+
+def test_without_json_the_guesses_are_told() -> None:
+    said = CliRunner().invoke(build(), ["hands", "check", "barrett", "--no-self-test"]).stdout
+    for word in ("palm", "approach", "fingertips", "dofs", "pre-shape"):
+        assert word in said
+
+
+def test_a_hand_option_goes_over_the_guess() -> None:
+    _, report = check("hands", "check", "allegro", "--fix", "thumb_rotation=1.0,index_distal=0.2")
+    assert len(report["facts"]["dofs"]) == 14
+
+
+def test_a_dropped_link_takes_its_finger_along() -> None:
+    _, report = check("hands", "check", "allegro", "--drop", "ring_proximal_link")
+    assert not [name for name in report["facts"]["fingertips"] if name.startswith("ring")]
+
+
+def test_a_mass_follows_from_the_density_given() -> None:
+    _, report = check("objects", "check", "block", "--density", "500")
+    assert report["facts"]["mass_kg"] == pytest.approx(500 * report["facts"]["volume_m3"])
+
+
+@pytest.mark.parametrize(
+    "options", [("--approach", "1,2"), ("--approach", "a,b,c"), ("--fix", "thumb"), ("--pre-shape", "thumb=x")]
+)
+def test_an_option_that_cannot_be_read_is_the_callers_mistake(options: tuple[str, ...]) -> None:
+    result = CliRunner().invoke(build(), ["hands", "check", "allegro", *options])
+    assert result.exit_code == 2
+    assert options[0] in result.stderr
+
+
+@pytest.mark.parametrize(("kind", "name"), [("hands", "barrett"), ("objects", "mug")])
+def test_the_picture_shows_something(kind: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(portraits, "_SAMPLES", 2)  # grainy, and shown all the same
+    path = tmp_path / "p.png"
+    code, _ = check(kind, "check", name, "--picture", str(path))
+    assert code == 0
+    pixels = np.asarray(Image.open(path).convert("RGB")).astype(int)
+    thirds = np.array_split(pixels, 3, axis=1)
+    assert all((third[..., 0] - third[..., 2] > WARM).sum() > 100 for third in thirds)
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["hands", "--help"], ["objects", "--help"]])
+def test_an_overview_imports_no_engine(arguments: list[str]) -> None:
+    code = (
+        "import sys; from typer.testing import CliRunner; from graspd.cli import build;"
+        f"assert CliRunner().invoke(build(), {arguments!r}).exit_code == 0;"
+        "sys.exit(any(name in sys.modules for name in ('warp', 'newton', 'scipy', 'worker')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,47 @@
+"""Several workers by one command: numbered, started again, ended together."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+from graspd.commands.worker import run_workers
+from graspd.service.settings import Settings
+from tests.system.conftest import alive
+from tests.waiting import until
+
+#: Notes its pid under its number and waits.
+PROGRAM = (
+    "import os, pathlib, sys, time\n"
+    "number = os.environ['GRASPD_WORKER_NUMBER']\n"
+    "note = pathlib.Path(sys.argv[1]) / f'{number}-{os.getpid()}'\n"
+    "note.touch()\n"
+    "time.sleep(600)\n"
+)
+
+
+def test_each_has_a_number_and_one_that_ends_comes_again(tmp_path: Path) -> None:
+    stop = threading.Event()
+    program = (sys.executable, "-c", PROGRAM)
+    running = threading.Thread(
+        target=run_workers, args=(3, [str(tmp_path)], Settings(), stop), kwargs={"program": program}
+    )
+    running.start()
+
+    def notes(count: int) -> list[tuple[int, int]]:
+        until(lambda: len(list(tmp_path.iterdir())) >= count, f"{count} processes start")
+        found = [file.name.split("-") for file in tmp_path.iterdir()]
+        return sorted((int(number), int(pid)) for number, pid in found)
+
+    try:
+        first = notes(3)
+        assert [number for number, _ in first] == [0, 1, 2]
+        subprocess.run(["kill", "-9", str(first[1][1])], check=True)
+        (again,) = set(notes(4)) - set(first)
+        assert again[0] == 1
+    finally:
+        stop.set()
+        running.join()
+    assert not any(alive(pid) for _, pid in notes(4))

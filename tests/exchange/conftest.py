@@ -1,0 +1,72 @@
+"""A few real grasps for the formats to carry."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from graspd.cli import build
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.store.shards import Shard, read_shard, write_shard
+from graspd.worker.engines import backend
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import synthesize
+from graspd.worker.planners.port import Wanted
+
+
+@pytest.fixture(scope="session")
+def hand() -> HandModel:
+    backend.start()
+    return hand_from_path("barrett")
+
+
+@pytest.fixture(scope="session")
+def block() -> ObjectModel:
+    return object_from_path("block")
+
+
+@pytest.fixture(scope="session")
+def grasps(hand: HandModel, block: ObjectModel) -> GraspSet:
+    return synthesize(hand, block, Wanted(count=4, fidelity=FIDELITIES["draft"], seed=5))
+
+
+@pytest.fixture(scope="session")
+def on_tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Shards of grasps on tables with pictures of their scenes, two objects. What is told of the other object's grasps
+    and pictures is not true of it: their numbers are the block's, which is all that writers and readers see of them."""
+    folder = tmp_path_factory.mktemp("on-tables")
+    block, views = folder / "block.h5", folder / "block-views.h5"
+    words = ["--hand", "barrett", "--object", "block", "--scene", "table", "--scenes", "2", "-n", "8", "--want", "raw"]
+    words += ["--seed", "1"]  # all eight of these are valid
+    run("synth", *words, "--fidelity", "draft", "-o", block)
+    run("render", block, "--views", "2", "--width", "96", "--height", "72", "-o", views)
+    base, seen = read_shard(block, kind="base"), read_shard(views, kind="views")
+    mug = {"object": "mug", "object_digest": object_from_path("mug").digest}
+    base_id, seen_id = "a" * 64, "b" * 64
+    again = write_shard("base", base.arrays, {**base.attributes, **mug, "shard_id": base_id})
+    (folder / "mug.h5").write_bytes(again)
+    (folder / "mug-views.h5").write_bytes(
+        write_shard("views", seen.arrays, {**seen.attributes, **mug, "shard_id": seen_id, "base_shard": base_id})
+    )
+    return folder
+
+
+@pytest.fixture(scope="session")
+def stored(on_tables: Path) -> Shard:
+    """The block's grasps among these."""
+    return read_shard(on_tables / "block.h5", kind="base")
+
+
+def run(*words: object) -> dict[str, Any]:
+    """What a command says with --json."""
+    result = CliRunner().invoke(build(), [str(word) for word in (*words, "--json")])
+    assert result.exit_code == 0, result.output
+    return dict(json.loads(result.stdout.splitlines()[-1]))

@@ -1,0 +1,202 @@
+"""An arm that carries the hand: it is where the hand should be, within its limits, and runs into nothing."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import yourdfpy
+
+from graspd.exchange.robots.arm import read_arm
+from graspd.exchange.robots.execution import ASSUMED_RAD_S
+from graspd.service.model.transforms import IDENTITY_POSE, compose, pose_from_matrix
+from tests.exchange.robots.arms import JOINTS, write_arm
+from tests.exchange.robots.shards import run
+
+pytest.importorskip("mink")
+
+MOUNT_POSE = "0 0 0.11 1 0 0 0"
+#: The search ends at 0.1 mm and 1 mrad; between two of its points, 5 mm apart, joints move straight.
+NEAR_M = 5e-4
+NAMES = [name for name, *_ in JOINTS]
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_arm(tmp_path_factory.mktemp("arm"))
+
+
+def export(shard: Path, arm: Path, folder: Path, format_: str = "csv", base: str = "-0.45 0 0 1 0 0 0") -> Any:
+    return run(
+        "export",
+        shard,
+        "--format",
+        format_,
+        "--all",
+        "--arm",
+        arm,
+        "--mount",
+        "flange",
+        "--mount-pose",
+        MOUNT_POSE,
+        "--base",
+        base,
+        "-o",
+        folder,
+        "--json",
+    )
+
+
+@pytest.fixture(scope="module")
+def carried(table_shard: Path, arm: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    folder = tmp_path_factory.mktemp("carried")
+    found = export(table_shard, arm, folder)
+    assert found.exit_code == 0, found.output
+    return json.loads(found.stdout.splitlines()[-1]), folder
+
+
+def rows(folder: Path, table: str = "trajectories") -> list[dict[str, str]]:
+    with (folder / f"{table}.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_share_of_grasps_that_the_arm_reaches_is_told(carried: tuple[dict[str, Any], Path]) -> None:
+    told, folder = carried
+    assert told["tried"] == 6 and told["grasps"] == len({row["grasp"] for row in rows(folder)}) >= 2
+    assert told["reach_share"] == pytest.approx(told["grasps"] / told["tried"], abs=1e-4)
+    assert sum(told["refused"].values()) == told["tried"] - told["grasps"]
+
+
+def test_the_arm_holds_the_hand_where_the_grasp_has_it_all_along(
+    carried: tuple[dict[str, Any], Path], arm: Path
+) -> None:
+    """yourdfpy's forward kinematics is the oracle; poses are told in the frame of the arm's base."""
+    robot = yourdfpy.URDF.load(str(arm), load_meshes=False, build_scene_graph=True)
+    for row in rows(carried[1])[::5]:
+        robot.update_cfg({name: float(row[name]) for name in NAMES})
+        flange = pose_from_matrix(robot.get_transform("flange", "base"))
+        root = compose(flange, np.array([float(part) for part in MOUNT_POSE.split()]))
+        told = np.array([float(row[part]) for part in ("x", "y", "z", "qw", "qx", "qy", "qz")])
+        np.testing.assert_allclose(root[:3], told[:3], atol=NEAR_M)
+        assert abs(root[3:] @ told[3:]) > np.cos(0.005)
+
+
+def test_joints_stay_within_their_limits_of_place_and_speed(carried: tuple[dict[str, Any], Path]) -> None:
+    by_grasp: dict[str, list[dict[str, str]]] = {}
+    for row in rows(carried[1]):
+        by_grasp.setdefault(row["grasp"], []).append(row)
+    for points in by_grasp.values():
+        time = np.array([float(row["time_s"]) for row in points])
+        for name, _, _, limit, speed, *_ in JOINTS:
+            values = np.array([float(row[name]) for row in points])
+            assert np.abs(values).max() <= limit + 1e-6
+            # Half the limits is the default; 1e-6: rounding of the table.
+            assert np.abs(np.diff(values) / np.diff(time)).max() <= 0.5 * speed + 1e-6
+
+
+def test_the_arms_scene_opens_in_mujoco_and_nothing_of_the_arm_touches(
+    table_shard: Path, arm: Path, tmp_path: Path
+) -> None:
+    assert export(table_shard, arm, tmp_path, "mujoco").exit_code == 0
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml"))
+    data = mujoco.MjData(model)
+    assert model.nkey % 6 == 0 and model.nkey >= 12
+    for key in range(model.nkey):
+        mujoco.mj_resetDataKeyframe(model, data, key)
+        mujoco.mj_forward(model, data)
+        assert not [c for c in data.contact if c.dist < 0], model.key(key).name
+        low, high = model.jnt_range[:6].T
+        assert (data.qpos[:6] >= low - 1e-5).all() and (data.qpos[:6] <= high + 1e-5).all()
+    assert model.body("flange").id and model.body("palm").id
+    assert mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "gripper") == -1, "what the mount carried is left out"
+
+
+def test_moveit_is_told_poses_in_the_arms_base_and_joints_of_arm_and_hand(
+    table_shard: Path, arm: Path, tmp_path: Path
+) -> None:
+    import yaml
+
+    assert export(table_shard, arm, tmp_path, "moveit").exit_code == 0
+    grasps = yaml.safe_load((tmp_path / "grasps.yaml").read_text())
+    assert {grasp["grasp_pose"]["header"]["frame_id"] for grasp in grasps} == {"base"}
+    file = sorted((tmp_path / "trajectories").iterdir())[0]
+    assert yaml.safe_load(file.read_text())["joint_trajectory"]["joint_names"][:6] == NAMES
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--mount", "flange", "--base", "-5 0 0 1 0 0 0"], "carries out none of 1 grasps (1 out of reach)"),
+        (["--mount", "flage"], "no link 'flage'"),  # codespell:ignore flage
+        (["--mount", "base"], "no joint of the arm six moves the link 'base'"),
+        ([], "--mount LINK"),
+        (["--mount", "flange", "--base", "0 0 0"], "--base '0 0 0' is no pose"),
+    ],
+)
+def test_an_arm_that_cannot_is_refused_in_a_line(
+    options: list[str], said: str, free_shard: Path, arm: Path, tmp_path: Path
+) -> None:
+    found = run("export", free_shard, "--format", "csv", "--arm", arm, *options, "-o", tmp_path / "out")
+    output = found.output.replace("of 6 grasps (6", "of 1 grasps (1").replace("of 5 grasps (5", "of 1 grasps (1")
+    assert found.exit_code == 2 and said in output and found.output.strip().count("\n") == 0
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_base_without_an_arm_and_an_arm_without_mink_are_refused(
+    free_shard: Path, arm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = run("export", free_shard, "--format", "csv", "--base", "0 0 0 1 0 0 0", "-o", tmp_path)
+    assert found.exit_code == 2 and "--arm ARM.urdf" in found.output
+    monkeypatch.setitem(sys.modules, "mink", None)
+    found = run("export", free_shard, "--format", "csv", "--arm", arm, "--mount", "flange", "-o", tmp_path)
+    assert found.exit_code == 2 and "pip install 'graspd[arm]'" in found.output
+
+
+def test_speeds_that_the_arm_does_not_state_are_assumed_and_told(free_shard: Path, tmp_path: Path) -> None:
+    found = export(free_shard, write_arm(tmp_path, velocities=False), tmp_path / "out", base="-0.45 0 -0.3 1 0 0 0")
+    assert found.exit_code == 0, found.output
+    notes = json.loads(found.stdout.splitlines()[-1])["notes"]
+    assert any(f"6 joints have no velocity limit (pan, shoulder, elbow, ...): {ASSUMED_RAD_S:g}" in n for n in notes)
+
+
+@pytest.mark.parametrize("name", ["panda_description/urdf/panda_collision.urdf"])
+def test_a_real_arm_carries_grasps(table_shard: Path, tmp_path: Path, name: str) -> None:
+    """Where the package example-robot-data is installed."""
+    packages = [Path(entry) / "cmeel.prefix/share/example-robot-data/robots" for entry in sys.path]
+    folder = next((one for one in packages if (one / name).is_file()), None)
+    if folder is None:
+        pytest.skip("example-robot-data is not installed")
+    found = run(
+        "export",
+        table_shard,
+        "--format",
+        "csv",
+        "--all",
+        "--arm",
+        folder / name,
+        "--mount",
+        "panda_link8",
+        "--mount-pose",
+        MOUNT_POSE,
+        "--base",
+        "-0.5 0 0 1 0 0 0",
+        "-o",
+        tmp_path,
+        "--json",
+    )
+    assert found.exit_code == 0, found.output
+    assert json.loads(found.stdout.splitlines()[-1])["reach_share"] > 0
+
+
+@pytest.mark.parametrize("kind", ["floating", "planar"])
+def test_an_arm_on_a_base_that_floats_stands_still_there(kind: str, tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    free = f'<link name="world"/><joint name="free" type="{kind}"><parent link="world"/><child link="base"/></joint>'
+    urdf.write_text(urdf.read_text().replace("</robot>", f"{free}</robot>"))
+    assert read_arm(urdf, "flange", IDENTITY_POSE).model.joint_names == tuple(NAMES)

@@ -1,0 +1,229 @@
+"""Each format of robots, opened by what reads it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+
+import graspd.service
+from graspd.exchange.cases import load_case
+from graspd.service.model.transforms import compose, invert
+from graspd.service.store.shards import read_shard, write_shard
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.urdf import read_urdf
+from tests.exchange.robots.shards import COMMON, make, run
+
+BLOCK = next(Path(service.__file__).parent.glob("builtin/objects/block/*.stl"))
+#: Fields of the messages, from docs.ros.org (moveit_msgs, trajectory_msgs).
+GRASP = {
+    "id",
+    "pre_grasp_posture",
+    "grasp_posture",
+    "grasp_pose",
+    "grasp_quality",
+    "pre_grasp_approach",
+    "post_grasp_retreat",
+    "post_place_retreat",
+    "max_contact_force",
+    "allowed_touch_objects",
+}
+POINT = {"positions", "velocities", "accelerations", "effort", "time_from_start"}
+
+
+def export(shard: Path, format_: str, folder: Path, *more: str) -> dict[str, Any]:
+    found = run("export", shard, "--format", format_, "--all", "-o", folder, "--json", *more)
+    assert found.exit_code == 0, found.output
+    return json.loads(found.stdout.splitlines()[-1])
+
+
+def limp(shard: Path, out: Path) -> Path:
+    """The shard with two grasps that press no more than the open hand does: nothing is held by them."""
+    made = read_shard(shard, kind="base")
+    squeeze = np.array(made["squeeze/joint_positions"])
+    squeeze[:2] = made["pregrasp/joint_positions"][:2]
+    out.write_bytes(write_shard("base", {**made.arrays, "squeeze/joint_positions": squeeze}, made.attributes))
+    return out
+
+
+def export_of(hand: str, format_: str, folder: Path) -> Path:
+    """Export grasps of a built-in hand on an object whose name no format takes as it is."""
+    thing = folder / "003_mug.v2-final.stl"
+    thing.write_bytes(BLOCK.read_bytes())
+    made = make(["--hand", hand, "--object", str(thing), "-n", "2", *COMMON], folder / "grasps.h5")
+    export(made, format_, folder / format_)
+    return folder / format_
+
+
+@pytest.mark.parametrize("hand", ["allegro", "barrett", "shadow"])
+def test_a_scene_of_every_built_in_hand_compiles_in_mujoco(hand: str, tmp_path: Path) -> None:
+    model = mujoco.MjModel.from_xml_path(str(export_of(hand, "mujoco", tmp_path) / "scene.xml"))
+    tendons = {model.tendon(k).name for k in range(model.ntendon)}
+    # Actuators of a tendon bear its name, which is that of its first degree of freedom.
+    assert tendons <= {model.actuator(k).name for k in range(model.nu)} and bool(tendons) == (hand == "shadow")
+
+
+def test_isaac_names_prims_that_the_usd_export_has(tmp_path: Path) -> None:
+    usd = pytest.importorskip("pxr.Usd")
+    isaac = yaml.safe_load(next(export_of("barrett", "isaac", tmp_path).glob("*.yaml")).read_text())
+    export(tmp_path / "grasps.h5", "usd", tmp_path / "usd")
+    stage = usd.Stage.Open(str(next((tmp_path / "usd").glob("*.usd"))))
+    assert isaac["object_frame_link"] == "/World/_003_mug_v2_final"
+    for name in ("object_frame_link", "gripper_frame_link"):
+        assert stage.GetPrimAtPath(isaac[name]).IsValid()
+
+
+def judged(shard: Path) -> list[bool]:
+    """What the referee says of each row."""
+    case = load_case(shard)
+    protocol = "dexgraspbench" if case.placed is None else "lift"
+    found = run("evaluate", shard, "--protocol", protocol, "--json")
+    return [one["held"] for one in json.loads(found.stdout.splitlines()[-1])["verdicts"]]
+
+
+@pytest.mark.parametrize("which", ["free_shard", "table_shard", "pressing_shard", "clutter_shard"])
+def test_a_mujoco_scene_replays_to_the_verdict_of_the_referee(
+    which: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    shard = limp(request.getfixturevalue(which), tmp_path / "limp.h5")
+    told = export(shard, "mujoco", tmp_path)
+    # A script that has only mujoco and numpy must do: -I keeps this checkout out of its reach.
+    command = [sys.executable, "-I", str(tmp_path / "replay.py"), str(tmp_path / "scene.xml"), "--json"]
+    found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    verdicts = judged(shard)
+    assert len(found) == told["grasps"] and set(verdicts) == {True, False}
+    assert {name: what == "held" for name, what in found.items()} == {
+        name: verdicts[int(name.removeprefix("grasp_"))] for name in found
+    }
+
+
+def test_a_mujoco_scene_has_the_hands_names_and_a_key_frame_for_each_posture(table_shard: Path, tmp_path: Path) -> None:
+    export(table_shard, "mujoco", tmp_path)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
+    data = mujoco.MjData(model)
+    case = load_case(table_shard)
+    assert {model.actuator(k).name for k in range(model.nu)} == set(case.hand.dof_names)
+    shard = read_shard(table_shard, kind="base")
+    at = shard["scene/object_pose"][shard["grasp/scene_index"]]
+    for row in range(len(case.grasps)):
+        key = model.key(f"grasp_{row:04}/grasp").id
+        mujoco.mj_resetDataKeyframe(model, data, key)
+        mujoco.mj_forward(model, data)
+        pose = compose(at[row], case.grasps.grasp.hand_pose[row])
+        bodies = body_poses(case.hand, pose, case.grasps.grasp.joint_positions[row])[0]
+        for name, expected in zip(case.hand.body_names, bodies, strict=True):
+            # 1e-5: MuJoCo writes the tree's own numbers with six digits.
+            np.testing.assert_allclose(data.body(name).xpos, expected[:3], atol=1e-5)
+        np.testing.assert_allclose(data.site("object_frame").xpos, at[row, :3], atol=1e-6)
+
+
+def test_an_isaac_file_has_the_fields_of_its_documentation(free_shard: Path, tmp_path: Path) -> None:
+    told = export(free_shard, "isaac", tmp_path)
+    found = yaml.safe_load((tmp_path / "barrett_block.yaml").read_text())
+    assert found["format"] == "isaac_grasp" and float(found["format_version"]) == 1.0
+    assert found["object_frame_link"] == found["object_frame"] == "/World/block"
+    assert found["gripper_frame_link"] == found["gripper_frame"] == "/World/barrett/palm"
+    assert len(found["grasps"]) == told["grasps"]
+    case = load_case(free_shard)
+    valid = read_shard(free_shard, kind="base")["quality/valid"]
+    mimics = {"finger_1_spread"}
+    for name, grasp in found["grasps"].items():
+        row = int(name.removeprefix("grasp_"))
+        pose = case.grasps.grasp.hand_pose[row]
+        np.testing.assert_allclose(
+            [*grasp["position"], grasp["orientation"]["w"], *grasp["orientation"]["xyz"]], pose, atol=1e-8
+        )
+        assert grasp["confidence"] == float(valid[row])
+        assert set(grasp["cspace_position"]) == set(grasp["pregrasp_cspace_position"])
+        joints = dict(zip(case.hand.joint_names, case.grasps.grasp.joint_positions[row], strict=True))
+        for joint, value in grasp["cspace_position"].items():
+            assert value == pytest.approx(joints[joint], abs=1e-8)
+        assert mimics <= set(grasp["cspace_position"]) < set(joints), "driven joints, and no coupled ones"
+
+
+def test_moveit_grasps_have_the_fields_of_the_messages(table_shard: Path, tmp_path: Path) -> None:
+    told = export(table_shard, "urdf+yaml", tmp_path)
+    grasps = yaml.safe_load((tmp_path / "grasps.yaml").read_text())
+    assert len(grasps) == told["grasps"]
+    for grasp in grasps:
+        assert set(grasp) == GRASP
+        assert grasp["grasp_pose"]["header"]["frame_id"] == "scene"
+        x, y, z, w = (grasp["grasp_pose"]["pose"]["orientation"][k] for k in "xyzw")
+        assert x * x + y * y + z * z + w * w == pytest.approx(1.0, abs=1e-6)
+        for name, points in (("pre_grasp_posture", 1), ("grasp_posture", 2)):
+            trajectory = grasp[name]
+            assert set(trajectory) == {"header", "joint_names", "points"} and len(trajectory["points"]) == points
+            for point in trajectory["points"]:
+                assert set(point) == POINT and len(point["positions"]) == len(trajectory["joint_names"])
+        assert len(grasp["grasp_posture"]["points"][-1]["effort"]) == len(grasp["grasp_posture"]["joint_names"])
+        for name in ("pre_grasp_approach", "post_grasp_retreat", "post_place_retreat"):
+            way = grasp[name]
+            assert way["desired_distance"] == pytest.approx(0.1, abs=1e-6) and 0 < way["min_distance"] < 0.1
+            assert np.linalg.norm(list(way["direction"]["vector"].values())) == pytest.approx(1.0, abs=1e-6)
+        assert grasp["post_grasp_retreat"]["direction"]["vector"]["z"] == pytest.approx(1.0, abs=1e-6)
+    assert read_urdf((tmp_path / "object" / "bottle.urdf").read_bytes().replace(b"</robot>", _FINGER)).root == "bottle"
+    assert hand_from_path(tmp_path / "hand").joint_names == load_case(table_shard).hand.joint_names
+
+
+#: A link that moves, which our reader of robots asks for.
+_FINGER = (
+    b'<link name="f"/><joint name="j" type="revolute"><parent link="bottle"/><child link="f"/><axis xyz="0 0 1"/>'
+    b'<limit lower="0" upper="1"/></joint></robot>'
+)
+
+
+def test_moveit_trajectories_are_messages_that_rise_in_time(free_shard: Path, tmp_path: Path) -> None:
+    export(free_shard, "moveit", tmp_path, "--best", "2")
+    files = sorted((tmp_path / "trajectories").iterdir())
+    assert len(files) == 2
+    found = yaml.safe_load(files[0].read_text())
+    assert set(found) == {"joint_trajectory", "multi_dof_joint_trajectory"}
+    points = found["joint_trajectory"]["points"]
+    times = [p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in points]
+    assert times == sorted(times) and times[0] == 0.0
+    assert len(points) == len(found["multi_dof_joint_trajectory"]["points"])
+
+
+def test_tables_name_their_columns_and_hold_what_the_shard_holds(free_shard: Path, tmp_path: Path) -> None:
+    export(free_shard, "csv", tmp_path, "--tool-frame", "0 0 0.1 1 0 0 0")
+    with (tmp_path / "postures.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    case = load_case(free_shard)
+    grasps = [row for row in rows if row["posture"] == "grasp"]
+    for row in grasps:
+        number = int(row["grasp"].removeprefix("grasp_"))
+        tool = np.array([float(row[part]) for part in ("x", "y", "z", "qw", "qx", "qy", "qz")])
+        root = compose(tool, invert(np.array([0, 0, 0.1, 1, 0, 0, 0])))
+        np.testing.assert_allclose(root, case.grasps.grasp.hand_pose[number], atol=1e-8)
+        joints = [float(row[name]) for name in case.hand.joint_names]
+        np.testing.assert_allclose(joints, case.grasps.grasp.joint_positions[number], atol=1e-8)
+    with (tmp_path / "trajectories.csv").open() as file:
+        assert {row["phase"] for row in csv.DictReader(file)} == {"approach", "shape", "close", "squeeze", "lift"}
+    with (tmp_path / "grasps.csv").open() as file:
+        assert {row["tool_frame"] for row in csv.DictReader(file)} == {"tool"}
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--tool-frame", "no_such_link"], "the hand has no link 'no_such_link'"),
+        (["--tool-frame", "finger_1_distal_link"], "moves with a finger"),
+        (["--speed", "0"], "--speed is 0"),
+        (["--speed", "1.5"], "at most 1"),
+    ],
+)
+def test_a_mistake_is_one_line_and_writes_nothing(
+    options: list[str], said: str, free_shard: Path, tmp_path: Path
+) -> None:
+    found = run("export", free_shard, "--format", "csv", *options, "-o", tmp_path / "out")
+    assert found.exit_code == 2 and said in found.output and found.output.strip().count("\n") == 0
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,225 @@
+"""A folder that DexGraspBench's evaluator takes as it is: each file that its loader reads, read by `bench_loader`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from graspd.exchange import dexgraspbench
+from graspd.exchange.bench_hand import body_names
+from graspd.service.model.transforms import quat_to_matrix
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from tests.exchange.bench_loader import PREFIX, files_of, load
+
+#: Rounding of a pose in float64 through text of 12 digits [m].
+ROUNDING_M = 1e-8
+
+
+@pytest.fixture(scope="module")
+def bench(hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("bench")
+    dexgraspbench.write(hand, block, grasps, range(len(grasps)), root)
+    return root
+
+
+def test_a_grasp_has_each_field_that_is_read(bench: Path, hand: HandModel, grasps: GraspSet) -> None:
+    files = files_of(bench, "graspd_barrett")
+    assert len(files) == len(grasps)
+    for file in files:
+        found = np.load(file, allow_pickle=True).item()
+        assert found["obj_scale"] == 1.0 and found["obj_pose"].tolist() == [0, 0, 0, 1, 0, 0, 0]
+        assert {found[f"{name}_qpos"].shape for name in dexgraspbench.POSTURES} == {(7 + len(hand.joint_names),)}
+        assert not Path(found["obj_path"]).is_absolute()
+
+
+def test_the_object_weighs_what_the_evaluator_wants(bench: Path, block: ObjectModel) -> None:
+    found = load(bench, files_of(bench, "graspd_barrett")[0], "graspd_barrett")
+    number = found.model.body("object").id
+    assert found.model.body_mass[number] == pytest.approx(0.1, rel=1e-4)  # float32 of MuJoCo's meshes
+    np.testing.assert_allclose(found.model.body_ipos[number], block.centre_of_mass, atol=1e-4)
+    info = json.loads((bench / found.grasp["obj_path"] / "info" / "simplified.json").read_text())
+    assert set(info) == {"gravity_center", "obb", "scale", "density", "mass"}
+    assert info["mass"] == pytest.approx(info["density"] * block.volume, rel=0.05)  # the pieces' against the mesh's
+
+
+def test_every_file_beside_the_pieces_is_a_piece_also_after_a_second_export(
+    bench: Path, hand: HandModel, block: ObjectModel, grasps: GraspSet
+) -> None:
+    pieces = bench / np.load(files_of(bench, "graspd_barrett")[0], allow_pickle=True).item()["obj_path"] / "urdf/meshes"
+    (pieces / "convex_piece_099.obj").write_text("of another decomposition")
+    dexgraspbench.write(hand, block, grasps, [0], bench)
+    assert [file.name for file in pieces.iterdir()] == ["convex_piece_000.obj"]
+
+
+@pytest.mark.parametrize("name", ["barrett", "allegro", "shadow"])
+def test_the_evaluators_hand_stands_where_ours_does(name: str, block: ObjectModel, tmp_path: Path) -> None:
+    hand = hand_from_path(name)
+    grasps = random_postures(hand)
+    files = dexgraspbench.write(hand, block, grasps, [0, 1], tmp_path)
+    found = load(tmp_path, files[1], f"graspd_{name}")
+    assert found.model.nq == 7 + len(hand.joint_names) + 7
+    for posture in dexgraspbench.POSTURES:
+        found.at(found.grasp[f"{posture}_qpos"])
+        ours = getattr(grasps, posture)
+        poses = body_poses(hand, ours.hand_pose[1:2], ours.joint_positions[1:2])[0]
+        for body, pose in zip(body_names(hand), poses, strict=True):
+            assert_at(found.data.body(PREFIX + body), pose)
+
+
+def test_the_evaluators_actuators_aim_at_the_joints_of_a_posture(bench: Path, hand: HandModel) -> None:
+    found = load(bench, files_of(bench, "graspd_barrett")[0], "graspd_barrett")
+    qpos = found.grasp["squeeze_qpos"]
+    found.at(qpos)
+    targets = found.controls(qpos)
+    assert found.model.nu == hand.dofs
+    for number, target in enumerate(targets):
+        joint = found.model.joint(int(found.model.actuator_trnid[number, 0]))
+        assert target == pytest.approx(qpos[int(joint.qposadr[0])], abs=1e-12)
+        assert found.model.actuator_gainprm[number, 0] == pytest.approx(5.0)
+    assert found.model.neq == 1 + len(hand.joint_names) - hand.dofs  # the weld, and what follows another joint
+
+
+def test_the_bodies_that_the_configuration_names_are_in_the_model(bench: Path, hand: HandModel) -> None:
+    found = load(bench, files_of(bench, "graspd_barrett")[0], "graspd_barrett")
+    known = {found.model.body(number).name for number in range(found.model.nbody)}
+    said = found.hand
+    assert {PREFIX + name for name in said["valid_body_name"]} <= known
+    assert set(said["tip_body_name"]) <= set(said["valid_body_name"]) and len(said["tip_body_name"]) == 3
+    assert said["mocap"] is True and said["exclude_table_contact"] is None
+    for prefix in said["finger_prefix"]:
+        assert any(name.startswith(prefix) for name in said["valid_body_name"])
+
+
+def test_a_hand_of_meshes_is_loaded_with_them(
+    shared_data: Path, block: ObjectModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hand = hand_from_path(shared_data / "hands" / "allegro" / "allegro_hand_right.urdf")
+    (file,) = dexgraspbench.write(hand, block, random_postures(hand), [0], tmp_path)
+    monkeypatch.chdir(tmp_path)  # nothing may depend on where the export was written
+    found = load(tmp_path, file, "graspd_allegro_hand_right")
+    meshes = {found.model.mesh(number).name for number in range(found.model.nmesh)}
+    hulls = {f"{PREFIX}piece_{k:03}" for k, piece in enumerate(hand.pieces) if piece.kind == "hull"}
+    assert hulls and hulls <= meshes
+
+
+def test_the_scene_names_files_that_are_there(bench: Path) -> None:
+    record = np.load(files_of(bench, "graspd_barrett")[0], allow_pickle=True).item()
+    file = bench / record["scene_path"]
+    scene = np.load(file, allow_pickle=True).item()
+    thing = scene["scene"][scene["task"]["obj_name"]]
+    for key in ("file_path", "info_path", "urdf_path"):
+        assert (file.parent / thing[key]).is_file()
+    # The converters take the object's folder to be two above its mesh.
+    assert (file.parent / thing["file_path"]).resolve().parents[1] == (bench / record["obj_path"]).resolve()
+    assert thing["scale"].tolist() == [1, 1, 1] and thing["pose"].tolist() == record["obj_pose"].tolist()
+    assert json.loads((bench / "assets/object/graspd/valid_split/all.json").read_text()) == ["block"]
+
+
+#: Index fingertip frame of the benchmark's Allegro, from its model: palm turned by the quaternion 0 1 0 1 in the world.
+_ALLEGRO_INDEX = [
+    ([0, 0.0435, -0.001542], [0.999048, -0.0436194, 0, 0], [0, 0, 1]), ([0, 0, 0.0164], [1, 0, 0, 0], [0, 1, 0]),
+    ([0, 0, 0.054], [1, 0, 0, 0], [0, 1, 0]), ([0, 0, 0.0384], [1, 0, 0, 0], [0, 1, 0]),
+]  # fmt: skip
+_ALLEGRO_THUMB = [
+    ([-0.0182, 0.019333, -0.045987], [0.477714, -0.521334, -0.521334, -0.477714], [-1, 0, 0]),
+    ([-0.027, 0.005, 0.0399], [1, 0, 0, 0], [0, 0, 1]), ([0, 0, 0.0177], [1, 0, 0, 0], [0, 1, 0]),
+    ([0, 0, 0.0514], [1, 0, 0, 0], [0, 1, 0]),
+]  # fmt: skip
+#: And of its Shadow hand: palm 34 mm above the world's origin.
+_SHADOW_INDEX = [
+    ([0.033, 0, 0.095], [1, 0, 0, 0], [0, -1, 0]), ([0, 0, 0], [1, 0, 0, 0], [1, 0, 0]),
+    ([0, 0, 0.045], [1, 0, 0, 0], [1, 0, 0]), ([0, 0, 0.025], [1, 0, 0, 0], [1, 0, 0]),
+]  # fmt: skip
+_SHADOW_THUMB = [
+    ([0.034, -0.00858, 0.029], [0.92388, 0, 0.382683, 0], [0, 0, -1]), ([0, 0, 0], [1, 0, 0, 0], [1, 0, 0]),
+    ([0, 0, 0.038], [1, 0, 0, 0], [1, 0, 0]), ([0, 0, 0], [1, 0, 0, 0], [0, -1, 0]),
+    ([0, 0, 0.032], [1, 0, 0, -1], [1, 0, 0]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("file", "config", "root", "chain", "first", "tip"),
+    [
+        ("allegro/allegro_hand_right.urdf", "allegro", [0, 0, 0, 0, 1, 0, 1], _ALLEGRO_INDEX, 0, "joint_3.0"),
+        ("allegro/allegro_hand_right.urdf", "allegro", [0, 0, 0, 0, 1, 0, 1], _ALLEGRO_THUMB, 12, "joint_15.0"),
+        ("shadow/shadow_hand_right.urdf", "shadow", [0, 0, 0.034, 1, 0, 0, 0], _SHADOW_INDEX, 0, "FFJ1"),
+        ("shadow/shadow_hand_right.urdf", "shadow", [0, 0, 0.034, 1, 0, 0, 0], _SHADOW_THUMB, 17, "THJ1"),
+    ],
+)
+def test_a_hand_that_the_benchmark_has_is_mapped_onto_its_own_model(
+    shared_data: Path,
+    block: ObjectModel,
+    tmp_path: Path,
+    file: str,
+    config: str,
+    root: list[float],
+    chain: list[Any],
+    first: int,
+    tip: str,
+) -> None:
+    hand = hand_from_path(shared_data / "hands" / file)
+    grasps = random_postures(hand)
+    dexgraspbench.write(hand, block, grasps, [0], tmp_path)
+    (npy,) = files_of(tmp_path, config)
+    qpos = np.load(npy, allow_pickle=True).item()["grasp_qpos"]
+    model = mujoco.MjModel.from_xml_string(_chain(root, chain))
+    data = mujoco.MjData(model)
+    data.qpos[:] = [*qpos[:7], *qpos[7 + first : 7 + first + len(chain)]]
+    mujoco.mj_kinematics(model, data)
+    ours = body_poses(hand, grasps.grasp.hand_pose[:1], grasps.grasp.joint_positions[:1])[0]
+    body = int(hand.joint_body[hand.joint_names.index(tip)])
+    # The models write their numbers with five to seven digits.
+    np.testing.assert_allclose(data.xpos[-1], ours[body, :3], atol=2e-5)
+    mapping = json.loads((npy.parents[3] / "hand_mapping.json").read_text())
+    assert mapping["root_link"] == hand.root_link and mapping["config"] == config
+    assert [ours for _, ours in mapping["joints"]][first + len(chain) - 1] == tip
+
+
+def test_grasps_for_the_benchmarks_own_model_come_back_as_they_were(block: ObjectModel, tmp_path: Path) -> None:
+    hand = hand_from_path("shadow")
+    grasps = random_postures(hand)
+    dexgraspbench.write(hand, block, grasps, [0, 1], tmp_path)
+    for config in ("shadow", "graspd_shadow"):
+        (back,) = dexgraspbench.read(tmp_path / "output" / f"graspd_{config}", hand="shadow", obj="block")
+        np.testing.assert_allclose(back.grasps.grasp.hand_pose, grasps.grasp.hand_pose, atol=1e-12)
+        np.testing.assert_array_equal(back.grasps.grasp.joint_positions, grasps.grasp.joint_positions)
+
+
+def random_postures(hand: HandModel) -> GraspSet:
+    """Two grasps in which every joint and the root stand anywhere."""
+    rng = np.random.default_rng(7)
+    parts = []
+    for _ in range(3):
+        pose = np.concatenate([rng.uniform(-0.2, 0.2, (2, 3)), rng.normal(size=(2, 4))], axis=1)
+        pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+        parts.append(Posture(pose, hand.expand(rng.uniform(hand.lower, hand.upper, (2, hand.dofs)))))
+    return GraspSet(parts[0], parts[1], parts[2], np.full(2, np.nan))
+
+
+def assert_at(body: Any, pose: np.ndarray) -> None:
+    np.testing.assert_allclose(body.xpos, pose[:3], atol=ROUNDING_M)
+    np.testing.assert_allclose(body.xmat.reshape(3, 3), quat_to_matrix(pose[3:]), atol=1e-7)
+
+
+def _chain(root: list[float], chain: list[Any]) -> str:
+    """A single finger with a free root as MJCF."""
+
+    def text(values: list[float]) -> str:
+        return " ".join(map(str, values))
+
+    geom = '<geom size="0.01" mass="0.01"/>'
+    lines = [f'<body name="world_of_hand"><freejoint/>{geom}', f'<body pos="{text(root[:3])}" quat="{text(root[3:])}">']
+    lines += [
+        f'<body pos="{text(pos)}" quat="{text(quat)}"><joint axis="{text(axis)}"/>{geom}' for pos, quat, axis in chain
+    ]
+    inside = "".join([*lines, *["</body>"] * (len(chain) + 2)])
+    return f'<mujoco><compiler angle="radian"/><worldbody>{inside}</worldbody></mujoco>'

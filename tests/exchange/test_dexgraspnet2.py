@@ -1,0 +1,277 @@
+"""A folder that DexGraspNet 2.0 trains on: each field as its loader reads it, and the grasps as they were."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import scipy.io
+import trimesh
+
+from graspd.exchange import dexgraspnet2
+from graspd.exchange.dexgraspnet2 import load_npz
+from graspd.exchange.dexgraspnet2_graspness import surface_samples
+from graspd.exchange.lots import Look
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import IDENTITY_POSE, apply, compose, pose_from_matrix
+from graspd.service.readers import Pictures, open_shards
+from graspd.service.store.shards import Shard, read_shard, write_shard
+from graspd.worker.hands.jaws import fingertip_pad
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.rendering.annotate import TABLE
+from tests.exchange.conftest import run
+from tests.exchange.dexgraspnet2_loader import graspness_at, pointed, sample, some_views
+
+TRAIN, VAL = range(90), range(90, 100)
+#: Poses go through matrices in float64 and there and back between frames [m].
+ROUNDING_M = 1e-9
+#: Half a step of depth, 0.05 mm, along a ray that is at most 1.3 times as long [m].
+POINT_M = 8e-5
+
+
+@pytest.fixture(scope="module")
+def root(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("dexgraspnet2")
+    said = run("export", on_tables, "--format", "dexgraspnet2", "-o", folder)
+    assert (said["scenes"], said["views"], said["files"]) == (4, 8, 4)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def split(root: Path) -> range:
+    """Where the block's scenes are, for one of the two objects is held out."""
+    return TRAIN if next((root / "data" / "dex_grasps_new" / "scene_0000").rglob("*.npz")).stem == "block" else VAL
+
+
+def test_every_view_that_may_be_drawn_can_be_read(root: Path, hand: HandModel) -> None:
+    for split in (TRAIN, VAL):
+        for scene, view in some_views(root, split, 6, seed=3):
+            found = sample(root, scene, view, "barrett", list(hand.joint_names))
+            assert set(np.unique(found.seg)) <= {0, 1} and (found.seg == 1).sum() > 20
+            count = len(found.trans)
+            assert found.rot.shape == (count, 3, 3) and found.qpos.shape == (count, 8) and count
+            np.testing.assert_allclose(np.linalg.det(found.rot), 1, atol=1e-12)
+
+
+def test_a_fingertip_stands_where_ours_does_in_the_camera(
+    root: Path, split: range, hand: HandModel, stored: Shard, on_tables: Path
+) -> None:
+    pictures = Pictures(open_shards(on_tables))
+    tip, met = hand.fingertips[0], 0
+    for scene, view in some_views(root, split, 6, seed=4):
+        found = sample(root, scene, view, "barrett", list(hand.joint_names))
+        rows = np.load(root / "data" / "dex_grasps_new" / scene / "barrett" / "block.npz")["row"]
+        in_root = body_poses(hand, np.tile(IDENTITY_POSE, (len(rows), 1)), found.qpos)[:, tip, :3]
+        there = np.einsum("nij,nj->ni", found.rot, in_root) + found.trans
+        # The picture of the same scene and view, two a scene; others are these again.
+        seen = [one for one in pictures if one["object"] == "block" and one["scene"] == scene_of(stored, rows)][
+            view % 2
+        ]
+        poses = compose(seen["object/pose"], stored["grasp/hand_pose"][rows])
+        ours = body_poses(hand, poses, stored["grasp/joint_positions"][rows])[:, tip, :3]
+        np.testing.assert_allclose(there, ours, atol=ROUNDING_M)
+        met += len(rows)
+    assert met
+
+
+def scene_of(stored: Shard, rows: np.ndarray) -> int:
+    (scene,) = set(stored["grasp/scene_index"][rows].tolist())
+    return int(scene)
+
+
+def test_the_object_of_the_cloud_is_where_grasps_mean_it(
+    root: Path, split: range, hand: HandModel, block: ObjectModel
+) -> None:
+    mesh = trimesh.Trimesh(block.vertices, block.faces, process=False)
+    for scene, view in some_views(root, split, 4, seed=5):
+        found = sample(root, scene, view, "barrett", list(hand.joint_names))
+        path = root / "data" / "scenes" / scene / "realsense"
+        first = dexgraspnet2._object_pose(root / "data" / "dex_grasps_new" / scene / "barrett" / "block.npz", 0)
+        camera = pose_from_matrix(np.linalg.inv(np.load(path / "camera_poses.npy")[view]))
+        there = compose(camera, first)
+        points = found.point_clouds[found.seg == 1]
+        local = (points - there[:3]) @ trimesh.transformations.quaternion_matrix(there[3:])[:3, :3]
+        assert np.abs(trimesh.proximity.closest_point(mesh, local)[1]).max() < POINT_M
+        on_table = np.load(path / "cam0_wrt_table.npy") @ np.load(path / "camera_poses.npy")[view]
+        rest = found.point_clouds[found.seg == 0]
+        assert np.abs(apply(pose_from_matrix(on_table), rest)[:, 2]).max(initial=0) < POINT_M
+
+
+def test_a_grasp_points_at_the_object(root: Path, block: ObjectModel) -> None:
+    mesh = trimesh.Trimesh(block.vertices, block.faces, process=False)
+    for file in sorted((root / "data" / "dex_grasps_new").rglob("block.npz")):
+        place = dexgraspnet2._object_pose(file, 0)
+        turn = trimesh.transformations.quaternion_matrix(place[3:])[:3, :3]
+        points = (np.load(file)["point"] - place[:3]) @ turn
+        assert np.abs(trimesh.proximity.closest_point(mesh, points)[1]).max() < ROUNDING_M
+
+
+def placed(root: Path, scene: str, view: int, points: np.ndarray) -> np.ndarray:
+    """Points of the object's frame in the camera of a view."""
+    meta = scipy.io.loadmat(root / "data" / "scenes" / scene / "realsense" / "meta" / f"{view:04}.mat")
+    pose = meta["poses"][:, :, 0]
+    return np.asarray(points @ pose[:, :3].T + pose[:, 3])
+
+
+def test_a_grasp_points_where_its_script_says(
+    root: Path, split: range, hand: HandModel, stored: Shard, block: ObjectModel
+) -> None:
+    surface, names = surface_samples(block), list(hand.joint_names)
+    pads = [fingertip_pad(hand, tip).centre for tip in hand.fingertips]
+    (scene, view), *_ = some_views(root, split, 1, seed=6)
+    found = sample(root, scene, view, "barrett", names)
+    rows = np.load(root / "data" / "dex_grasps_new" / scene / "barrett" / "block.npz")["row"]
+    for number, row in enumerate(rows):
+        pose = stored["grasp/hand_pose"][row].astype(float)
+        bodies = body_poses(hand, pose[None], stored["grasp/joint_positions"][row][None])[0]
+        # A Barrett's thumb is its third finger.
+        first, second, thumb = (apply(bodies[tip], pad) for tip, pad in zip(hand.fingertips, pads, strict=True))
+        best = pointed(apply(pose, hand.palm.centre), ((first + second) / 2 + thumb) / 2, surface)
+        np.testing.assert_allclose(found.point[number], placed(root, scene, view, surface)[best], atol=ROUNDING_M)
+    assert len(rows)
+
+
+def test_graspness_is_that_of_its_script(root: Path, split: range, hand: HandModel, block: ObjectModel) -> None:
+    surface = surface_samples(block)
+    for scene, view in some_views(root, split, 3, seed=7):
+        found = sample(root, scene, view, "barrett", list(hand.joint_names))
+        assert found.has_graspness
+        there = placed(root, scene, view, surface)
+        mine = np.flatnonzero(found.seg == 1)
+        for number in mine[:: max(1, len(mine) // 40)]:
+            value = graspness_at(found.point_clouds[number], there, found.point)
+            np.testing.assert_allclose(found.graspness[number], np.log(value + 1e-3), rtol=1e-5)
+        np.testing.assert_allclose(found.graspness[found.seg != 1], np.log(1e-3), rtol=1e-6)
+        assert found.graspness.max() > np.log(0.5)
+
+
+def test_graspness_lies_as_its_loader_expects_it(root: Path) -> None:
+    scenes = sorted((root / "data" / "scenes").iterdir())
+    for scene in scenes:
+        folder = root / "data" / "dex_graspness_new" / scene.name / "realsense"
+        assert sorted(file.name for file in folder.iterdir()) == [f"{view:04}.npy" for view in range(256)]
+        values = np.load(folder / "0001.npy")
+        assert values.dtype == np.float32 and values.ndim == 2 and values.shape[1] == 1
+        assert np.isfinite(values).all() and values.min() >= 0
+        np.testing.assert_array_equal(np.load(folder / "0255.npy"), values)
+    assert sorted(file.name for file in (root / "data" / "dex_graspness_new").iterdir()) == [s.name for s in scenes]
+
+
+def test_graspness_belongs_to_the_cloud_that_a_depth_camera_tells(
+    on_tables: Path, hand: HandModel, tmp_path: Path
+) -> None:
+    run("export", on_tables, "--format", "dexgraspnet2", "--noise", "stereo", "-o", tmp_path)
+    for scene, view in some_views(tmp_path, TRAIN, 4, seed=8):
+        found = sample(tmp_path, scene, view, "barrett", list(hand.joint_names))
+        assert found.has_graspness and (found.graspness[found.seg == 1] > np.log(1e-3)).any()
+
+
+def test_a_view_of_nothing_has_no_cloud_and_no_graspness(on_tables: Path, hand: HandModel, tmp_path: Path) -> None:
+    views = read_shard(on_tables / "block-views.h5", kind="views")
+    labels = np.array(views["image/segmentation"])
+    labels[::2] = np.minimum(labels[::2], TABLE)
+    shards = tmp_path / "shards"
+    shards.mkdir()
+    (shards / "block.h5").write_bytes((on_tables / "block.h5").read_bytes())
+    arrays = {**views.arrays, "image/segmentation": labels}
+    (shards / "views.h5").write_bytes(write_shard("views", arrays, views.attributes))
+    run("export", shards, "--format", "dexgraspnet2", "-o", tmp_path / "out")
+    for folder in (tmp_path / "out" / "data" / "dex_graspness_new").glob("*/realsense"):
+        assert sorted(file.name for file in folder.iterdir()) == [f"{view:04}.npy" for view in range(1, 256, 2)]
+        assert sample(tmp_path / "out", folder.parent.name, 3, "barrett", list(hand.joint_names)).has_graspness
+
+
+def test_a_file_of_graspness_holds_no_grasps(root: Path) -> None:
+    (file, *_) = sorted((root / "data" / "dex_graspness_new").rglob("0000.npy"))
+    with pytest.raises(InputError, match="read safely"):
+        dexgraspnet2.read(file, hand="barrett", obj="block")
+
+
+def test_grasps_come_back_as_they_were(root: Path, stored: Shard) -> None:
+    met = []
+    for file in sorted((root / "data" / "dex_grasps_new").rglob("block.npz")):
+        rows = np.load(file)["row"]
+        (back,) = dexgraspnet2.read(file, hand="barrett", obj="block")
+        for name in ("pregrasp", "grasp", "squeeze"):
+            found = getattr(back.grasps, name)
+            np.testing.assert_array_equal(found.joint_positions, stored[f"{name}/joint_positions"][rows])
+            np.testing.assert_allclose(found.hand_pose[:, :3], stored[f"{name}/hand_pose"][rows, :3], atol=ROUNDING_M)
+        assert back.published is not None
+        np.testing.assert_array_equal(back.published, stored["quality/valid"][rows])
+        met += rows.tolist()
+    assert sorted(met) == np.flatnonzero(stored["quality/valid"]).tolist()
+
+
+def test_grasps_of_others_have_no_more_than_their_joints(root: Path, tmp_path: Path) -> None:
+    (file, *_) = sorted((root / "data" / "dex_grasps_new").rglob("block.npz"))
+    bare = {name: values for name, values in load_npz(file).items() if name not in dexgraspnet2._OURS}
+    changed = moved(root, file, tmp_path)
+    np.savez(changed, **bare)
+    (back,) = dexgraspnet2.read(changed, hand="barrett", obj="block")
+    assert back.published is None and len(back.grasps.pregrasp) == len(bare["point"])
+    np.savez(changed, **bare | {"thumb": np.zeros(len(bare["point"]))})
+    with pytest.raises(InputError, match="no joint 'thumb'"):
+        dexgraspnet2.read(changed, hand="barrett", obj="block")
+
+
+def moved(root: Path, file: Path, folder: Path) -> Path:
+    """A place for another file of the same scene."""
+    scene = file.parents[1].name
+    meta = folder / "data" / "scenes" / scene / "realsense" / "meta"
+    meta.mkdir(parents=True)
+    there = root / "data" / "scenes" / scene / "realsense" / "meta" / "0000.mat"
+    (meta / "0000.mat").write_bytes(there.read_bytes())
+    place = folder / "data" / "dex_grasps_new" / scene / "barrett"
+    place.mkdir(parents=True)
+    return place / file.name
+
+
+def test_a_file_without_its_scene_is_told(root: Path, tmp_path: Path) -> None:
+    (file, *_) = sorted((root / "data" / "dex_grasps_new").rglob("block.npz"))
+    place = tmp_path / "data" / "dex_grasps_new" / "scene_0000" / "barrett" / "block.npz"
+    place.parent.mkdir(parents=True)
+    place.write_bytes(file.read_bytes())
+    with pytest.raises(InputError, match="needs its scene"):
+        dexgraspnet2.read(place, hand="barrett", obj="block")
+
+
+def test_objects_in_an_archive_are_not_unpickled(tmp_path: Path) -> None:
+    np.savez(tmp_path / "x.npz", point=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(InputError, match="read safely"):
+        load_npz(tmp_path / "x.npz")
+
+
+def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dexgraspnet2, "LARGEST", 2**20)
+    np.savez_compressed(tmp_path / "x.npz", point=np.zeros(2**20))
+    with pytest.raises(InputError, match="unpacks to more"):
+        load_npz(tmp_path / "x.npz")
+
+
+def test_a_header_that_promises_what_is_not_there_is_told(tmp_path: Path) -> None:
+    header = b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (30000000000,), }"
+    with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
+        archive.writestr("point.npy", header.ljust(127) + b"\n")
+    with pytest.raises(InputError, match="read safely"):
+        load_npz(tmp_path / "x.npz")
+
+
+def test_no_pictures_no_scenes(on_tables: Path, tmp_path: Path) -> None:
+    with pytest.raises(AssertionError, match="no picture shows"):
+        run("export", on_tables / "block.h5", "--format", "dexgraspnet2", "-o", tmp_path / "out")
+
+
+def test_pictures_of_scenes_in_which_no_grasp_is_clear_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    none = Look(0, "base", "views", 0, np.eye(4), IDENTITY_POSE, np.zeros(0, np.intp))
+    monkeypatch.setattr(dexgraspnet2, "looks", lambda pictures: [none])
+    lots: list[Any] = [SimpleNamespace(id="base")]
+    with pytest.raises(InputError, match="no grasp is valid and clear"):
+        dexgraspnet2.write(lots, cast(Pictures, None), tmp_path, frozenset())

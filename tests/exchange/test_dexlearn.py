@@ -1,0 +1,164 @@
+"""A folder that DexLearn trains on: each field as its loader reads it, and the grasps as they were."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from graspd.exchange import dexgraspbench, dexlearn
+from graspd.exchange.bench_hand import body_names
+from graspd.exchange.lots import held_out, looks
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import apply, compose, invert, pose_to_matrix
+from graspd.service.readers import Pictures, open_shards
+from graspd.service.readers.clouds import COLUMNS
+from graspd.service.readers.depth_noise import noise_of
+from graspd.service.store.shards import Shard
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from tests.exchange.conftest import run
+from tests.exchange.dexlearn_loader import Data
+
+NAME = "graspd_tabletop_graspd_barrett"
+#: A pose in float64 through a model in text of 12 digits [m].
+ROUNDING_M = 1e-8
+#: A point of a picture: depth in float32, and a surface met by a ray in float32 [m].
+POINT_M = 2e-5
+
+
+@pytest.fixture(scope="module")
+def checkout(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("dexlearn")
+    said = run("export", on_tables, "--format", "dexlearn", "--all", "-o", folder)
+    assert (said["grasps"], said["scenes"], said["clouds"]) == (16, 4, 8)
+    return folder
+
+
+def test_all_that_may_be_drawn_is_there(checkout: Path) -> None:
+    data = Data(checkout, NAME)
+    assert data.config["joint_num"] == 8 and data.config["traj_length"] == 3
+    assert sorted(data.split("train") + data.split("test")) == ["block", "mug"]
+    for split in ("train", "test"):
+        for sample in data.samples(split):
+            count = len(sample.hand_trans)
+            assert sample.hand_trans.shape == (count, 3, 3) and sample.hand_rot.shape == (count, 3, 3, 3)
+            assert sample.hand_joint.shape == (count, 3, 8)
+            assert all(cloud.ndim == 2 and cloud.shape[1] == 3 and len(cloud) for cloud in sample.clouds)
+            assert len(data.types) == 1 or sample.grasp_type_id == int(sample.file.parts[-4].split("_")[0])
+    assert len(data.test_scenes()) == 2
+
+
+def test_a_fingertip_stands_where_ours_does(checkout: Path, hand: HandModel, stored: Shard) -> None:
+    model = mujoco.MjModel.from_xml_path(str(checkout / "assets" / "hand" / "graspd_barrett" / "hand.xml"))
+    state = mujoco.MjData(model)
+    tip = hand.fingertips[0]
+    rows = []
+    for sample in every(checkout, "block"):
+        away = invert(sample.scene["scene"]["block"]["pose"])
+        record = np.load(sample.file, allow_pickle=True).item()
+        for k, row in enumerate(record["row"]):
+            rows.append(int(row))
+            for when, name in enumerate(dexgraspbench.POSTURES):
+                state.qpos[:] = sample.hand_joint[k, when]
+                mujoco.mj_kinematics(model, state)
+                there = sample.hand_rot[k, when] @ state.body(body_names(hand)[tip]).xpos + sample.hand_trans[k, when]
+                ours = body_poses(
+                    hand, *(stored[f"{name}/{what}"][row][None] for what in ("hand_pose", "joint_positions"))
+                )
+                np.testing.assert_allclose(apply(away, there), ours[0, tip, :3], atol=ROUNDING_M)
+    assert len(rows) == len(set(rows)) > 0
+
+
+def test_a_cloud_lies_on_the_object_where_its_scene_has_it(checkout: Path, block: ObjectModel) -> None:
+    mesh = trimesh.Trimesh(block.vertices, block.faces, process=False)
+    for sample in every(checkout, "block"):
+        thing = sample.scene["scene"]["block"]
+        there = mesh.copy().apply_transform(pose_to_matrix(thing["pose"]))
+        np.testing.assert_allclose(trimesh.load(thing["file_path"]).bounds, mesh.bounds, atol=1e-8)  # 9 digits of text
+        for cloud in sample.clouds:
+            assert len(cloud) > 20
+            assert np.abs(trimesh.proximity.closest_point(there, cloud)[1]).max() < POINT_M
+
+
+def test_a_cloud_of_a_free_object_lies_on_it_where_it_is_itself(on_tables: Path, block: ObjectModel) -> None:
+    pictures = Pictures(open_shards(on_tables), COLUMNS, valid=False)
+    mesh = trimesh.Trimesh(block.vertices, block.faces, process=False)
+    seen = [look for look in looks(pictures) if look.base != "a" * 64]
+    assert len(seen) == 4
+    for look in seen:
+        points = dexlearn.points_of(pictures, look, None, on_table=False)
+        assert np.abs(trimesh.proximity.closest_point(mesh, points)[1]).max() < POINT_M
+        noisy = dexlearn.points_of(pictures, look, noise_of("stereo"), on_table=False)
+        # A camera is off by some tenths of a millimetre and more, and has holes.
+        assert 1e-4 < np.abs(trimesh.proximity.closest_point(mesh, noisy)[1]).max() < 0.05
+
+
+def test_collected_grasps_come_back_with_their_scenes_and_verdicts(checkout: Path, stored: Shard) -> None:
+    sets = dexgraspbench.read(checkout / "assets" / "grasp" / NAME / "succ_collect", hand="barrett", obj="block")
+    (back,) = sets
+    assert back.placed is not None and len(back.grasps) == 16
+    for k in range(len(back.grasps)):
+        place = compose(back.placed.object_pose[back.placed.index[k]], back.grasps.grasp.hand_pose[k])
+        ours = compose(stored["scene/object_pose"][stored["grasp/scene_index"]], stored["grasp/hand_pose"])
+        (row,) = np.flatnonzero(np.abs(ours[:, :3] - place[:3]).max(axis=1) < ROUNDING_M)
+        np.testing.assert_array_equal(back.grasps.squeeze.joint_positions[k], stored["squeeze/joint_positions"][row])
+        assert back.published is not None and back.published[k] == stored["quality/success"][row]
+
+
+def test_a_file_that_names_only_its_scene_is_read_with_it(checkout: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "checkout"
+    shutil.copytree(checkout, copy)
+    (file, *_) = sorted((copy / "assets" / "grasp" / NAME / "succ_collect").rglob("*.npy"))
+    record = np.load(file, allow_pickle=True).item()
+    pose = record.pop("obj_pose")[0]
+    record["scene_scale"] = np.full(len(record["row"]), 0.5)
+    save(file, record)
+    (found,) = dexgraspbench.read(file, hand="barrett", obj="block")
+    assert found.placed is not None and found.scale == 0.5
+    np.testing.assert_allclose(found.placed.object_pose[0], pose, atol=ROUNDING_M)
+
+
+@pytest.mark.parametrize("path", ["/etc/passwd", "assets/../../secret.npy", "other/scene.npy"])
+def test_a_scene_that_lies_elsewhere_is_refused(checkout: Path, tmp_path: Path, path: str) -> None:
+    (file, *_) = sorted((checkout / "assets" / "grasp" / NAME / "succ_collect").rglob("*.npy"))
+    record = np.load(file, allow_pickle=True).item()
+    del record["obj_pose"]
+    save(tmp_path / "x.npy", record | {"scene_path": path})
+    with pytest.raises(InputError, match="below assets"):
+        dexgraspbench.read(tmp_path / "x.npy", hand="barrett", obj="block")
+
+
+def test_types_that_only_one_split_has_are_not_listed(checkout: Path) -> None:
+    """Its loader draws a type first, and then fails where the split has none of its objects."""
+    data = Data(checkout, NAME)
+    assert data.types and all(data.samples(split) for split in ("train", "test"))
+
+
+def test_without_pictures_it_is_told_that_there_is_nothing_to_see(on_tables: Path, tmp_path: Path) -> None:
+    said = run("export", on_tables / "block.h5", "--format", "dexlearn", "--all", "-o", tmp_path / "out")
+    assert said["clouds"] == 0 and any("no pictures" in note for note in said["notes"])
+    assert any("one object" in note for note in said["notes"])
+
+
+def test_objects_of_the_same_files_are_held_out_together() -> None:
+    digests = {"mug": "1", "cup": "1", "bowl": "2", "pan": "3", "pot": "4"}
+    for share in (0.01, 0.3, 0.5, 0.99):
+        out = held_out(digests, share)
+        assert out and out < set(digests) and ("mug" in out) == ("cup" in out)
+    assert held_out({"mug": "1", "cup": "1"}, 0.5) == frozenset()
+
+
+def every(checkout: Path, name: str) -> list:  # type: ignore[type-arg]
+    data = Data(checkout, NAME)
+    split = next(split for split in ("train", "test") if name in data.split(split))
+    return [sample for sample in data.samples(split) if name in sample.file.parts]
+
+
+def save(file: Path, record: dict[str, object]) -> None:
+    np.save(file, np.array(record, dtype=object), allow_pickle=True)

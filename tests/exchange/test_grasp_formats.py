@@ -1,0 +1,215 @@
+"""Grasps through the formats of others and back; files that would run code are refused."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from graspd.exchange import dexgraspbench, published
+from graspd.exchange.imported import Origin, load_npy, verdicts
+from graspd.exchange.scoring import write_scored
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import compose, quat_to_matrix
+from graspd.service.store.shards import read_shard
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.validation.validator import judge
+
+TINY = 1e-9  # positions and quaternions are only re-ordered, not computed with
+
+
+class Bomb:
+    """Runs a command when it is unpickled."""
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, ("bomb-went-off",)
+
+
+def test_a_file_that_would_run_code_is_refused_and_does_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.save("bomb.npy", np.array([Bomb()], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match="cannot be read safely"):
+        load_npy(Path("bomb.npy"))
+    assert not Path("bomb-went-off").exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"\x93NUMPY", b"no array at all"])
+def test_what_is_no_numpy_file_is_told(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "x.npy"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"x\.npy"):
+        load_npy(path)
+
+
+def test_a_verdict_of_others_is_yes_no_or_none() -> None:
+    assert verdicts([1, 0, True, False, 1.0, None, "yes", 300, float("nan")]).tolist() == [
+        1,
+        0,
+        1,
+        0,
+        1,
+        -1,
+        -1,
+        -1,
+        -1,
+    ]
+    assert verdicts(np.array([[1], [0], [-1]])).tolist() == [1, 0, -1]
+
+
+def test_dexgraspbench_there_and_back_is_the_same_grasp_with_the_same_verdict(
+    hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
+) -> None:
+    dexgraspbench.write(hand, block, grasps, range(len(grasps)), tmp_path)
+    (back,) = dexgraspbench.read(tmp_path, hand="barrett", obj="block")
+    np.testing.assert_allclose(back.grasps.squeeze.hand_pose, grasps.squeeze.hand_pose, atol=TINY)
+    np.testing.assert_array_equal(back.grasps.pregrasp.joint_positions, grasps.pregrasp.joint_positions)
+    ours, theirs = (judge(hand, block, some).success for some in (grasps, back.grasps))
+    np.testing.assert_array_equal(theirs, ours)
+
+
+def test_dexgraspbench_grasps_are_told_in_the_frame_of_their_moved_object(
+    hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
+) -> None:
+    (path, *_) = dexgraspbench.write(hand, block, grasps, [0], tmp_path)
+    row = load_npy(path)
+    moved = np.array([0.3, -0.2, 0.7, *Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_quat(scalar_first=True)])
+    for name in dexgraspbench.POSTURES:
+        row[f"{name}_qpos"][:7] = compose(moved, row[f"{name}_qpos"][:7])
+    np.save(path, np.array(row | {"obj_pose": moved}, dtype=object), allow_pickle=True)
+    (back,) = dexgraspbench.read(path, hand="barrett", obj="block")
+    place, turn = back.grasps.grasp.hand_pose[0, :3], quat_to_matrix(back.grasps.grasp.hand_pose[0, 3:])
+    np.testing.assert_allclose(place, grasps.grasp.hand_pose[0, :3], atol=TINY)
+    np.testing.assert_allclose(turn, quat_to_matrix(grasps.grasp.hand_pose[0, 3:]), atol=TINY)
+
+
+def test_dexgraspbench_scales_become_sets_of_their_own(
+    hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
+) -> None:
+    paths = dexgraspbench.write(hand, block, grasps, range(2), tmp_path)
+    np.save(paths[0], np.array(load_npy(paths[0]) | {"obj_scale": 0.5}, dtype=object), allow_pickle=True)
+    sets = dexgraspbench.read(tmp_path, hand="barrett", obj="block")
+    assert [one.scale for one in sets] == [0.5, 1.0]
+    assert np.ptp(sets[0].obj.vertices, axis=0) == pytest.approx(np.ptp(block.vertices, axis=0) / 2, rel=1e-6)
+
+
+def test_dexgraspbench_of_another_hand_is_told(
+    hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
+) -> None:
+    dexgraspbench.write(hand, block, grasps, [0], tmp_path)
+    with pytest.raises(InputError, match="is --hand the right hand"):
+        dexgraspbench.read(tmp_path, hand="allegro", obj="block")
+
+
+def test_dexgraspnets_angles_turn_about_the_fixed_axes(tmp_path: Path) -> None:
+    angles = np.array([0.4, -1.2, 2.2])
+    qpos = dict(zip(("WRJRx", "WRJRy", "WRJRz"), angles, strict=True)) | {"WRJTx": 0.1, "WRJTy": 0.2, "WRJTz": -0.3}
+    path = _dexgraspnet(tmp_path, qpos | {"robot0:FFJ2": 0.5}, scale=1.0)
+    (found,) = published.read_dexgraspnet(path, hand="shadow", obj="block")
+    expected = Rotation.from_euler("xyz", angles).as_matrix()  # SciPy's lower-case letters are fixed axes too
+    np.testing.assert_allclose(quat_to_matrix(found.grasps.grasp.hand_pose[0, 3:]), expected, atol=TINY)
+    np.testing.assert_allclose(found.grasps.grasp.hand_pose[0, :3], [0.1, 0.2, -0.3])
+
+
+def test_dexgraspnets_joints_are_the_urdfs_of_one_number_more(tmp_path: Path) -> None:
+    qpos = dict.fromkeys(("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz"), 0.0)
+    (found,) = published.read_dexgraspnet(
+        _dexgraspnet(tmp_path, qpos | {"robot0:THJ4": 0.37}, 1.0), hand="shadow", obj="block"
+    )
+    at = next(k for k, name in enumerate(found.hand.joint_names) if name.endswith("THJ5"))
+    assert found.grasps.grasp.joint_positions[0, at] == 0.37
+
+
+def test_dexgraspnets_scale_is_put_on_the_mesh(block: ObjectModel, tmp_path: Path) -> None:
+    qpos = dict.fromkeys(("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz"), 0.0)
+    (found,) = published.read_dexgraspnet(_dexgraspnet(tmp_path, qpos, 1.5), hand="shadow", obj="block")
+    assert np.ptp(found.obj.vertices, axis=0) == pytest.approx(1.5 * np.ptp(block.vertices, axis=0), rel=1e-6)
+
+
+def _dexgraspnet(folder: Path, qpos: dict[str, float], scale: float) -> Path:
+    path = folder / "core-block.npy"
+    np.save(path, np.array([{"qpos": qpos, "scale": scale}], dtype=object), allow_pickle=True)
+    return path
+
+
+def test_two_columns_of_a_rotation_give_it_back() -> None:
+    matrices = Rotation.random(20, rng=np.random.default_rng(1)).as_matrix()
+    columns = np.concatenate([matrices[:, :, 0], matrices[:, :, 1]], axis=1)
+    np.testing.assert_allclose(quat_to_matrix(published.rotation_of_columns(columns)), matrices, atol=1e-12)
+
+
+def test_rotating_axes_are_scipys_capital_letters() -> None:
+    angles = np.random.default_rng(2).uniform(-3, 3, (20, 3))
+    expected = Rotation.from_euler("XYZ", angles).as_matrix()
+    np.testing.assert_allclose(quat_to_matrix(published.rotation_of_angles(angles)), expected, atol=1e-12)
+
+
+def test_multidex_gives_the_grasps_of_one_robot_on_one_object(hand: HandModel, tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch", reason="torch is not installed; `pip install torch` runs this test")
+    joints = len(hand.joint_names)
+    q = torch.cat([torch.tensor([0.1, 0.2, 0.3, 1.0, 0, 0, 0, 1, 0]), torch.full((joints,), 0.4)])
+    rows = [(q, "ycb+block", "barrett"), (q + 1, "ycb+cup", "barrett"), (q, "ycb+block", "allegro")]
+    torch.save({"info": {}, "metadata": rows}, tmp_path / "cmap_dataset.pt")
+    (found,) = published.read_multidex(
+        tmp_path / "cmap_dataset.pt", hand="barrett", obj="block", robot="barrett", object_name="ycb+block"
+    )
+    np.testing.assert_allclose(found.grasps.grasp.hand_pose, [[0.1, 0.2, 0.3, 1, 0, 0, 0]], atol=1e-6)  # float32
+    np.testing.assert_allclose(found.grasps.grasp.joint_positions, 0.4, atol=1e-6)
+
+
+def test_ddgcs_quaternion_and_joints_are_put_in_our_order(hand: HandModel, tmp_path: Path) -> None:
+    place = np.array([[0.1, 0.2, 0.3, 0.0, 0.0, np.sin(0.5), np.cos(0.5)]])
+    angles = np.array([[0.1, 0.2, 0.3, 0.1, 0.5, 0.6, 0.7, 0.8]])
+    for name, values in (("translation", place), ("representation", angles)):
+        rows = np.empty(2, dtype=object)
+        rows[:] = [[], values.tolist()]
+        np.save(tmp_path / f"barrett_{name}_3.npy", rows, allow_pickle=True)
+    (found,) = published.read_ddgc(tmp_path / "barrett_translation_3.npy", hand="barrett", obj="block", number=1)
+    np.testing.assert_allclose(found.grasps.grasp.hand_pose[0, 3:], [np.cos(0.5), 0, 0, np.sin(0.5)], atol=TINY)
+    joints = dict(zip(hand.joint_names, found.grasps.grasp.joint_positions[0], strict=True))
+    assert abs(joints["finger_3_medial"]) == pytest.approx(0.7)
+    assert abs(joints["finger_2_distal"]) == pytest.approx(0.6)
+
+
+def test_imported_grasps_are_scored_and_say_where_they_come_from(
+    hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
+) -> None:
+    dexgraspbench.write(hand, block, grasps, range(len(grasps)), tmp_path / "bench")
+    (found,) = dexgraspbench.read(tmp_path / "bench", hand="barrett", obj="block")
+    path = write_scored(
+        found, Origin("dexgraspbench", "a test", "CC0-1.0"), tmp_path / "out", referee="screen", friction=1
+    )
+    shard = read_shard(path, kind="base")
+    assert (shard.attributes["source"], shard.attributes["licence"]) == ("a test", "CC0-1.0")
+    assert len(shard["quality/epsilon"]) == len(grasps)
+    assert set(np.unique(shard["quality/success"])) <= {0, 1}
+
+
+def test_published_reference_grasps_come_in_by_name(shared_data: Path) -> None:
+    from graspd.exchange import published
+
+    path = shared_data / "reference_grasps" / "frogger_allegro" / "061_foam_brick.json"
+    (found,) = published.read_reference(path)
+    assert (len(found.grasps), found.name) == (28, "061_foam_brick")
+    assert found.published is not None
+    assert found.published.mean() == pytest.approx(0.64, abs=0.005)  # the rate that DATA.md states
+
+
+def test_a_hand_that_lacks_a_joint_is_told() -> None:
+    from graspd.exchange.imported import joints_by_name
+
+    with pytest.raises(InputError, match="has no joint 'elbow'"):
+        joints_by_name(hand_from_path("barrett"), ["elbow"], [[0.0]], what="x")
+
+
+def test_an_object_at_two_scales_is_two_objects() -> None:
+    from graspd.exchange.imported import scaled_object
+
+    # What is kept of a pair between calls is found by digest.
+    assert len({scaled_object("block", scale).digest for scale in (1.0, 0.5, 2.0)}) == 3

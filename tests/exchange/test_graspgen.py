@@ -1,0 +1,176 @@
+"""Data that GraspGen trains on, read as its reader and WebDataset do, and hostile files of that kind.
+
+What is read of a record is what `load_object_grasp_datapoint_objaverse` and `GraspWebDatasetReader` of
+Kashu7100/GraspGen take (grasp_gen/dataset/dataset_utils.py at a6900321fc57ec8fb96c4a0c879e94f958693513 and
+webdataset_utils.py at 07773f7d1307ed0d454b60e7ea1ef38c5a108c0f, copies of NVlabs/GraspGen); its documents
+docs/GRASP_DATASET_FORMAT.md and docs/GRIPPER_DESCRIPTION.md say what the frames are.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import tarfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from scipy.spatial.transform import Rotation
+
+from graspd.exchange import graspgen
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import IDENTITY_POSE
+from graspd.service.store import validity
+from graspd.service.store.shards import Shard
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from tests.exchange.conftest import run
+from tests.worker.hands.grippers import OPENING, gripper
+
+#: JSON gives float64 back as it was; what is left is a quaternion made a matrix [m].
+ROUNDING_M = 1e-12
+
+
+@pytest.fixture(scope="module")
+def data(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("graspgen") / "data"
+    said = run("export", on_tables, "--format", "graspgen", "-o", folder)
+    assert (said["grasps"], said["objects"], said["files"]) == (16, 2, 1)
+    return folder
+
+
+def record_of(data: Path, uuid: str) -> dict[str, Any]:
+    """As its reader finds it: the index names the shard, the shard is searched for the key."""
+    folder = data / "grasps" / "barrett"
+    number = json.loads((folder / "uuid_index.json").read_text())[uuid]
+    found = []
+    with tarfile.open(folder / f"shard_{number:03}.tar") as shard:
+        for member in shard:
+            # WebDataset's rule: a sample's key ends at the first dot of the name, the rest says what of it a member is.
+            parts = re.fullmatch(r"((?:.*/|)[^.]+)[.]([^/]*)", member.name)
+            assert parts is not None
+            if parts[1] == uuid and parts[2] == "grasps.json":
+                found.append(json.loads(shard.extractfile(member).read()))  # type: ignore[union-attr]
+    assert len(found) == 1
+    return dict(found[0])
+
+
+def test_every_object_of_a_split_has_a_record_and_a_mesh(data: Path) -> None:
+    splits = [(data / "splits" / "barrett" / f"{name}.txt").read_text().split() for name in ("train", "valid")]
+    assert all(splits) and sorted([*splits[0], *splits[1]]) == ["block", "mug"]
+    paths = json.loads((data / "objects" / "map_uuid_to_path.json").read_text())
+    for uuid in paths:
+        assert record_of(data, uuid)["object"] == {"file": paths[uuid], "scale": 1.0}
+        assert (data / "objects" / paths[uuid]).is_file()
+
+
+def test_its_grasps_are_ours_with_their_verdicts(
+    data: Path, hand: HandModel, block: ObjectModel, stored: Shard
+) -> None:
+    record = record_of(data, "block")
+    poses, mask = np.array(record["grasps"]["transforms"]), np.array(record["grasps"]["object_in_gripper"])
+    assert poses.shape == (8, 4, 4) and mask.dtype == bool
+    np.testing.assert_array_equal(mask, validity.valid(stored.arrays))
+    assert len(poses[mask]) + len(poses[~mask]) == 8
+    joints = np.array(record["grasps"]["grasp_joints"])
+    tip = hand.fingertips[0]
+    in_base = body_poses(hand, np.tile(IDENTITY_POSE, (8, 1)), joints)[:, tip, :3]
+    there = np.einsum("nij,nj->ni", poses[:, :3, :3], in_base) + poses[:, :3, 3]
+    ours = body_poses(hand, stored["grasp/hand_pose"], stored["grasp/joint_positions"])[:, tip, :3]
+    np.testing.assert_allclose(there, ours, atol=ROUNDING_M)
+    mesh = trimesh.load(data / "objects" / record["object"]["file"]).apply_scale(record["object"]["scale"])
+    np.testing.assert_allclose(mesh.bounds, [block.vertices.min(0), block.vertices.max(0)], atol=1e-8)
+
+
+def test_a_gripper_is_turned_into_its_convention(data: Path, hand: HandModel) -> None:
+    said = yaml.safe_load((data / "grippers" / "barrett.yaml").read_text())
+    place, turn = said["transform_offset_from_asset_to_graspgen_convention"]
+    matrix = Rotation.from_quat(turn).as_matrix()  # x y z w, as SciPy has it
+    np.testing.assert_allclose(matrix[:, 2], hand.palm.approach, atol=1e-12)
+    assert place == [0, 0, 0] and said["width"] > 0.05 and said["depth"] > 0.02
+
+
+def test_the_jaws_of_a_gripper_close_along_x_of_its_convention() -> None:
+    said = graspgen.convention(gripper())
+    turn = Rotation.from_quat(said["transform_offset_from_asset_to_graspgen_convention"][1]).as_matrix()
+    assert np.abs(turn[:, 0]) == pytest.approx([1, 0, 0], abs=1e-9) and turn[:, 2] == pytest.approx([0, 0, 1], abs=1e-9)
+    assert said["width"] == pytest.approx(OPENING, abs=1e-5)
+    # The pads reach from 70 to 110 mm in front of the base link.
+    assert 0.07 < said["depth"] < 0.11
+
+
+def test_grasps_come_back_as_they_were(data: Path, stored: Shard) -> None:
+    (back,) = graspgen.read(data / "grasps" / "barrett", hand="barrett", obj="block", object_name="block")
+    for name in graspgen.POSTURES:
+        found = getattr(back.grasps, name)
+        np.testing.assert_array_equal(found.joint_positions, stored[f"{name}/joint_positions"])
+        np.testing.assert_allclose(found.hand_pose[:, :3], stored[f"{name}/hand_pose"][:, :3], atol=ROUNDING_M)
+    assert back.published is not None
+    np.testing.assert_array_equal(back.published == 1, validity.valid(stored.arrays))
+
+
+def test_of_grasps_without_joints_the_fingers_close_until_they_touch(
+    data: Path, hand: HandModel, tmp_path: Path
+) -> None:
+    record = record_of(data, "block")
+    del record["gripper"]
+    path = tmp_path / "block.json"
+    path.write_text(json.dumps(record))
+    (back,) = graspgen.read(path, hand="barrett", obj="block")
+    opened = np.abs(back.grasps.pregrasp.joint_positions - back.grasps.grasp.joint_positions).max(axis=1)
+    assert (opened > 0.01).all() and len(back.grasps) == 8
+    assert (np.abs(hand.reduce(back.grasps.grasp.joint_positions) - hand.preshape).max(axis=1) > 0.05).all()
+
+
+def test_an_object_among_several_is_named(data: Path) -> None:
+    for name in ("", "cup"):
+        with pytest.raises(InputError, match="block, mug"):
+            graspgen.read(data / "grasps" / "barrett", hand="barrett", obj="block", object_name=name)
+
+
+def test_what_nobody_judged_has_no_label(on_tables: Path, tmp_path: Path) -> None:
+    with pytest.raises(AssertionError, match="whether it holds"):
+        run("export", on_tables, "--format", "graspgen", "--unjudged", "-o", tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"transforms": [np.zeros((4, 4)).tolist()] * 8}, "no poses"),
+        ({"transforms": [np.diag([1.0, 1, -1, 1]).tolist()] * 8}, "no poses"),
+        ({"transforms": [[1, 2], [3]]}, "no record"),
+        ({"object_in_gripper": [True]}, "shape"),
+        ({"squeeze_pose": [[0, 0, 0, 1, 0, 0, 0]]}, "as many"),
+    ],
+)
+def test_a_record_that_is_wrong_is_told(data: Path, tmp_path: Path, change: dict[str, Any], said: str) -> None:
+    record = record_of(data, "block")
+    record["grasps"] |= change
+    path = tmp_path / "block.json"
+    path.write_text(json.dumps(record))
+    with pytest.raises(InputError, match=said):
+        graspgen.read(path, hand="barrett", obj="block")
+
+
+def test_a_record_that_is_too_large_is_not_read(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(graspgen, "LARGEST", 1000)
+    with pytest.raises(InputError, match="larger than"):
+        graspgen.read(data / "grasps" / "barrett", hand="barrett", obj="block", object_name="block")
+
+
+def test_links_and_compressed_files_are_not_followed(tmp_path: Path) -> None:
+    link = tarfile.TarInfo("block.grasps.json")
+    link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
+    with tarfile.open(tmp_path / "links.tar", "w") as tar:
+        tar.addfile(link)
+    with pytest.raises(InputError, match="it has none"):
+        graspgen.read(tmp_path / "links.tar", hand="barrett", obj="block")
+    with tarfile.open(tmp_path / "packed.tar", "w:gz") as tar:
+        tar.addfile(tarfile.TarInfo("block.grasps.json"), io.BytesIO())
+    with pytest.raises(InputError, match="no tar file"):
+        graspgen.read(tmp_path / "packed.tar", hand="barrett", obj="block")

@@ -1,0 +1,143 @@
+"""Pictures in the layouts of others, read back by other readers."""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from graspd.exchange import replicator, webdataset
+from graspd.service.model.errors import InputError
+from graspd.service.pipeline.backends import Services
+from graspd.service.readers import Pictures, Shards, open_shards
+from graspd.service.settings import Settings
+from graspd.service.store.shards import Shard
+from graspd.service.store.store import open_store
+from graspd.worker.rendering.annotate import box_corners
+from tests.indexes import empty_index
+from tests.memory_queue import MemoryQueue
+
+H, W = 24, 32
+K = np.array([[30.0, 0, 17], [0, 28, 11], [0, 0, 1]])
+
+
+def camera() -> np.ndarray:  # type: ignore[type-arg]
+    """World to camera: somewhere above, looking at the origin."""
+    extrinsics = np.eye(4)
+    extrinsics[:3, :3] = Rotation.from_euler("xyz", [2.6, 0.2, 0.4]).as_matrix()
+    extrinsics[:3, 3] = [0.02, -0.01, 0.6]
+    return extrinsics
+
+
+@pytest.fixture
+def views() -> Shard:
+    """One picture of a box that stands askew in the world."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("xyz", [0.3, -0.5, 1.0]).as_matrix()
+    pose[:3, 3] = [0.05, 0.02, 0.04]
+    local = box_corners(np.array([[-0.02, -0.03, -0.05], [0.04, 0.01, 0.02]]))
+    world = local @ pose[:3, :3].T + pose[:3, 3]
+    corners = world @ camera()[:3, :3].T + camera()[:3, 3]
+    arrays = {
+        "camera/intrinsics": K[None],
+        "camera/extrinsics": camera()[None],
+        "camera/scene_index": np.zeros(1, np.int32),
+        "camera/eye": np.zeros(1, np.uint8),
+        "camera/stereo_baseline_m": np.zeros(1),
+        "image/rgb": np.zeros((1, H, W, 3), np.uint8),
+        "image/depth": np.ones((1, H, W), np.float32),
+        "image/segmentation": np.full((1, H, W), 2, np.uint8),
+        "box/bounding_box_2d_tight": np.array([[3, 4, 20, 15]], np.float32),
+        "box/bounding_box_2d_loose": np.array([[2.6, 4, 21, 15]], np.float32),
+        "box/bounding_box_3d": corners[None].astype(np.float32),
+        "box/occlusion_ratio": np.array([0.25], np.float32),
+    }
+    return Shard("views", {"object": "mug"}, arrays)
+
+
+def test_the_3d_box_of_replicators_layout_has_the_corners_of_ours(views: Shard, tmp_path: Path) -> None:
+    replicator.write(views, tmp_path)
+    (row,) = np.load(tmp_path / "bounding_box_3d_0000.npy")
+    local = box_corners(
+        np.array([[row["x_min"], row["y_min"], row["z_min"]], [row["x_max"], row["y_max"], row["z_max"]]], float)
+    )
+    world = np.concatenate([local, np.ones((8, 1))], axis=1) @ row["transform"].astype(float)  # row vectors
+    corners = world[:, :3] @ camera()[:3, :3].T + camera()[:3, 3]
+    np.testing.assert_allclose(corners, views["box/bounding_box_3d"][0], atol=1e-6)  # float32 of the file
+
+
+def test_usds_matrices_put_a_point_on_the_same_pixel(views: Shard, tmp_path: Path) -> None:
+    replicator.write(views, tmp_path)
+    said = json.loads((tmp_path / "camera_params_0000.json").read_text())
+    view, projection = (np.reshape(said[f"camera{name}"], (4, 4)) for name in ("ViewTransform", "Projection"))
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (20, 3))
+    clip = np.concatenate([points, np.ones((20, 1))], axis=1) @ view @ projection  # row vectors, as USD has them
+    ndc = clip[:, :2] / clip[:, 3:]
+    pixels = np.stack([(ndc[:, 0] + 1) / 2 * W, (1 - ndc[:, 1]) / 2 * H], axis=1)
+    in_camera = (points @ camera()[:3, :3].T + camera()[:3, 3]) @ K.T
+    np.testing.assert_allclose(pixels, in_camera[:, :2] / in_camera[:, 2:], atol=1e-9)
+
+
+def test_2d_boxes_are_structured_arrays_of_whole_pixels(views: Shard, tmp_path: Path) -> None:
+    replicator.write(views, tmp_path)
+    (row,) = np.load(tmp_path / "bounding_box_2d_tight_0000.npy")
+    assert [int(row[name]) for name in ("x_min", "y_min", "x_max", "y_max")] == [3, 4, 20, 15]
+    assert float(row["occlusionRatio"]) == 0.25
+    labels = json.loads((tmp_path / "bounding_box_2d_tight_labels_0000.json").read_text())
+    assert labels == {"0": {"class": "mug"}}
+
+
+def test_an_object_out_of_view_has_no_2d_box(views: Shard, tmp_path: Path) -> None:
+    views.arrays["box/bounding_box_2d_tight"] = np.full((1, 4), np.nan, np.float32)
+    replicator.write(views, tmp_path)
+    assert len(np.load(tmp_path / "bounding_box_2d_tight_0000.npy")) == 0
+
+
+@pytest.fixture
+def shards(tmp_path: Path) -> Shards:
+    """A finished job with pictures."""
+    from tests.api import factories
+
+    settings = Settings(data_dir=tmp_path)
+    services = Services(settings, open_store("memory://"), empty_index(settings.resolved_index_url), MemoryQueue())
+    factories.add_builtins(services)
+    record = factories.add_job(services, scenes=2, views=2, width=W, height=H)
+    factories.finish_all(services, record)
+    found = open_shards(services.store, job=record.id, cache=tmp_path / "cache")
+    services.close()
+    return found
+
+
+def test_every_picture_is_one_sample_of_a_tar_file(shards: Shards, tmp_path: Path) -> None:
+    written = webdataset.write(shards, tmp_path / "tars", pictures_a_file=3)
+    keys: dict[str, set[str]] = {}
+    for path in written:
+        with tarfile.open(path) as tar:
+            for member in tar.getnames():
+                key, _, what = member.partition(".")
+                keys.setdefault(key, set()).add(what)
+    assert len(keys) == len(Pictures(shards)) == 4
+    assert all(services == {"rgb.png", "depth.exr", "segmentation.png", "json"} for services in keys.values())
+    assert len(written) == 2
+
+
+def test_a_tar_files_sample_holds_the_picture_and_its_grasps(shards: Shards, tmp_path: Path) -> None:
+    (path,) = webdataset.write(shards, tmp_path / "tars")
+    expected = Pictures(shards)[1]
+    with tarfile.open(path) as tar:
+        record = json.loads(tar.extractfile("00000001.json").read())  # type: ignore[union-attr]
+        with Image.open(io.BytesIO(tar.extractfile("00000001.rgb.png").read())) as image:  # type: ignore[union-attr]
+            np.testing.assert_array_equal(np.array(image), expected["image/rgb"])
+    np.testing.assert_allclose(record["grasps"]["hand_pose"], expected["grasp/hand_pose"])
+    assert record["grasp_frame"] == "camera"
+
+
+def test_shards_without_pictures_are_told(shards: Shards, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no picture"):
+        webdataset.write(Shards(shards.of("base")), tmp_path / "tars")

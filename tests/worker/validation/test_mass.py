@@ -1,0 +1,179 @@
+"""Mass and friction of the object: what is lifted weighs what it weighs, and the payload is the heaviest of it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+from graspd.cli import build
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import MeshError
+from graspd.service.model.matter import ACCELERATION, FRICTION, MASS_KG
+from graspd.service.store.shards import read_shard
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.objects.options import as_asked
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.simulation.surroundings import Obstacle, Placed
+from graspd.worker.validation.decomposition import ConvexPieces
+from graspd.worker.validation.key import verdict_key
+from graspd.worker.validation.lifting import judge_lifts
+from graspd.worker.validation.payload import AMPLITUDE_M, FREQUENCY_HZ, payloads, shake_margins
+from tests.worker.models import object_from_mesh, two_finger_hand
+
+#: A box between the fingertips of the two-finger hand, whose pads are 58 mm apart and 68 mm above its joints.
+BOX = object_from_mesh(trimesh.creation.box((0.058, 0.06, 0.04)), "box")
+PIECES = ConvexPieces((BOX.hull_vertices,), 1.0, 0.0, "box")
+LEVER_M = 0.068
+#: Torque of a finger [N m].
+TORQUE = 0.2
+HAND = replace(two_finger_hand(), effort=np.full(2, TORQUE))
+#: The object's y is up: friction alone holds it.
+UPRIGHT = np.array([[0.0, 0.0, 0.03, np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]])
+TABLE = Placed((Obstacle.half_space((0, 0, 1), 0.0),), UPRIGHT, np.zeros(1, np.intp))
+
+
+def pinch() -> GraspSet:
+    """Both fingers from beside the box to where they touch it, then commanded so far into it that their torque is what
+    limits them."""
+    opened, touching, pressing = (np.array([[q, q]]) for q in (-0.1, 0.0, 0.3))
+    at = np.array([[0.0, 0.0, -LEVER_M, 1.0, 0.0, 0.0, 0.0]])
+    found = GraspSet(Posture(at, touching), Posture(at, opened), Posture(at, pressing), np.zeros(1))
+    found.scene, found.coming = np.zeros(1, np.intp), opened
+    found.approach = np.stack([at + np.array([0.0, 0.0, back, 0, 0, 0, 0]) for back in (-0.15, -0.05, 0.0)], axis=1)
+    return found
+
+
+def payload(friction: float) -> float:
+    (found,) = payloads(HAND, BOX.weighing(mass=0.02, friction=friction), pinch(), pieces=PIECES, placed=TABLE)
+    return float(found)
+
+
+@pytest.mark.parametrize("friction", [0.3, FRICTION, 1.0])
+def test_the_payload_of_a_pinch_is_what_its_friction_bears(friction: float) -> None:
+    bears = 2 * friction * TORQUE / LEVER_M / ACCELERATION
+    assert 0.95 * bears < payload(friction) < bears
+
+
+def test_what_is_slippery_is_not_lifted() -> None:
+    assert np.isnan(payload(0.01))
+
+
+@pytest.mark.parametrize("friction", [0.3, FRICTION, 1.0])
+def test_what_friction_bears_with_the_accelerations_of_the_shake_survives_it(friction: float) -> None:
+    # Along the line of the fingers an acceleration takes from the forces that press: mg <= friction (2 F - ma).
+    accelerated = AMPLITUDE_M * (2 * np.pi * FREQUENCY_HZ) ** 2
+    bears = 2 * friction * TORQUE / LEVER_M / (ACCELERATION + friction * accelerated)
+    survives, lost = (
+        shake_margins(HAND, BOX.weighing(mass=share * bears, friction=friction), pinch(), TABLE, pieces=PIECES)[0]
+        for share in (0.92, 1.15)
+    )
+    assert survives < 0.2 and lost >= 1
+    # Gravity alone loses neither.
+    assert 1.15 * bears < payload(friction)
+
+
+def test_a_lift_has_the_mass_and_the_friction_of_the_object() -> None:
+    bears = 2 * FRICTION * TORQUE / LEVER_M / ACCELERATION
+    for mass, friction, lifted in (
+        (0.8 * bears, FRICTION, 1),
+        (1.2 * bears, FRICTION, 0),
+        (1.2 * bears, 1.5 * FRICTION, 1),
+    ):
+        obj = BOX.weighing(mass=mass, friction=friction)
+        assert judge_lifts(HAND, obj, pinch(), TABLE, pieces=PIECES).success.tolist() == [lifted], (mass, friction)
+
+
+def test_verdicts_of_other_masses_have_other_keys() -> None:
+    objects = [BOX, BOX.weighing(mass=0.5), BOX.weighing(friction=0.5), BOX.weighing(mass=0.5).published]
+    keys = [verdict_key(HAND, obj, "certificate", False, pieces=PIECES) for obj in objects]
+    assert len(set(keys)) == 3 and keys[0] == keys[3]
+
+
+def test_the_letter_has_the_mass_of_the_protocol() -> None:
+    obj = BOX.weighing(mass=0.7, friction=0.4)
+    published = as_asked(obj, JobOptions(referee="letter"))
+    assert (published.mass, published.friction) == (MASS_KG, FRICTION)
+    assert as_asked(obj, JobOptions()).mass == 0.7
+    asked = as_asked(obj, JobOptions(density=500.0, object_friction=0.8))
+    assert (asked.mass, asked.friction) == (pytest.approx(500 * BOX.volume), 0.8)
+    with pytest.raises(ValueError, match="letter is DexGraspBench's protocol"):
+        JobOptions(referee="letter", mass=0.5)
+
+
+def test_what_is_said_with_a_job_goes_over_what_the_file_says() -> None:
+    assert object_from_path("block").mass == pytest.approx(650 * object_from_path("block").volume)
+    assert object_from_path("block", options={"mass": 0.4}).mass == 0.4
+    with pytest.raises(MeshError, match="give one of them"):
+        object_from_path("block", options={"mass": 0.4, "density": 3.0})
+    with pytest.raises(MeshError, match="100 kg"):
+        BOX.weighing(density=1e7)
+
+
+def test_whoever_says_what_the_object_weighs_is_told_what_the_grasps_lift(tmp_path: Path) -> None:
+    words = [
+        "synth",
+        "--hand",
+        "barrett",
+        "--object",
+        "block",
+        "--scene",
+        "table",
+        "-n",
+        "1",
+        "--fidelity",
+        "draft",
+        "--seed",
+        "3",
+        "--json",
+        "-o",
+        str(tmp_path / "g.h5"),
+    ]
+    keys = {"mass_kg", "lift_share", "lift_hard_share", "payload_kg"}
+    for more, told in ((["--mass", "0.37"], keys), (["--mass", "0.37", "--no-payload"], keys - {"payload_kg"})):
+        said = json.loads(CliRunner().invoke(build(), words + more).stdout.splitlines()[-1])
+        assert keys & said.keys() == told
+        assert said["mass_kg"] == 0.37 and said.get("payload_kg", 1.0) >= 0.37
+
+
+@pytest.mark.parametrize(("least", "kept", "outcomes"), [(0.3, 2, {}), (90.0, 0, {"weak": 2})])
+def test_a_job_counts_grasps_that_lift_the_wanted_payload(
+    tmp_path: Path, least: float, kept: int, outcomes: dict[str, int]
+) -> None:
+    words = [
+        "synth",
+        "--hand",
+        "barrett",
+        "--object",
+        "block",
+        "--mass",
+        "0.2",
+        "--scene",
+        "table",
+        "-n",
+        "2",
+        "--budget",
+        "1",
+        "--fidelity",
+        "draft",
+        "--seed",
+        "3",
+        "--min-payload",
+        str(least),
+        "--shake",
+        "--json",
+        "-o",
+        str(tmp_path / "g.h5"),
+    ]
+    told = json.loads(CliRunner().invoke(build(), words).stdout.splitlines()[-1])
+    shard = read_shard(tmp_path / "g.h5")
+    assert (told["grasps"], told["mass_kg"], shard.attributes["object_mass_kg"]) == (kept, 0.2, 0.2)
+    assert {name: told["outcomes"].get(name) for name in outcomes} == outcomes
+    assert (shard["quality/payload_kg"] >= least).all()
+    survive = shard["quality/shake_margin"] < 1
+    assert told["shake_share"] == (survive.mean() if kept else None)

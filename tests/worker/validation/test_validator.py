@@ -1,0 +1,436 @@
+"""The referee: what any engine must say of simple grasps, and that its levels say the same."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import re
+import threading
+import time
+from pathlib import Path
+from types import ModuleType
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from graspd.service.model.errors import InputError, MeshError, TaskCancelled
+from graspd.service.model.matter import MASS_KG
+from graspd.worker.control import postures
+from graspd.worker.control.postures import pregrasp, squeeze
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.convex import union_volume
+from graspd.worker.run import Run
+from graspd.worker.validation import model, protocol
+from graspd.worker.validation.decomposition import ConvexPieces, decompose
+from graspd.worker.validation.key import LEVEL_MOVES, MOVES, Level, verdict_key
+from graspd.worker.validation.model import MujocoOptions, blend, build
+from graspd.worker.validation.protocol import Outcome, Test
+from graspd.worker.validation.robust import robustness
+from graspd.worker.validation.validator import judge
+from tests.worker.models import object_from_mesh, two_finger_hand
+from tests.worker.quality.helpers import pad_hand, plate_hand, posture
+
+BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
+WHOLE = ConvexPieces((BOX.hull_vertices,), 1.0, 0.0, "box")
+#: Their soft drives press with 10 N from 10 cm behind the box.
+PADS = dataclasses.replace(pad_hand(), upper=np.full(2, 0.2))
+CONTACT = posture(((0, 0, 0), (0.065, 0.065)))
+
+
+def grasp_of(hand: HandModel = PADS, contact: Posture = CONTACT, force: float = 20.0) -> GraspSet:
+    """Open by 10 mm, touch, press."""
+    command = squeeze(hand, BOX, contact, total_normal_force=force)
+    return GraspSet(contact, pregrasp(hand, BOX, contact), command, np.full(len(contact), np.nan))
+
+
+def many_grasps() -> GraspSet:
+    """Pads that hold the box ever nearer to its edge, from firm to none at all."""
+    rows = [((0, 0, z), (0.065, 0.065)) for z in np.linspace(0.0, 0.055, 8)]
+    return grasp_of(contact=posture(*rows))
+
+
+def test_a_box_between_pressing_pads_is_held() -> None:
+    verdict = judge(PADS, BOX, grasp_of(), level="letter", pieces=WHOLE)
+    assert verdict.reasons == ["held"]
+    assert verdict.success.tolist() == [1]
+    assert (verdict.outcome == Outcome.HELD).all()
+
+
+def test_the_same_box_slips_at_friction_0_04() -> None:
+    # Two pads of 10 N give 0.8 N of friction against a push of 1 N across; along their normals they need none.
+    scene = build(PADS, BOX, WHOLE, MujocoOptions(friction=(0.04, 0.001)))
+    trial = Test(scene).letter(grasp_of(), 0)
+    assert trial.outcomes[:3] == [Outcome.HELD, Outcome.HELD, Outcome.DISPLACED]
+
+
+def test_the_same_box_holds_at_friction_0_06() -> None:
+    # 1.2 N of friction against 1 N.
+    scene = build(PADS, BOX, WHOLE, MujocoOptions(friction=(0.06, 0.001)))
+    assert Test(scene).letter(grasp_of(), 0).success
+
+
+def test_a_free_object_falls() -> None:
+    away = posture(((0, 0, -0.5), (0.0, 0.0)))
+    verdict = judge(PADS, BOX, grasp_of(contact=away), pieces=WHOLE)
+    assert verdict.reasons == ["displaced under +x"]
+
+
+def test_a_free_object_moves_as_newton_says() -> None:
+    test = Test(build(PADS, BOX, WHOLE, MujocoOptions()))
+    away = grasp_of(contact=posture(((0, 0, -0.5), (0.0, 0.0))))
+    test._close(away, 0)
+    test._push(2)
+    test._run(0.1)
+    moved = test._offset()
+    # x = F t^2 / 2m, and the implicit step adds half a step of velocity.
+    assert moved[1] == pytest.approx(0.5 * 10 * 0.1 * (0.1 + 0.004), rel=1e-6)
+    assert moved[[0, 2]] == pytest.approx([0, 0], abs=1e-9)
+
+
+def test_a_deep_start_is_refused_as_penetration() -> None:
+    deep = posture(((0, 0, 0), (0.08, 0.08)))
+    closed = GraspSet(deep, deep, deep, np.full(1, np.nan))
+    verdict = judge(PADS, BOX, closed, pieces=WHOLE)
+    assert verdict.reasons == ["penetration"]
+    assert verdict.penetration_depth_mm[0] > 10
+
+
+@pytest.mark.parametrize("level", ["letter", "certificate", "screen"])
+def test_penetration_counts_at_the_pregrasp_where_the_simulation_starts(level: str) -> None:
+    deep, clear = posture(((0, 0, 0), (0.08, 0.08))), posture(((0, 0, 0), (0.06, 0.06)))
+    from_outside = GraspSet(deep, clear, deep, np.full(1, np.nan))
+    from_inside = GraspSet(clear, deep, clear, np.full(1, np.nan))
+    verdicts = [judge(PADS, BOX, g, level=level, pieces=WHOLE) for g in (from_outside, from_inside)]
+    assert verdicts[0].penetration_depth_mm[0] > 10
+    assert [v.reasons for v in verdicts] == [["held"], ["penetration"]]
+
+
+def test_joints_have_the_damping_of_the_protocol_and_no_armature_nor_dry_friction() -> None:
+    model = build(PADS, BOX, WHOLE, MujocoOptions()).model
+    fingers = [int(model.joint(f"joint{b}").dofadr[0]) for b in PADS.joint_body]
+    assert model.dof_damping[fingers] == pytest.approx(0.02 * PADS.stiffness)
+    assert not model.dof_armature.any()
+    assert not model.dof_frictionloss.any()
+
+
+@pytest.mark.parametrize(("jaws", "contacts"), [(False, 2), (True, 8)], ids=["hand", "gripper"])
+def test_a_pair_of_convex_pieces_has_one_contact_as_the_protocol_pins_but_between_jaws(
+    jaws: bool, contacts: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not jaws:
+        monkeypatch.setattr(model, "jaws_of", lambda hand: None)
+    scene = build(plate_hand(), BOX, WHOLE, MujocoOptions())
+    data = mujoco.MjData(scene.model)
+    scene.place(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0] + 1e-3)
+    mujoco.mj_forward(scene.model, data)
+    # A plate's face lies flat on the box: with multi-contact each of the two has four points.
+    assert len(data.contact.dist) == contacts
+
+
+def test_displacement_is_that_of_the_mesh_s_own_frame() -> None:
+    mesh = trimesh.creation.box((0.06, 0.04, 0.05))
+    mesh.apply_translation([0.3, 0, 0])
+    far = object_from_mesh(mesh)
+    scene = build(PADS, far, ConvexPieces((far.hull_vertices,), 1.0, 0.0, "far"), MujocoOptions())
+    test = Test(scene)
+    scene.place(test.data, np.array([0, 0, -0.5, 1.0, 0, 0, 0]), np.zeros(2))
+    assert test._motion() == (pytest.approx(0, abs=1e-12), 0)
+    angle = 0.2
+    turned = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]
+    test.data.qpos[scene.object_qpos + 3 : scene.object_qpos + 7] = turned
+    # Turned about its centre the box stays; the mesh's origin, 0.3 m away, does not.
+    assert test._motion() == (pytest.approx(2 * 0.3 * np.sin(angle / 2)), pytest.approx(angle))
+
+
+def test_the_root_turns_at_an_even_rate_between_two_postures() -> None:
+    half = np.array([[0.0, 0, 0, 1, 0, 0, 0], [0.0, 0, 0, 0, 0, 0, 1.0]])
+    a, b = (Posture(row[None], np.zeros((1, 2))) for row in half)
+    turns = [2 * np.arctan2(*blend(a, b, 0, share)[0][[6, 3]]) for share in (0.1, 0.5, 0.9)]
+    assert turns == pytest.approx([0.1 * np.pi, 0.5 * np.pi, 0.9 * np.pi])
+
+
+def test_penetration_depth_is_that_of_the_pressed_pads() -> None:
+    pressed = posture(((0, 0, 0), (0.068, 0.067)))
+    verdict = judge(PADS, BOX, grasp_of(contact=pressed), pieces=WHOLE)
+    assert verdict.penetration_depth_mm[0] == pytest.approx(3.0, abs=0.01)
+
+
+def test_a_push_from_the_saved_state_is_a_push_after_closing_anew() -> None:
+    grasps, test = many_grasps(), Test(build(PADS, BOX, WHOLE, MujocoOptions()))
+    ends = []
+    for anew in (False, True):
+        test._close(grasps, 3)
+        test._save()
+        test._push(0)
+        test._run(0.4)
+        if anew:
+            test._close(grasps, 3)
+        else:
+            test._restore()
+        test._push(2)
+        test._run(0.4)
+        ends.append(test.data.qpos.copy())
+    assert np.array_equal(*ends)
+
+
+@pytest.mark.parametrize("level", ["certificate", "screen"])
+def test_cheaper_levels_say_what_the_letter_says(level: str) -> None:
+    grasps = many_grasps()
+    letter = judge(PADS, BOX, grasps, level="letter", pieces=WHOLE)
+    cheap = judge(PADS, BOX, grasps, level=level, pieces=WHOLE)
+    assert 0 < letter.success.sum() < len(grasps), "the set must hold both kinds"
+    assert cheap.success.tolist() == letter.success.tolist()
+    assert cheap.steps < 0.5 * letter.steps
+
+
+def test_hard_holds_no_more_than_normal() -> None:
+    grasps = many_grasps()
+    normal, hard = (judge(PADS, BOX, grasps, hard=h, pieces=WHOLE) for h in (False, True))
+    assert (hard.success <= normal.success).all()
+    assert normal.key != hard.key
+
+
+def test_verdicts_do_not_depend_on_threads() -> None:
+    one, two = (judge(PADS, BOX, many_grasps(), pieces=WHOLE, run=Run(threads=n)) for n in (1, 2))
+    assert np.array_equal(one.margin, two.margin)
+    assert one.key == two.key
+
+
+def test_progress_is_told_by_one_thread_at_a_time_and_counts_every_grasp() -> None:
+    told, alone, overlaps = [], threading.Lock(), 0
+
+    def progress(done: float, total: float, message: str) -> None:
+        nonlocal overlaps
+        if not alone.acquire(blocking=False):
+            overlaps += 1
+            return
+        told.append(done)
+        time.sleep(0.02)  # long enough for another thread to come in, if it may
+        alone.release()
+
+    judge(PADS, BOX, many_grasps(), level="screen", pieces=WHOLE, run=Run(threads=4, progress=progress))
+    assert overlaps == 0
+    assert told == list(range(1, len(many_grasps()) + 1))
+
+
+def test_everything_that_moves_a_verdict_is_in_its_key() -> None:
+    grasps = grasp_of()
+    keys = {judge(PADS, BOX, grasps, pieces=WHOLE).key}
+    keys.add(judge(PADS, BOX, grasp_of(force=10.0), pieces=WHOLE).key)
+    keys.add(judge(dataclasses.replace(PADS, stiffness=np.full(2, 90.0)), BOX, grasps, pieces=WHOLE).key)
+    keys.add(judge(PADS, BOX, grasps, pieces=dataclasses.replace(WHOLE, digest="other")).key)
+    keys.add(judge(PADS, BOX, grasps, level="letter", pieces=WHOLE).key)
+    assert len(keys) == 5
+
+
+def test_terms_do_not_depend_on_the_grasps_and_follow_everything_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    terms = verdict_key(PADS, BOX, "letter", False, pieces=WHOLE)
+    assert judge(PADS, BOX, grasp_of(force=10.0), level="letter", pieces=WHOLE).terms == terms
+    heavier = dataclasses.replace(PADS, masses=PADS.masses * 2)
+    found = {
+        terms,
+        verdict_key(PADS, BOX, "letter", True, pieces=WHOLE),
+        verdict_key(PADS, BOX, "screen", False, pieces=WHOLE),
+        verdict_key(heavier, BOX, "letter", False, pieces=WHOLE),
+        verdict_key(PADS, BOX, "letter", False, pieces=dataclasses.replace(WHOLE, digest="other")),
+    }
+    for constant in ("postures.TOTAL_NORMAL_FORCE", "referee.protocol.HOLD_S", "referee.model.FRICTION"):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"graspd.worker.quality.{constant}", 1.5)
+            found.add(verdict_key(PADS, BOX, "letter", False, pieces=WHOLE))
+    assert len(found) == 8
+
+
+def test_a_constant_that_moves_no_verdict_moves_no_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    terms = verdict_key(PADS, BOX, "letter", False, pieces=WHOLE)
+    monkeypatch.setattr(protocol, "UNRELATED", 7, raising=False)
+    monkeypatch.setattr(postures, "ROOM_M", 5)
+    assert verdict_key(PADS, BOX, "letter", False, pieces=WHOLE) == terms
+
+
+def test_a_constant_of_one_level_moves_the_key_of_that_level_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    levels: tuple[Level, ...] = ("letter", "certificate", "screen")
+
+    def terms() -> list[str]:
+        return [verdict_key(PADS, BOX, level, False, pieces=WHOLE) for level in levels]
+
+    before = terms()
+    monkeypatch.setattr(protocol, "SCREEN_BAND", (0.2, 4.0))
+    assert [a == b for a, b in zip(before, terms(), strict=True)] == [True, True, False]
+
+
+def test_every_constant_of_the_protocol_is_said_to_move_verdicts_or_not_to() -> None:
+    # A new constant belongs in key.py, or here if no verdict depends on it.
+    # These move lifts: lifting.py has them.
+    still = {"postures.ROOM_M", "postures.WIDE", "model.TOUCH_ROUNDING_M"}
+    # Of short tests.
+    still |= {"protocol.STILL", "protocol.LOST"}
+    # Of the choice of grasps.
+    still |= {"postures.STANDS_OFF_M"}
+    # Of raised pregrasps, which are among the postures that are judged.
+    still |= {f"postures.{name}" for name in ("RAISE_LOOKS", "RAISE_OPEN_M", "RAISE_CLOSING_M", "HIGHEST_RAISE_M")}
+    # Of the object of a verdict, which is in its key, and the bound of what is taken.
+    still |= {"matter.MASS_KG", "matter.FRICTION", "matter.MOST_KG"}
+    named = {f"{part.__name__.rpartition('.')[2]}.{name}" for part, names in MOVES.items() for name in names}
+    for modules in LEVEL_MOVES.values():
+        named |= {f"{part.__name__.rpartition('.')[2]}.{name}" for part, names in modules.items() for name in names}
+    there = {
+        f"{part.__name__.rpartition('.')[2]}.{name}"
+        for part in MOVES
+        for name in vars(part)
+        if name.lstrip("_").isupper() and _assigned(part, name)
+    }
+    assert there == named | still
+
+
+def _assigned(module: ModuleType, name: str) -> bool:
+    """Whether the constant is the module's own, not imported from another."""
+    return re.search(rf"^{name}\b[^=\n]*=", inspect.getsource(module), re.MULTILINE) is not None
+
+
+def test_joint_limits_reach_the_engine_in_radians() -> None:
+    hand = two_finger_hand()
+    model = build(hand, BOX, WHOLE, MujocoOptions()).model
+    assert model.joint("joint1").range == pytest.approx([hand.lower[0], hand.upper[0]])
+
+
+def test_object_weighs_100_grams_with_its_own_inertia() -> None:
+    model = build(PADS, BOX, WHOLE, MujocoOptions()).model
+    body = model.body("object")
+    assert body.mass[0] == pytest.approx(MASS_KG)
+    assert sorted(body.inertia) == pytest.approx(sorted(MASS_KG * np.linalg.eigvalsh(BOX.inertia)), rel=1e-6)
+
+
+def test_the_mass_lies_in_the_centre_of_mass_wherever_the_mesh_has_its_origin() -> None:
+    away = np.array([0.03, -0.02, 0.2])
+    moved = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05), trimesh.transformations.translation_matrix(away)))
+    scene = build(PADS, moved, ConvexPieces((moved.hull_vertices,), 1.0, 0.0, "box"), MujocoOptions())
+    data = mujoco.MjData(scene.model)
+    scene.place(data, *(part[0] for part in (CONTACT.hand_pose + 5, CONTACT.joint_positions)))
+    mujoco.mj_kinematics(scene.model, data)
+    mujoco.mj_comPos(scene.model, data)
+    np.testing.assert_allclose(data.xipos[scene.object_body], moved.centre_of_mass, atol=1e-9)
+
+
+def test_a_verdict_does_not_depend_on_the_origin_of_the_mesh() -> None:
+    away = np.array([0.03, -0.02, 0.2])
+    moved = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05), trimesh.transformations.translation_matrix(away)))
+    there = ConvexPieces((moved.hull_vertices,), 1.0, 0.0, "box")
+    grasps = many_grasps()
+    here = judge(PADS, BOX, grasps, level="letter", pieces=WHOLE)
+    parts = (grasps.grasp, grasps.pregrasp, grasps.squeeze)
+    shifted = [Posture(p.hand_pose + np.append(away, np.zeros(4)), p.joint_positions) for p in parts]
+    found = judge(PADS, moved, GraspSet(*shifted, grasps.stability_loss), level="letter", pieces=there)
+    assert 0 < here.success.sum() < len(grasps)
+    np.testing.assert_array_equal(found.success, here.success)
+
+
+def test_hand_masses_are_the_model_s() -> None:
+    model = build(PADS, BOX, WHOLE, MujocoOptions()).model
+    assert [model.body(f"body{b}").mass[0] for b in range(3)] == pytest.approx(PADS.masses)
+
+
+def test_forward_kinematics_agree_with_ours() -> None:
+    hand = two_finger_hand()
+    scene = build(hand, BOX, WHOLE, MujocoOptions())
+    data = mujoco.MjData(scene.model)
+    pose, joints = np.array([0.1, 0.2, -0.3, 0.5, -0.5, 0.5, 0.5]), np.array([0.4, -0.2])
+    scene.place(data, pose, joints)
+    mujoco.mj_forward(scene.model, data)
+    ours = body_poses(hand, pose, joints)[0]
+    for b in range(hand.bodies):
+        assert data.body(f"body{b}").xpos == pytest.approx(ours[b, :3], abs=1e-12)
+        assert abs(float(data.body(f"body{b}").xquat @ ours[b, 3:])) == pytest.approx(1.0, abs=1e-12)
+
+
+def coupled_pads() -> HandModel:
+    """One dof closes both pads, the right one at half the pace from an offset of 10 mm."""
+    return dataclasses.replace(
+        PADS, dof=np.array([-1, 0, 0], np.int32), multiplier=np.array([1.0, 1.0, 0.5]),
+        offset=np.array([0.0, 0.0, 0.01]), dof_names=("grip",), lower=np.zeros(1), upper=np.full(1, 0.1),
+        effort=np.full(1, 100.0), stiffness=np.full(1, 100.0), preshape=np.zeros(1), closing=np.ones(1),
+    )  # fmt: skip
+
+
+def test_coupled_joints_stay_coupled_while_moving() -> None:
+    hand = coupled_pads()
+    scene = build(hand, BOX, WHOLE, MujocoOptions())
+    assert scene.model.nu == 1
+    data = mujoco.MjData(scene.model)
+    far = np.array([0, 0, -0.5, 1.0, 0, 0, 0])
+    scene.place(data, far, hand.expand(np.array([0.0])))
+    scene.command(data, far, hand.expand(np.array([0.06])))
+    mujoco.mj_step(scene.model, data, nstep=500)
+    joints = data.qpos[scene.joint_qpos]
+    assert joints[0] == pytest.approx(0.06, abs=1e-5)
+    assert joints[1] == pytest.approx(0.5 * joints[0] + 0.01, abs=1e-4)
+
+
+def test_actuators_never_exceed_the_effort() -> None:
+    weak = dataclasses.replace(PADS, effort=np.array([2.0, 3.0]))
+    scene = build(weak, BOX, WHOLE, MujocoOptions())
+    data = mujoco.MjData(scene.model)
+    scene.place(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0])
+    scene.command(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0] + 0.08)
+    mujoco.mj_step(scene.model, data, nstep=5)
+    assert data.actuator_force == pytest.approx([2.0, 3.0])
+
+
+def test_a_firm_grasp_survives_noise_and_a_grazing_one_does_not_gain() -> None:
+    share = robustness(PADS, BOX, many_grasps(), repeats=2, pieces=WHOLE)
+    assert share[0] == 1.0
+    assert share[-1] == 0.0
+
+
+def test_only_grasps_that_held_are_tried_with_noise() -> None:
+    grasps = many_grasps()
+    all_of_them = robustness(PADS, BOX, grasps, repeats=2, pieces=WHOLE)
+    held = np.array([1, 0, 1, 0, -1, 0, 0, 0], np.int8)
+    share = robustness(PADS, BOX, grasps, held=held, repeats=2, pieces=WHOLE)
+    assert np.isfinite(share).tolist() == (held == 1).tolist()
+    assert np.array_equal(share[held == 1], all_of_them[held == 1]), "noise must not depend on what else is tried"
+
+
+def test_unknown_level_is_refused() -> None:
+    with pytest.raises(InputError, match="letter, certificate, screen"):
+        judge(PADS, BOX, grasp_of(), level="quick", pieces=WHOLE)
+
+
+def test_cancelled_referee_stops() -> None:
+    with pytest.raises(TaskCancelled):
+        judge(PADS, BOX, grasp_of(), pieces=WHOLE, run=Run(cancelled=lambda: True))
+
+
+def test_convex_object_is_its_own_single_piece(tmp_path: Path) -> None:
+    pieces = decompose(BOX, cache=tmp_path)
+    assert len(pieces) == 1
+    assert pieces.volume_ratio == pytest.approx(1.0, abs=1e-6)
+
+
+def test_l_shape_is_cut_and_kept(tmp_path: Path) -> None:
+    parts = [trimesh.creation.box((0.1, 0.02, 0.02)), trimesh.creation.box((0.02, 0.1, 0.02))]
+    parts[1].apply_translation([0.04, 0.04, 0])
+    shape = object_from_mesh(trimesh.boolean.union(parts, engine="manifold"))
+    pieces = decompose(shape, cache=tmp_path)
+    assert 2 <= len(pieces) <= 4
+    assert pieces.volume_ratio == pytest.approx(1.0, abs=0.05)
+    assert len(list(tmp_path.glob("*.npz"))) == 1
+
+
+@pytest.mark.slow
+def test_a_shell_that_convex_pieces_fill_in_is_refused_with_the_reason(tmp_path: Path) -> None:
+    """At this radius even the most pieces allowed stand more than 2 mm away from the inner wall."""
+    shell = trimesh.creation.icosphere(subdivisions=2, radius=0.15)
+    inner = trimesh.creation.icosphere(subdivisions=2, radius=0.1495)
+    hollow = object_from_mesh(trimesh.boolean.difference([shell, inner], engine="manifold"), "bubble")
+    with pytest.raises(MeshError, match=r"bubble: its .* convex pieces have"):
+        decompose(hollow, cache=tmp_path)
+
+
+def test_union_counts_overlap_once() -> None:
+    cube = np.asarray(trimesh.creation.box((0.02, 0.02, 0.02)).vertices)
+    assert union_volume((cube, cube + np.array([0.01, 0, 0]))) == pytest.approx(12e-6, rel=1e-5)

@@ -1,0 +1,276 @@
+"""How hands open around their grasps, on a device: see `worker.control.postures` for what is wanted, and
+`worker.simulation.kernels.opening` and `.jamming` for how it is found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from graspd.service.model.transforms import Floats, quat_rotate
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.jaws import jaws_of, slides
+from graspd.worker.hands.model import HandModel
+from graspd.worker.quality.contact import finger_of_body
+from graspd.worker.quality.posed import Posing
+from graspd.worker.simulation.kernels import distance, jamming, opening, optimizers
+from graspd.worker.simulation.launches import Launches, launch
+
+#: Fingers open until this far from the object [m]: enough for the errors of a calibrated arm, and what opens farther
+#: comes back faster and kicks the object away more often.
+CLEARANCE_M: Final = 0.003
+#: A finger that cannot get this far along its contact normals opens plainly [m].
+STUCK_M: Final = 0.003
+#: The root retreats only where the open hand is nearer than this [m]: a palm left in touch kicks the object, but so
+#: does one that comes back from afar while the fingers close.
+PALM_CLEARANCE_M: Final = 0.0005
+#: Share of plain opening, against `HandModel.closing`, in the way a finger leaves; the rest is along the contact
+#: normals, so that the finger comes back without dragging the object along.
+PLAIN_OPENING: Final = 0.3
+#: Opening steps of each finger [rad], of sliding ones [m], and their number.
+OPENING_STEP: Final = 0.05
+SLIDING_STEP_M: Final = 0.002
+OPENING_STEPS: Final = 24
+#: A finger may run into the rest of the hand by this much more than it does in the grasp [m]; it is looked at in these
+#: shares of its way, and one that jams opens half as far, at the last of so many looks not at all.
+JAM_M: Final = 5e-4
+WAY: Final = (1 / 3, 2 / 3, 1.0)
+JAM_LOOKS: Final = 4
+RETREATS_M: Final = (0.0, 0.0025, 0.005, 0.0075, 0.010, 0.015, 0.020)
+
+#: Of a hand (row) and each finger, whether something else is in its way, at dofs (n, K, D) on ways of hands `rows`.
+Blocked = Callable[[NDArray[np.intp], Floats], NDArray[np.bool_]]
+
+
+def fingers_of_dofs(hand: HandModel) -> NDArray[np.int32]:
+    """(D,) the first finger that each dof drives; -1: none, so it stays when fingers open."""
+    finger = fingers_of_bodies(hand)
+    driven = [finger[np.flatnonzero((hand.dof == d) & (finger >= 0))] for d in range(hand.dofs)]
+    return np.array([f[0] if len(f) else -1 for f in driven], np.int32)
+
+
+def fingers_of_bodies(hand: HandModel) -> NDArray[np.int32]:
+    """(L,) what opens as one: a finger, as `finger_of_body` has them; of a gripper all that one dof moves."""
+    if jaws_of(hand) is None:
+        return finger_of_body(hand)
+    out = np.full(hand.bodies, -1, np.int32)
+    for body in range(1, hand.bodies):
+        out[body] = out[hand.parent[body]] if out[hand.parent[body]] >= 0 else hand.dof[body]
+    return out
+
+
+def count_fingers(hand: HandModel) -> int:
+    """Size of arrays by finger."""
+    return max(1, len(hand.fingertips), int(fingers_of_bodies(hand).max()) + 1)
+
+
+class Openings:
+    """N hands in their grasps, opened together: dofs `q` (N, D), and where fingers go, `wide`; None: to be found."""
+
+    def __init__(self, posing: Posing, hand_pose: Floats, q: Floats, wide: Floats | None = None) -> None:
+        self.posing, self.hand_pose, self.q = posing, hand_pose, q
+        self.count, self.fingers_count = len(q), count_fingers(posing.hand)
+        with wp.ScopedDevice(posing.device):
+            self.fingers = _fingers(posing.hand)
+            self.hands = opening.Hands()
+            self.hands.position, self.hands.rotation = posing.roots(hand_pose)
+            self.hands.q = wp.array(q, dtype=wp.float64)
+            self.open = wp.array(q if wide is None else wide, dtype=wp.float64)
+            self.step = wp.zeros(1, dtype=wp.int32)
+        self.bodies = posing.bodies(self.count)
+
+    def open_from(self, grasp: Posture) -> None:
+        """Find where fingers have left the object as far as they get, each by itself; `grasp` is where they are."""
+        first, plain = self._sweep(), self._sweep()
+        self._leave(grasp, first)
+        self._step(first)
+        launch(
+            opening.open_plainly,
+            self.count,
+            inputs=[self.fingers, STUCK_M, first],
+            outputs=[plain, self.step],
+            device=self.posing.device,
+        )
+        self._step(plain)
+        launch(
+            opening.take_opening,
+            (self.count, self.posing.hand.dofs),
+            inputs=[self.fingers, self.hands, STUCK_M, first, plain],
+            outputs=[self.open],
+            device=self.posing.device,
+        )
+
+    def without_jams(self, blocked: Blocked | None = None) -> Floats:
+        """(N, D) where fingers are to go, held back towards the grasp where they would run into one another or where
+        `blocked` says so.
+
+        Fingers that jam never reach the grasp when they close again.
+        """
+        device, jams = self.posing.device, self._jams()
+        depth = self._depths(jams)
+        depth[0].run()
+        launch(jamming.limit_depth, self.count, inputs=[JAM_M], outputs=[jams], device=device)
+        for look in range(JAM_LOOKS):
+            for way in depth[1:]:
+                way.run()
+            if blocked is not None:
+                jams.blocked.assign(self._blocked(jams, blocked))
+            less = wp.float64(0.5 if look < JAM_LOOKS - 1 else 0.0)
+            launch(jamming.hold_back, self.count, inputs=[less], outputs=[jams], device=device)
+        launch(
+            jamming.take_way,
+            (self.count, self.posing.hand.dofs),
+            inputs=[self.fingers, self.hands, jams],
+            outputs=[self.open],
+            device=device,
+        )
+        found: Floats = self.open.numpy().copy()
+        return found
+
+    def retreated(self) -> Floats:
+        """(N, 7) poses of the roots of the open hands, back along the palm's approach where they are still in touch."""
+        posing, device = self.posing, self.posing.device
+        with wp.ScopedDevice(device):
+            back = jamming.Retreat()
+            back.going, back.chosen = wp.full(self.count, 1, dtype=wp.int32), wp.zeros(self.count, dtype=wp.int32)
+            back.clear = wp.full(self.count, PALM_CLEARANCE_M, dtype=wp.float32)
+            back.best = wp.full(self.count, -1e9, dtype=wp.float32)
+            jams = self._jams()
+            self._place(Launches(device), jams, 1.0).run()
+            approach = wp.vec3d(*posing.hand.palm.approach)
+            for step, way in enumerate(RETREATS_M):
+                launch(
+                    jamming.hand_clearance,
+                    (self.count, posing.lanes),
+                    inputs=[
+                        posing.probe.skin,
+                        posing.points,
+                        posing.lane,
+                        approach,
+                        PALM_CLEARANCE_M,
+                        wp.float64(way),
+                        self.bodies,
+                    ],
+                    outputs=[back],
+                )
+                launch(jamming.judge_retreat, self.count, inputs=[PALM_CLEARANCE_M, step], outputs=[back])
+        poses = self.hand_pose.copy()
+        away = np.array(RETREATS_M)[back.chosen.numpy()]
+        poses[:, :3] -= away[:, None] * quat_rotate(poses[:, 3:], posing.hand.palm.approach)
+        return poses
+
+    def _sweep(self) -> Any:
+        out, shape = opening.Sweep(), (self.count, self.fingers_count)
+        with wp.ScopedDevice(self.posing.device):
+            out.going = wp.empty(self.count, dtype=wp.int32)
+            out.direction = wp.empty((self.count, self.posing.hand.dofs), dtype=wp.float64)
+            out.clear, out.best = (wp.empty(shape, dtype=wp.float32) for _ in range(2))
+            out.chosen = wp.empty(shape, dtype=wp.int32)
+        return out
+
+    def _leave(self, grasp: Posture, sweep: Any) -> None:
+        """The way on which each finger leaves the object."""
+        posing, hand = self.posing, self.posing.hand
+        bodies, near = posing.touch(grasp, CLEARANCE_M)
+        with wp.ScopedDevice(posing.device):
+            wrench = [wp.empty((self.count, hand.bodies), dtype=wp.vec3d) for _ in range(2)]
+            launch(
+                opening.body_wrenches,
+                (self.count, hand.bodies),
+                inputs=[posing.points, bodies, near, CLEARANCE_M],
+                outputs=wrench,
+            )
+            away = wp.empty((self.count, hand.dofs), dtype=wp.float64)
+            launch(
+                opening.leave,
+                self.count,
+                inputs=[posing.chain, self.fingers, wp.float64(PLAIN_OPENING), bodies],
+                outputs=[*wrench, away, sweep],
+            )
+
+    def _step(self, sweep: Any) -> None:
+        """Step by step along the way of a sweep, until all fingers are clear."""
+        posing, out = self.posing, Launches(self.posing.device)
+        out.add(
+            opening.place_opening,
+            self.count,
+            inputs=[posing.chain, self.fingers, self.hands, CLEARANCE_M, self.step],
+            outputs=[sweep, self.bodies],
+        )
+        out.add(
+            opening.finger_clearance,
+            (self.count, posing.lanes),
+            inputs=[posing.probe.skin, posing.points, self.fingers, posing.lane, CLEARANCE_M, self.bodies],
+            outputs=[sweep],
+        )
+        out.add(opening.judge_opening, self.count, inputs=[CLEARANCE_M, self.step], outputs=[sweep])
+        out.add(optimizers.advance, 1, inputs=[], outputs=[self.step])
+        out.run(OPENING_STEPS + 1)
+
+    def _jams(self) -> Any:
+        out, shape = jamming.Jams(), (self.count, self.fingers_count)
+        with wp.ScopedDevice(self.posing.device):
+            out.going = wp.full(self.count, 1, dtype=wp.int32)
+            out.share = wp.full(shape, 1.0, dtype=wp.float64)
+            out.limit, out.depth = (wp.zeros(shape, dtype=wp.float32) for _ in range(2))
+            out.blocked = wp.zeros(shape, dtype=wp.int32)
+        return out
+
+    def _place(self, out: Launches, jams: Any, way: float) -> Launches:
+        out.add(
+            jamming.place_on_way,
+            self.count,
+            inputs=[self.posing.chain, self.fingers, self.hands, jams, self.open, wp.float64(way)],
+            outputs=[self.bodies],
+        )
+        return out
+
+    def _depths(self, jams: Any) -> list[Launches]:
+        """Launches that tell how deep fingers are in the grasp, then at each look on the way."""
+        posing = self.posing
+        shape = (self.count, len(posing.hand.pieces))
+        with wp.ScopedDevice(posing.device):
+            frames = [wp.empty(shape, dtype=wp.vec3), wp.empty(shape, dtype=wp.quat)]
+        bodies = [self.bodies.position, self.bodies.rotation]
+        found = []
+        for way in (0.0, *WAY):
+            out = self._place(Launches(posing.device), jams, way)
+            out.add(
+                distance.place_pieces,
+                shape,
+                inputs=[posing.probe.pieces, wp.vec3d(), *posing.probe.frames, *bodies],
+                outputs=frames,
+            )
+            out.add(
+                jamming.finger_depth,
+                (self.count, posing.hand.bodies),
+                inputs=[posing.probe.pieces, posing.probe.body_points, self.fingers, self.bodies, *frames],
+                outputs=[jams],
+            )
+            found.append(out)
+        return found
+
+    def _blocked(self, jams: Any, blocked: Blocked) -> NDArray[np.int32]:
+        """(N, F) what is in the way of hands that are still looked at."""
+        rows = np.flatnonzero(jams.going.numpy())
+        out = np.zeros((self.count, self.fingers_count), np.int32)
+        if len(rows):
+            finger = fingers_of_dofs(self.posing.hand)
+            share = np.where(finger >= 0, jams.share.numpy()[rows][:, finger], 1.0)
+            move = (self.open.numpy()[rows] - self.q[rows]) * share
+            out[rows] = blocked(rows, self.q[rows, None] + np.array(WAY)[None, :, None] * move[:, None])
+        return out
+
+
+def _fingers(hand: HandModel) -> Any:
+    out = opening.Fingers()
+    out.of_body = wp.array(fingers_of_bodies(hand), dtype=wp.int32)
+    out.of_dof = wp.array(fingers_of_dofs(hand), dtype=wp.int32)
+    out.closing = wp.array(np.asarray(hand.closing, float), dtype=wp.float64)
+    out.step = wp.array(np.where(slides(hand), SLIDING_STEP_M, OPENING_STEP), dtype=wp.float64)
+    out.lower = wp.array(hand.lower, dtype=wp.float64)
+    out.upper = wp.array(hand.upper, dtype=wp.float64)
+    return out

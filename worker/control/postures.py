@@ -1,0 +1,218 @@
+"""Postures around a grasp: the pregrasp, open, clear and raised where fingers would dip into a support; and the
+squeeze, which presses.
+
+They decide more of a grasp's success than the optimiser does (Dexonomy, table VI).
+
+A finger that stands on the table swings through it when it opens: its hand comes from a little higher.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.service.model.matter import ACCELERATION
+from graspd.service.model.transforms import Floats
+from graspd.worker.control.jaw_squeeze import jaw_squeeze
+from graspd.worker.control.opening import Blocked, Openings, count_fingers, fingers_of_bodies, fingers_of_dofs
+from graspd.worker.control.squeeze import Holds, balanced
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.jaws import jaws_of
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.quality.posed import posing_of
+from graspd.worker.simulation.obstacles import body_room, obstacle_room
+from graspd.worker.simulation.surroundings import CLEAR_M, Placed
+
+#: Distance that opening fingers keep from obstacles [m].
+ROOM_M: Final = 0.0025
+#: Share of its range by which a joint opens beyond the pregrasp for the way in: fingers that reach around the object
+#: would sweep it away.
+WIDE: Final = 0.4
+
+#: Hand points that postures are judged by; those within so much of the object press on it [m], as many at most.
+_POINTS: Final = 600
+PRESSING_M: Final = 0.003
+MAX_PRESSING: Final = 16
+#: A finger that stands off presses with its points within so much [m]: commanded to close, or the others push a free
+#: object past it.
+CLOSING_M: Final = 0.009
+#: A finger between the two stands off: it could touch and does not. One that is farther away is not of the grasp [m].
+STANDS_OFF_M: Final = (0.005, 0.02)
+#: Sum of the contact forces' normal components [N], and the Coulomb coefficient they are balanced with: less than that
+#: of what is held, for forces at the edge of their cones slip as soon as a contact is not quite where it was thought.
+TOTAL_NORMAL_FORCE: Final = 50.0
+FRICTION: Final = 0.3
+#: The same over the object's weight, at least and at most: 50 N push what is light and flat from between fingertips,
+#: which bear against its upper edges. At 0.1 kg the most is 50 N.
+OF_WEIGHT: Final = (10.0, 50.0)
+
+
+def pregrasp(
+    hand: HandModel, obj: ObjectModel, grasp: Posture, placed: Placed | None = None, *, device: str = "cpu"
+) -> Posture:
+    """N postures from which the hand closes.
+
+    Every finger leaves the object along its contact normals until its points are `CLEARANCE_M` away, or as far as it
+    can get without running into other fingers or, where the grasps are `placed`, an obstacle of their scene; then the
+    root moves back along the palm's approach if the hand is still in touch, and up where fingers would dip into what
+    they may touch.
+    """
+    posing = posing_of(hand, obj, points=_POINTS, device=device)
+    poses, joints = np.zeros((len(grasp), 7)), np.zeros((len(grasp), len(hand.joint_names)))
+    for rows in posing.parts(len(grasp)):
+        some, scene = grasp.take(rows), placed.take(rows) if placed is not None else None
+        opening = Openings(posing, some.hand_pose, hand.reduce(some.joint_positions))
+        opening.open_from(some)
+        joints[rows] = hand.expand(opening.without_jams(_in_the_way(hand, opening, scene)))
+        poses[rows] = opening.retreated()
+    found = Posture(poses, joints)
+    return found if placed is None else raised(hand, grasp, found, placed)
+
+
+def wide_open(hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: Placed, *, device: str = "cpu") -> Floats:
+    """(N, J) joint positions in which a hand comes to its pregrasp: fingers plainly opened as far as `WIDE` of their
+    range, or until they would run into one another or into an obstacle."""
+    posing, joints = (
+        posing_of(hand, obj, points=_POINTS, device=device),
+        np.zeros((len(pregrasp), len(hand.joint_names))),
+    )
+    for rows in posing.parts(len(pregrasp)):
+        some, scene = pregrasp.take(rows), placed.take(rows)
+        q = hand.reduce(some.joint_positions)
+        far = np.where(hand.closing > 0, hand.lower, np.where(hand.closing < 0, hand.upper, q))
+        wide = np.where(fingers_of_dofs(hand) >= 0, q + np.clip(far - q, -WIDE * hand.span, WIDE * hand.span), q)
+        opening = Openings(posing, some.hand_pose, q, wide)
+        joints[rows] = hand.expand(opening.without_jams(_in_the_way(hand, opening, scene)))
+    return joints
+
+
+def squeeze(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasp: Posture,
+    *,
+    total_normal_force: float | None = None,
+    friction: float = FRICTION,
+    device: str = "cpu",
+) -> Posture:
+    """N commanded postures that press: q + Kp^-1 J^T f, the root unchanged; see `worker.control.squeeze`."""
+    force = normal_force(obj) if total_normal_force is None else total_normal_force
+    if (jaws := jaws_of(hand)) is not None:
+        probe = posing_of(hand, obj, points=_POINTS, device=device).probe
+        return jaw_squeeze(probe, jaws, grasp, total_normal_force=force)
+    holds = hold_forces(hand, obj, grasp, total_normal_force=force, friction=friction, closing=CLOSING_M, device=device)
+    q = hand.reduce(grasp.joint_positions) + holds.torque / hand.stiffness
+    return Posture(np.array(grasp.hand_pose, float), hand.expand(q))
+
+
+def hold_forces(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasp: Posture,
+    *,
+    total_normal_force: float | None = None,
+    friction: float = FRICTION,
+    closing: float = 0.0,
+    device: str = "cpu",
+) -> Holds:
+    """Balanced contact forces of N grasps; `Holds.residual` predicts whether a grasp will hold. Fingers that touch
+    nothing press with their points that are nearer than `closing` [m]."""
+    posing = posing_of(hand, obj, points=_POINTS, device=device)
+    return balanced(
+        posing,
+        grasp,
+        total_normal_force=normal_force(obj) if total_normal_force is None else total_normal_force,
+        friction=friction,
+        within=PRESSING_M,
+        most=MAX_PRESSING,
+        closing=closing,
+    )
+
+
+def normal_force(obj: ObjectModel) -> float:
+    """Sum of the contact forces' normal components with which an object is held [N]."""
+    least, most = (times * ACCELERATION * obj.mass for times in OF_WEIGHT)
+    return min(max(TOTAL_NORMAL_FORCE, least), most)
+
+
+def touching_links(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.int32]:
+    """(N,) bodies of the hand in contact, as the geometric gate counts them."""
+    return posing_of(hand, obj, points=_POINTS, device=device).touching_links(grasp)
+
+
+def standing_off(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.bool_]:
+    """(N,) whether a finger stands off the object, see `STANDS_OFF_M`."""
+    near, far = STANDS_OFF_M
+    gap = posing_of(hand, obj, points=_POINTS, device=device).finger_gaps(grasp, 2 * far)
+    return np.asarray(((gap > near) & (gap < far)).any(axis=1))
+
+
+def _in_the_way(hand: HandModel, opening: Openings, placed: Placed | None) -> Blocked | None:
+    """What obstacles are in the way of opening fingers."""
+    if placed is None:
+        return None
+    pose = opening.hand_pose
+    # A finger may stand nearer to an obstacle in the grasp than it should: opening must not bring it nearer still.
+    room = np.minimum(_finger_room(hand, pose, opening.q[:, None], placed), ROOM_M)
+
+    def blocked(rows: NDArray[np.intp], way: Floats) -> NDArray[np.bool_]:
+        near: NDArray[np.bool_] = _finger_room(hand, pose[rows], way, placed.take(rows)) < room[rows] - 1e-6
+        return near
+
+    return blocked
+
+
+def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: Placed) -> Floats:
+    """(B, fingers) least room of each finger, as `body_room` has it, on paths (B, K, D); inf: no finger."""
+    count, steps, _ = paths.shape
+    finger = fingers_of_bodies(hand)
+    out = np.full((count, count_fingers(hand)), np.inf)
+    postures = Posture(np.repeat(hand_pose, steps, axis=0), hand.expand(paths).reshape(count * steps, -1))
+    found = body_room(hand, postures, placed.scenes, np.repeat(placed.index, steps))
+    found = found.reshape(count, steps, -1).min(axis=1)
+    for f in np.unique(finger[finger >= 0]):
+        out[:, f] = found[:, finger == f].min(axis=1)
+    return out
+
+
+#: Room that the open hand has, and that it has while it closes [m]: a little more than is asked for, since ways are
+#: looked at in steps.
+RAISE_OPEN_M: Final = CLEAR_M + 0.0025
+
+RAISE_CLOSING_M: Final = CLEAR_M + 0.0003
+#: Shares of the way to the grasp that are looked at: those of the sweep, but for the grasp itself.
+RAISE_LOOKS: Final = tuple(np.arange(8) / 8)
+#: A hand is raised by no more than this [m]: from higher it would come down on the object.
+HIGHEST_RAISE_M: Final = 0.008
+
+
+def raised(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: Placed) -> Posture:
+    """Pregrasps (N) whose root went against gravity by what the hand lacks of its room on the straight way from there
+    to the grasp; those that lack nothing, or too much, are as they were."""
+    poses = np.array(pregrasp.hand_pose, float)
+    near = np.array([any(one.tips_m is not None for one in scene.obstacles) for scene in placed.scenes], bool)
+    rows = np.flatnonzero(near[placed.index])
+    if not len(rows):
+        return pregrasp
+    lack = _lack(hand, grasp.take(rows), pregrasp.take(rows), placed.take(rows))
+    # What the root is raised by at first is less and less on the way.
+    height = (lack / (1 - np.array(RAISE_LOOKS))).max(axis=1)
+    height = np.where(height <= HIGHEST_RAISE_M, height, 0.0)
+    up = np.array([scene.up for scene in placed.scenes])[placed.index[rows]]
+    poses[rows, :3] += height[:, None] * up
+    return Posture(poses, pregrasp.joint_positions)
+
+
+def _lack(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: Placed) -> Floats:
+    """(n, looks) what hands lack of their room at the shares `RAISE_LOOKS` of their way."""
+    share = np.array(RAISE_LOOKS)[None, :, None]
+    pose = (1 - share) * pregrasp.hand_pose[:, None] + share * grasp.hand_pose[:, None]
+    pose[..., 3:] = pregrasp.hand_pose[:, None, 3:]  # a pregrasp is never turned against its grasp
+    joints = (1 - share) * pregrasp.joint_positions[:, None] + share * grasp.joint_positions[:, None]
+    postures = Posture(pose.reshape(-1, 7), joints.reshape(-1, joints.shape[-1]))
+    room = obstacle_room(hand, postures, placed.scenes, np.repeat(placed.index, len(RAISE_LOOKS)))
+    wanted = np.where(np.array(RAISE_LOOKS) > 0, RAISE_CLOSING_M, RAISE_OPEN_M)
+    return np.maximum(0.0, wanted - room.reshape(len(grasp), -1))

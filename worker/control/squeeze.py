@@ -1,0 +1,173 @@
+"""Contact forces that balance and hold an object, and the torques with which a position-controlled hand exerts them.
+
+q_squeeze = q + Kp^-1 sum_i J_i^T f_i (Dexonomy), with f a non-negative combination of friction pyramid edges that
+leaves no net wrench and whose normal components sum to a given force.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from graspd.service.model.transforms import Floats
+from graspd.worker.grasps import Posture
+from graspd.worker.quality.posed import Posing
+from graspd.worker.quality.probe import FACING_COS
+from graspd.worker.simulation.kernels import balance as kernels
+from graspd.worker.simulation.kernels import touching
+from graspd.worker.simulation.launches import launch
+
+#: Weight of each edge's own size: spreads the load over contacts that would do equally well.
+SPREAD: Final = 0.1
+#: Weight of joint torques, the hardest one to exert being 1: prefers forces the hand is strong in.
+TORQUE: Final = 0.05
+#: Weight of the sum of normal forces: it is met closely, then exactly by scaling, balance or not.
+SUM: Final = 10.0
+
+
+@dataclass(frozen=True)
+class Holds:
+    """Balanced forces of N grasps."""
+
+    residual: Floats
+    """(N,) net wrench over the sum of normal forces, torques over the object's radius; 0: perfectly balanced, 1 where
+    nothing presses. It predicts whether a grasp will hold."""
+    torque: Floats
+    """(N, D) torques of the dofs that exert the forces [N m or N]."""
+
+
+def balanced(
+    posing: Posing,
+    grasp: Posture,
+    *,
+    total_normal_force: float,
+    friction: float,
+    within: float,
+    most: int,
+    closing: float = 0.0,
+) -> Holds:
+    """Balanced contact forces of N grasps within the hand's torque limits.
+
+    Where the torques exceed a limit all forces shrink together, so the balance stays.
+
+    Args:
+        posing: hand and object.
+        grasp: the grasps.
+        total_normal_force: wanted sum of normal forces [N].
+        friction: Coulomb coefficient of the pyramids.
+        within: hand points that are nearer to the object press on it [m].
+        most: as many of them are taken, those that spread most widely.
+        closing: points of a finger that has none so near press where they are nearer than this [m].
+    """
+    hand = posing.hand
+    found = Holds(np.ones(len(grasp)), np.zeros((len(grasp), hand.dofs)))
+    for rows in posing.parts(len(grasp)):
+        residual, torque = _balanced(posing, grasp.take(rows), total_normal_force, friction, (within, closing), most)
+        found.residual[rows], found.torque[rows] = residual.numpy(), torque.numpy()
+    return found
+
+
+def _balanced(
+    posing: Posing, grasp: Posture, total: float, friction: float, reach: tuple[float, float], most: int
+) -> tuple[Any, Any]:
+    bodies, near = posing.touch(grasp, max(reach))
+    count, points, radius = len(grasp), len(posing.probe.points), posing.probe.obj.radius
+    rows = int(touching.FIRST_TORQUE) + posing.hand.dofs
+    with wp.ScopedDevice(posing.device):
+        scratch = [wp.empty((count, points), dtype=kind) for kind in (wp.int32, wp.float64)]
+        touches = wp.empty((count, posing.fingers), dtype=wp.bool)
+        chosen, used = wp.empty((count, most), dtype=wp.int32), wp.empty(count, dtype=wp.int32)
+        launch(
+            touching.choose,
+            count,
+            inputs=[posing.points, posing.finger, near, *reach, wp.float64(FACING_COS), wp.float64(radius)],
+            outputs=[touches, *scratch, chosen, used],
+        )
+        matrix = wp.empty((count, most * int(touching.EDGES), rows), dtype=wp.float64)
+        launch(
+            touching.columns,
+            chosen.shape,
+            inputs=[
+                posing.chain,
+                posing.effort,
+                posing.points,
+                bodies,
+                near,
+                chosen,
+                used,
+                wp.float64(friction),
+                wp.float64(radius),
+                wp.float64(SUM),
+            ],
+            outputs=[matrix],
+        )
+        unit = wp.empty(count, dtype=wp.float64)
+        launch(touching.scale_torques, count, inputs=[wp.float64(TORQUE)], outputs=[used, matrix, unit])
+        target = np.zeros(rows)
+        target[6] = SUM
+        share = solved(matrix, target, SPREAD, used)
+        residual = wp.empty(count, dtype=wp.float64)
+        torque = wp.empty((count, posing.hand.dofs), dtype=wp.float64)
+        launch(
+            touching.hold,
+            count,
+            inputs=[posing.effort, matrix, share, used, unit, wp.float64(total)],
+            outputs=[residual, torque],
+        )
+    return residual, torque
+
+
+def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
+    """(B, K) the x >= 0 that minimise |M x - t|^2 + ridge^2 |x|^2 for each of B systems, on their device.
+
+    Args:
+        matrix: (B, K, R) columns of M, a Warp array in double precision.
+        target: (R,) t.
+        ridge: weight of x itself, above 0.
+        count: (B,) columns of each system that are used, a Warp array; x is 0 for the others.
+    """
+    (batch, columns, rows), device = matrix.shape, matrix.device
+    with wp.ScopedDevice(device):
+        work = kernels.Workspace()
+        work.normal, work.factor = (wp.empty((batch, rows, rows), dtype=wp.float64) for _ in range(2))
+        work.residual, work.wanted = (wp.empty((batch, rows), dtype=wp.float64) for _ in range(2))
+        work.used = wp.empty((batch, columns), dtype=wp.int32)
+        x = wp.empty((batch, columns), dtype=wp.float64)
+        sound = wp.empty(batch, dtype=wp.int32)
+        launch(
+            kernels.nonnegative,
+            batch,
+            inputs=[matrix, wp.array(target, dtype=wp.float64), wp.float64(ridge), count],
+            outputs=[work, x, sound],
+        )
+    unsolved = np.flatnonzero(sound.numpy() == 0)
+    if len(unsolved):
+        found, columns, used = x.numpy(), matrix.numpy(), count.numpy()
+        for b in unsolved:
+            found[b] = _plain(columns[b], target, ridge, int(used[b]))
+        x.assign(found)
+    return x
+
+
+def nonnegative_weights(matrix: Floats, target: Floats, ridge: float, count: NDArray[np.integer[Any]]) -> Floats:
+    """`solved` for systems that are in NumPy, on the CPU."""
+    if not len(matrix):
+        return np.zeros(matrix.shape[:2])
+    with wp.ScopedDevice("cpu"):
+        given = wp.array(matrix, dtype=wp.float64), wp.array(count, dtype=wp.int32)
+    found: Floats = np.array(solved(given[0], target, ridge, given[1]).numpy())
+    return found
+
+
+def _plain(matrix: Floats, target: Floats, ridge: float, count: int) -> Floats:
+    """One system by SciPy, the ridge as rows of its own."""
+    from scipy.optimize import nnls
+
+    system = np.vstack([matrix[:count].T, ridge * np.eye(count)])
+    out = np.zeros(len(matrix))
+    out[:count] = nnls(system, np.concatenate([target, np.zeros(count)]))[0]
+    return out

@@ -1,0 +1,139 @@
+"""Compiled models of the engine, kept for pairs that meet again, and threads of simulated tests: a compilation costs
+as much as half a verdict."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Final, TypeVar
+
+import numpy as np
+from cachetools import LRUCache
+from numpy.typing import NDArray
+
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.disk_cache import content_of
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.run import Run
+from graspd.worker.simulation.surroundings import Neighbour, Obstacle
+from graspd.worker.validation.decomposition import ConvexPieces
+from graspd.worker.validation.model import MujocoOptions, Scene, build
+
+#: Models kept; one takes some megabytes.
+KEPT: Final = 8
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """All that a model follows from."""
+
+    test: str
+    hand: HandModel
+    obj: ObjectModel
+    pieces: ConvexPieces
+    physics: MujocoOptions | None
+    supports: tuple[Obstacle, ...]
+    neighbours: tuple[Neighbour, ...]
+
+
+_models: LRUCache[str, Any] = LRUCache(KEPT)
+_lock = threading.Lock()
+
+
+def scene_of(
+    hand: HandModel,
+    obj: ObjectModel,
+    pieces: ConvexPieces,
+    physics: MujocoOptions,
+    supports: Sequence[Obstacle] = (),
+    neighbours: Sequence[Neighbour] = (),
+) -> Scene:
+    """`build`, or what it gave for the same arguments lately. Threads share a scene: nobody may write to its model."""
+    asked = _Asked("pushes", hand, obj, pieces, physics, tuple(supports), tuple(neighbours))
+    scene: Scene = _kept(asked, lambda: build(hand, obj, pieces, physics, supports, neighbours))
+    return scene
+
+
+def slipping_model(
+    hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, make: Callable[[HandModel, ObjectModel, ConvexPieces], Any]
+) -> Any:
+    """The model of the displacement test, made by `make` where it was not lately."""
+    return _kept(_Asked("slips", hand, obj, pieces, None, (), ()), lambda: make(hand, obj, pieces))
+
+
+def _kept(asked: _Asked, make: Callable[[], Any]) -> Any:
+    key = content_of(asked)
+    with _lock:
+        model = _models.get(key)
+        if model is None:
+            model = _models[key] = make()
+        return model
+
+
+Test = TypeVar("Test")
+Answer = TypeVar("Answer")
+
+
+def answers(
+    rows: Sequence[int], make: Callable[[], Test], ask: Callable[[Test, int], Answer], *, threads: int, name: str
+) -> list[Answer]:
+    """What tests say of some grasps, in their order.
+
+    Args:
+        rows: the grasps.
+        make: makes a test.
+        ask: asks a test of a grasp.
+        threads: at most.
+        name: of the threads.
+    """
+    tests: queue.SimpleQueue[Test] = queue.SimpleQueue()
+    workers = max(1, min(threads, len(rows)))
+    for _ in range(workers):
+        tests.put(make())
+
+    def work(row: int) -> Answer:
+        test = tests.get()
+        try:
+            return ask(test, row)
+        finally:
+            tests.put(test)
+
+    with ThreadPoolExecutor(workers, thread_name_prefix=name) as pool:
+        return list(pool.map(work, rows))
+
+
+def measured(
+    count: int,
+    held: NDArray[np.bool_] | None,
+    make: Callable[[], Test],
+    ask: Callable[[Test, int], float],
+    *,
+    run: Run,
+    name: str,
+) -> NDArray[np.float64]:
+    """(count,) what tests measure of the grasps that are `held` (count,), None: of all; nan of the others.
+
+    Args:
+        count: grasps.
+        held: which of them are tested.
+        make: makes a test; not called where there is nothing to test.
+        ask: asks a test of a grasp.
+        run: asked between grasps whether to stop.
+        name: of the threads.
+
+    Raises:
+        TaskCancelled: when `run.cancelled()` answers True.
+    """
+
+    def asked(test: Test, row: int) -> float:
+        run.check("the referee")
+        return ask(test, row)
+
+    out = np.full(count, np.nan)
+    rows = np.arange(count) if held is None else np.flatnonzero(held)
+    if len(rows):
+        out[rows] = answers(rows.tolist(), make, asked, threads=run.cores, name=name)
+    return out

@@ -1,0 +1,152 @@
+"""Verdicts on grasps in another model of their hand: what was planned with one is judged with the other.
+
+The mechanism is the other model's: shapes, masses, where the joints are, their limits, couplings, armature and dry
+friction. The controller belongs to the grasp and stays: the commanded postures, gains, torque limits and, with the
+gains, the damping.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+
+from graspd.service.model.transforms import Floats, apply, compose, invert
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.collisions import resting_neighbours
+from graspd.worker.hands.model import ConvexPiece, HandModel
+from graspd.worker.hands.same_hand import SameHand
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.run import ALONE, Run
+from graspd.worker.validation.decomposition import ConvexPieces
+from graspd.worker.validation.key import Level
+from graspd.worker.validation.validator import Verdicts, judge
+
+
+@dataclass(frozen=True)
+class ForeignVerdicts:
+    """Verdicts on the same N grasps in the model they were planned with and in another."""
+
+    nominal: Verdicts
+    foreign: Verdicts
+    same: SameHand
+
+    def facts(self) -> dict[str, Any]:
+        """judge_hand: name of the other model; fingertips_mm: how far it is from ours; foreign_key: terms of its
+        verdicts; and `share_counts`."""
+        a, b = self.nominal.success == 1, self.foreign.success == 1
+        return {
+            "judge_hand": self.same.theirs.name,
+            "fingertips_mm": round(1e3 * self.same.fingertips_m, 6),
+            "foreign_key": self.foreign.terms,
+            **share_counts(
+                {
+                    "both": int((a & b).sum()),
+                    "nominal": int((a & ~b).sum()),
+                    "foreign": int((~a & b).sum()),
+                    "neither": int((~a & ~b).sum()),
+                }
+            ),
+        }
+
+
+def share_counts(held: Mapping[str, int]) -> dict[str, Any]:
+    """What becomes of grasps of which so many hold in both models, in the nominal or the foreign one alone, in neither.
+
+    foreign_held: these counts; agreement: share with the same verdict in both; foreign_share: of those that hold
+    nominally, the share that holds in the other model; foreign_gsr: the share of all that does. None: of nothing.
+    """
+    n, nominal = sum(held.values()), held["both"] + held["nominal"]
+
+    def share(part: int, whole: int) -> float | None:
+        return round(part / whole, 6) if whole else None
+
+    return {
+        "foreign_held": dict(held),
+        "agreement": share(held["both"] + held["neither"], n),
+        "foreign_share": share(held["both"], nominal),
+        "foreign_gsr": share(held["both"] + held["foreign"], n),
+    }
+
+
+def foreign_verdicts(
+    same: SameHand, obj: ObjectModel, grasps: GraspSet, nominal: Verdicts, *, pieces: ConvexPieces, run: Run = ALONE
+) -> ForeignVerdicts:
+    """Judge grasps of `same.ours` in the other model, on the terms of their nominal verdicts."""
+    level = cast(Level, nominal.level)
+    moved = in_other_model(same, grasps)
+    found = judge(driven_as(same), obj, moved, level=level, hard=nominal.hard, pieces=pieces, run=run)
+    return ForeignVerdicts(nominal, found, same)
+
+
+def driven_as(same: SameHand) -> HandModel:
+    """Their model with the gains and limits of ours.
+
+    A dof of gain k and limit e that moves n joints by m_i gives each of them the gain k / (n m_i^2) and the limit
+    e / (n |m_i|), and takes sum(m_i^2 k_i) and sum(|m_i| e_i) from joints: what a drive does along the joints' common
+    motion stays the same where they turn as one in the one model, and hang on a tendon of equal pulls in the other.
+    """
+    ours, theirs = same.ours, same.theirs
+    gain, limit = _of_joints(ours)
+    gain, limit = gain[same.joints], limit[same.joints]
+    dof, rate = theirs.dof[theirs.joint_body], theirs.multiplier[theirs.joint_body]
+    stiffness, effort = np.zeros(theirs.dofs), np.zeros(theirs.dofs)
+    np.add.at(stiffness, dof, rate**2 * gain)
+    np.add.at(effort, dof, np.abs(rate) * limit)
+    return replace(theirs, stiffness=stiffness, effort=effort)
+
+
+def _of_joints(hand: HandModel) -> tuple[Floats, Floats]:
+    """(J,) gains and limits of joints."""
+    dof, rate = hand.dof[hand.joint_body], hand.multiplier[hand.joint_body]
+    joints = np.bincount(dof, minlength=hand.dofs)[dof]
+    return hand.stiffness[dof] / (joints * rate**2), hand.effort[dof] / (joints * np.abs(rate))
+
+
+def in_other_model(same: SameHand, grasps: GraspSet) -> GraspSet:
+    """The grasps as postures of their model: their base put where it belongs, joints by their names.
+
+    Where joints follow one another in their model and not in ours, they take the nearest values that do.
+    """
+
+    def posture(part: Posture) -> Posture:
+        pose = compose(np.asarray(part.hand_pose, float), same.base)
+        return Posture(pose, _nearest(same.theirs, np.asarray(part.joint_positions, float)[:, same.joints]))
+
+    loss = np.asarray(grasps.stability_loss, float)
+    return GraspSet(posture(grasps.grasp), posture(grasps.pregrasp), posture(grasps.squeeze), loss)
+
+
+def _nearest(hand: HandModel, joints: Floats) -> Floats:
+    if hand.dofs == len(hand.joint_names):
+        return joints
+    dof, rate = hand.dof[hand.joint_body], hand.multiplier[hand.joint_body]
+    drive = np.zeros((len(dof), hand.dofs))
+    drive[np.arange(len(dof)), dof] = rate
+    return hand.expand((joints - hand.offset[hand.joint_body]) @ np.linalg.pinv(drive).T)
+
+
+def with_our_shapes(same: SameHand) -> HandModel:
+    """Their model with the pieces of ours, to tell what shapes have to do with a verdict."""
+    there = np.zeros(same.ours.bodies, np.intp)
+    there[same.bodies] = np.arange(same.theirs.bodies)
+    frames = invert(same.frames)[there]
+    return _dressed(same.theirs, tuple(_moved(p, int(there[p.body]), frames[p.body]) for p in same.ours.pieces))
+
+
+def with_their_shapes(same: SameHand) -> HandModel:
+    """Our model with the pieces of theirs."""
+    pieces = tuple(_moved(p, int(same.bodies[p.body]), same.frames[p.body]) for p in same.theirs.pieces)
+    return _dressed(same.ours, pieces)
+
+
+def _moved(piece: ConvexPiece, body: int, frame: Floats) -> ConvexPiece:
+    pose = piece.pose if piece.kind == "hull" else compose(frame, piece.pose)
+    return replace(piece, body=body, pose=pose, vertices=apply(frame, piece.vertices))
+
+
+def _dressed(hand: HandModel, pieces: tuple[ConvexPiece, ...]) -> HandModel:
+    dressed = replace(hand, pieces=pieces)
+    return replace(dressed, neighbours=resting_neighbours(dressed))

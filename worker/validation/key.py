@@ -1,0 +1,132 @@
+"""The key of a verdict: a digest of everything that moves it. Rates of verdicts with different keys do not compare."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final, Literal
+
+import mujoco
+import numpy as np
+
+from graspd.service.model import matter
+from graspd.service.model.digests import digest_bytes, digest_json
+from graspd.worker.control import jaw_squeeze, opening, postures, squeeze
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.validation import model, protocol
+from graspd.worker.validation.decomposition import ConvexPieces, decompose
+
+Level = Literal["letter", "certificate", "screen"]
+
+#: Raise when the code of the protocol or of the scene changes what it says, constants aside.
+REVISION: Final = 6
+
+_EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "SURE", "LOST_ROTATION")
+#: The constants that move a verdict, module by module, and those that only one level reads. A constant of these modules
+#: that stands in neither moves none.
+MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
+    protocol: ("DIRECTIONS", "MAX_DISPLACEMENT_M", "MAX_ROTATION", "MAX_PENETRATION_M", "STAGES", "STAGE_S", "HOLD_S"),
+    matter: ("ACCELERATION",),
+    model: (
+        "FRICTION",
+        "HARD",
+        "DAMPING_TIME",
+        "HAND_SOLIMP",
+        "HAND_SOLREF",
+        "COUPLING_SOLREF",
+        "COUPLING_SOLIMP",
+        "NOT_IN_3_3_2",
+        "SPARSE",
+        "_BARE_RADIUS",
+        "_MIN_MASS",
+    ),
+    opening: (
+        "CLEARANCE_M",
+        "STUCK_M",
+        "PALM_CLEARANCE_M",
+        "PLAIN_OPENING",
+        "OPENING_STEP",
+        "SLIDING_STEP_M",
+        "OPENING_STEPS",
+        "JAM_M",
+        "WAY",
+        "JAM_LOOKS",
+        "RETREATS_M",
+    ),
+    postures: ("PRESSING_M", "CLOSING_M", "TOTAL_NORMAL_FORCE", "OF_WEIGHT", "FRICTION", "MAX_PRESSING", "_POINTS"),
+    squeeze: ("SPREAD", "TORQUE", "SUM"),
+    jaw_squeeze: ("GAP_M", "STALL", "LEAST_WAY"),
+}
+LEVEL_MOVES: Final[dict[Level, dict[ModuleType, tuple[str, ...]]]] = {
+    "letter": {protocol: ("LETTER_INTERVAL_S",)},
+    "certificate": {protocol: _EARLY},
+    "screen": {protocol: (*_EARLY, "SCREEN_BAND"), model: ("COARSE",)},
+}
+
+
+def verdict_key(
+    hand: HandModel,
+    obj: ObjectModel,
+    level: Level,
+    hard: bool,
+    *,
+    pieces: ConvexPieces | None = None,
+    cache: Path | None = None,
+    first_judge: Sequence[Any] = (),
+) -> str:
+    """Digest of the terms of a verdict: all that it follows from but the grasp's own postures.
+
+    In it: level, friction, masses, gains and torque limits, the rules of pregrasp and squeeze, shapes of the hand,
+    convex pieces of the object, the constants of `MOVES` and of the level, version of the engine; and `first_judge`,
+    the first judge's terms where it takes part.
+
+    Raises:
+        MeshError: `pieces` is not given and the object has none that are usable.
+    """
+    pieces = pieces or decompose(obj, cache=cache)
+    shapes = b"".join(np.round(p.vertices, 9).tobytes() + np.round(p.pose, 9).tobytes() for p in hand.pieces)
+    return digest_json(
+        {
+            "revision": REVISION,
+            "level": level,
+            "hard": hard,
+            "engine": mujoco.__version__,
+            "hand": [hand.digest, digest_bytes(shapes)],
+            "gains": [array.tolist() for array in (hand.stiffness, hand.effort, hand.masses)],
+            "matter": [obj.mass, obj.friction],
+            "object": [obj.digest, np.round(obj.inertia, 12).tolist(), np.round(obj.centre_of_mass, 9).tolist()],
+            "pieces": pieces.digest,
+            "physics": asdict(model.MujocoOptions().hardened() if hard else model.MujocoOptions()),
+            "constants": [_values(MOVES), _values(LEVEL_MOVES[level])],
+            # Of grippers alone: the keys of hands stay what they are.
+            **({"several_contacts": flag} if (flag := model.several_contacts(hand)) else {}),
+            # Of hands that have them alone, likewise.
+            **({"tendons": [[*t.dofs, *t.coefficients] for t in hand.tendons]} if hand.tendons else {}),
+            **({"drag": [hand.drag.armature.tolist(), hand.drag.dry_friction.tolist()]} if hand.drag else {}),
+            **({"first_judge": list(first_judge)} if first_judge else {}),
+        }
+    )
+
+
+def postures_key(terms: str, grasps: GraspSet) -> str:
+    """Digest of the terms (`verdict_key`) together with the postures that were judged."""
+    parts = (grasps.pregrasp, grasps.grasp, grasps.squeeze)
+    arrays = (array for part in parts for array in (part.hand_pose, part.joint_positions))
+    return digest_json([terms, digest_bytes(b"".join(np.ascontiguousarray(a, float).tobytes() for a in arrays))])
+
+
+def _values(names: dict[ModuleType, tuple[str, ...]]) -> dict[str, Any]:
+    """Values of the named constants by the last word of their module's name; those of `opening` are of postures."""
+    out: dict[str, Any] = {}
+    for part, there in names.items():
+        group = out.setdefault((postures if part is opening else part).__name__.rpartition(".")[2], {})
+        group |= {name: _plain(getattr(part, name)) for name in there}
+    return out
+
+
+def _plain(value: Any) -> Any:
+    return asdict(value) if isinstance(value, model.MujocoOptions) else value

@@ -1,0 +1,247 @@
+"""The lift test: the object stands in its scene, the hand closes, squeezes, lifts it and holds it.
+
+letter: DexGraspBench's tabletop test as published: from the pregrasp, 1 N downwards, 10 cm up in 0.4 s, no hold.
+lift: the hand comes from its standoff and must touch nothing on the way, but that fingertips may touch supports, or
+press into them, as deep as the scene says; it rises smoothly in 0.8 s and holds for 2 s, cut short as the certificate's
+pushes are.
+Neighbours stand on the table as free bodies; at level lift they must not be moved 2 cm, nor toppled.
+The world of the simulation is the object frame: the scene lies under it as it stood when the object came to rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from itertools import pairwise
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from graspd.service.model.matter import ACCELERATION
+from graspd.service.model.transforms import Floats, invert, quat_conjugate, quat_multiply, quat_rotate, slerp
+from graspd.worker.engines.mujoco_warnings import void
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.simulation.surroundings import RISE_M, Placed
+from graspd.worker.validation.model import Scene, blend
+from graspd.worker.validation.protocol import (
+    MAX_PENETRATION_M,
+    MAX_ROTATION,
+    STAGE_S,
+    STAGES,
+    Outcome,
+    Test,
+    Trial,
+)
+
+#: A neighbour may be moved by this [m], and tilted by this [rad]: more is toppled. It may turn about the vertical.
+NEIGHBOUR_MOVED_M: Final = 0.02
+NEIGHBOUR_TILTED: Final = MAX_ROTATION
+#: Postures looked at between two waypoints of an approach.
+LOOKS: Final = 4
+#: The open hand may be this deep in the object's convex pieces on its way [m]: they stand out from its surface, where
+#: the hand is clear, by up to this much. Supports are exact.
+OVERHANG_M: Final = 0.002
+#: Steps of the rise and their length [s], and the shares of it that they end at: minimum jerk (Flash and Hogan, "The
+#: coordination of arm movements", 1985), at most 0.9 m/s2 for 10 cm in 0.8 s. A stage of a centimetre, as published,
+#: asks the hand for 25 m/s2.
+RISING: Final = 100
+RISING_S: Final = 0.008
+#: Steps of the rise between two looks for an object that is lost.
+LOSSES: Final = 5
+SMOOTHLY: Final = np.asarray(np.polyval([6, -15, 10, 0, 0, 0], np.linspace(0, 1, RISING + 1)[1:]), float)
+
+
+class LiftOutcome(IntEnum):
+    """What became of a lift."""
+
+    NOT_TRIED = 0
+    LIFTED = 1
+    PENETRATION = 2
+    TOUCHED_ON_THE_WAY = 3
+    LOST_WHILE_CLOSING = 4
+    NOT_LIFTED = 5
+    TURNED = 6
+    DIVERGED = 7
+    NEIGHBOUR_MOVED = 8
+
+
+@dataclass
+class LiftTrial:
+    """Verdict on one grasp."""
+
+    outcome: LiftOutcome = LiftOutcome.NOT_TRIED
+    margin: float = 0.0
+    """Worst displacement or rotation from where it should be over its limit, at the end of the lift and after."""
+    steps: int = 0
+
+    @property
+    def success(self) -> bool:
+        return self.outcome is LiftOutcome.LIFTED
+
+
+class Lift(Test):
+    """Runs lifts of grasps in one scene with supports. Not for several threads at once."""
+
+    def __init__(self, scene: Scene, placed: Placed) -> None:
+        super().__init__(scene)
+        self.placed = placed
+        self._goal = np.zeros(3)
+        self._in_hand = True
+        self._beside = placed.neighbours_of(0)
+
+    def letter(self, grasps: GraspSet, row: int) -> LiftTrial:  # type: ignore[override]
+        """As published: success is read once, when the root has risen, from where the object is in the world."""
+        self._in_hand = False
+        if (trial := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
+            return trial
+        self._close(grasps, row)
+        self._rise(grasps, row, np.arange(1, STAGES + 1) / STAGES, STAGE_S)
+        return self._ended(trial, self._judge(Trial()))
+
+    def lift(self, grasps: GraspSet, row: int) -> LiftTrial:
+        """From the standoff to the end of the hold; `grasps.approach` says how the hand comes."""
+        self._in_hand = True
+        if (trial := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
+            return trial
+        if self._touches(grasps, row):
+            trial.outcome = LiftOutcome.TOUCHED_ON_THE_WAY
+            return trial
+        if not self._close(grasps, row, give_up=True):
+            trial.outcome = LiftOutcome.DIVERGED if void(self.data) else LiftOutcome.LOST_WHILE_CLOSING
+            trial.steps = self._steps
+            return trial
+        self._rise(grasps, row)
+        inner = Trial()
+        outcome = self._judge(inner)
+        if outcome is Outcome.HELD:
+            outcome = self._hold(inner)
+        trial = self._ended(trial, outcome)
+        if trial.success and self._neighbours_moved():
+            trial.outcome = LiftOutcome.NEIGHBOUR_MOVED
+        return trial
+
+    def _begin(self, grasps: GraspSet, row: int) -> LiftTrial:
+        """The scene as this grasp has it; the object at rest; gravity on the object alone, as published."""
+        self._steps, number = 0, int(self.placed.index[row])
+        self._scene_pose = invert(np.asarray(self.placed.object_pose[number], float))
+        self._up = self.placed.scenes[number].up
+        self._beside = self.placed.neighbours_of(number)
+        self._goal = np.zeros(3)
+        self._put(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
+        mujoco.mj_forward(self.scene.model, self.data)
+        trial = LiftTrial()
+        if max(self._depths_here()) > MAX_PENETRATION_M:
+            trial.outcome = LiftOutcome.PENETRATION
+        return trial
+
+    def _put(self, hand_pose: Floats, joints: Floats) -> None:
+        self.scene.place(self.data, hand_pose, joints)
+        self.data.mocap_pos[1], self.data.mocap_quat[1] = self._scene_pose[:3], self._scene_pose[3:]
+        self.data.xfrc_applied[self.scene.object_body, :3] = -self.scene.push * self._up
+        for free, pose in zip(self.scene.neighbours, self._beside, strict=True):
+            centre = pose[:3] + quat_rotate(pose[3:], free.centre)
+            self.data.qpos[free.qpos : free.qpos + 7] = [*centre, *pose[3:]]
+            self.data.xfrc_applied[free.body, :3] = -ACCELERATION * free.mass * self._up
+
+    def _neighbours_moved(self) -> bool:
+        """Whether a neighbour is not where it stood, or has toppled."""
+        for free, pose in zip(self.scene.neighbours, self._beside, strict=True):
+            now = self.data.qpos[free.qpos : free.qpos + 7]
+            moved = float(np.linalg.norm(now[:3] - pose[:3] - quat_rotate(pose[3:], free.centre)))
+            standing = quat_rotate(now[3:], quat_rotate(quat_conjugate(pose[3:]), self._up))
+            if moved > NEIGHBOUR_MOVED_M or float(standing @ self._up) < np.cos(NEIGHBOUR_TILTED):
+                return True
+        return False
+
+    def _depths_here(self) -> tuple[float, float]:
+        """Deepest penetration of the hand into the object, and into itself or a support [m]."""
+        contact = self.data.contact
+        if not len(contact.dist):
+            return 0.0, 0.0
+        ours, support = self.scene.hand_geoms[contact.geom], self.scene.support_geoms[contact.geom]
+        hand, within = ours.any(axis=1), ours.all(axis=1) | (ours | support).all(axis=1)
+        depth = np.maximum(0.0, -np.asarray(contact.dist))
+        return float(depth[hand & ~within].max(initial=0.0)), float(depth[hand & within].max(initial=0.0))
+
+    def _touches(self, grasps: GraspSet, row: int) -> bool:
+        """Whether the open hand, on its way, reaches into the object or a support."""
+        assert grasps.approach is not None, "a lift needs the grasps' approach"
+        assert grasps.coming is not None
+        path, joints = grasps.approach[row], grasps.coming[row]
+        for a, b in pairwise(path):
+            for share in np.arange(LOOKS) / LOOKS:
+                pose = np.concatenate([(1 - share) * a[:3] + share * b[:3], slerp(a[3:], b[3:], float(share))])
+                self._put(pose, joints)
+                mujoco.mj_kinematics(self.scene.model, self.data)
+                mujoco.mj_collision(self.scene.model, self.data)
+                if self._in_touch():
+                    return True
+        wide, closed = Posture(path[-1:], joints[None]), grasps.pregrasp.take(slice(row, row + 1))
+        for share in np.arange(LOOKS) / LOOKS:
+            self._put(*blend(wide, closed, 0, float(share)))
+            mujoco.mj_kinematics(self.scene.model, self.data)
+            mujoco.mj_collision(self.scene.model, self.data)
+            if self._in_touch():
+                return True
+        return False
+
+    def _in_touch(self) -> bool:
+        contact = self.data.contact
+        if not len(contact.dist):
+            return False
+        distance, geom = np.asarray(contact.dist), contact.geom
+        ours, support = self.scene.hand_geoms[geom], self.scene.support_geoms[geom]
+        of_hand = ours.any(axis=1) & ~ours.all(axis=1)
+        on_support = of_hand & support.any(axis=1)
+        tip = self.scene.tip_geoms[geom].any(axis=1)
+        allowed = np.where(tip, self.scene.pressing[geom].max(axis=1), 0.0)
+        return bool((distance < -allowed)[on_support].any() or (distance[of_hand & ~on_support] < -OVERHANG_M).any())
+
+    def _rise(self, grasps: GraspSet, row: int, path: Floats = SMOOTHLY, step_s: float = RISING_S) -> None:
+        """The root to the top, or, but for the letter, to where the object is lost."""
+        root = np.asarray(grasps.squeeze.hand_pose[row], float)
+        self.scene.command(self.data, root, grasps.squeeze.joint_positions[row])
+        for number, share in enumerate(path):
+            self._goal = share * RISE_M * self._up
+            self.data.mocap_pos[0] = root[:3] + self._goal
+            self._run(step_s)
+            if self._in_hand and number % LOSSES == 0 and self._lost():
+                break
+
+    def _offset(self) -> Floats:
+        """(3,) of the object's frame from where it should be [m]."""
+        at, yielded = super()._offset(), self._yielded()
+        if yielded is not None:
+            root, turn = yielded
+            at = self.data.mocap_pos[0] + quat_rotate(quat_conjugate(turn), at - root)
+        return np.asarray(at - self._goal)
+
+    def _turned(self) -> Floats:
+        """(4,) rotation of the object since the start."""
+        turned, yielded = super()._turned(), self._yielded()
+        return turned if yielded is None else quat_multiply(quat_conjugate(yielded[1]), turned)
+
+    def _yielded(self) -> tuple[Floats, Floats] | None:
+        """Where the root is (3,), and its rotation (4,) from what was commanded; None: it is fixed, or does not matter.
+
+        The weld of the protocol gives way by 10 degrees under a hammer, as no arm does: an object that only follows its
+        hand has not moved in it."""
+        at = self.scene.root_qpos
+        if at < 0 or not self._in_hand:
+            return None
+        root = self.data.qpos[at : at + 7]
+        return root[:3], quat_multiply(root[3:], quat_conjugate(self.data.mocap_quat[0]))
+
+    def _ended(self, trial: LiftTrial, outcome: Outcome) -> LiftTrial:
+        trial.steps, trial.margin = self._steps, self._excess()
+        trial.outcome = _OUTCOMES[outcome]
+        return trial
+
+
+_OUTCOMES: Final[dict[Any, LiftOutcome]] = {
+    Outcome.HELD: LiftOutcome.LIFTED,
+    Outcome.DISPLACED: LiftOutcome.NOT_LIFTED,
+    Outcome.ROTATED: LiftOutcome.TURNED,
+    Outcome.DIVERGED: LiftOutcome.DIVERGED,
+}

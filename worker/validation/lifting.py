@@ -1,0 +1,161 @@
+"""Verdicts of the lift test on many grasps in their scenes, all cores used."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.service.model.digests import digest_bytes, digest_json
+from graspd.service.model.errors import InputError
+from graspd.worker.control import postures
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.run import ALONE, Run
+from graspd.worker.simulation import surroundings
+from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.validation import lift as protocol
+from graspd.worker.validation.compiled import answers, scene_of
+from graspd.worker.validation.decomposition import ConvexPieces, decompose
+from graspd.worker.validation.key import postures_key, verdict_key
+from graspd.worker.validation.lift import Lift, LiftOutcome, LiftTrial
+from graspd.worker.validation.model import TOUCH_ROUNDING_M, MujocoOptions
+
+LiftLevel = Literal["letter", "lift"]
+#: Lifts that were done, by `lift_of`.
+KnownLifts = dict[str, LiftTrial]
+LEVELS: Final[tuple[LiftLevel, ...]] = get_args(LiftLevel)
+#: Raise when the code of the lift test changes what it says, constants aside.
+REVISION: Final = 4
+_MOVES: Final = {surroundings: ("RISE_M",), protocol: ("LOOKS", "OVERHANG_M", "LOSSES"), postures: ("ROOM_M", "WIDE")}
+
+
+@dataclass(frozen=True)
+class LiftVerdicts:
+    """What the lift test says of N grasps."""
+
+    success: NDArray[np.int8]
+    """(N,) 1 lifted and held, 0 not."""
+    outcome: NDArray[np.uint8]
+    """(N,) `LiftOutcome`."""
+    margin: NDArray[np.float64]
+    """(N,) worst displacement or rotation over its limit."""
+    level: LiftLevel
+    hard: bool
+    terms: str
+    """Digest of all that moves a verdict but the grasp and its scene."""
+    seconds: float
+
+    @property
+    def reasons(self) -> list[str]:
+        """Per grasp what became of it, in words."""
+        return [LiftOutcome(int(value)).name.lower().replace("_", " ") for value in self.outcome]
+
+
+def judge_lifts(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    placed: Placed,
+    *,
+    level: LiftLevel = "lift",
+    hard: bool = False,
+    pieces: ConvexPieces | None = None,
+    cache: Path | None = None,
+    known: KnownLifts | None = None,
+    run: Run = ALONE,
+) -> LiftVerdicts:
+    """Lift grasps out of their scenes; see `worker.validation.lift`.
+
+    Args:
+        hand: the hand; its stiffness and effort are the actuators' gains and limits.
+        obj: the object, with its mass and friction; `ObjectModel.published` has those of the protocol.
+        grasps: N grasps with pregrasp, squeeze and, for level lift, approach.
+        placed: their scenes; `index` has a scene for each.
+        level: letter or lift.
+        hard: sliding friction halved, torsional friction a tenth, of supports too.
+        pieces: convex pieces of the object; by default its CoACD pieces.
+        cache: folder of the pieces.
+        known: lifts of this hand, object and level that are not done again; others are added.
+        run: told of grasps done; asked between grasps whether to stop.
+
+    Raises:
+        InputError: unknown level, or no scene or approach to lift from.
+        MeshError: the object has no usable convex pieces.
+        TaskCancelled: when `run.cancelled()` answers True.
+    """
+    require_ways(grasps, placed, level)
+    began = time.perf_counter()
+    pieces = pieces or decompose(obj, cache=cache)
+    physics = MujocoOptions().hardened() if hard else MujocoOptions()
+    scene = scene_of(hand, obj, pieces, physics, placed.supports, placed.neighbours)
+    done, lock = 0, threading.Lock()
+
+    def ask(test: Lift, row: int) -> LiftTrial:
+        nonlocal done
+        run.check("the referee")
+        key = lift_of(grasps, row, placed, hard=hard) if known is not None else ""
+        trial = known.get(key) if known is not None else None
+        if trial is None:
+            trial = test.letter(grasps, row) if level == "letter" else test.lift(grasps, row)
+            if known is not None:
+                known[key] = trial
+        with lock:
+            done += 1
+            run.progress(done, len(grasps), "lifts")
+        return trial
+
+    trials = answers(range(len(grasps)), lambda: Lift(scene, placed), ask, threads=run.cores, name="lift")
+    return LiftVerdicts(
+        success=np.array([t.success for t in trials], np.int8),
+        outcome=np.array([t.outcome for t in trials], np.uint8),
+        margin=np.array([t.margin for t in trials], float),
+        level=level,
+        hard=hard,
+        terms=lift_key(hand, obj, placed, level, hard, pieces=pieces),
+        seconds=time.perf_counter() - began,
+    )
+
+
+def lift_of(grasps: GraspSet, row: int, placed: Placed, *, hard: bool) -> str:
+    """Digest of all that a lift of one grasp depends on besides hand, object, level and fixed surroundings."""
+    number = int(placed.index[row])
+    around = [array[row] for array in (grasps.approach, grasps.coming) if array is not None]
+    around += [placed.object_pose[number], placed.scenes[number].up, *placed.neighbours_of(number)]
+    terms = digest_bytes(b"".join(np.asarray(array, float).tobytes() for array in around) + bytes([hard]))
+    return postures_key(terms, grasps.take(slice(row, row + 1)))
+
+
+def require_ways(grasps: GraspSet, placed: Placed, level: LiftLevel) -> None:
+    """
+    Raises:
+        InputError: unknown level, or no scene or approach to lift from.
+    """
+    if level not in LEVELS:
+        raise InputError(f"unknown level {level!r} of the lift test; choose one of {', '.join(LEVELS)}")
+    if len(placed.index) != len(grasps) or (level == "lift" and grasps.approach is None):
+        raise InputError("the lift test needs a scene and, but for the letter, an approach of each grasp")
+
+
+def lift_key(
+    hand: HandModel, obj: ObjectModel, placed: Placed, level: LiftLevel, hard: bool, *, pieces: ConvexPieces
+) -> str:
+    """Digest of the terms of a lift: those of the six pushes, the supports, and the constants of the lift."""
+    pushes = verdict_key(hand, obj, "letter" if level == "letter" else "certificate", hard, pieces=pieces)
+    supports = b"".join(np.round(s.planes, 9).tobytes() for s in placed.supports)
+    constants = {name: getattr(module, name) for module, names in _MOVES.items() for name in names}
+    physics = asdict(MujocoOptions().hardened() if hard else MujocoOptions())
+    terms = [REVISION, pushes, level, physics, digest_bytes(supports), constants]
+    if any(support.tips_m is not None for support in placed.supports):
+        terms.append([TOUCH_ROUNDING_M, *(support.tips_m for support in placed.supports)])
+    if placed.neighbours:
+        corners = b"".join(np.round(piece, 9).tobytes() for one in placed.neighbours for piece in one.pieces)
+        masses = [one.obj.mass for one in placed.neighbours]
+        terms += [digest_bytes(corners), [*masses, protocol.NEIGHBOUR_MOVED_M, protocol.NEIGHBOUR_TILTED]]
+    return digest_json(terms)

@@ -1,0 +1,439 @@
+"""A hand with its drives and an object in MuJoCo, as DexGraspBench has them. The object's body frame stands in its
+centre of mass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.service.model.matter import ACCELERATION
+from graspd.service.model.matter import FRICTION as SLIDING
+from graspd.service.model.transforms import Floats, slerp
+from graspd.worker.engines.mujoco_warnings import ARENA
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.jaws import jaws_of
+from graspd.worker.hands.model import ConvexPiece, HandModel, JointType
+from graspd.worker.hands.tendons import Tendon, actuators
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.simulation.surroundings import CLEAR_M, Neighbour, Obstacle
+from graspd.worker.validation.decomposition import ConvexPieces
+
+#: Sliding and torsional friction; `hard` scales them by `HARD`.
+FRICTION: Final = (SLIDING, 0.02)
+HARD: Final = (0.5, 0.1)
+#: Joint damping over position gain [s]: 0.1 N m s/rad at the protocol's gain of 5.
+DAMPING_TIME: Final = 0.02
+HAND_SOLIMP: Final = (0.5, 0.99, 1e-4, 0.5, 2.0)
+HAND_SOLREF: Final = (0.005, 1.0)
+#: Couplings are stiffer than contacts, or a pressed finger would stretch them; 2 steps is MuJoCo's floor.
+COUPLING_SOLREF: Final = (0.008, 1.0)
+COUPLING_SOLIMP: Final = (0.98, 0.999, 1e-4, 0.5, 2.0)
+#: What the engine does by default today and did not in 3.3.2, the version that DexGraspBench pins: several contacts for
+#: a pair of convex pieces, and a solver for each island of contacts.
+NOT_IN_3_3_2: Final = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+#: Degrees of freedom from which on sparse Jacobians cost less, though the engine's own rule has 60: lifts .77 of the
+#: time with 28 (Allegro), .73 with 34 (Shadow); 1.09 with 20 (Barrett). Verdicts are the same but for rounding.
+SPARSE: Final = 24
+#: Inertia of a body without geometry: that of a ball of this radius [m].
+_BARE_RADIUS: Final = 0.01
+_MIN_MASS: Final = 1e-3
+#: Fingertips that are told to touch a support are in it by as much at most, for the way is looked at in steps [m].
+TOUCH_ROUNDING_M: Final = 1e-4
+
+
+@dataclass(frozen=True)
+class MujocoOptions:
+    """What may differ between the levels of a certificate."""
+
+    timestep: float = 0.004
+    noslip_iterations: int = 2
+    root: str = "weld"
+    """weld: free root held to a mocap body (the protocol); fixed: the root itself is the mocap body."""
+    friction: tuple[float, float] = FRICTION
+    """Sliding and torsional coefficient of every contact with an object whose own is `FRICTION`; of others in
+    proportion."""
+
+    def hardened(self) -> MujocoOptions:
+        """The same at the friction of the hard protocol."""
+        slide, twist = self.friction
+        return replace(self, friction=(slide * HARD[0], twist * HARD[1]))
+
+
+#: Coarse physics that decide the clear cases of a screen. At 6 ms a contact is as stiff as at 4 ms (two steps are less
+#: than the 12.5 ms that hand and object agree on), at 8 ms it is not.
+COARSE: Final = MujocoOptions(timestep=0.006, root="fixed")
+
+
+@dataclass(frozen=True)
+class FreeBody:
+    """Where a neighbour is in a compiled model; its body's frame stands in its centre of mass."""
+
+    body: int
+    qpos: int
+    centre: Floats
+    """(3,) of mass in its object frame."""
+    mass: float
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A compiled model with the places of its parts. The model is read-only: threads share it, each with its data."""
+
+    model: Any
+    hand: HandModel
+    physics: MujocoOptions
+    hand_geoms: NDArray[np.bool_]
+    """(G,) geoms of the hand."""
+    object_body: int
+    object_qpos: int
+    root_qpos: int
+    """-1 where the root is fixed."""
+    joint_qpos: NDArray[np.intp]
+    """(J,) in `HandModel.joint_names` order."""
+    dof_gain: Floats
+    """(D,) value of each dof's leading joint = gain q + shift."""
+    dof_shift: Floats
+    pulls: Floats | None
+    """(A, D) controls of the actuators from these values; None: they are the values."""
+    centre: Floats
+    """(3,) the object's centre of mass in the object frame."""
+    mass: float
+    """The object's [kg]."""
+    support_geoms: NDArray[np.bool_]
+    """(G,) geoms of the scene's supports and neighbours; the scene frame is the mocap body 1."""
+    neighbours: tuple[FreeBody, ...]
+    """The other objects of the scene."""
+    tip_geoms: NDArray[np.bool_]
+    """(G,) geoms of fingertips."""
+    pressing: Floats
+    """(G,) how deep fingertips that come may press into a geom [m]: above 0 of supports that say so."""
+
+    @property
+    def push(self) -> float:
+        """A push, and the weight [N]."""
+        return ACCELERATION * self.mass
+
+    def place(self, data: Any, hand_pose: Floats, joints: Floats) -> None:
+        """Reset `data` with the hand in a posture (7,), (J,) and the object at its initial pose."""
+        mujoco.mj_resetData(self.model, data)
+        data.qpos[self.object_qpos : self.object_qpos + 7] = [*self.centre, 1, 0, 0, 0]
+        data.qpos[self.joint_qpos] = joints
+        if self.root_qpos >= 0:
+            data.qpos[self.root_qpos : self.root_qpos + 7] = hand_pose
+        self.command(data, hand_pose, joints)
+
+    def command(self, data: Any, hand_pose: Floats, joints: Floats) -> None:
+        """Target posture of actuators and root."""
+        data.mocap_pos[0] = hand_pose[:3]
+        data.mocap_quat[0] = hand_pose[3:]
+        data.ctrl[:] = self.controls(joints)
+
+    def controls(self, joints: Floats) -> Floats:
+        """(..., A) targets of the actuators for joint positions (..., J)."""
+        values: Floats = self.hand.reduce(joints) * self.dof_gain + self.dof_shift
+        return values if self.pulls is None else values @ self.pulls.T
+
+
+def build(
+    hand: HandModel,
+    obj: ObjectModel,
+    pieces: ConvexPieces,
+    physics: MujocoOptions,
+    supports: Sequence[Obstacle] = (),
+    neighbours: Sequence[Neighbour] = (),
+) -> Scene:
+    """Compile the scene of a hand and an object, with the supports that it stands on or between and what stands beside
+    it, if any."""
+    model = scene_spec(hand, obj, pieces, physics, supports, neighbours).compile()
+    if model.nv >= SPARSE:
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
+    gain, shift = leading_joints(hand)
+    body_of_geom = model.geom_bodyid
+    object_body = model.body("object").id
+    beside = tuple(_free_body(model, f"neighbour{k}", one.obj) for k, one in enumerate(neighbours))
+    stand = [one.body for one in beside] + ([model.body("supports").id] if supports else [])
+    support = np.isin(body_of_geom, stand)
+    return Scene(
+        model=model,
+        hand=hand,
+        physics=physics,
+        hand_geoms=np.asarray((body_of_geom != object_body) & ~support),
+        object_body=object_body,
+        object_qpos=int(model.joint("object").qposadr[0]),
+        root_qpos=int(model.joint("root").qposadr[0]) if physics.root == "weld" else -1,
+        joint_qpos=np.array([int(model.joint(f"joint{b}").qposadr[0]) for b in hand.joint_body], np.intp),
+        dof_gain=gain,
+        dof_shift=shift,
+        pulls=actuators(hand.tendons, hand.dofs) if hand.tendons else None,
+        centre=obj.centre_of_mass,
+        mass=obj.mass,
+        support_geoms=np.asarray(support),
+        neighbours=beside,
+        tip_geoms=np.isin(body_of_geom, [model.body(f"body{b}").id for b in hand.fingertips]),
+        pressing=_pressing(model, supports),
+    )
+
+
+def _pressing(model: Any, supports: Sequence[Obstacle]) -> Floats:
+    out = np.zeros(model.ngeom)
+    for i, support in enumerate(supports):
+        if support.tips_m is not None and support.tips_m < CLEAR_M:
+            out[model.geom(f"support{i}").id] = max(0.0, -support.tips_m) + TOUCH_ROUNDING_M
+    return out
+
+
+def _free_body(model: Any, name: str, obj: ObjectModel) -> FreeBody:
+    body = model.body(name).id
+    return FreeBody(body, int(model.joint(name).qposadr[0]), obj.centre_of_mass, float(model.body_mass[body]))
+
+
+def scene_spec(
+    hand: HandModel,
+    obj: ObjectModel,
+    pieces: ConvexPieces,
+    physics: MujocoOptions,
+    supports: Sequence[Obstacle] = (),
+    neighbours: Sequence[Neighbour] = (),
+) -> Any:
+    """What `build` compiles: bodies `body0` ..., joints `joint1` ..., actuators `dof0` ..., object, supports,
+    `neighbour0` ..."""
+    spec = mujoco.MjSpec()
+    # MJCF angles are degrees by default: radians there freeze every finger silently.
+    spec.compiler.degree = False
+    option = spec.option
+    option.timestep = physics.timestep
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = 10.0
+    option.noslip_iterations = physics.noslip_iterations
+    spec.memory = ARENA
+    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) | (NOT_IN_3_3_2 & ~several_contacts(hand))
+    slide, twist = (coefficient * obj.friction / SLIDING for coefficient in physics.friction)
+    friction = [slide, twist, 1e-4]
+    _add_hand(spec, hand, friction, physics.root)
+    add_object(spec, obj, pieces.vertices, friction, obj.mass)
+    if supports:
+        _add_supports(spec, supports, friction)
+    for k, one in enumerate(neighbours):
+        add_object(spec, one.obj, one.pieces, friction, one.obj.mass, name=f"neighbour{k}")
+    return spec
+
+
+def several_contacts(hand: HandModel) -> int:
+    """What a gripper needs of `NOT_IN_3_3_2`: a flat pad on a flat side touches in an area. At a single point of it,
+    wherever the engine puts that, an object turns as no real one does. The protocol was made for rounded fingers."""
+    return int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) if jaws_of(hand) is not None else 0
+
+
+def _add_hand(spec: Any, hand: HandModel, friction: list[float], root: str) -> None:
+    if root == "weld":
+        spec.worldbody.add_body(name="mocap", mocap=True)
+        base = spec.worldbody.add_body(name="body0")
+        base.add_freejoint(name="root")
+        spec.add_equality(
+            type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1="mocap", name2="body0",
+            solimp=[0.9, 0.95, 0.001, 0.5, 2.0], data=equality_data(0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1),
+        )  # fmt: skip
+    else:
+        base = spec.worldbody.add_body(name="body0", mocap=True)
+    bodies = [base]
+    for b in range(1, hand.bodies):
+        body = bodies[hand.parent[b]].add_body(name=f"body{b}", pos=hand.origin[b, :3], quat=hand.origin[b, 3:])
+        _add_joint(body, hand, b)
+        bodies.append(body)
+    for b, body in enumerate(bodies):
+        _add_mass_and_geoms(spec, body, hand, b, friction)
+    _add_actuators(spec, hand)
+    for a, b in sorted(_excluded(hand)):
+        spec.add_exclude(bodyname1=f"body{a}", bodyname2=f"body{b}")
+
+
+def _add_joint(body: Any, hand: HandModel, b: int) -> None:
+    revolute = hand.joint_type[b] == JointType.REVOLUTE
+    d, m, shift = int(hand.dof[b]), float(hand.multiplier[b]), float(hand.offset[b])
+    ends = sorted((m * float(hand.lower[d]) + shift, m * float(hand.upper[d]) + shift))
+    body.add_joint(
+        name=f"joint{b}",
+        type=mujoco.mjtJoint.mjJNT_HINGE if revolute else mujoco.mjtJoint.mjJNT_SLIDE,
+        axis=hand.axis[b],
+        range=ends,
+        limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        damping=[DAMPING_TIME * float(hand.stiffness[d]), 0, 0],
+        **_mechanism(hand, b, d),
+    )
+
+
+def _mechanism(hand: HandModel, b: int, d: int) -> dict[str, Any]:
+    """What the protocol's joints do not have. A tendon drives a joint against its limit for good, so that has to stop
+    it: as stiff as a coupling."""
+    found: dict[str, Any] = {}
+    if hand.drag is not None:
+        found |= {"armature": float(hand.drag.armature[b]), "frictionloss": float(hand.drag.dry_friction[b])}
+    if any(d in tendon.dofs for tendon in hand.tendons):
+        found |= {"solref_limit": COUPLING_SOLREF, "solimp_limit": COUPLING_SOLIMP}
+    return found
+
+
+def _add_mass_and_geoms(spec: Any, body: Any, hand: HandModel, b: int, friction: list[float]) -> None:
+    mass = max(float(hand.masses[b]), _MIN_MASS)
+    mine = [(i, p) for i, p in enumerate(hand.pieces) if p.body == b]
+    if not mine:
+        body.mass = mass
+        body.inertia = np.full(3, 0.4 * mass * _BARE_RADIUS**2)
+        body.ipos, body.explicitinertial = [0, 0, 0], True
+        return
+    share = np.array([float(np.prod(np.ptp(p.vertices, axis=0))) for _, p in mine])
+    for (i, p), part in zip(mine, share / share.sum(), strict=True):
+        geom = body.add_geom(
+            condim=4,
+            friction=friction,
+            solimp=HAND_SOLIMP,
+            solref=HAND_SOLREF,
+            mass=mass * float(part),
+            name=f"hand{i}",
+        )
+        add_shape(spec, geom, p, f"hand{i}")
+
+
+def add_shape(spec: Any, geom: Any, piece: ConvexPiece, name: str) -> None:
+    """Give a geom the shape of a convex piece, in its body's frame."""
+    kinds = {
+        "box": mujoco.mjtGeom.mjGEOM_BOX,
+        "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+        "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+        "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    }
+    if piece.kind == "hull":
+        _mesh(spec, geom, piece.vertices, name)
+        return
+    geom.type = kinds[piece.kind]
+    geom.pos, geom.quat = piece.pose[:3], piece.pose[3:]
+    if piece.kind == "box":
+        geom.size = np.array(piece.size) / 2
+    elif piece.kind == "sphere":
+        geom.size = [piece.size[0], 0, 0]
+    else:
+        geom.size = [piece.size[0], piece.size[1] / 2, 0]
+
+
+def _mesh(spec: Any, geom: Any, vertices: Floats, name: str) -> None:
+    mesh = spec.add_mesh(name=name)
+    mesh.uservert = np.ascontiguousarray(vertices, np.float32).ravel()
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+    geom.type = mujoco.mjtGeom.mjGEOM_MESH
+    geom.meshname = name
+
+
+def _add_actuators(spec: Any, hand: HandModel) -> None:
+    leading = leading_bodies(hand)
+    pulled = {d: tendon for tendon in hand.tendons for d in tendon.dofs}
+    for d, lead in enumerate(leading):
+        if (tendon := pulled.get(d)) is not None:
+            if d == min(tendon.dofs):
+                add_tendon(spec, hand, tendon, f"dof{d}", leading)
+            continue
+        # The actuator sits on the joint: a dof's gain and limit are the joint's through its multiplier.
+        m = float(hand.multiplier[lead])
+        actuator = spec.add_actuator(name=f"dof{d}", target=f"joint{lead}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_position(kp=float(hand.stiffness[d]) / m**2)
+        limit = float(hand.effort[d]) / abs(m)
+        actuator.forcerange = [-limit, limit]
+        actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        for b in np.flatnonzero(hand.dof == d):
+            if b == lead:
+                continue
+            ratio = float(hand.multiplier[b]) / m
+            start = float(hand.offset[b]) - ratio * float(hand.offset[lead])
+            spec.add_equality(
+                type=mujoco.mjtEq.mjEQ_JOINT,
+                objtype=mujoco.mjtObj.mjOBJ_JOINT,
+                name1=f"joint{b}",
+                name2=f"joint{lead}",
+                data=equality_data(start, ratio),
+                solref=COUPLING_SOLREF,
+                solimp=COUPLING_SOLIMP,
+            )
+
+
+def _excluded(hand: HandModel) -> set[tuple[int, int]]:
+    """Pairs of bodies whose contact does not count: neighbours, parents and grandparents."""
+    pairs = set(hand.neighbours)
+    for b in range(1, hand.bodies):
+        parent = int(hand.parent[b])
+        pairs.add((parent, b))
+        if parent > 0:
+            pairs.add((int(hand.parent[parent]), b))
+    return {(min(a, b), max(a, b)) for a, b in pairs}
+
+
+def add_object(
+    spec: Any, obj: ObjectModel, pieces: Sequence[Floats], friction: list[float], mass: float, name: str = "object"
+) -> None:
+    """A free body of a given mass [kg], its frame in the object's centre of mass; corners (V, 3) of each piece."""
+    body = spec.worldbody.add_body(name=name, pos=obj.centre_of_mass)
+    body.add_freejoint(name=name)
+    # Where nothing is said, MuJoCo takes the place of the body in its parent for the place of the mass in the body.
+    body.mass, body.ipos = mass, [0, 0, 0]
+    inertia = mass * obj.inertia
+    body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+    body.explicitinertial = True
+    for i, corners in enumerate(pieces):
+        geom = body.add_geom(condim=4, friction=friction, name=f"{name}-{i}")
+        _mesh(spec, geom, corners - obj.centre_of_mass, f"{name}-{i}")
+
+
+def _add_supports(spec: Any, supports: Sequence[Obstacle], friction: list[float]) -> None:
+    """Planes and convex solids on a mocap body, which is put where the scene is as seen from the object."""
+    body = spec.worldbody.add_body(name="supports", mocap=True)
+    for i, support in enumerate(supports):
+        geom = body.add_geom(condim=4, friction=friction, name=f"support{i}")
+        if len(support.corners):
+            _mesh(spec, geom, support.corners, f"support{i}")
+            continue
+        normal, offset = support.planes[0, :3], support.planes[0, 3]
+        geom.type = mujoco.mjtGeom.mjGEOM_PLANE
+        geom.size = [0, 0, 0.1]
+        geom.pos = offset * normal
+        mujoco.mju_quatZ2Vec(geom.quat, normal)
+
+
+def blend(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Floats]:
+    """Posture `share` of the way from a to b: positions and joints linearly, the root's turn at an even rate."""
+    start, end = a.hand_pose[row], b.hand_pose[row]
+    pose = np.concatenate([(1 - share) * start[:3] + share * end[:3], slerp(start[3:], end[3:], share)])
+    return pose, (1 - share) * a.joint_positions[row] + share * b.joint_positions[row]
+
+
+def leading_joints(hand: HandModel) -> tuple[Floats, Floats]:
+    """Multiplier and offset of the first body that each dof drives."""
+    first = leading_bodies(hand)
+    return hand.multiplier[first], hand.offset[first]
+
+
+def leading_bodies(hand: HandModel) -> NDArray[np.intp]:
+    """(D,) the body whose joint carries each dof's actuator: of the first joint it drives, as `HandModel.reduce`."""
+    drives = hand.dof[hand.joint_body]
+    return np.array([hand.joint_body[int(np.flatnonzero(drives == d)[0])] for d in range(hand.dofs)], np.intp)
+
+
+def add_tendon(spec: Any, hand: HandModel, tendon: Tendon, name: str, leading: NDArray[np.intp]) -> None:
+    """One actuator on the sum of joints; nothing else holds them to each other."""
+    cord = spec.add_tendon(name=name)
+    for d, pull in zip(tendon.dofs, tendon.coefficients, strict=True):
+        cord.wrap_joint(f"joint{leading[d]}", pull)
+    actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_TENDON)
+    actuator.set_to_position(kp=tendon.gain(hand.stiffness))
+    limit = tendon.limit(hand.effort)
+    actuator.forcerange = [-limit, limit]
+    actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+
+
+def equality_data(*values: float) -> Floats:
+    data = np.zeros(mujoco.mjNEQDATA)
+    data[: len(values)] = values
+    return data

@@ -1,0 +1,412 @@
+"""Payload of grasps: the heaviest mass that each lifts, holds under the six pushes, or keeps when shaken; the hand's
+limit and its actuators' capacity.
+
+The hand closes once around the object with its own mass. Then the object hangs, or is pushed, with other masses until
+its motion tells how that ends: first what the forces of the closed hand and friction bear, then nearer and nearer, each
+from where the heaviest one so far hangs.
+
+The shake: what was lifted is moved to and fro, first along x of the scene, then along y.
+
+The hand stands still and the object feels the inertial force of the motion. Accelerations begin at zero: the velocity
+that this leaves the hand with is the same as none (Galilei).
+
+Load capacity of grasps: the heaviest object that contact forces could bear within actuator limits and friction.
+
+A linear program for each grasp: contact forces inside friction pyramids balance the weight and all torques about the
+centre of mass, and no drive exceeds its effort. A bound from above: it chooses the forces as no controller can, and its
+pyramids enclose the cones. What presses against the palm, across joints, or towards a joint's stop costs no effort.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.service.model.matter import ACCELERATION, MASS_KG, MOST_KG
+from graspd.service.model.planning import limit_told
+from graspd.service.model.transforms import Floats, cross, quat_rotate
+from graspd.worker.engines.mujoco_warnings import void
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.kinematics import generalized_forces
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.quality.contact import choose_contacts
+from graspd.worker.quality.posed import posing_of
+from graspd.worker.quality.wrench_space import EDGES, cone_edges
+from graspd.worker.run import ALONE, Run
+from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.validation.compiled import measured, scene_of
+from graspd.worker.validation.decomposition import ConvexPieces
+from graspd.worker.validation.model import Scene
+from graspd.worker.validation.prescreening import HANGING_CLOSING, LIFTING, Hanging
+from graspd.worker.validation.protocol import DIRECTIONS, LOST, Outcome, Test
+
+#: The payload is told downwards, to this ratio.
+TOLD: Final = 1.03
+#: Share of the friction bound that is tried first, its median over the grasps of `benchmarks.payload`; and the first
+#: step from there.
+FIRST: Final = 0.75
+STEP: Final = math.sqrt(2)
+#: Stages that a load is watched at most.
+WATCHED: Final = 10
+
+
+class _Weighed(Test):
+    """A test in which the object's mass changes. Not for several threads at once: the model is its own."""
+
+    def __init__(self, scene: Scene, *rest: Any) -> None:
+        super().__init__(replace(scene, model=copy.copy(scene.model)), *rest)
+        self._own = scene.mass
+        self._inertia = np.array(scene.model.body_inertia[scene.object_body])
+
+    def _weigh(self, mass: float) -> None:
+        model, body = self.scene.model, self.scene.object_body
+        self.scene = replace(self.scene, mass=mass)
+        model.body_mass[body] = mass
+        model.body_inertia[body] = self._inertia * (mass / self._own)
+        # Inverse inertias that follow from the mass set how stiff contacts are. What this leaves in the data is put
+        # right by what comes next: a state is restored, or a grasp begun.
+        mujoco.mj_setConst(model, self.data)
+
+    def _bound(self, against: Floats) -> float:
+        """Mass [kg] whose weight along -`against` (3,) the contacts of the closed hand bear by their present normal
+        forces and friction. An estimate: a load changes these forces."""
+        contact, model = self.data.contact, self.scene.model
+        at_object = model.geom_bodyid[contact.geom] == self.scene.object_body
+        rows = np.flatnonzero(
+            self.scene.hand_geoms[contact.geom].any(axis=1) & at_object.any(axis=1) & (contact.efc_address >= 0)
+        )
+        # A normal points from the first geom to the second.
+        along = contact.frame[rows, :3] @ against * np.where(at_object[rows, 1], 1, -1)
+        slide = contact.friction[rows, 0] * np.sqrt(np.maximum(0.0, 1 - along**2))
+        return float(self.data.efc_force[contact.efc_address[rows]] @ (along + slide)) / ACCELERATION
+
+    def _heaviest(self, bears: Callable[[float], bool], first: float) -> float:
+        """The heaviest mass [kg] that `bears` is true of, tried from `first` on, none below the object's own; nan: not
+        even that."""
+        low, high, step, borne = self._own, math.inf, STEP, False
+        mass = min(max(first, low), MOST_KG)
+        while True:
+            if bears(mass):
+                low, borne = mass, True
+            elif mass <= self._own:
+                return math.nan
+            else:
+                high = mass
+            if borne and (low >= MOST_KG or high <= TOLD * low):
+                return low
+            if borne and high < math.inf:
+                mass = math.sqrt(low * high)
+            else:
+                mass = min(low * step, MOST_KG) if borne else max(high / step, low)
+                step **= 2
+
+
+class LiftPayload(_Weighed, Hanging):
+    """Of grasps in one scene."""
+
+    def payload(self, grasps: GraspSet, row: int) -> float:
+        """[kg]; nan: the grasp does not lift the object."""
+        self._weigh(self._own)
+        if not self._closed(grasps, row):
+            return math.nan
+        self._save()
+        borne = 0.0
+
+        def bears(mass: float) -> bool:
+            nonlocal borne
+            self._weigh(mass)
+            self._restore()
+            self._hang(borne, mass)
+            if self._ahead(WATCHED) >= 1.0:
+                return False
+            self._save()
+            borne = mass
+            return True
+
+        return self._heaviest(bears, FIRST * self._bound(self._up))
+
+
+class PushPayload(_Weighed):
+    """Of grasps of a free object."""
+
+    __test__ = False
+
+    def payload(self, grasps: GraspSet, row: int) -> float:
+        """[kg]; nan: the grasp does not hold the object under the pushes."""
+        self._weigh(self._own)
+        if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
+            return math.nan
+        if not self._close(grasps, row, give_up=True, stages=HANGING_CLOSING) or void(self.data):
+            return math.nan
+        self._save()
+        bounds = [self._bound(-np.array(direction, float)) for direction in DIRECTIONS]
+        weakest_first = np.argsort(bounds).tolist()
+
+        def bears(mass: float) -> bool:
+            self._weigh(mass)
+            for direction in weakest_first:
+                self._restore()
+                self._push(direction)
+                if self._ahead(WATCHED) >= 1.0:
+                    # Of the next masses, too, it is asked first.
+                    weakest_first.remove(direction)
+                    weakest_first.insert(0, direction)
+                    return False
+            return True
+
+        return self._heaviest(bears, FIRST * min(bounds))
+
+
+def payloads(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    *,
+    pieces: ConvexPieces,
+    placed: Placed | None = None,
+    held: NDArray[np.bool_] | None = None,
+    run: Run = ALONE,
+) -> Floats:
+    """(N,) heaviest mass that each grasp lifts [kg]; nan: not tried, or it does not lift the object itself.
+
+    Args:
+        hand: the hand.
+        obj: the object; masses below its own are not tried.
+        grasps: N grasps.
+        pieces: the object's convex pieces.
+        placed: the scenes that they lift it out of; None: a free object is pushed six ways.
+        held: (N,) which grasps are tried; None: all.
+        run: asked between grasps whether to stop.
+
+    Raises:
+        TaskCancelled: when `run.cancelled()` answers True.
+    """
+
+    def make() -> LiftPayload | PushPayload:
+        around = (placed.supports, placed.neighbours) if placed is not None else ()
+        scene = scene_of(hand, obj, pieces, LIFTING, *around)
+        return PushPayload(scene) if placed is None else LiftPayload(scene, placed)
+
+    return measured(len(grasps), held, make, lambda test, row: test.payload(grasps, row), run=run, name="payload")
+
+
+#: Grasps that must lift what weighs little, before what they lift is told as the hand's limit: else their shape may be
+#: why. It weighs as much as an object of which nothing is said, or this share of what is wanted.
+LEAST: Final = 2
+LIGHT: Final = 1 / 8
+#: So many grasps show that no further ones need be tried.
+ENOUGH: Final = 8
+#: What is wanted over what the best of them lifts, from which on no further ones are tried.
+HOPELESS: Final = 2.0
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What some grasps of a hand lift."""
+
+    hand: str
+    friction: float
+    grasps: int
+    lifts_kg: float
+    """Payload of the best, by simulated lifts."""
+    bound_kg: float
+    """Largest load capacity of one (`worker.validation.payload`)."""
+    wanted_kg: float | None = None
+    """What they should lift; None: nobody asked."""
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether what is wanted is so much more that further grasps need not be tried."""
+        return self.grasps >= ENOUGH and self.wanted_kg is not None and self.wanted_kg > HOPELESS * self.lifts_kg
+
+    @property
+    def line(self) -> str:
+        """A sentence for people."""
+        return limit_told(self.hand, self.friction, self.grasps, self.lifts_kg, self.bound_kg, self.wanted_kg)
+
+    def facts(self) -> dict[str, Any]:
+        """For JSON; no bound: None."""
+        bound = round(self.bound_kg, 3) if math.isfinite(self.bound_kg) else None
+        return {"lifts_kg": round(self.lifts_kg, 3), "bound_kg": bound, "grasps": self.grasps, "says": self.line}
+
+
+def limit_of(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    *,
+    pieces: ConvexPieces,
+    placed: Placed | None = None,
+    wanted: float | None = None,
+    least: int = LEAST,
+    run: Run = ALONE,
+) -> Limit | None:
+    """What the best of N grasps lifts; None: it lifts as much as is wanted, or fewer than `least` lift anything.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        grasps: N grasps.
+        pieces: the object's convex pieces.
+        placed: their scenes; None: the object is free.
+        wanted: mass that should be lifted [kg]; None: nobody asked.
+        least: grasps that must lift what weighs little.
+        run: asked between grasps whether to stop.
+
+    Raises:
+        TaskCancelled: when `run.cancelled()` answers True.
+    """
+    if len(grasps) < least:
+        return None
+    light = obj.weighing(mass=MASS_KG if wanted is None else min(MASS_KG, LIGHT * wanted))
+    found = payloads(hand, light, grasps, pieces=pieces, placed=placed, run=run)
+    if np.isfinite(found).sum() < least:
+        return None
+    lifts = float(np.nanmax(found))
+    if wanted is not None and lifts >= wanted:
+        return None
+    against = np.broadcast_to(-np.array(DIRECTIONS, float), (len(grasps), len(DIRECTIONS), 3))
+    if placed is not None:
+        against = np.array([[placed.scenes[number].up] for number in placed.index])
+    bound = float(capacities(hand, obj, grasps.grasp, against).max())
+    return Limit(hand.name, obj.friction, len(grasps), lifts, max(bound, lifts), wanted)
+
+
+#: Amplitude [m], frequency [Hz] and periods along each axis: at most 7.1 m/s2.
+AMPLITUDE_M: Final = 0.02
+FREQUENCY_HZ: Final = 3.0
+PERIODS: Final = 3
+#: The force changes in steps of this length [s].
+STEP_S: Final = 0.008
+
+
+class Shake(Hanging):
+    """Shakes grasps in one scene. Not for several threads at once."""
+
+    def margin(self, grasps: GraspSet, row: int) -> float:
+        """Worst displacement or rotation of the object in the hand over its limit, until it is lost: 1 or more."""
+        if not self._closed(grasps, row):
+            return LOST
+        self._hang(0.0, self.scene.mass)
+        turn = 2 * math.pi * FREQUENCY_HZ
+        worst = 0.0
+        for axis in np.eye(3)[:2]:
+            along = quat_rotate(self._scene_pose[3:], axis)
+            for step in range(round(PERIODS / FREQUENCY_HZ / STEP_S)):
+                jerked = AMPLITUDE_M * turn**2 * math.sin(turn * step * STEP_S) * along
+                force = -self.scene.mass * (ACCELERATION * self._up + jerked)
+                self.data.xfrc_applied[self.scene.object_body, :3] = force
+                self._run(STEP_S)
+                worst = max(worst, LOST if void(self.data) else self._excess())
+                if worst >= 1.0:
+                    return worst
+        return worst
+
+
+def shake_margins(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    placed: Placed,
+    *,
+    pieces: ConvexPieces,
+    held: NDArray[np.bool_] | None = None,
+    run: Run = ALONE,
+) -> Floats:
+    """(N,) worst displacement or rotation over its limit of each grasp that is shaken: below 1 it survives; nan: not
+    tried.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        grasps: N grasps.
+        placed: their scenes.
+        pieces: the object's convex pieces.
+        held: (N,) which grasps are tried; None: all.
+        run: asked between grasps whether to stop.
+
+    Raises:
+        TaskCancelled: when `run.cancelled()` answers True.
+    """
+
+    def make() -> Shake:
+        return Shake(scene_of(hand, obj, pieces, LIFTING, placed.supports, placed.neighbours), placed)
+
+    return measured(len(grasps), held, make, lambda test, row: test.margin(grasps, row), run=run, name="shake")
+
+
+_POINTS: Final = 600
+#: Hand points that are nearer may come to press while the hand closes [m]; as many at most, those that spread most.
+WITHIN_M: Final = 0.01
+MOST: Final = 32
+#: A joint that is nearer to its limit, as a share of its range, rests on its stop.
+AT_STOP: Final = 0.02
+#: Result of `linprog`.
+_UNBOUNDED: Final = 3
+
+
+def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Floats) -> Floats:
+    """(N,) heaviest mass [kg] that N grasps could bear; 0: nothing touches; inf: no drive and no friction limits it.
+
+    Args:
+        hand: the hand.
+        obj: the object, with its friction.
+        grasp: N postures at contact.
+        against: (N, K, 3) unit vectors against the weight; the least of K counts.
+    """
+    probe = posing_of(hand, obj, points=_POINTS).probe
+    found = probe.touch(grasp)
+    facing = (found.distance < WITHIN_M) & probe.facing(found)
+    q = hand.reduce(grasp.joint_positions)
+    out = np.zeros(len(grasp))
+    for row in range(len(grasp)):
+        chosen = choose_contacts(facing[row], found.closest[row], found.normal[row], scale=obj.radius, limit=MOST)
+        if not len(chosen):
+            continue
+        points = found.closest[row, chosen]
+        forces = cone_edges(-found.normal[row, chosen], obj.friction / math.cos(math.pi / EDGES))
+        torques = generalized_forces(hand, found.bodies[row], probe.points.body[chosen], points, -forces)
+        moments = cross((points - obj.centre_of_mass)[:, None] / obj.radius, forces)
+        efforts = _limits(hand, q[row])
+        loads = [
+            _load(forces.reshape(-1, 3), moments.reshape(-1, 3), torques.reshape(-1, hand.dofs), efforts, along)
+            for along in against[row]
+        ]
+        out[row] = min(loads) / ACCELERATION
+    return out
+
+
+def _limits(hand: HandModel, q: Floats) -> Floats:
+    """(2 D,) what contacts may exert on each dof upwards, then downwards [N m or N]: beyond a stop anything."""
+    near = AT_STOP * hand.span
+    up = np.where(q > hand.upper - near, np.inf, hand.effort)
+    return np.concatenate([up, np.where(q < hand.lower + near, np.inf, hand.effort)])
+
+
+def _load(forces: Floats, moments: Floats, torques: Floats, efforts: Floats, along: Floats) -> float:
+    """Largest weight [N] that edges of pyramids, of forces (E, 3), moments (E, 3) and torques (E, D), balance."""
+    from scipy.optimize import linprog
+
+    count = len(forces)
+    balance = np.column_stack([np.hstack([forces, moments]).T, -np.concatenate([along, np.zeros(3)])])
+    exerted = np.column_stack([np.vstack([torques.T, -torques.T]), np.zeros(len(efforts))])
+    limited = np.isfinite(efforts)
+    solved = linprog(
+        np.append(np.zeros(count), -1.0),
+        A_ub=exerted[limited],
+        b_ub=efforts[limited],
+        A_eq=balance,
+        b_eq=np.zeros(6),
+        bounds=(0, None),
+    )
+    if solved.status == _UNBOUNDED:
+        return math.inf
+    return -float(solved.fun) if solved.fun is not None else 0.0

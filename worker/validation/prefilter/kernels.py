@@ -1,0 +1,327 @@
+"""The certificate's schedule for many worlds at once: close, push six ways, watch, and take the next grasp.
+
+A tick is what the engine simulates between two looks (`protocol.INTERVAL_S`). After each tick every world looks at its
+own object and goes its own way: worlds do not wait for each other, and one that has decided takes the next grasp of
+the queue. Quaternions are w x y z, kept in the order of `wp.quat`'s components as MuJoCo Warp has it.
+"""
+
+import warp as wp
+
+from graspd.worker.validation import protocol
+from graspd.worker.validation.prefilter.phases import BAND, MOST_TICKS, PATIENCE
+from graspd.worker.validation.protocol import Outcome
+
+wp.set_module_options({"enable_backward": False})
+
+#: Ticks of one stage of closing, of closing in all, until the first look at a push, and of a whole push.
+STAGE = wp.constant(round(protocol.STAGE_S / protocol.INTERVAL_S))
+STAGES = wp.constant(protocol.STAGES)
+FIRST_LOOK = wp.constant(round(protocol.FIRST_LOOK_S / protocol.INTERVAL_S))
+HOLD = wp.constant(round(protocol.HOLD_S / protocol.INTERVAL_S))
+PUSHES = wp.constant(len(protocol.DIRECTIONS))
+MOVED = wp.constant(protocol.MAX_DISPLACEMENT_M)
+TURNED = wp.constant(protocol.MAX_ROTATION)
+SURE = wp.constant(protocol.SURE)
+LOST_TURN = wp.constant(protocol.LOST_ROTATION)
+HELD = wp.constant(int(Outcome.HELD))
+LOST = wp.constant(int(Outcome.LOST_WHILE_CLOSING))
+DISPLACED = wp.constant(int(Outcome.DISPLACED))
+ROTATED = wp.constant(int(Outcome.ROTATED))
+DIVERGED = wp.constant(int(Outcome.DIVERGED))
+#: A broken limit is clear at so many times itself, or given up after so many ticks; a grasp after so many.
+CLEAR = wp.constant(BAND[1])
+PATIENT = wp.constant(PATIENCE)
+MOST = wp.constant(MOST_TICKS)
+#: Where the object of a world without a grasp waits, out of reach of the hand [m].
+PARKED = wp.constant(10.0)
+
+
+@wp.struct
+class Grasps:
+    """What N grasps ask of their worlds."""
+
+    queue: wp.array(dtype=wp.int32)
+    """The grasps to judge, in turn."""
+    start: wp.array2d(dtype=wp.float32)
+    """(N, nq) state in the pregrasp."""
+    position: wp.array2d(dtype=wp.vec3)
+    """(N, 3) of the root in pregrasp, grasp and squeeze [m]."""
+    turn: wp.array2d(dtype=wp.vec4)
+    """(N, 3) its quaternions."""
+    control: wp.array3d(dtype=wp.float32)
+    """(N, 3, nu) commands of the actuators."""
+
+
+@wp.struct
+class Engine:
+    """The arrays of W simulations that are set and read."""
+
+    qpos: wp.array2d(dtype=wp.float32)
+    qvel: wp.array2d(dtype=wp.float32)
+    warmstart: wp.array2d(dtype=wp.float32)
+    ctrl: wp.array2d(dtype=wp.float32)
+    mocap_pos: wp.array2d(dtype=wp.vec3)
+    mocap_quat: wp.array2d(dtype=wp.quat)
+    force: wp.array2d(dtype=wp.spatial_vector)
+    overflow: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class Worlds:
+    """How far each of W worlds is."""
+
+    grasp: wp.array(dtype=wp.int32)
+    """-1: none is left for it."""
+    ticks: wp.array(dtype=wp.int32)
+    """Since its grasp began to close."""
+    push: wp.array(dtype=wp.int32)
+    """-1 while closing."""
+    looks: wp.array(dtype=wp.int32)
+    """Ticks of the present push."""
+    broken: wp.array(dtype=wp.int32)
+    """Outcome of the limit that the present push broke; 0: none."""
+    before: wp.array(dtype=wp.vec3)
+    turned_before: wp.array(dtype=wp.float32)
+    qpos: wp.array2d(dtype=wp.float32)
+    """The closed state, which every push starts from; so the next two."""
+    qvel: wp.array2d(dtype=wp.float32)
+    warmstart: wp.array2d(dtype=wp.float32)
+
+
+@wp.struct
+class Found:
+    """What is said of N grasps."""
+
+    outcome: wp.array2d(dtype=wp.int32)
+    """(N, 6)"""
+    margin: wp.array(dtype=wp.float32)
+    """Worst displacement or rotation over its limit that was seen."""
+    ticks: wp.array(dtype=wp.int32)
+    overflow: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class Terms:
+    """What is the same in all worlds."""
+
+    object_qpos: wp.int32
+    object_body: wp.int32
+    push: wp.float32
+    """[N]"""
+    centre: wp.vec3
+    """Of the object's mass in its frame [m]."""
+
+
+@wp.func
+def blend(a: wp.vec4, b: wp.vec4, share: wp.float32):
+    """Unit quaternion `share` of the way from a to b at an even rate, along the shorter arc."""
+    cosine = wp.dot(a, b)
+    if cosine < 0.0:
+        b = -b
+        cosine = -cosine
+    angle = wp.acos(wp.min(cosine, 1.0))
+    first, second = 1.0 - share, share
+    if angle > 1.0e-3:  # below, the chord is the arc
+        first, second = wp.sin(first * angle) / wp.sin(angle), wp.sin(second * angle) / wp.sin(angle)
+    return wp.normalize(first * a + second * b)
+
+
+@wp.func
+def command(w: wp.int32, g: wp.int32, ticks: wp.int32, grasps: Grasps, engine: Engine):
+    """Target posture of the stage that begins after so many ticks of closing."""
+    stage = wp.min(ticks / STAGE, 2 * STAGES - 1)
+    part = stage / STAGES
+    share = float(stage % STAGES + 1) / float(STAGES)
+    q = blend(grasps.turn[g, part], grasps.turn[g, part + 1], share)
+    engine.mocap_pos[w, 0] = (1.0 - share) * grasps.position[g, part] + share * grasps.position[g, part + 1]
+    engine.mocap_quat[w, 0] = wp.quat(q[0], q[1], q[2], q[3])
+    for k in range(engine.ctrl.shape[1]):
+        engine.ctrl[w, k] = (1.0 - share) * grasps.control[g, part, k] + share * grasps.control[g, part + 1, k]
+
+
+@wp.func
+def offset(w: wp.int32, terms: Terms, engine: Engine):
+    """Displacement of the object's own frame since the start [m]."""
+    at = terms.object_qpos
+    position = wp.vec3(engine.qpos[w, at], engine.qpos[w, at + 1], engine.qpos[w, at + 2])
+    turn = wp.quat(engine.qpos[w, at + 4], engine.qpos[w, at + 5], engine.qpos[w, at + 6], engine.qpos[w, at + 3])
+    return position - wp.quat_rotate(turn, terms.centre)
+
+
+@wp.func
+def turned(w: wp.int32, terms: Terms, engine: Engine):
+    """Rotation of the object since the start [rad]."""
+    at = terms.object_qpos + 3
+    axis = wp.vec3(engine.qpos[w, at + 1], engine.qpos[w, at + 2], engine.qpos[w, at + 3])
+    return 2.0 * wp.atan2(wp.length(axis), wp.abs(engine.qpos[w, at]))
+
+
+@wp.func
+def push(w: wp.int32, number: wp.int32, terms: Terms, worlds: Worlds, engine: Engine):
+    """Begin a push from the closed state."""
+    for k in range(engine.qpos.shape[1]):
+        engine.qpos[w, k] = worlds.qpos[w, k]
+    for k in range(engine.qvel.shape[1]):
+        engine.qvel[w, k] = worlds.qvel[w, k]
+        engine.warmstart[w, k] = worlds.warmstart[w, k]
+    way = float(1 - 2 * (number % 2)) * terms.push
+    axis = number / 2
+    force = wp.vec3(0.0)
+    force[axis] = way
+    engine.force[w, terms.object_body] = wp.spatial_vector(force, wp.vec3(0.0))
+    worlds.push[w] = number
+    worlds.looks[w] = 0
+    worlds.broken[w] = 0
+
+
+@wp.func
+def take(w: wp.int32, terms: Terms, grasps: Grasps, worlds: Worlds, engine: Engine, state: wp.array(dtype=wp.int32)):
+    """Begin with the next grasp of the queue, or wait for good."""
+    place = wp.atomic_add(state, 0, 1)
+    g = wp.int32(-1)
+    if place < state[2]:
+        g = grasps.queue[place]
+    else:
+        wp.atomic_sub(state, 1, 1)
+    row = wp.max(g, 0)
+    for k in range(engine.qpos.shape[1]):
+        engine.qpos[w, k] = grasps.start[row, k]
+    for k in range(engine.qvel.shape[1]):
+        engine.qvel[w, k] = 0.0
+        engine.warmstart[w, k] = 0.0
+    if g < 0:
+        engine.qpos[w, terms.object_qpos] = PARKED
+    engine.force[w, terms.object_body] = wp.spatial_vector(wp.vec3(0.0), wp.vec3(0.0))
+    engine.overflow[w] = 0
+    worlds.grasp[w] = g
+    worlds.ticks[w] = 0
+    worlds.push[w] = -1
+    command(w, row, 0, grasps, engine)
+
+
+@wp.kernel
+def begin(
+    # Model:
+    terms_in: Terms,
+    grasps_in: Grasps,
+    # Data out:
+    worlds_out: Worlds,
+    engine_out: Engine,
+    state_out: wp.array(dtype=wp.int32),
+):
+    take(wp.tid(), terms_in, grasps_in, worlds_out, engine_out, state_out)
+
+
+@wp.kernel
+def look(
+    # Model:
+    terms_in: Terms,
+    grasps_in: Grasps,
+    # Data out:
+    worlds_out: Worlds,
+    engine_out: Engine,
+    found_out: Found,
+    state_out: wp.array(dtype=wp.int32),
+):
+    """What a tick has brought; `state_out`: places of the queue taken, worlds with a grasp, grasps in the queue."""
+    w = wp.tid()
+    g = worlds_out.grasp[w]
+    if g < 0:
+        return
+    worlds_out.ticks[w] = worlds_out.ticks[w] + 1
+    now = offset(w, terms_in, engine_out)
+    angle = turned(w, terms_in, engine_out)
+    moved = wp.length(now)
+    excess = wp.max(moved / MOVED, angle / TURNED)
+    number = worlds_out.push[w]
+    over = bool(False)
+    if not wp.isfinite(excess):
+        found_out.outcome[g, wp.max(number, 0)] = DIVERGED
+        found_out.margin[g] = wp.inf
+        over = True
+    elif number < 0:
+        ticks = worlds_out.ticks[w]
+        ended = ticks == 2 * STAGES * STAGE
+        lost = ticks % STAGE == 0 and (moved > MOVED or angle > LOST_TURN)
+        if lost or (ended and excess >= 1.0):
+            found_out.outcome[g, 0] = LOST
+            found_out.margin[g] = excess
+            over = True
+        elif ended:
+            found_out.margin[g] = excess
+            for k in range(engine_out.qpos.shape[1]):
+                worlds_out.qpos[w, k] = engine_out.qpos[w, k]
+            for k in range(engine_out.qvel.shape[1]):
+                worlds_out.qvel[w, k] = engine_out.qvel[w, k]
+                worlds_out.warmstart[w, k] = engine_out.warmstart[w, k]
+            push(w, 0, terms_in, worlds_out, engine_out)
+        elif ticks % STAGE == 0:
+            command(w, g, ticks, grasps_in, engine_out)
+    else:
+        looks = worlds_out.looks[w] + 1
+        if looks >= FIRST_LOOK:
+            found_out.margin[g] = wp.max(found_out.margin[g], excess)
+            if worlds_out.broken[w] == 0 and excess >= 1.0:
+                worlds_out.broken[w] = wp.where(moved >= MOVED, DISPLACED, ROTATED)
+                looks = wp.max(looks, HOLD - PATIENT)
+            if worlds_out.broken[w] > 0:
+                if excess > CLEAR or looks >= HOLD:
+                    found_out.outcome[g, number] = worlds_out.broken[w]
+                    over = True
+            else:
+                more = float(HOLD - looks)
+                ahead = wp.length(now + more * (now - worlds_out.before[w]))
+                turns = angle + more * (angle - worlds_out.turned_before[w])
+                if looks >= HOLD or (ahead < SURE * MOVED and turns < SURE * TURNED):
+                    found_out.outcome[g, number] = HELD
+                    over = number + 1 == PUSHES
+                    if not over:
+                        push(w, number + 1, terms_in, worlds_out, engine_out)
+                        looks = 0
+        worlds_out.looks[w] = looks
+        worlds_out.before[w] = now
+        worlds_out.turned_before[w] = angle
+    if over or worlds_out.ticks[w] >= MOST:
+        found_out.ticks[g] = worlds_out.ticks[w]
+        found_out.overflow[g] = engine_out.overflow[w]
+        take(w, terms_in, grasps_in, worlds_out, engine_out, state_out)
+
+
+@wp.kernel
+def place(
+    # Model:
+    first_in: wp.int32,
+    states_in: wp.array2d(dtype=wp.float32),
+    # Data out:
+    engine_out: Engine,
+):
+    """The states from row `first_in` on, at rest."""
+    w = wp.tid()
+    row = wp.min(first_in + w, states_in.shape[0] - 1)
+    for k in range(engine_out.qpos.shape[1]):
+        engine_out.qpos[w, k] = states_in[row, k]
+    for k in range(engine_out.qvel.shape[1]):
+        engine_out.qvel[w, k] = 0.0
+
+
+@wp.kernel
+def depths(
+    # Model:
+    first_in: wp.int32,
+    of_hand_in: wp.array(dtype=wp.int32),
+    # Data in:
+    contacts_in: wp.array(dtype=wp.int32),
+    world_in: wp.array(dtype=wp.int32),
+    geom_in: wp.array(dtype=wp.vec2i),
+    distance_in: wp.array(dtype=wp.float32),
+    # Data out:
+    depth_out: wp.array2d(dtype=wp.float32),
+):
+    """Deepest penetration of hand and object, and of the hand and itself [m], of the states from row `first_in` on."""
+    i = wp.tid()
+    if i >= contacts_in[0]:
+        return
+    row = first_in + world_in[i]
+    if row < depth_out.shape[0]:
+        within = of_hand_in[geom_in[i][0]] * of_hand_in[geom_in[i][1]]
+        wp.atomic_max(depth_out, row, within, -distance_in[i])

@@ -1,0 +1,394 @@
+"""The GPU prefilter in MuJoCo Warp: it gives the clear verdicts, and MuJoCo on the CPU all others and a sample of
+these.
+
+At level `certificate` it only refuses: what clearly fails goes no further, and whatever may hold is certified on the
+CPU. At level `screen` its clear verdicts stand both ways. It has no part in the letter, and none in lifts.
+
+The model is the referee's own, compiled once; what differs between grasps (postures, commands, pushes) is data. A pool
+of worlds takes grasps from a queue on the device, so a launch stays full until the queue is empty, and one graph serves
+any number of grasps.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import logging
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import Floats
+from graspd.worker.engines import backend
+from graspd.worker.engines.devices import check_device, is_out_of_memory
+from graspd.worker.grasps import GraspSet, Posture, joined
+from graspd.worker.hands.jaws import jaws_of
+from graspd.worker.hands.model import HandModel
+from graspd.worker.run import ALONE, Run
+from graspd.worker.validation import protocol
+from graspd.worker.validation.model import Scene
+from graspd.worker.validation.prefilter import kernels
+from graspd.worker.validation.prefilter.phases import AUDIT_ONE_IN, FirstTrials
+from graspd.worker.validation.protocol import INTERVAL_S, JudgedBy, Outcome, Trial
+
+log = logging.getLogger(__name__)
+
+#: Worlds of a pool, for few grasps and for many: pools of any size would be made anew for nearly every launch.
+WORLDS: Final = {"cuda": (256, 1024), "cpu": (8, 32)}
+#: Pools that are kept, each with its model, arrays and graph: those of the pairs that were judged last.
+_KEPT_POOLS: Final = 4
+#: Share of audited verdicts that the CPU may contradict, beyond one, before the first judge is not believed.
+_MOST_CONTRADICTED: Final = 0.05
+
+
+class WorldPool:
+    """Worlds of one scene on one device. Not for several threads at once."""
+
+    def __init__(self, scene: Scene, device: str, worlds: int) -> None:
+        self.scene, self.device, self.worlds = scene, device, worlds
+        self._engine = mujoco_warp()
+        self._steps = round(protocol.INTERVAL_S / scene.physics.timestep)
+        self._doublings, self._capacity = 0, 0
+        self.launches = 0
+        """Ticks of the last `judge`."""
+        voiding = (getattr(self._engine.OverflowType, name) for name in _VOIDING)
+        self._voiding = int(sum(int(bit) for bit in voiding))
+        with wp.ScopedDevice(device):
+            self._model = self._engine.put_model(scene.model)
+            self._model.opt.warn_overflow = 0
+            self._of_hand = wp.array(scene.hand_geoms.astype(np.int32), dtype=wp.int32)
+            self._terms = self._make_terms()
+            self._allocate()
+
+    def judge(self, grasps: GraspSet, run: Run = ALONE) -> FirstTrials:
+        """The certificate's test of N grasps.
+
+        Raises:
+            TaskCancelled: when `run.cancelled()` answers True.
+        """
+        with wp.ScopedDevice(self.device):
+            found = self._judge(grasps, run)
+            lost = np.flatnonzero(found.overflow)
+            while len(lost) and self._doublings < DOUBLINGS:
+                self._doublings += 1
+                log.info("%d of %d grasps need more room for contacts: it is doubled", len(lost), len(grasps))
+                self._allocate()
+                found = found.put(lost, self._judge(grasps.take(lost), run.quiet()))
+                lost = np.flatnonzero(found.overflow)
+        return found
+
+    def _make_terms(self) -> Any:
+        scene, terms = self.scene, kernels.Terms()
+        terms.object_qpos, terms.object_body = scene.object_qpos, scene.object_body
+        terms.push = scene.push
+        terms.centre = wp.vec3(*(float(x) for x in scene.centre))
+        return terms
+
+    def _allocate(self) -> None:
+        """Data of the simulations, with the room that is known to be needed."""
+        model, w, more = self.scene.model, self.worlds, 2**self._doublings
+        self._data = data = self._engine.make_data(model, nworld=w, nconmax=CONTACTS * more, njmax=ROWS * more)
+        self._graph: Any = None
+        engine = self._arrays = kernels.Engine()
+        engine.qpos, engine.qvel, engine.warmstart, engine.ctrl = data.qpos, data.qvel, data.qacc_warmstart, data.ctrl
+        engine.mocap_pos, engine.mocap_quat, engine.force = data.mocap_pos, data.mocap_quat, data.xfrc_applied
+        engine.overflow = data.overflow
+        worlds = self._worlds = kernels.Worlds()
+        for name in ("grasp", "ticks", "push", "looks", "broken"):
+            setattr(worlds, name, wp.zeros(w, dtype=wp.int32))
+        worlds.before = wp.zeros(w, dtype=wp.vec3)
+        worlds.turned_before = wp.zeros(w, dtype=wp.float32)
+        worlds.qpos = wp.zeros((w, model.nq), dtype=wp.float32)
+        worlds.qvel = wp.zeros((w, model.nv), dtype=wp.float32)
+        worlds.warmstart = wp.zeros((w, model.nv), dtype=wp.float32)
+        self._state = wp.zeros(3, dtype=wp.int32)
+
+    def _judge(self, grasps: GraspSet, run: Run) -> FirstTrials:
+        n = len(grasps)
+        self._room_for(n)
+        starts = self._states(grasps.pregrasp)
+        depth, short = self._depths(self._states(grasps.grasp))
+        at_start, short_too = self._depths(starts)
+        inside = at_start.max(axis=1) > protocol.MAX_PENETRATION_M
+        queue, found = np.flatnonzero(~inside), self._found
+        for name in ("outcome", "margin", "ticks", "overflow"):
+            getattr(found, name).zero_()
+        self._ask(grasps, starts, queue)
+        self._simulate(len(queue), run)
+        outcome = found.outcome.numpy()[:n].astype(np.uint8)
+        outcome[inside, 0] = protocol.Outcome.PENETRATION
+        return FirstTrials(
+            outcome=outcome,
+            margin=found.margin.numpy()[:n].astype(float),
+            penetration_m=depth[:, 0],
+            self_penetration_m=depth[:, 1],
+            overflow=short | short_too | ((found.overflow.numpy()[:n] & self._voiding) != 0),
+            ticks=found.ticks.numpy()[:n],
+        )
+
+    def _room_for(self, n: int) -> None:
+        """Arrays for at least so many grasps. A graph holds on to its arrays, so they change as seldom as may be."""
+        if n <= self._capacity:
+            return
+        rows, model, self._graph = max(self.worlds, 1 << (n - 1).bit_length()), self.scene.model, None
+        asked, found = kernels.Grasps(), kernels.Found()
+        asked.queue = wp.zeros(rows, dtype=wp.int32)
+        asked.start = wp.zeros((rows, model.nq), dtype=wp.float32)
+        asked.position = wp.zeros((rows, 3), dtype=wp.vec3)
+        asked.turn = wp.zeros((rows, 3), dtype=wp.vec4)
+        asked.control = wp.zeros((rows, 3, model.nu), dtype=wp.float32)
+        found.outcome = wp.zeros((rows, len(protocol.DIRECTIONS)), dtype=wp.int32)
+        found.margin = wp.zeros(rows, dtype=wp.float32)
+        found.ticks, found.overflow = (wp.zeros(rows, dtype=wp.int32) for _ in range(2))
+        self._capacity, self._asked, self._found = rows, asked, found
+
+    def _states(self, posture: Posture) -> NDArray[np.float32]:
+        """(N, nq) the hand in postures, the object at its start."""
+        scene = self.scene
+        out = np.tile(scene.model.qpos0, (len(posture), 1))
+        out[:, scene.object_qpos : scene.object_qpos + 7] = [*scene.centre, 1, 0, 0, 0]
+        out[:, scene.joint_qpos] = posture.joint_positions
+        if scene.root_qpos >= 0:
+            out[:, scene.root_qpos : scene.root_qpos + 7] = posture.hand_pose
+        return out.astype(np.float32)
+
+    def _ask(self, grasps: GraspSet, starts: NDArray[np.float32], queue: NDArray[np.intp]) -> None:
+        """Put grasps on the device, with the order in which they are taken."""
+        scene, parts = self.scene, (grasps.pregrasp, grasps.grasp, grasps.squeeze)
+        poses = np.stack([part.hand_pose for part in parts], axis=1)
+        joints = np.stack([part.joint_positions for part in parts], axis=1)
+        values: dict[str, Any] = {
+            "queue": queue,
+            "start": starts,
+            "position": poses[..., :3],
+            "turn": poses[..., 3:],
+            "control": scene.controls(joints),
+        }
+        for name, value in values.items():
+            array = getattr(self._asked, name)
+            whole = array.numpy()
+            whole[: len(value)] = value
+            array.assign(whole)
+
+    def _depths(self, states: NDArray[np.float32]) -> tuple[Floats, NDArray[np.bool_]]:
+        """(N, 2) deepest penetration of hand and object, and within the hand [m]; (N,) whether room was short."""
+        n, data = len(states), self._data
+        out, rows, short = wp.zeros((n, 2), dtype=wp.float32), wp.array(states, dtype=wp.float32), np.zeros(n, bool)
+        for first in range(0, n, self.worlds):
+            wp.launch(kernels.place, self.worlds, inputs=[first, rows], outputs=[self._arrays])
+            self._engine.fwd_position(self._model, data)
+            contact = data.contact
+            wp.launch(
+                kernels.depths,
+                data.naconmax,
+                inputs=[first, self._of_hand, data.nacon, contact.worldid, contact.geom, contact.dist],
+                outputs=[out],
+            )
+            most = max(int(data.nacon.numpy()[0]), int(data.ncollision.numpy()[0]))
+            short[first : first + self.worlds] = most > data.naconmax
+        return out.numpy().astype(float), short
+
+    def _simulate(self, count: int, run: Run) -> None:
+        """Tick until no world has a grasp."""
+        self.launches = 0
+        self._state.assign(np.array([0, self.worlds, count], np.int32))
+        wp.launch(
+            kernels.begin,
+            self.worlds,
+            inputs=[self._terms, self._asked],
+            outputs=[self._worlds, self._arrays, self._state],
+        )
+        while True:
+            taken, alive, _ = self._state.numpy()
+            run.progress(min(int(taken), count) - int(alive), count, "first judge")
+            if alive <= 0:
+                return
+            run.check("the first judge")
+            self.launches += 1
+            self._tick()
+
+    def _tick(self) -> None:
+        """One tick of all worlds; on CUDA a graph, once the first tick has loaded what it launches."""
+        if self._graph is not None:
+            wp.capture_launch(self._graph)
+            return
+        self._launch()
+        if wp.get_device().is_cuda and wp.is_conditional_graph_supported():
+            with wp.ScopedCapture() as capture:
+                self._launch()
+            self._graph = capture.graph
+
+    def _launch(self) -> None:
+        for _ in range(self._steps):
+            self._engine.step(self._model, self._data)
+        wp.launch(
+            kernels.look,
+            self.worlds,
+            inputs=[self._terms, self._asked],
+            outputs=[self._worlds, self._arrays, self._found, self._state],
+        )
+
+
+_pools: OrderedDict[tuple[str, str, int], WorldPool] = OrderedDict()
+_lock = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Screened:
+    """What the first judge says of N grasps."""
+
+    stands: dict[int, Trial]
+    """Verdicts that stand, by row. All other rows are for the CPU."""
+    audited: dict[int, bool]
+    """Verdicts that would stand and are asked of the CPU as well: whether the first judge said that the grasp holds."""
+
+    def contradicted(self, trials: dict[int, Trial]) -> int:
+        """How many audited verdicts the CPU's trials contradict."""
+        return sum(trials[row].success != held for row, held in self.audited.items())
+
+    def believed(self, contradicted: int) -> bool:
+        """Whether the verdicts that stand may stand."""
+        return contradicted <= max(1, _MOST_CONTRADICTED * len(self.audited))
+
+
+def first_terms(hand: HandModel, level: str, run: Run) -> list[Any]:
+    """The terms of the first judge where it takes part in verdicts of a level, for `verdict_key`; else none.
+
+    Grippers have none: their flat pads touch in an area, and how the engines spread contacts over it differs. Hands
+    with tendons have none: on a tenth of Shadow's grasps the engines differ (docs/explanation/quality.md).
+
+    Raises:
+        InputError: it is insisted on, and not installed.
+    """
+    if run.first_judge == "off" or level not in ("certificate", "screen"):
+        return []
+    if jaws_of(hand) is not None or hand.tendons:
+        return []
+    if run.first_judge == "auto" and not (run.device.startswith("cuda") and has_mujoco_warp()):
+        return []
+    return FirstTrials.terms(mujoco_warp_version())
+
+
+def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: Run) -> Screened:
+    """What the first judge says of grasps in a scene; in one launch with those of the others in `run.meeting`.
+
+    Args:
+        scene: the referee's own.
+        terms: digest of all that the scene follows from.
+        grasps: N grasps.
+        level: certificate or screen.
+        run: its device is where the worlds are.
+
+    Raises:
+        TaskCancelled: when `run.cancelled()` answers True.
+    """
+
+    def work(asked: Sequence[GraspSet]) -> list[FirstTrials]:
+        with _lock:
+            every = joined(asked)
+            found = _pool(scene, terms, run.device, len(every)).judge(every, run if run.meeting is None else ALONE)
+        check_device(run.device)
+        return found.parts([len(one) for one in asked])
+
+    postures = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
+    if not len(grasps):
+        return Screened({}, {})
+    try:
+        if run.meeting is None:
+            found = work([postures])[0]
+        else:
+            key = ("first judge", terms, run.device)
+            found = run.meeting.ask(key, postures, work, size=len(grasps), cancelled=run.cancelled)
+    except RuntimeError as error:
+        if not is_out_of_memory(error):
+            raise
+        log.warning("%s has no memory for the first judge: the CPU judges %d grasps", run.device, len(grasps))
+        return Screened({}, {})
+    clear = found.clearly_failed | (found.clearly_held if level == "screen" else False)
+    audited = clear & _drawn(grasps)
+    if found.overflow.any():
+        log.warning("%d of %d grasps overflow the first judge; the CPU judges them", found.overflow.sum(), len(grasps))
+    return Screened(
+        {int(row): _trial(found, int(row), scene) for row in np.flatnonzero(clear & ~audited)},
+        {int(row): bool(found.held[row]) for row in np.flatnonzero(audited)},
+    )
+
+
+def _pool(scene: Scene, terms: str, device: str, count: int) -> WorldPool:
+    """Worlds for so many grasps of a scene. The last ones are kept: a graph takes longer to make than to use once."""
+    few, many = WORLDS[device.partition(":")[0]]
+    size = few if count <= few else many
+    key = (terms, device, size)
+    if key not in _pools:
+        while len(_pools) >= _KEPT_POOLS:
+            _pools.popitem(last=False)
+
+        _pools[key] = WorldPool(scene, device, size)
+    _pools.move_to_end(key)
+    return _pools[key]
+
+
+def _drawn(grasps: GraspSet) -> NDArray[np.bool_]:
+    """(N,) one grasp in so many, told by its own numbers: whatever batch it stands in."""
+    pose = np.ascontiguousarray(grasps.grasp.hand_pose, float)
+    digests = (hashlib.sha256(row.tobytes()).digest() for row in pose)
+    return np.array([int.from_bytes(one[:8], "big") % AUDIT_ONE_IN == 0 for one in digests], bool)
+
+
+def _trial(found: FirstTrials, row: int, scene: Scene) -> Trial:
+    return Trial(
+        outcomes=[Outcome(int(one)) for one in found.outcome[row]],
+        margin=float(found.margin[row]),
+        penetration_m=float(found.penetration_m[row]),
+        self_penetration_m=float(found.self_penetration_m[row]),
+        steps=int(found.ticks[row]) * round(INTERVAL_S / scene.physics.timestep),
+        judged_by=JudgedBy.MUJOCO_WARP,
+    )
+
+
+#: Contacts and constraint rows that a world has room for at first: twice what grasps of three hands were seen to need.
+CONTACTS: Final = 96
+ROWS: Final = 256
+#: Room is doubled up to this many times where it did not do.
+DOUBLINGS: Final = 3
+#: Overflows that leave contacts or constraints out. The others are limits of iterations, which MuJoCo has as well.
+_VOIDING: Final = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")
+
+
+def has_mujoco_warp() -> bool:
+    """Whether it is installed; nothing is imported."""
+    return importlib.util.find_spec("mujoco_warp") is not None
+
+
+def mujoco_warp_version() -> str:
+    """Name and version.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    if not has_mujoco_warp():
+        raise InputError("the first judge needs mujoco-warp; run pip install 'graspd[gpu]'")
+    return f"mujoco-warp {version('mujoco-warp')}"
+
+
+@cache
+def mujoco_warp() -> Any:
+    """The module, with Warp started.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    mujoco_warp_version()
+    backend.start()
+    import mujoco_warp as engine
+
+    return engine

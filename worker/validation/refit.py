@@ -1,0 +1,210 @@
+"""The same hand with other collision shapes: what another author of its model might have drawn.
+
+hull: one convex hull of all that a link has; primitive: the box, cylinder or capsule nearest to each hull;
+capsule: a capsule in place of each piece that is about as thick as wide; and all of it grown or shrunk.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import groupby
+from typing import Final, Literal
+
+import numpy as np
+
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, invert, quat_from_matrix
+from graspd.worker.hands.collisions import resting_neighbours
+from graspd.worker.hands.model import ConvexPiece, HandModel
+from graspd.worker.hands.primitives import hull, sample, signed_distance, tessellate, volume
+
+Fit = Literal["own", "hull", "primitive", "capsule"]
+
+#: A capsule stands for no piece that is wider than this over its thickness.
+WIDE: Final = 1.5
+#: Shrinking leaves at least this share of a piece's half thickness.
+_LEFT: Final = 0.5
+_SAMPLES: Final = 400
+#: Least length of a capsule over its radius.
+_SHORTEST: Final = 1e-3
+_PRIMITIVES: Final = ("box", "cylinder", "capsule")
+
+
+def refitted(hand: HandModel, fit: Fit, grown_m: float = 0.0) -> HandModel:
+    """The hand with its collision shapes replaced, then grown by `grown_m` [m], or shrunk where that is negative.
+
+    Bodies that touch at rest in their new shapes do not count as touching, as in the hand itself.
+    """
+    pieces = hand.pieces
+    if fit == "hull":
+        pieces = _hulls(hand)
+    elif fit != "own":
+        pieces = tuple(_fitted(piece, fit) for piece in pieces)
+    if grown_m:
+        pieces = tuple(grown(piece, grown_m) for piece in pieces)
+    if len(pieces) == len(hand.pieces) and all(a is b for a, b in zip(pieces, hand.pieces, strict=True)):
+        return hand
+    other = replace(hand, pieces=pieces)
+    return replace(other, neighbours=hand.neighbours | resting_neighbours(other))
+
+
+def fits_of(hand: HandModel) -> frozenset[Fit]:
+    """Fits that change something in this hand."""
+    links = {(piece.body, piece.link) for piece in hand.pieces}
+    found: set[Fit] = set()
+    if len(links) < len(hand.pieces):
+        found.add("hull")
+    if any(piece.kind == "hull" for piece in hand.pieces):
+        found.add("primitive")
+    if any(piece.kind not in ("capsule", "sphere") and _thickness(piece)[1] for piece in hand.pieces):
+        found.add("capsule")
+    return frozenset(found)
+
+
+def grown(piece: ConvexPiece, by_m: float) -> ConvexPiece:
+    """A piece whose surface stands out by `by_m` [m] along every normal of its faces, or back where that is negative.
+
+    Boxes and cylinders keep their edges, capsules and spheres are exact. Corners of a hull are cut where the offset
+    surface of Minkowski's sum with a ball is. A piece too thin to shrink keeps half of its thickness.
+    """
+    if piece.kind == "hull":
+        vertices, faces = hull(_offset(piece.vertices, by_m))
+        return replace(piece, vertices=vertices, faces=faces)
+    size = np.array(piece.size)
+    half = size / 2 if piece.kind == "box" else np.array([size[0]])
+    by = max(by_m, -_LEFT * float(half.min()))
+    match piece.kind:
+        case "box":
+            size = size + 2 * by
+        case "cylinder":
+            by = max(by, -_LEFT * size[1] / 2)
+            size = size + np.array([by, 2 * by])
+        case _:
+            size = np.concatenate([size[:1] + by, size[1:]])
+    return _primitive(piece, piece.kind, tuple(float(s) for s in size), piece.pose)
+
+
+def _primitive(piece: ConvexPiece, kind: str, size: tuple[float, ...], pose: Floats) -> ConvexPiece:
+    vertices, faces = tessellate(kind, size)
+    return replace(piece, kind=kind, size=size, pose=pose, vertices=apply(pose, vertices), faces=faces)
+
+
+def _hulls(hand: HandModel) -> tuple[ConvexPiece, ...]:
+    out: list[ConvexPiece] = []
+    ordered = sorted(hand.pieces, key=lambda piece: (piece.body, piece.link))
+    for _, group in groupby(ordered, key=lambda piece: (piece.body, piece.link)):
+        parts = list(group)
+        if len(parts) > 1:
+            vertices, faces = hull(np.concatenate([part.vertices for part in parts]))
+            parts = [ConvexPiece(parts[0].body, "hull", (), IDENTITY_POSE.copy(), vertices, faces, parts[0].link)]
+        out += parts
+    return tuple(out)
+
+
+def _fitted(piece: ConvexPiece, fit: Fit) -> ConvexPiece:
+    if fit == "primitive":
+        if piece.kind != "hull":
+            return piece
+        found = [_like(piece, kind) for kind in _PRIMITIVES]
+        return min(found, key=lambda one: _distance(one, piece))
+    _, round_ = _thickness(piece)
+    return piece if piece.kind in ("capsule", "sphere") or not round_ else _like(piece, "capsule")
+
+
+def _moments(piece: ConvexPiece) -> tuple[float, Floats, Floats, Floats]:
+    """Volume, centre, variances (3,) of the solid along its principal axes, least first, and these as columns."""
+    import trimesh  # slow to load, as SciPy below
+
+    solid = trimesh.Trimesh(piece.vertices, piece.faces, process=False)
+    inertia = np.asarray(solid.moment_inertia)
+    spread, axes = np.linalg.eigh((np.trace(inertia) / 2 * np.eye(3) - inertia) / solid.volume)
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    return float(solid.volume), np.asarray(solid.center_mass), spread, axes
+
+
+def _thickness(piece: ConvexPiece) -> tuple[float, bool]:
+    """Least half thickness [m] of a box of the same second moments, and whether its section is about as thick as
+    wide."""
+    _, _, spread, _ = _moments(piece)
+    low, middle, _ = np.sqrt(3 * spread)
+    return float(low), bool(middle <= WIDE * low)
+
+
+def _like(piece: ConvexPiece, kind: str) -> ConvexPiece:
+    """A primitive with the centre, the principal axes and the volume of a piece, proportioned by its second moments."""
+    solid, centre, spread, axes = _moments(piece)
+    long = 2
+    if kind == "cylinder" and spread[2] - spread[1] < spread[1] - spread[0]:
+        # A disc: its axis is the short one.
+        long = 0
+    order = [(long + 1) % 3, (long + 2) % 3, long]
+    spread, axes = spread[order], axes[:, order]
+    across = float(spread[:2].mean())
+    radius = 2 * math.sqrt(across)
+    size = {
+        "box": tuple(float(side) for side in np.sqrt(12 * spread)),
+        "cylinder": (radius, math.sqrt(12 * float(spread[2]))),
+        "capsule": _capsule(solid, across),
+    }[kind]
+    scale = (solid / volume(kind, size, *tessellate(kind, size))) ** (1 / 3)
+    pose = np.concatenate([centre, quat_from_matrix(axes)])
+    return _primitive(piece, kind, tuple(scale * side for side in size), pose)
+
+
+def _capsule(solid: float, across: float) -> tuple[float, float]:
+    """Radius and length of a capsule of a volume [m^3] and a variance across its axis [m^2], the sphere's at least.
+
+    A cylinder's variance is r^2 / 4, a ball's r^2 / 5: of a capsule whose caps are the share s of its volume it is
+    r^2 (1 / 4 - s / 20). Iterated, for s grows with r^3 and moves r little.
+    """
+    radius = 2 * math.sqrt(across)
+    for _ in range(20):
+        caps = min(1.0, 4 / 3 * math.pi * radius**3 / solid)
+        radius = math.sqrt(across / (0.25 - caps / 20))
+    return radius, max(_SHORTEST * radius, solid / (math.pi * radius**2) - 4 * radius / 3)
+
+
+def _distance(one: ConvexPiece, piece: ConvexPiece) -> float:
+    """Mean distance of a piece's surface from a primitive's [m]."""
+    points, _ = sample("hull", (), piece.vertices, piece.faces, _SAMPLES, np.random.default_rng(0))
+    local = apply(invert(one.pose), points)
+    return float(np.abs(signed_distance(one.kind, one.size, one.vertices, one.faces, local)).mean())
+
+
+def _offset(vertices: Floats, by_m: float) -> Floats:
+    """Corners of a convex solid whose faces were moved outward by `by_m` [m].
+
+    Half-spaces of the faces and, where it grows, of the corners' mean normals: each at the distance at which the sum
+    with a ball has it. So what grows by 1 mm has its support 1 mm farther in all of these directions.
+    """
+    from scipy.spatial import ConvexHull, HalfspaceIntersection
+
+    scale = float(np.ptp(vertices, axis=0).max())
+    points, by = (vertices - vertices.mean(axis=0)) / scale, by_m / scale
+    solid = ConvexHull(points)
+    normals = np.unique(np.round(solid.equations[:, :3], 9), axis=0)
+    inside = points.mean(axis=0)
+    if by < 0:
+        inside, depth = _deepest(solid.equations)
+        by = max(by, -_LEFT * depth)
+    else:
+        corner = np.zeros_like(points)
+        for face, normal in zip(solid.simplices, solid.equations[:, :3], strict=True):
+            corner[face] += normal
+        corner = corner[solid.vertices]
+        normals = np.concatenate([normals, corner / np.linalg.norm(corner, axis=1, keepdims=True)])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    reach = (normals @ points.T).max(axis=1) + by
+    found = HalfspaceIntersection(np.column_stack([normals, -reach]), inside).intersections
+    return np.asarray(found * scale + vertices.mean(axis=0))
+
+
+def _deepest(planes: Floats) -> tuple[Floats, float]:
+    """Centre and radius of the largest ball in a convex solid of unit planes (F, 4): n x + b <= 0."""
+    from scipy.optimize import linprog
+
+    found = linprog([0, 0, 0, -1], np.column_stack([planes[:, :3], np.ones(len(planes))]), -planes[:, 3],
+                    bounds=[(None, None)] * 3 + [(0, None)])  # fmt: skip
+    assert found.x is not None, "a convex solid holds a ball"
+    return np.asarray(found.x[:3]), float(found.x[3])

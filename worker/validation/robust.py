@@ -1,0 +1,257 @@
+"""Robustness of grasps: verdicts in other models of the same hand and object, and with the object displaced.
+
+A grasp is judged in k models, each of which departs from the nominal one along one axis (`variant`). Axes take turns
+in an order at random; all is drawn from the seed and the grasp's own numbers, so a grasp meets the same models wherever
+it stands, and the first 8 of 16 are those of 8.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.service.model.metrics import ROBUST_MODELS, Axis
+from graspd.service.model.transforms import Floats, compose, invert, quat_from_axis_angle
+from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.run import ALONE, Run
+from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.validation.decomposition import ConvexPieces, decompose
+from graspd.worker.validation.key import Level
+from graspd.worker.validation.lifting import LiftLevel, require_ways
+from graspd.worker.validation.model import MujocoOptions
+from graspd.worker.validation.validator import judge
+from graspd.worker.validation.variant import Variant, dealt, draw
+from graspd.worker.validation.varied import Models
+
+NOT_JUDGED: Final = -1
+#: Shares are wanted to this: 0.9 of 10 models is 9 of them.
+_EXACT: Final = 1e-9
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """What became of N grasps in k models."""
+
+    held: NDArray[np.int8]
+    """(N, k) 1 held, 0 not, -1 not judged: the grasp was not tried, or its share was decided."""
+    axis: NDArray[np.uint8]
+    """(N, k) `Axis` of each model."""
+    wanted: float
+    seconds: float
+
+    @property
+    def share(self) -> Floats:
+        """(N,) share of the models in which a grasp holds; nan: not tried. Where judging ended early, what it is at
+        least if the wanted share was reached, at most if it was missed."""
+        models = self.held.shape[1]
+        held, failed = (self.held == 1).sum(axis=1), (self.held == 0).sum(axis=1)
+        reached = held >= needed(self.wanted, models)
+        share = np.where(reached, held, models - failed) / models
+        return np.where((self.held == NOT_JUDGED).all(axis=1), np.nan, share)
+
+    @property
+    def weakest(self) -> NDArray[np.uint8]:
+        """(N,) `Axis` of the first model in which a grasp does not hold; 0: there is none."""
+        failed = self.held == 0
+        first = failed.argmax(axis=1)
+        return np.where(failed.any(axis=1), self.axis[np.arange(len(first)), first], np.uint8(Axis.NONE))
+
+    @property
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """The columns of a base shard."""
+        return {"quality/robust_share": self.share, "quality/robust_weakest": self.weakest}
+
+    def by_axis(self) -> dict[Axis, tuple[int, int]]:
+        """Of each axis that was judged: models in which a grasp held, and all of them."""
+        counts = {}
+        for axis in Axis:
+            found = self.held[(self.axis == axis) & (self.held != NOT_JUDGED)]
+            if len(found):
+                counts[axis] = (int(found.sum()), len(found))
+        return counts
+
+
+def needed(wanted: float, models: int) -> int:
+    """Models of `models` in which a grasp has to hold for the wanted share; none is wanted at 0, so all are judged."""
+    return math.ceil(wanted * models - _EXACT) if wanted > 0 else models
+
+
+def reaches(share: Floats, wanted: float) -> NDArray[np.bool_]:
+    """(N,) whether shares (N,) are as large as is wanted; one that is not known is not."""
+    return np.asarray(np.nan_to_num(share, nan=-1.0) >= wanted - _EXACT)
+
+
+def robust(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    *,
+    held: NDArray[np.generic] | None = None,
+    placed: Placed | None = None,
+    level: LiftLevel = "lift",
+    models: int = ROBUST_MODELS,
+    wanted: float = 0.0,
+    seed: int = 0,
+    hard: bool = False,
+    pieces: ConvexPieces | None = None,
+    cache: Path | None = None,
+    run: Run = ALONE,
+) -> Robustness:
+    """Judge grasps in models around the nominal one: six pushes at the level of the certificate, or lifts.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        grasps: N grasps.
+        held: (N,) verdicts of the nominal model; only grasps with 1 are tried. By default all.
+        placed: their scenes; the lift test out of these then judges. None: the six pushes do.
+        level: of the lift test.
+        models: for each grasp.
+        wanted: share of them; judging a grasp ends when it is sure whether it is reached. 0: all are judged.
+        seed: of the models, with the grasp's own numbers.
+        hard: at the hard protocol's friction.
+        pieces: convex pieces of the object; by default its CoACD pieces.
+        cache: folder of the pieces, see `decompose`.
+        run: told of grasps done; asked between models whether to stop.
+
+    Raises:
+        InputError: no scene or way of each grasp to lift it from.
+        MeshError: the object has no usable convex pieces.
+        TaskCancelled: when `run.cancelled()` answers True.
+    """
+    if placed is not None:
+        require_ways(grasps, placed, level)
+    began = time.perf_counter()
+    verdicts = np.full((len(grasps), models), NOT_JUDGED, np.int8)
+    axes = np.zeros((len(grasps), models), np.uint8)
+    tried = np.arange(len(grasps)) if held is None else np.flatnonzero(np.asarray(held) == 1)
+    if not len(tried):
+        return Robustness(verdicts, axes, wanted, 0.0)
+    physics = MujocoOptions().hardened() if hard else MujocoOptions()
+    beside = (placed.supports, placed.neighbours) if placed is not None else ()
+    around = Models(hand, obj, pieces or decompose(obj, cache=cache), physics, *beside)
+    least, done, lock = needed(wanted, models), 0, threading.Lock()
+
+    def holds(row: int, variant: Variant) -> bool:
+        if placed is None:
+            return around.certificate(grasps, row, variant).success
+        return around.lift(grasps, row, placed, variant, letter=level == "letter").success
+
+    def work(row: int) -> None:
+        nonlocal done
+        for k, (axis, variant) in enumerate(models_of(hand, grasps, row, models, seed)):
+            run.check("robustness")
+            axes[row, k] = axis
+            verdicts[row, k] = holds(row, variant)
+            ok, lost = (verdicts[row] == 1).sum(), (verdicts[row] == 0).sum()
+            if wanted > 0 and (ok >= least or models - lost < least):
+                break
+        with lock:
+            done += 1
+            run.progress(done, len(tried), "robustness")
+
+    with ThreadPoolExecutor(run.cores, thread_name_prefix="robust") as pool:
+        list(pool.map(work, tried.tolist()))
+    return Robustness(verdicts, axes, wanted, time.perf_counter() - began)
+
+
+def models_of(hand: HandModel, grasps: GraspSet, row: int, models: int, seed: int) -> list[tuple[Axis, Variant]]:
+    """The models in which a grasp is judged, in their order."""
+    words = (seed, *_words(grasps, row))
+    axes = dealt(hand, models, words)
+    return [(axis, draw(axis, hand, np.random.default_rng((*words, k)))) for k, axis in enumerate(axes)]
+
+
+def _words(grasps: GraspSet, row: int) -> tuple[int, ...]:
+    """A grasp's own numbers as a seed."""
+    whole = hashlib.sha256()
+    for part in (grasps.pregrasp, grasps.grasp, grasps.squeeze):
+        for array in (part.hand_pose, part.joint_positions):
+            whole.update(np.ascontiguousarray(array[row], "<f8").tobytes())
+    return tuple(np.frombuffer(whole.digest()[:16], "<u4").tolist())
+
+
+NOISE_M: Final = 1e-3
+NOISE_RAD: Final = float(np.radians(1.0))
+
+
+def robustness(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    *,
+    held: NDArray[np.generic] | None = None,
+    repeats: int = 5,
+    noise_m: float = NOISE_M,
+    noise_rad: float = NOISE_RAD,
+    seed: int = 0,
+    level: Level = "screen",
+    hard: bool = False,
+    pieces: ConvexPieces | None = None,
+    cache: Path | None = None,
+    run: Run = ALONE,
+) -> Floats:
+    """(N,) share of `repeats` in which a grasp still holds with noise on the object's pose; nan: not tried.
+
+    The object is moved by `noise_m` in a random direction and turned by `noise_rad` about a random axis through its
+    centre of mass; a grasp's noise follows from `seed`, the repeat and its place in the set.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        grasps: N grasps.
+        held: (N,) verdicts without noise; only grasps with 1 are tried. By default all.
+        repeats: noisy verdicts for each grasp.
+        noise_m: size of the shift [m].
+        noise_rad: size of the turn [rad].
+        seed: of the noise.
+        level: what a noisy verdict costs; a share is no rate of success, so the cheap level does.
+        hard: the hard protocol's friction.
+        pieces: convex pieces of the object; by default its CoACD pieces.
+        cache: folder of the pieces, see `decompose`.
+        run: told of noisy verdicts done; asked between them whether to stop.
+
+    Raises:
+        MeshError: the object has no usable convex pieces.
+        TaskCancelled: when `run.cancelled()` answers True.
+    """
+    out = np.full(len(grasps), np.nan)
+    tried = np.arange(len(grasps)) if held is None else np.flatnonzero(np.asarray(held) == 1)
+    if not len(tried) or repeats < 1:
+        return out
+    moves = np.array([_noise(obj, noise_m, noise_rad, (seed, k, int(i))) for k in range(repeats) for i in tried])
+    noisy = _moved(grasps, np.tile(tried, repeats), invert(moves))
+    verdicts = judge(hand, obj, noisy, level=level, hard=hard, pieces=pieces, cache=cache, run=run)
+    out[tried] = verdicts.success.reshape(repeats, len(tried)).mean(axis=0)
+    return out
+
+
+def _noise(obj: ObjectModel, noise_m: float, noise_rad: float, seed: tuple[int, ...]) -> Floats:
+    """(7,) motion of the object."""
+    rng = np.random.default_rng(seed)
+    shift, axis = rng.normal(size=(2, 3))
+    rotation = quat_from_axis_angle(axis / np.linalg.norm(axis), np.array(noise_rad))
+    about = np.concatenate([obj.centre_of_mass + noise_m * shift / np.linalg.norm(shift), rotation])
+    return compose(about, np.concatenate([-obj.centre_of_mass, [1.0, 0, 0, 0]]))
+
+
+def _moved(grasps: GraspSet, rows: NDArray[np.intp], motion: Floats) -> GraspSet:
+    """The rows of the grasps with the hand moved by one motion (K, 7) each."""
+
+    def moved(part: Posture) -> Posture:
+        pose, joints = np.asarray(part.hand_pose, float), np.asarray(part.joint_positions, float)
+        return Posture(compose(motion, pose[rows]), joints[rows])
+
+    loss = np.asarray(grasps.stability_loss)[rows]
+    return GraspSet(moved(grasps.grasp), moved(grasps.pregrasp), moved(grasps.squeeze), loss)

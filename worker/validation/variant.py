@@ -1,0 +1,215 @@
+"""Variants of the validator's model: other shapes, drives, tendons, masses and places that a real hand might as well
+have.
+
+A `Variant` says how a model departs from the nominal one, `draw` draws one along an axis, `varied.Models` judges in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from graspd.service.model.metrics import Axis
+from graspd.service.model.transforms import Floats
+from graspd.worker.hands.model import HandModel
+from graspd.worker.validation.refit import Fit, fits_of
+
+Vector = tuple[float, float, float]
+
+#: How far each axis goes. Shapes stand out or back by this [m].
+GROWTH_M: Final = 1e-3
+#: Factors of drives and of the mass.
+FACTOR: Final = 2.0
+#: Armature [kg m^2] and dry friction [N m] of DexGraspBench's Shadow, which the protocol otherwise leaves out.
+ARMATURE: Final = 2e-4
+DRY_FRICTION: Final = 0.01
+#: Sliding friction over the nominal 0.6; the torsional coefficient goes with it.
+FRICTIONS: Final = (0.4 / 0.6, 0.8 / 0.6)
+CENTRE_M: Final = 5e-3
+SHIFT_M: Final = 2e-3
+TURN: Final = float(np.radians(2.0))
+#: The last finger begins so much later than the first, as a share of the time of closing (0.8 s).
+LATEST: Final = 0.25
+
+Coupling = Literal["own", "compliant", "separate", "ratio"]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A model around the nominal one; by default that itself."""
+
+    fit: Fit = "own"
+    """What the hand's collision shapes are replaced by, see `refit`."""
+    grown_m: float = 0.0
+    """How far the hand's collision shapes stand out from where they were [m]."""
+    armature: float | None = None
+    """Of every joint [kg m^2 or kg]; None: the model's own."""
+    dry_friction: float | None = None
+    """Of every joint [N m or N]; None: the model's own."""
+    damping: float = 1.0
+    """Joint damping over the model's own."""
+    gain: float = 1.0
+    """Position gain over the model's own; limits of torque stay."""
+    coupling: Coupling = "own"
+    """compliant: what couples joints gives way under load; separate, ratio: tendons read otherwise, see `recoupled`."""
+    friction: float = 1.0
+    """Sliding and torsional friction over the model's own."""
+    mass: float = 1.0
+    """Mass of the object over the model's own; what pushes it is its weight and grows with it."""
+    centre_m: Vector = (0.0, 0.0, 0.0)
+    """Shift of the object's centre of mass in its frame [m]."""
+    object_shift_m: Vector = (0.0, 0.0, 0.0)
+    """The object stands off by this, in its frame [m]."""
+    object_turn: Vector = (0.0, 0.0, 0.0)
+    """and turned by this rotation vector about its centre of mass [rad]."""
+    hand_shift_m: Vector = (0.0, 0.0, 0.0)
+    """The hand's root is off by this all the time, in its own frame [m]."""
+    lags: tuple[float, ...] = ()
+    """Of each fingertip: how much later than the first its finger begins, as a share of the time of closing."""
+
+
+NOMINAL: Final = Variant()
+
+
+def axes_of(hand: HandModel) -> tuple[Axis, ...]:
+    """Axes along which a model of this hand can differ: without coupled joints there is nothing to vary in them."""
+    missing = set() if couplings_of(hand) else {Axis.COUPLINGS}
+    missing |= {Axis.ORDER} if len(hand.fingertips) < 2 else set()
+    return tuple(axis for axis in Axis if axis is not Axis.NONE and axis not in missing)
+
+
+def couplings_of(hand: HandModel) -> tuple[Coupling, ...]:
+    """Readings of a hand's couplings that are not its own: of dofs that drive several joints, and of tendons."""
+    rigid: tuple[Coupling, ...] = ("compliant",) if len(hand.joint_body) > hand.dofs else ()
+    return (*rigid, "separate", "ratio") if hand.tendons else rigid
+
+
+def dealt(hand: HandModel, models: int, seed: tuple[int, ...]) -> list[Axis]:
+    """The axes of the first models of a grasp: all of the hand's in an order at random, then again."""
+    axes = axes_of(hand)
+    rounds = range(-(-models // len(axes)))
+    return [axes[i] for k in rounds for i in np.random.default_rng((*seed, k)).permutation(len(axes))][:models]
+
+
+def draw(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
+    """A variant of a hand along one axis. Directions are even over the sphere, sizes over their range, factors over
+    the logarithm of theirs.
+
+    Raises:
+        ValueError: the axis is none, or the hand has no couplings.
+    """
+    match axis:
+        case Axis.SHAPES:
+            fit, grown = SHAPES[int(rng.choice(_shapes(hand)))]
+            return Variant(fit=fit, grown_m=grown)
+        case Axis.JOINTS:
+            armature, dry = (float(rng.random() < 0.5) * _factor(rng) for _ in range(2))
+            return Variant(
+                armature=ARMATURE * armature, dry_friction=DRY_FRICTION * dry, damping=_factor(rng), gain=_factor(rng)
+            )
+        case Axis.COUPLINGS:
+            found = couplings_of(hand)
+            return Variant(coupling=found[int(rng.integers(len(found)))])
+        case Axis.FRICTION:
+            return Variant(friction=float(rng.uniform(*FRICTIONS)))
+        case Axis.MASS:
+            return Variant(mass=_factor(rng))
+        case Axis.CENTRE:
+            return Variant(centre_m=_vector(rng, CENTRE_M))
+        case Axis.POSE:
+            return Variant(object_shift_m=_vector(rng, SHIFT_M), object_turn=_vector(rng, TURN))
+        case Axis.CALIBRATION:
+            return Variant(hand_shift_m=_vector(rng, SHIFT_M))
+        case Axis.ORDER:
+            fingers = len(hand.fingertips)
+            return Variant(lags=tuple((LATEST * rng.permutation(fingers) / (fingers - 1)).tolist()))
+        case _:
+            raise ValueError("nothing varies along no axis")
+
+
+def together(variants: Iterable[Variant]) -> Variant:
+    """One variant that departs along the axes of several; where two change the same, the later one counts."""
+    own, changed = asdict(NOMINAL), dict[str, Any]()
+    for one in variants:
+        changed |= {name: value for name, value in asdict(one).items() if value != own[name]}
+    return replace(NOMINAL, **changed)
+
+
+#: Ways in which collision shapes differ.
+SHAPES: Final[tuple[tuple[Fit, float], ...]] = (
+    ("hull", 0.0),
+    ("primitive", 0.0),
+    ("capsule", 0.0),
+    ("own", GROWTH_M),
+    ("own", -GROWTH_M),
+)
+
+
+def _shapes(hand: HandModel) -> list[int]:
+    """Rows of `SHAPES` that change something in this hand."""
+    fits = fits_of(hand)
+    return [i for i, (fit, _) in enumerate(SHAPES) if fit == "own" or fit in fits]
+
+
+def _factor(rng: np.random.Generator) -> float:
+    return float(FACTOR ** rng.uniform(-1.0, 1.0))
+
+
+def _vector(rng: np.random.Generator, most: float) -> Vector:
+    direction = rng.normal(size=3)
+    x, y, z = (most * rng.random() * direction / np.linalg.norm(direction)).tolist()
+    return x, y, z
+
+
+def recoupled(hand: HandModel, coupling: Coupling) -> HandModel:
+    """The hand in another reading of its tendons; itself where it has none, or where the reading is of other things.
+
+    separate: each joint of a tendon has the drive that it would have without. ratio: joints of a tendon turn as one,
+    each by the same angle over its coefficient's sign, with the gain and the limit of all their drives together.
+    """
+    if not hand.tendons or coupling not in ("separate", "ratio"):
+        return hand
+    if coupling == "separate":
+        return replace(hand, tendons=())
+    leader = np.arange(hand.dofs)
+    sign = np.ones(hand.dofs)
+    for tendon in hand.tendons:
+        leader[list(tendon.dofs)] = tendon.dofs[0]
+        sign[list(tendon.dofs)] = np.sign(tendon.coefficients) * np.sign(tendon.coefficients[0])
+    kept = np.unique(leader)
+    drives = np.zeros((len(kept), hand.dofs))
+    drives[np.searchsorted(kept, leader), np.arange(hand.dofs)] = sign
+    ends = np.sort(np.stack([hand.lower, hand.upper]) * sign, axis=0)
+    lower, upper = ends[0][kept].copy(), ends[1][kept].copy()
+    for d, place in enumerate(np.searchsorted(kept, leader)):
+        lower[place], upper[place] = max(lower[place], ends[0][d]), min(upper[place], ends[1][d])
+    moved = hand.dof >= 0
+    dof, rate = hand.dof.copy(), hand.multiplier.copy()
+    dof[moved] = np.searchsorted(kept, leader[hand.dof[moved]])
+    rate[moved] = hand.multiplier[moved] * sign[hand.dof[moved]]
+    pulls = np.abs(drives)
+    return replace(
+        hand,
+        tendons=(),
+        dof=dof,
+        multiplier=rate,
+        dof_names=tuple(hand.dof_names[d] for d in kept),
+        lower=lower,
+        upper=upper,
+        effort=pulls @ hand.effort,
+        stiffness=pulls @ hand.stiffness,
+        preshape=hand.preshape[kept],
+        closing=hand.closing[kept],
+        velocity=hand.velocity[kept] if len(hand.velocity) else hand.velocity,
+    )
+
+
+def nearest(hand: HandModel, joints: Floats) -> Floats:
+    """Joint positions (N, J) that a hand of fewer dofs can take, nearest to those given."""
+    dof, rate = hand.dof[hand.joint_body], hand.multiplier[hand.joint_body]
+    drive = np.zeros((len(dof), hand.dofs))
+    drive[np.arange(len(dof)), dof] = rate
+    return hand.expand((joints - hand.offset[hand.joint_body]) @ np.linalg.pinv(drive).T)
