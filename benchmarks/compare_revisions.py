@@ -33,7 +33,18 @@ import h5py
 import numpy as np
 import typer
 
-ROOMS: Final = ("service", "worker", "api", "tests", "benchmarks", "examples")
+ROOMS: Final = (
+    "service",
+    "worker",
+    "api",
+    "baselines",
+    "exchange",
+    "studies",
+    "graspd",
+    "tests",
+    "benchmarks",
+    "examples",
+)
 #: Attributes of a shard that tell of the run and not of what was made.
 OF_THE_RUN: Final = {"seconds", "created"}
 #: Fields of a record that do; checksums are of times too, and a shard's attributes are compared in the shard.

@@ -21,8 +21,8 @@ from typing import Any, Final
 
 import httpx
 
-import graspd.worker.process.engine
-import graspd.worker.process.main
+import graspd.worker.process.engine as engine
+import graspd.worker.process.main as worker_main
 from graspd.api.access.keys import KeyFile, Scope
 from graspd.service.index.index import Index
 from graspd.service.model import names
@@ -95,7 +95,7 @@ def queue() -> None:
     """What a task costs beyond its work: the queue alone, then with its shard, manifest and place in the index."""
     spent: list[float] = []
 
-    class Timed(worker.process.engine.Runner):
+    class Timed(engine.Runner):
         def run(self, *args: Any) -> Any:
             start = time.perf_counter()
             try:
@@ -105,9 +105,9 @@ def queue() -> None:
 
     with service(workers=0) as services:
         job_actions.submit(services, request(grasps=32 * 500), lane=Lane.BULK)
-        worker.process.engine.Runner = Timed  # type: ignore[misc]
+        engine.Runner = Timed  # type: ignore[misc]
         start = time.perf_counter()
-        worker.process.main.run_worker(services.settings, start=engine_of(fake_stages()), max_tasks=400)
+        worker_main.run_worker(services.settings, start=engine_of(fake_stages()), max_tasks=400)
         whole = (time.perf_counter() - start) / len(spent)
     alone = whole - statistics.fmean(spent)
     say("| what | measured | beside |\n| --- | --: | --: |")

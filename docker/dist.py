@@ -21,7 +21,9 @@ from typing import Final
 
 REPOSITORY: Final = Path(__file__).resolve().parent.parent
 #: What the packages are made of; tests and benchmarks stay in the repository.
-_PARTS: Final = ("pyproject.toml", "README.md", "LICENSE", "graspd", "service", "worker", "api")
+#: Folders that are packages of graspd: graspd/ links to them, a distribution has them there.
+_PACKAGES: Final = ("service", "worker", "api", "baselines", "exchange", "studies")
+_PARTS: Final = ("pyproject.toml", "README.md", "LICENSE", "graspd", *_PACKAGES)
 
 
 def build(folder: Path) -> list[Path]:
@@ -47,7 +49,7 @@ def _copy(sources: Path) -> None:
     for name in _git("ls-files", "--", *_PARTS).splitlines():
         file = REPOSITORY / name
         if file.is_file():
-            target = sources / name
+            target = sources / ("graspd" if Path(name).parts[0] in _PACKAGES else "") / name
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, target)
             target.chmod(0o644)

@@ -9,15 +9,11 @@
     graspd.Client("http://127.0.0.1:8000").submit("allegro", "mug", grasps=64).wait().grasps()
 
 Everything is imported when it is first used. Every error that graspd raises on purpose is a `graspd.GraspdError`.
-
-Its rooms are top-level packages called service, worker and api: no folder of a user must hide them.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.util import find_spec
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from graspd.service.model.libraries import imports
@@ -101,32 +97,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return __all__
-
-
-#: The packages that graspd is made of, besides this one.
-_PACKAGES: Final = ("service", "worker", "api")
-
-
-def _check_packages() -> None:
-    """ImportError, in one line that names the folder, if a package of the user stands in the place of one of graspd's.
-
-    Nothing is imported. A package that is not there at all is told when it is needed.
-    """
-    home = Path(__file__).resolve().parent.parent
-    for package in _PACKAGES:
-        if not (home / package).is_dir():
-            continue
-        spec = find_spec(package)
-        if spec is None or spec.origin == str(home / package / "__init__.py"):
-            continue
-        places = [spec.origin] if spec.origin else list(spec.submodule_search_locations or [])
-        found = Path(places[0]) if places else home
-        if found.name == "__init__.py":
-            found = found.parent
-        if found.resolve() != home / package:
-            raise ImportError(
-                f"graspd: {found} hides graspd's own package {package!r}; rename it, or start Python in another folder"
-            )
-
-
-_check_packages()

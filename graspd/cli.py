@@ -74,9 +74,10 @@ JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
 )
 
 #: What a package cannot work without, and the extra that brings it: an image has only the packages it needs.
-ROOMS: Final[dict[str, tuple[str, str]]] = {
-    "api": ("fastapi", "api"),
-    "worker": ("warp", "worker"),
+PACKAGES: Final[dict[str, tuple[str, str]]] = {
+    "graspd.api": ("fastapi", "api"),
+    "graspd.client": ("fastapi", "api"),
+    "graspd.commands": ("warp", "worker"),
     "graspd.demo": ("warp", "all"),
 }
 
@@ -176,7 +177,7 @@ def escape_help(command: Any) -> None:
 
 def missing_extra(module: str) -> str | None:
     """The extra to install before a module can be used; None if it can be used now."""
-    needed, extra = ROOMS.get(module) or ROOMS.get(module.partition(".")[0], ("", ""))
+    needed, extra = next((PACKAGES[name] for name in PACKAGES if f"{module}.".startswith(f"{name}.")), ("", ""))
     return extra if needed and find_spec(needed) is None else None
 
 

@@ -76,7 +76,7 @@ def all_checks(settings: Settings, *, full: bool = False) -> list[Check]:
 
 
 def _of_api(settings: Settings) -> list[Check]:
-    if missing_extra("api"):
+    if missing_extra("graspd.api"):
         return [_absent("keys", "api")]
     from graspd.api.access.doctor import keys
 
@@ -84,7 +84,7 @@ def _of_api(settings: Settings) -> list[Check]:
 
 
 def _of_worker(settings: Settings) -> list[Check]:
-    if missing_extra("worker"):
+    if missing_extra("graspd.commands"):
         return [_absent("gpu", "worker"), _absent("kernels", "worker")]
     from graspd.worker.process.doctor import checks_of as of_worker
 

@@ -41,6 +41,8 @@ def pytest_collection_finish() -> None:
 
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+#: Folders of the product.
+PACKAGES = ("graspd", "service", "worker", "api", "baselines", "exchange", "studies")
 
 
 @pytest.fixture(scope="session")

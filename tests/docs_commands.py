@@ -54,7 +54,7 @@ _ASKS: Final = re.compile(
 _FENCED: Final = re.compile(r"^```(\w*)\n(.*?)^```\n?", re.DOTALL | re.MULTILINE)
 _INDENTED: Final = re.compile(r"(?:^\n)((?:^    .*\n)+)", re.MULTILINE)
 _TRIED: Final = re.compile(r"<!-- tried: [\w-]+ -->\s*$")
-_OURS: Final = {"graspd", "api", "service", "worker", "benchmarks", "examples", "tests"}
+_OURS: Final = {"graspd", "benchmarks", "examples", "tests"}
 #: What an indented block of commands begins with; any other is a file or a formula.
 _FIRST: Final = re.compile(r"(?:\w+=\S+ )*(?:\S*/)?(?:graspd|python|make|export|cp|curl|docker|kubectl) ")
 #: Words that differ between what has ended and what is shown on its way.

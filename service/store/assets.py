@@ -224,7 +224,7 @@ def builtin_files(kind: AssetKind, name: str) -> dict[str, bytes]:
     Raises:
         NotFoundError: no such built-in.
     """
-    folder = Path(str(resources.files("service"))) / "builtin" / f"{kind.value}s" / name
+    folder = Path(str(resources.files("graspd.service"))) / "builtin" / f"{kind.value}s" / name
     if not (folder / "asset.json").is_file():
         known = ", ".join(builtin_names(kind))
         raise NotFoundError(f"there is no built-in {kind.value} {name!r}; there are: {known}")
@@ -235,12 +235,14 @@ def builtin_files(kind: AssetKind, name: str) -> dict[str, bytes]:
 
 def builtin_model(kind: AssetKind, name: str) -> bytes:
     """Binary glTF of a built-in hand or object, as `python -m graspd.worker.stages.models` wrote it."""
-    return (Path(str(resources.files("service"))) / "builtin" / "models" / f"{kind.value}-{name}.glb").read_bytes()
+    return (
+        Path(str(resources.files("graspd.service"))) / "builtin" / "models" / f"{kind.value}-{name}.glb"
+    ).read_bytes()
 
 
 def builtin_names(kind: AssetKind) -> tuple[str, ...]:
     """Names of the built-in hands or objects."""
-    root = Path(str(resources.files("service"))) / "builtin" / f"{kind.value}s"
+    root = Path(str(resources.files("graspd.service"))) / "builtin" / f"{kind.value}s"
     return tuple(sorted(path.parent.name for path in root.glob("*/asset.json")))
 
 

@@ -22,7 +22,9 @@ pytestmark = [
 
 #: What a user does first, from files of the package alone: templates, built-in hands.
 FIRST_STEPS = """
-import pathlib, graspd, service.index.index, api.dashboard.rendering, service.store.library
+import pathlib, graspd, graspd.api.dashboard.rendering
+from graspd import service
+import graspd.service.index.index, graspd.service.store.library
 assert str(pathlib.Path(graspd.__file__)).startswith({place!r}), graspd.__file__
 index = service.index.index.Index("sqlite:///" + {place!r} + "/index.sqlite")
 index.close()

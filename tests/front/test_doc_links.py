@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import REPOSITORY
+from tests.conftest import PACKAGES, REPOSITORY
 
 PAGES = sorted(
     page
@@ -19,7 +19,7 @@ PAGES = sorted(
     if page.is_file()
 )
 #: Sources whose comments, messages and help name pages.
-SOURCES = ("api", "benchmarks", "docker", "examples", "graspd", "service", "worker")
+SOURCES = (*PACKAGES, "benchmarks", "docker", "examples")
 _NAMED = re.compile(r"(?<![\w/.])(?:docs|README|CONTRIBUTING|ARCHITECTURE|SECURITY)[\w/-]*\.md\b")
 _CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.DOTALL | re.MULTILINE)
 _LINK = re.compile(r"\]\(([^()\s]+)\)|(?:src|href)=\"([^\"]+)\"")

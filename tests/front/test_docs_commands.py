@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests import docs_commands
-from tests.conftest import REPOSITORY
+from tests.conftest import PACKAGES, REPOSITORY
 from tests.docs_commands import NOT_RUN, PAGES, Line, lines_of
 
 #: `graspd jobs`, <pre>graspd jobs</pre>, epilog="graspd jobs".
@@ -24,7 +24,7 @@ def test_commands_of_a_page_are_those_of_the_command_line(page: Path) -> None:
 
 def test_commands_in_sentences_messages_and_examples_of_help_exist() -> None:
     files = [*REPOSITORY.glob("*.md")]
-    for room in ("api", "docker", "docs", "graspd", "service", "worker"):
+    for room in (*PACKAGES, "docker", "docs"):
         files += [file for file in (REPOSITORY / room).rglob("*") if file.suffix in {".html", ".md", ".py", ".yaml"}]
     # The changelog names commands of older releases.
     named = {(f.name, one) for f in files if f.name != "CHANGELOG.md" for one in _NAMED.findall(f.read_text())}

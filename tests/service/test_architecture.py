@@ -27,7 +27,7 @@ def rows_of(heading: str) -> list[list[str]]:
 @pytest.mark.parametrize("package", ["api", "worker", "service"])
 def test_the_floors_are_those_that_the_contracts_keep(package: str) -> None:
     contracts = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
-    (kept,) = [c["layers"] for c in contracts if c["type"] == "layers" and c["containers"] == [package]]
+    (kept,) = [c["layers"] for c in contracts if c["type"] == "layers" and c["containers"] == [f"graspd.{package}"]]
     layers = [set(re.findall(r"`(\w+)`", first)) for first, _ in rows_of(f"layer of `{package}/` | what it is")]
     assert layers == [set(re.findall(r"\w+", layer)) for layer in kept]
 

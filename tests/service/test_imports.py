@@ -7,10 +7,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import graspd.service
+from graspd import service
+from tests.conftest import PACKAGES
 
 MODULES = sorted(
-    "service."
+    "graspd.service."
     + ".".join(path.relative_to(Path(service.__file__).parent).with_suffix("").parts).removesuffix(".__init__")
     for path in Path(service.__file__).parent.rglob("*.py")
     # The readers' module for torch is for those who have it.
@@ -18,13 +19,13 @@ MODULES = sorted(
 )
 
 
-HEAVY = {"warp", "trimesh", "mujoco", "scipy", "newton", "torch", "worker", "api"}
+HEAVY = {"warp", "trimesh", "mujoco", "scipy", "newton", "torch", "graspd.worker", "graspd.api"}
 
 
 def test_no_line_spells_a_key_of_rq() -> None:
     """RQ itself says where it keeps what: `service.queue.lists` asks it."""
     root = Path(service.__file__).parents[1]
-    files = [file for room in ("service", "worker", "api", "graspd") for file in (root / room).rglob("*.py")]
+    files = [file for room in PACKAGES for file in (root / room).rglob("*.py")]
     assert [str(file) for file in files if re.search(r"""["']rq:""", file.read_text())] == []
 
 

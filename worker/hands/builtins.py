@@ -1,7 +1,7 @@
 """The built-in hands, written from published kinematic facts as URDFs of primitives.
 
-``python -m graspd.worker.hands.builtins`` writes them into `service/builtin/hands/`. Frames and numbers follow the makers'
-data: Wonik Allegro Hand (right), Barrett BH8-280, Shadow Dexterous Hand E (right, without forearm and wrist).
+``python -m graspd.worker.hands.builtins`` writes them into `service/builtin/hands/`. Frames and numbers follow the
+makers' data: Wonik Allegro Hand (right), Barrett BH8-280, Shadow Dexterous Hand E (right, without forearm and wrist).
 """
 
 from __future__ import annotations

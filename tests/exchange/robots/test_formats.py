@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import yaml
 
-import graspd.service
+from graspd import service
 from graspd.exchange.cases import load_case
 from graspd.service.model.transforms import compose, invert
 from graspd.service.store.shards import read_shard, write_shard

@@ -9,6 +9,7 @@ import pytest
 
 from graspd.service.model import cores
 from graspd.service.model.cores import available_cores
+from tests.conftest import PACKAGES
 
 MACHINE = 16
 
@@ -79,8 +80,9 @@ def test_what_cannot_be_read_is_no_limit(tmp_path: Path, text: str) -> None:
 
 def test_no_other_count_of_cores_is_asked_for() -> None:
     here = Path(__file__).parents[3]
-    packages = ("api", "service", "worker", "benchmarks", "examples")
-    files = [file for package in packages for file in (here / package).rglob("*.py")] + list(here.glob("*.py"))
+    files = [
+        file for package in (*PACKAGES, "benchmarks", "examples") for file in (here / package).rglob("*.py")
+    ] + list(here.glob("*.py"))
     asking = [
         str(file.relative_to(here))
         for file in files

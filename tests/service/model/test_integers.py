@@ -18,7 +18,8 @@ def test_values_are_ascending_and_each_there_once() -> None:
 
 def test_masked_arrays_are_not_loaded_for_it() -> None:
     code = (
-        "import sys, numpy as np; from graspd.service.model.integers import distinct_values; distinct_values(np.arange(3)); "
+        "import sys, numpy as np; from graspd.service.model.integers import distinct_values\n"
+        "distinct_values(np.arange(3))\n"
         "sys.exit('numpy.ma' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -28,7 +28,7 @@ from graspd.service.pipeline.indexer import Indexer
 from graspd.service.pipeline.lease_reaper import LeaseReaper
 from graspd.service.queue.lists import held_key, queue_name
 from graspd.service.queue.rq_queue import RqQueue, cancel_key, rq_id
-from tests.conftest import REPOSITORY
+from tests.conftest import PACKAGES, REPOSITORY
 from tests.fakes import request
 
 NAME = queue_name(Lane.INTERACTIVE, Stage.SYNTHESIZE)
@@ -156,7 +156,7 @@ def test_rq_is_used_as_rq() -> None:
         found
         for base in (BaseWorker, Job, Queue, BaseRegistry, Execution, BaseDeathPenalty)
         for found in _subclasses(base)
-        if found.__module__.partition(".")[0] in ROOMS
+        if found.__module__.startswith("graspd.")
     }
     assert {
         name
@@ -166,14 +166,11 @@ def test_rq_is_used_as_rq() -> None:
     } == OVERRIDDEN
 
 
-ROOMS = ("service", "worker", "api", "graspd")
-
-
 def _modules_with_rq() -> list[str]:
-    files = [file for room in ROOMS for file in sorted((REPOSITORY / room).rglob("*.py"))]
+    files = [file for package in PACKAGES for file in sorted((REPOSITORY / package).rglob("*.py"))]
     found = [file for file in files if re.search(r"^(from|import) rq\b", file.read_text(), re.MULTILINE)]
     assert found
-    return [".".join(file.relative_to(REPOSITORY).with_suffix("").parts) for file in found]
+    return ["graspd." + ".".join(file.relative_to(REPOSITORY).with_suffix("").parts) for file in found]
 
 
 def _subclasses(base: type) -> Iterator[type]:

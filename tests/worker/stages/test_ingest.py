@@ -199,7 +199,8 @@ def test_a_check_that_is_stopped_ends_its_child(
 
 def test_a_check_loads_no_engine() -> None:
     """It would cost four seconds of computing for every upload, and memory of the child's limit."""
-    code = "import sys, graspd.worker.stages.ingest, graspd.worker.hands.check, graspd.worker.objects.check, graspd.worker.stages.models\n"
+    modules = ("stages.ingest", "hands.check", "objects.check", "stages.models")
+    code = f"import sys, {', '.join(f'graspd.worker.{module}' for module in modules)}\n"
     done = subprocess.run(
         [sys.executable, "-c", f"{code}print(*sys.modules)"], capture_output=True, text=True, check=True
     )
