@@ -38,9 +38,9 @@ def percent(value: float | None) -> str:
 
 
 def valid_yield(made: Any) -> str:
-    """Share of the judged grasps that are valid, of whatever counts them; words where nobody judged."""
+    """Share of the validated grasps that are valid, of whatever counts them; words where not validated."""
     if made.valid_yield is None:
-        return "not judged" if made.tried else NONE
+        return "not validated" if made.candidates else NONE
     return percent(made.valid_yield)
 
 

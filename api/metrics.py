@@ -58,11 +58,11 @@ class Snapshot:
                 self._set("graspd_part_latency_seconds", part, value=seconds)
 
     def add_queue(self, queue: QueueNow, *, is_kept: bool) -> None:
-        for (lane, stage), depth in queue.depth.items():
-            self._set("graspd_queue_depth", lane, stage, value=depth)
-            oldest = queue.oldest_s.get((lane, stage), 0.0)
-            self._set("graspd_queue_oldest_task_seconds", lane, stage, value=oldest)
-            self._set("graspd_tasks_running", lane, stage, value=queue.running.get((lane, stage), 0))
+        for (priority, stage), depth in queue.depth.items():
+            self._set("graspd_queue_depth", priority, stage, value=depth)
+            oldest = queue.oldest_s.get((priority, stage), 0.0)
+            self._set("graspd_queue_oldest_task_seconds", priority, stage, value=oldest)
+            self._set("graspd_tasks_running", priority, stage, value=queue.running.get((priority, stage), 0))
         states = [beat.state for beat, _ in queue.workers.values()]
         for state in ("checking", "idle", "busy", "stopping", "quarantined"):
             self._set("graspd_workers", state, value=states.count(state))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from graspd.service.index.views import AttemptView, GraspView, Judged, ShardView, StageProgress, TagView, WorkerView
+from graspd.service.index.views import AttemptView, GraspView, ShardView, StageProgress, TagView, Validated, WorkerView
 from graspd.service.model.base import TagName
 from graspd.service.model.domain import Digest, JobRequest
 from graspd.service.model.metric_fields import OfferedName, filters, means, with_fields
@@ -27,7 +27,7 @@ class StageStatus(StageProgress):
     eta_s: float | None = Field(None, description="expected time until the stage ends [s]")
 
 
-class Job(Judged):
+class Job(Validated):
     """A job as the list shows it."""
 
     id: str
@@ -37,8 +37,9 @@ class Job(Judged):
     method: str
     fidelity: str
     requested: int = Field(description="grasps asked for")
-    standing: Literal["valid", "sound", "kept"] = Field(
-        "valid", description="what its kept grasps can be: sound where nobody judges, or merely kept if raw were wanted"
+    standing: Literal["valid", "feasible", "kept"] = Field(
+        "valid",
+        description="what its kept grasps can be: feasible where nothing is validated, or merely kept if raw were wanted",
     )
     progress: float = Field(ge=0, le=1)
     eta_s: float | None = Field(None, description="expected time until the job ends [s]; absent: not known yet")
@@ -60,7 +61,7 @@ class MeanMetrics(BaseModel):
 
 
 class Diversity(BaseModel):
-    """How different the valid grasps of a job are, all that it kept where nobody judged them."""
+    """How different the valid grasps of a job are, all that it kept where not validated."""
 
     grasps: int = Field(description="grasps looked at")
     types: dict[str, int] = Field(description="how many are power, precision or lateral; none: not told")
@@ -88,8 +89,8 @@ class JobDetail(Job):
     outcomes: dict[str, int] = Field(
         {}, description="of a job that found fewer grasps than asked: candidates not kept, by what became of them"
     )
-    audited: int = Field(0, description="valid grasps judged again by the letter of the protocol")
-    audit_held: int = Field(0, description="of these, grasps that held")
+    rechecked: int = Field(0, description="valid grasps validated again under the unmodified DexGraspBench protocol")
+    recheck_held: int = Field(0, description="of these, grasps that held")
     attempts: list[AttemptView]
     mean: MeanMetrics
     diversity: Diversity | None = Field(None, description="absent while there is no such grasp")
@@ -110,8 +111,8 @@ class GraspQuery(BaseModel):
     )
     hand: str | None = Field(None, max_length=64)
     object: str | None = Field(None, max_length=64)
-    judged: bool | None = Field(None, description="whether the referee gave a verdict")
-    valid: bool | None = Field(None, description="false: judged, and not valid")
+    validated: bool | None = Field(None, description="whether the validator gave a verdict")
+    valid: bool | None = Field(None, description="false: validated, and not valid")
     success: bool | None = None
     type: Literal["power", "precision", "lateral"] | None = Field(None, description="what the hand does")
     scene: Literal["free", "table", "bin", "shelf", "file", "any"] | None = Field(
@@ -165,7 +166,7 @@ class GraspScene(BaseModel):
 
 
 class Push(BaseModel):
-    """What one push of the referee did to a grasp."""
+    """What one push of the validator did to a grasp."""
 
     direction: str
     outcome: str
@@ -182,12 +183,14 @@ class GraspDetail(GraspView):
     sweep: dict[str, list[float | None]] = Field(description="metric at each of the thresholds")
     way: list[Waypoint] = Field(description="from the standoff, where it has one, to the squeeze or the lift")
     scene: GraspScene | None = Field(None, description="where it was planned; None: around a free object")
-    pushes: list[Push] = Field(description="verdict per direction of push; empty: the referee did not judge")
+    pushes: list[Push] = Field(description="verdict per direction of push; empty: the validator did not validate")
     verdict_margin: float | None = Field(None, description="worst motion over its limit; below 1: held")
-    judged_by: Literal["mujoco", "mujoco_warp"] | None = Field(
-        None, description="whose verdict it is: of MuJoCo on the CPU, which certifies, or of the first judge"
+    validated_by: Literal["mujoco", "mujoco_warp"] | None = Field(
+        None, description="whose verdict it is: of MuJoCo on the CPU, which certifies, or of the prefilter"
     )
-    audit: bool | None = Field(None, description="verdict by the letter of the protocol; None: not audited")
+    recheck: bool | None = Field(
+        None, description="verdict under the unmodified DexGraspBench protocol; None: not rechecked"
+    )
     friction: float | None = Field(None, description="Coulomb coefficient of the metrics")
 
 

@@ -62,7 +62,7 @@ class Problem(BaseModel):
     type: str = Field(description="URI reference of the problem type; opens its description")
     title: str
     status: int
-    detail: str = Field(description="what is wrong and the mend, in one line")
+    detail: str = Field(description="what is wrong and the fix, in one line")
     instance: str = Field(description="path of the request")
     request_id: str | None = Field(None, description="the same as in header X-Request-Id and in the log")
     errors: list[FieldError] | None = None

@@ -1,4 +1,4 @@
-"""What the studies of quality share: raw grasps of a hand on an object and what is found out about them, kept on disk.
+"""What the studies of quality share: candidates of a hand on an object and what is found out about them, kept on disk.
 
 A cell is one (hand, object) with a number of grasps of one revision of synthesize, planned as a job plans them. What a
 cell has found once is read again from its folder, so a study that was stopped goes on where it was, and two studies of
@@ -21,18 +21,18 @@ import numpy as np
 
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.version import STAGE_REVISIONS
+from graspd.worker.execution_context import DEFAULT_CONTEXT
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
-from graspd.worker.planners.port import Wanted
-from graspd.worker.run import ALONE
-from graspd.worker.scenes.trial import trial_on
+from graspd.worker.planners.port import PlanRequest
+from graspd.worker.scenes.rollout import rollout_on
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.key import Level
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.validator import validate
 
 HANDS = {
     "allegro": "allegro/allegro_hand_right.urdf",
@@ -66,7 +66,7 @@ class Cell:
 
     @cached_property
     def grasps(self) -> GraspSet:
-        """The raw grasps; `seconds` is the wall time of making them with their postures, `info` has the CPU time."""
+        """The candidates; `seconds` is the wall time of making them with their postures, `info` has the CPU time."""
         file = self.folder / "grasps.npz"
         if file.is_file():
             with np.load(file) as stored:
@@ -99,7 +99,7 @@ class Cell:
 
         def make() -> dict[str, Any]:
             grasps, began = self.grasps, time.process_time()
-            found = judge(self.hand, self.obj, grasps, level=level, hard=hard)
+            found = validate(self.hand, self.obj, grasps, level=level, hard=hard)
             return {
                 "success": found.success.tolist(),
                 "reasons": found.reasons,
@@ -119,12 +119,12 @@ class Cell:
 
 
 def planned(hand: HandModel, obj: ObjectModel, *, count: int, seed: int, fidelity: str = "standard") -> GraspSet:
-    """Raw grasps of a free object as a job plans them: candidates go through the trial of `trial_on`.
+    """Candidates of a free object as a job plans them: candidates go through the trial of `trial_on`.
 
     Like a job's they are planned about the middle of the object, and their positions are on the grid.
     """
-    trial = trial_on(ALONE, hand, obj.centred, lambda: decompose(obj.centred), in_scenes=False)
-    found = synthesize(hand, obj.centred, Wanted(count, FIDELITIES[fidelity], seed, trial=trial))
+    rollout = rollout_on(DEFAULT_CONTEXT, hand, obj.centred, lambda: decompose(obj.centred), in_scenes=False)
+    found = synthesize(hand, obj.centred, PlanRequest(count, FIDELITIES[fidelity], seed, rollout=rollout))
     return found.moved(np.zeros(3)).moved(obj.centre)
 
 
@@ -158,7 +158,7 @@ def cell_parser(
     if hands:
         parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
     parser.add_argument("--objects", nargs="+", default=objects)
-    parser.add_argument("--grasps", type=int, default=grasps, help="raw grasps of each hand on each object")
+    parser.add_argument("--grasps", type=int, default=grasps, help="candidates of each hand on each object")
     return parser
 
 

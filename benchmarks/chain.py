@@ -9,8 +9,8 @@ docs/results/service.md.
 
 With --service a job of built-in hand and object goes through a whole service of each checkout: submitted over HTTP,
 planned, certified, measured, stored, indexed, after a small job that loads everything. Processor time is that of all
-processes of the service; beside it stands what BEFORE's planner alone takes for a raw grasp. With --pictures jobs are
-as examples/million/million.toml has them: for each batch six pictures of the object at rest on a table, eight audits.
+processes of the service; beside it stands what BEFORE's planner alone takes for a candidate. With --pictures jobs are
+as examples/million/million.toml has them: for each batch six pictures of the object at rest on a table, eight rechecks.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from graspd.worker.planners.fast_graspd import planner
 from graspd.worker.control.postures import pregrasp, squeeze
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.displacement import simulated_displacement_cm
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.validator import validate
 from graspd.worker.quality.table import measure
 
 path, name, count, seed = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
@@ -55,7 +55,7 @@ def chain(wanted):
     parts = timed("planner", lambda: planner.optimise_batch(hand, obj, wanted, run))
     states = [part.state for part in parts]
     grasps = timed("postures", lambda: planner.grasps_of(hand, obj, parts, 0.0))
-    verdicts = timed("referee", lambda: judge(hand, obj, grasps, pieces=pieces, run=run))
+    verdicts = timed("validator", lambda: validate(hand, obj, grasps, pieces=pieces, run=run))
     held = grasps.take(np.flatnonzero(verdicts.success == 1))
     timed("quality", lambda: measure(hand, obj, held, run=run))
     timed("displacement", lambda: simulated_displacement_cm(hand, obj, held.grasp, pieces=pieces, run=run))
@@ -69,7 +69,7 @@ print(json.dumps({"valid": valid, "raw": count // 32 * 32, "ms": {stage: 1e3 * s
 
 
 #: What a job of the pilot asks for besides grasps.
-PILOT: Final = {"scenes": 2, "views": 3, "audits": 8, "budget": 4}
+PILOT: Final = {"scenes": 2, "views": 3, "rechecks": 8, "budget": 4}
 
 
 def environment_of(root: Path) -> dict[str, str]:
@@ -102,10 +102,10 @@ def row(stage: str, before: float, after: float) -> str:
 
 
 def table(pair: str, before: dict[str, Any], after: dict[str, Any]) -> list[str]:
-    """The stages of one pair; the planner makes raw grasps, so all is told of a valid one."""
+    """The stages of one pair; the planner makes candidates, so all is told of a valid one."""
     each = [{stage: ms / max(1, found["valid"]) for stage, ms in found["ms"].items()} for found in (before, after)]
     lines = [
-        f"### {pair}: {before['valid']} and {after['valid']} of {before['raw']} hold",
+        f"### {pair}: {before['valid']} and {after['valid']} of {before['candidates']} hold",
         "",
         "| core-ms a valid grasp | before | after | times |",
         "| --- | --- | --- | --- |",
@@ -139,8 +139,8 @@ def service_table(pair: str, before: dict[str, float], after: dict[str, float], 
         "| --- | --: | --: | --: |",
         f"| valid grasps/s | {rates[0]:.2f} | {rates[1]:.2f} | {rates[1] / rates[0]:.2f} |",
         row("core-ms a valid grasp", *costs),
-        f"| core-ms a raw grasp of the planner alone, before | {raw_ms:.1f} | | |",
-        f"| valid grasps over raw ones of that planner, for the same processor time | {raw_ms / costs[0]:.2f} "
+        f"| core-ms a candidate of the planner alone, before | {raw_ms:.1f} | | |",
+        f"| valid grasps over candidates of that planner, for the same processor time | {raw_ms / costs[0]:.2f} "
         f"| {raw_ms / costs[1]:.2f} | |",
         "",
     ]
@@ -157,7 +157,7 @@ def compare_services(given: argparse.Namespace) -> dict[str, Any]:
             through_service(root, hand, obj, given.grasps or 256, PILOT if given.pictures else {}) for root in roots
         ]
         found[pair] = dict(zip(("planner", "before", "after"), (alone, *both), strict=True))
-        lines = service_table(pair, *both, raw_ms=alone["ms"]["planner"] / alone["raw"])
+        lines = service_table(pair, *both, raw_ms=alone["ms"]["planner"] / alone["candidates"])
         sys.stdout.write("\n".join(lines) + "\n")
         sys.stdout.flush()
     return found

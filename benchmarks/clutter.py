@@ -25,19 +25,19 @@ from graspd.service.model.domain import BATCH_SIZE, JobOptions
 from graspd.service.model.errors import MeshError
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.scene_spec import SceneSpec
-from graspd.worker.certified import certified_grasps
+from graspd.worker.execution_context import ExecutionContext
+from graspd.worker.generation import validated_grasps
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.run import Run
-from graspd.worker.scenes.beside import gaps_between, neighbour_of, scenes_of
+from graspd.worker.scenes.placement import gaps_between, neighbour_of, scenes_of
 
 #: Not a seed that any setting was chosen with.
 SEED = 505
 CORES = 2
 FIDELITY = FIDELITIES["standard"]
-TITLES = ("target", "scene", "neighbours", "gap, mm", "certified", "tried", "clear", "lift", "seconds")
+TITLES = ("target", "scene", "neighbours", "gap, mm", "validated_batch", "candidates", "clear", "lift", "seconds")
 
 
 def study(hand: HandModel, obj: ObjectModel, others: list[ObjectModel], scene: int, seconds: float) -> dict[str, Any]:
@@ -48,24 +48,24 @@ def study(hand: HandModel, obj: ObjectModel, others: list[ObjectModel], scene: i
     together = np.concatenate([poses["scene/object_pose"][:, None], poses["scene/neighbour_pose"]], axis=1)[-1:]
     gap = min(float(found[0]) for pair, found in gaps_between(things, together, 0.5).items() if pair[0] == 0)
     here = replace(scenes, object_pose=scenes.object_pose[-1:], neighbour_pose=scenes.neighbour_pose[-1:])
-    request = JobOptions(grasps=BATCH_SIZE, want="raw", seed=SEED, fidelity=FIDELITY, audits=0)
-    found = {"certified": 0, "tried": 0, "clear": 0.0, "lift": 0.0}
-    certified_grasps(hand, obj, request, count=2, batch=1 << 19, scenes=here, run=Run())  # kernels, pieces
+    request = JobOptions(grasps=BATCH_SIZE, want="candidates", seed=SEED, fidelity=FIDELITY, rechecks=0)
+    found = {"validated_batch": 0, "candidates": 0, "clear": 0.0, "lift": 0.0}
+    validated_grasps(hand, obj, request, count=2, batch=1 << 19, scenes=here, run=ExecutionContext())  # kernels, pieces
     began, batch = time.process_time(), 0
     while (spent := (time.process_time() - began) / CORES) < seconds:
-        made = certified_grasps(hand, obj, request, count=BATCH_SIZE, batch=batch, scenes=here, run=Run())
+        made = validated_grasps(hand, obj, request, count=BATCH_SIZE, batch=batch, scenes=here, run=ExecutionContext())
         if (time.process_time() - began) / CORES > seconds and batch:
             break  # its verdicts came too late
-        found["certified"] += int(made.columns["quality/valid"].sum())
-        found["tried"] += made.planned
+        found["validated_batch"] += int(made.columns["quality/valid"].sum())
+        found["candidates"] += made.planned
         found["clear"] += made.shares["clear_share"] * made.planned
         found["lift"] += made.shares["lift_share"] * made.planned
         batch += 1
-    tried = max(1, found["tried"])
+    candidates = max(1, found["candidates"])
     return {
         **found,
-        "clear": found["clear"] / tried,
-        "lift": found["lift"] / tried,
+        "clear": found["clear"] / candidates,
+        "lift": found["lift"] / candidates,
         "gap": 1e3 * gap,
         "seconds": min(spent, seconds),
     }
@@ -106,7 +106,7 @@ def main() -> None:
             row = {"target": target, "scene": scene, **row}
             rows.append(row)
             sys.stdout.write(
-                f"| {target} | {scene} | {len(others)} | {row['gap']:.0f} | {row['certified']} | {row['tried']} | "
+                f"| {target} | {scene} | {len(others)} | {row['gap']:.0f} | {row['validated_batch']} | {row['candidates']} | "
                 f"{row['clear']:.2f} | {row['lift']:.2f} | {row['seconds']:.0f} |\n"
             )
             sys.stdout.flush()

@@ -35,7 +35,7 @@ def lap(name):
     global last
     now = time.process_time()
     laps[name], last = now - last, now
-import graspd.worker.certified
+import graspd.worker.generation
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.service.model.domain import JobRequest
@@ -44,9 +44,9 @@ hand = hand_from_path(sys.argv[1])
 request = JobRequest(hand="h", object="o", grasps=1, fidelity="standard", seed=3)
 obj = object_from_path(sys.argv[2], face_error_m=request.knobs.face_error_m)
 lap("hand and object")
-found = worker.certified.certified_grasps(hand, obj, request, count=1)
+found = worker.generation.certified_grasps(hand, obj, request, count=1)
 lap("first valid grasp")
-worker.certified.certified_grasps(hand, obj, request, count=1, batch=1)
+worker.generation.certified_grasps(hand, obj, request, count=1, batch=1)
 lap("one more")
 print(json.dumps({"valid": len(found.grasps), "laps": laps}))
 """

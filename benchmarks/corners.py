@@ -4,7 +4,7 @@ usage: python -m benchmarks.corners DATA_DIR [--hands allegro ...] [--places wal
            [--grasps 16] [--seed 1400] [--page OUT.md]
        DATA_DIR holds hands/
 
-Shares are of raw candidates of fidelity standard on a box of 50 x 60 x 80 mm that stands, with a density of 700 kg/m3.
+Shares are of candidates of fidelity standard on a box of 50 x 60 x 80 mm that stands, with a density of 700 kg/m3.
 Walls are 150 mm high, those of a slot 80 mm; neighbours are four boxes of the same size.
 """
 
@@ -37,7 +37,7 @@ PLACES: Final = {
 WALL: Final = (0.02, 0.15)
 HEAD = """# Lifts beside walls and among neighbours
 
-`python -m benchmarks.corners DATA`: shares of {grasps} raw candidates on a box of 50 x 60 x 80 mm that are clear of
+`python -m benchmarks.corners DATA`: shares of {grasps} candidates on a box of 50 x 60 x 80 mm that are clear of
 what stands around, that lift, and that lift at half the friction, by the gap; seed {seed}, density 700 kg/m3. Slot:
 walls on both sides along x, as high as the box; neighbours: boxes of the same size on all four sides. Nothing lifts out
 of gaps narrower than a fingertip (Allegro 24 mm, Barrett 19 mm, Shadow 15 mm) on every axis.
@@ -86,8 +86,10 @@ def main() -> None:
 
 
 def lifts(given: Any, hand: str, name: str, gap: float, mesh: str) -> str:
-    """Shares of raw candidates, or why there is none."""
-    request = JobOptions(grasps=given.grasps, want="raw", audits=0, seed=given.seed, scene="table", density=700.0)
+    """Shares of candidates, or why there is none."""
+    request = JobOptions(
+        grasps=given.grasps, want="candidates", rechecks=0, seed=given.seed, scene="table", density=700.0
+    )
     try:
         made = synthesized(
             str(given.data / "hands" / HANDS[hand]), mesh, request, place=place_of(name, gap, mesh), scenes=1

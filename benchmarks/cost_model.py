@@ -66,7 +66,7 @@ class Measured:
     """Inputs that were measured; `docs/explanation/scaling.md` says with which commands."""
 
     core_s_per_grasp: float = 0.194
-    """A worker's time on one core for a valid grasp, standard fidelity: plan, judge, postures, quality [core s]."""
+    """A worker's time on one core for a valid grasp, standard fidelity: plan, validate, postures, quality [core s]."""
     core_s_per_scene: float = 0.073
     """The same of a scene with the grasps of its batch [core s]."""
     core_s_per_picture: float = 0.186

@@ -1,4 +1,4 @@
-"""How different raw standard grasps are: near pairs, types, directions of approach.
+"""How different standard candidates are: near pairs, types, directions of approach.
 
 usage: python -m benchmarks.diversity DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--grasps 64]
 DATA_DIR holds hands/ and objects/. Prints Markdown. Stopped runs go on, grasps of other studies serve (see cells.py).

@@ -1,8 +1,8 @@
 """The failures that are left: the worst objects of each hand, what became of their grasps, and pictures of some.
 
 usage: python -m benchmarks.failures DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out FOLDER]
-DATA_DIR holds hands/ and objects/. Raw standard grasps are judged at level certificate; stopped runs go on (cells.py).
-Writes failures.md, failures.json and a picture for each of the worst objects under `--out`/failures.
+DATA_DIR holds hands/ and objects/. Raw standard grasps are validated at level certificate; stopped runs go on
+(cells.py). Writes failures.md, failures.json and a picture for each of the worst objects under `--out`/failures.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from PIL import Image
 from benchmarks.cells import SEED, Cell, cell_parser, cells, write_json
 from graspd.service.model.version import STAGE_REVISIONS
 from graspd.worker.control.postures import hold_forces
-from graspd.worker.hands.oppositions import oppositions_of
+from graspd.worker.hands.pinch_postures import oppositions_of
 from graspd.worker.quality.contact import contact_distance_consistency_mm
 from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
 from graspd.worker.quality.table import measure
 from graspd.worker.rendering.pictures import grasp_pictures
 from graspd.worker.rendering.sheets import contact_sheet
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.validator import validate
 
 #: Objects of a hand that are shown, and failures of each beside one that holds.
 WORST, SHOWN = 3, 3
@@ -42,7 +42,7 @@ PUSHED_MM = 0.3
 def found_out(cell: Cell) -> dict[str, Any]:
     """Verdict and figures of each grasp, and what of the object and the hand decides them."""
     grasps, hand, obj = cell.grasps, cell.hand, cell.obj
-    verdicts = judge(hand, obj, grasps)
+    verdicts = validate(hand, obj, grasps)
     columns = measure(hand, obj, grasps, thresholds_m=[0.005])
     probe = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
     apart = contact_distance_consistency_mm(hand, probe.body_distance(probe.measure(grasps.grasp)))
@@ -135,7 +135,7 @@ def main() -> None:
     args = parser.parse_args()
     lines = [
         "# The failures left\n",
-        f"Raw `standard` grasps, seed {SEED}, {args.grasps} on each object, judged at level `certificate` (revision "
+        f"Raw `standard` grasps, seed {SEED}, {args.grasps} on each object, validated at level `standard` (revision "
         f"{STAGE_REVISIONS['synthesize']} of synthesize). Of each hand up to {WORST} objects on which most are lost, "
         f"of {len(args.objects or []) or 'all'} objects. Made by `python -m benchmarks.failures DATA --objects ...`; a "
         "margin is the worst motion over its limit. The pictures show the moment of contact: up to three that fail, "

@@ -4,7 +4,7 @@ usage: python -m benchmarks.flat DATA_DIR [--hands allegro ...] [--things 60x60x
            [--seed 1300] [--page OUT.md] [--keep FOLDER]
        DATA_DIR holds hands/; grasps are kept as FOLDER/HAND-THING.h5 where it is given
 
-Shares are of raw candidates of fidelity standard. Boxes and screwdriver are built here; their density is 700 kg/m3.
+Shares are of candidates of fidelity standard. Boxes and screwdriver are built here; their density is 700 kg/m3.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ BOXES: Final = (
 )  # fmt: skip
 HEAD = """# Table lifts of flat and thin things
 
-`python -m benchmarks.flat DATA`: shares of raw candidates that are clear of the table, that lift, and that lift at half
+`python -m benchmarks.flat DATA`: shares of candidates that are clear of the table, that lift, and that lift at half
 the friction. {grasps} candidates a pair, {scenes} scenes, seed {seed}, density 700 kg/m3. Boxes are named by their
 extents in mm; the screwdriver has a handle of 28 x 100 mm and a shaft of 6 x 100 mm.
 
@@ -81,9 +81,15 @@ def main() -> None:
 
 
 def lifts(given: Any, hand: str, name: str, mesh: Path) -> dict[str, Any]:
-    """What comes of raw candidates."""
+    """What comes of candidates."""
     request = JobOptions(
-        grasps=given.grasps, want="raw", audits=0, seed=given.seed, scene="table", scenes=given.scenes, density=DENSITY
+        grasps=given.grasps,
+        want="candidates",
+        rechecks=0,
+        seed=given.seed,
+        scene="table",
+        scenes=given.scenes,
+        density=DENSITY,
     )
     made = synthesized(
         str(given.data / "hands" / HANDS[hand]), str(mesh), request, place=parse_scene("table"), scenes=given.scenes

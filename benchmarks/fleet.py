@@ -32,7 +32,7 @@ from sqlalchemy import func, select
 from benchmarks.service_load import cpu_s, say
 from graspd.service.index.tables import tasks
 from graspd.service.model import names
-from graspd.service.model.states import Lane, Stage, State
+from graspd.service.model.states import Priority, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.leading import PART
@@ -88,7 +88,7 @@ class Machine:
         while tasks > 0:
             some = min(tasks, _BATCHES_A_JOB)
             self._seed += 1
-            job_actions.submit(self.services, request(grasps=32 * some, seed=self._seed), lane=Lane.BULK)
+            job_actions.submit(self.services, request(grasps=32 * some, seed=self._seed), priority=Priority.BULK)
             tasks -= some
 
     def cpu(self) -> dict[str, float]:
@@ -173,7 +173,7 @@ def measure(workers: int, given: argparse.Namespace) -> Result:
         at.submit(workers + int(given.rate * (given.seconds + task_s + 30)))
         with fleet(at.settings, workers, task_s):
             held = at.queue.connection
-            lists = [held_key(queue_name(lane, Stage.SYNTHESIZE)) for lane in Lane]
+            lists = [held_key(queue_name(priority, Stage.SYNTHESIZE)) for priority in Priority]
             _wait(lambda: sum(held.zcard(name) for name in lists) >= 0.9 * workers, "all workers hold a task")
             time.sleep(given.seconds / 2)
             lags, sweeps = _looks(at, given.seconds)

@@ -28,7 +28,7 @@ from rq.defaults import DEFAULT_WORKER_TTL as LEASE_KEPT_S
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.messages import TaskMessage
-from graspd.service.model.states import Lane, Stage
+from graspd.service.model.states import Priority, Stage
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.model.workers import own_ability
 from graspd.service.queue.lists import execution_keys, held_key, job_key, list_key, queue_name, rq_worker_key
@@ -41,7 +41,7 @@ from graspd.worker.stages.context import REPORT_EVERY_S
 from tests.fakes import make_shard
 
 _TICK_S: Final = 0.02
-_QUEUES: Final = tuple(queue_name(lane, Stage.SYNTHESIZE) for lane in Lane)
+_QUEUES: Final = tuple(queue_name(priority, Stage.SYNTHESIZE) for priority in Priority)
 
 
 @dataclass

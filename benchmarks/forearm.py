@@ -4,11 +4,11 @@ usage: python -m benchmarks.forearm DATA_DIR [--hand shadow/shadow_hand_right.ur
            [--grasps 16] [--scenes 4] [--seed 31] [--scene table] [--beside 048_hammer ...] [--json OUT]
        DATA_DIR holds hands/ and objects/
 
-Candidates of each object are planned and judged as `graspd synth --want raw --threads 1` does. The collision meshes of
-all links above the root are then placed by yourdfpy, which shares no code with graspd, at the stored wrist angles (0
-where none are stored). Two findings count on approach, grasp and lift: the lowest height of their vertices, and the
-volume that manifold3d finds common to them and to supports or neighbours. Seconds are CPU time of planning and judging
-a candidate.
+Candidates of each object are planned and validated as `graspd synth --want candidates --threads 1` does. The collision
+meshes of all links above the root are then placed by yourdfpy, which shares no code with graspd, at the stored wrist
+angles (0 where none are stored). Two findings count on approach, grasp and lift: the lowest height of their vertices,
+and the volume that manifold3d finds common to them and to supports or neighbours. Seconds are CPU time of planning and
+validating a candidate.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import yourdfpy
 
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.scene_spec import Box, NeighbourSpec, SceneSpec, supports_in
-from graspd.worker.files.synthesis import Synthesized, synthesized
+from graspd.worker.files.synthesis import SynthesisResult, synthesized
 from graspd.worker.hands.load import hand_from_path
 
 OBJECTS = ("005_tomato_soup_can", "006_mustard_bottle", "025_mug", "011_banana", "035_power_drill", "077_rubiks_cube")
@@ -93,7 +93,7 @@ class Found:
     """(N,) whether they are in something."""
 
 
-def look(upstream: Upstream, made: Synthesized, beside: list[trimesh.Trimesh]) -> Found:
+def look(upstream: Upstream, made: SynthesisResult, beside: list[trimesh.Trimesh]) -> Found:
     """The links above the root of each grasp, among supports and neighbours."""
     columns, lowest, inside = made.arrays, [], []
     names = list(made.attributes.get("wrist_joint_names", []))
@@ -177,10 +177,10 @@ def main() -> None:
         given.json.write_text(json.dumps({"rows": rows, "all": total(rows)}, indent=1) + "\n")
 
 
-def planned(urdf: Path, given: argparse.Namespace, name: str, count: int) -> Synthesized:
+def planned(urdf: Path, given: argparse.Namespace, name: str, count: int) -> SynthesisResult:
     """Candidates of the hand on an object."""
     mesh = given.data / "objects" / name / "clean.stl"
-    request = JobOptions(grasps=count, seed=given.seed, want="raw")
+    request = JobOptions(grasps=count, seed=given.seed, want="candidates")
     beside = tuple(NeighbourSpec(object=str(given.data / "objects" / one / "clean.stl")) for one in given.beside)
     place = SceneSpec(kind=given.scene, neighbours=beside)
     return synthesized(str(urdf), str(mesh), request, place=place, scenes=given.scenes, device="cpu", threads=1)

@@ -3,10 +3,10 @@
     pip install --no-deps --target /tmp/hands robopianist
     python -m benchmarks.foreign DATA --sources /tmp/hands --out docs/results/foreign
 
-DATA holds hands/ and objects/. Grasps are planned with the URDF, judged by the certificate in it, and again in the MJCF
-model of robopianist, which has other shapes, tendons, armature and dry friction. Three ways to plan: each joint with a
-drive of its own; with the tendons J1 + J2; and with the shapes that the URDF shows instead of those that touch in it.
-An object that is done is kept under `--work`, so a broken run goes on where it was.
+DATA holds hands/ and objects/. Grasps are planned with the URDF, validated at level standard in it, and again in the
+MJCF model of robopianist, which has other shapes, tendons, armature and dry friction. Three ways to plan: each joint
+with a drive of its own; with the tendons J1 + J2; and with the shapes that the URDF shows instead of those that touch
+in it. An object that is done is kept under `--work`, so a broken run goes on where it was.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.quality.intervals import wilson
 from graspd.worker.validation.foreign import driven_as, in_other_model, with_our_shapes, with_their_shapes
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.validator import validate
 
 HAND = "hands/shadow/shadow_hand_right.urdf"
 OTHER = "robopianist/models/hands/third_party/shadow_hand/right_hand.xml"
@@ -78,7 +78,7 @@ def main() -> None:
             obj = object_from_path(
                 asked.data / "objects" / name / "clean.stl", face_error_m=FIDELITIES["standard"].face_error_m
             )
-            kept.write_text(json.dumps(bench.tried(obj, asked.grasps, asked.seed)))
+            kept.write_text(json.dumps(bench.candidates(obj, asked.grasps, asked.seed)))
         rows[name] = json.loads(kept.read_text())
         sys.stderr.write(f"{name}\n")
     facts = {"grasps": asked.grasps, "seed": asked.seed, "fingertips_mm": 1e3 * bench.same["tendons"].fingertips_m}
@@ -95,19 +95,19 @@ class Bench:
         found = {plan: same_hand(hand, other) for plan, hand in self.hands.items()}
         self.same = {plan: replace(same, theirs=driven_as(same)) for plan, same in found.items()}
 
-    def tried(self, obj: ObjectModel, count: int, seed: int) -> dict[str, dict[str, list[int]]]:
+    def candidates(self, obj: ObjectModel, count: int, seed: int) -> dict[str, dict[str, list[int]]]:
         """Of each plan and each model: which of the grasps hold."""
         out: dict[str, dict[str, list[int]]] = {}
         for plan, hand in self.hands.items():
             grasps = planned(hand, obj, count=count, seed=seed)
             held = {
-                name: judge(model, obj, posed).success for name, (model, posed) in self.models(plan, grasps).items()
+                name: validate(model, obj, posed).success for name, (model, posed) in self.models(plan, grasps).items()
             }
             out[plan] = {name: success.tolist() for name, success in held.items()}
         return out
 
     def models(self, plan: str, grasps: GraspSet) -> dict[str, tuple[HandModel, GraspSet]]:
-        """The models that judge, each with the grasps as it has them; what tells causes judges `TRACED` alone."""
+        """The models that validate, each with the grasps as it has them; what tells causes validates `TRACED` alone."""
         same: SameHand = self.same[plan]
         ours, theirs, there = same.ours, same.theirs, in_other_model(same, grasps)
         found = {NOMINAL: (ours, grasps), FOREIGN: (theirs, there), TOUCH: (self.hands["tendons"], grasps)}
@@ -131,8 +131,8 @@ def page(rows: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
         "# Shadow grasps in a foreign model",
         "",
         "`python -m benchmarks.foreign DATA --sources SOURCES --out docs/results/foreign --objects ...`: "
-        f"{facts['grasps']} raw standard grasps on each object, seed {facts['seed']}, planned with the URDF, "
-        "judged by the certificate in it (*nominal*) and in robopianist's MJCF (*foreign*), fingertips within "
+        f"{facts['grasps']} standard candidates on each object, seed {facts['seed']}, planned with the URDF, "
+        "validated at level standard in it (*nominal*) and in robopianist's MJCF (*foreign*), fingertips within "
         f"{facts['fingertips_mm']:.2f} mm. Counts: grasps that hold nominally and, of these, in the foreign model.",
         "",
         "| object | " + " | ".join(PLANS) + " |",
@@ -158,9 +158,9 @@ def page(rows: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
         lines += [f"| **{title}** | " + " | ".join(cells) + " |"] if cells else []
     lines += [
         "",
-        "By model, all objects: the share of raw grasps that holds in it, and of those that hold nominally.",
+        "By model, all objects: the share of candidates that holds in it, and of those that hold nominally.",
         "",
-        "| planned with | judged in | holds | of nominal |",
+        "| planned with | validated in | holds | of nominal |",
         "| --- | --- | --: | --: |",
     ]
     for plan in PLANS:

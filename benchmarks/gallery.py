@@ -28,7 +28,7 @@ from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.rendering.pictures import grasp_pictures
-from graspd.worker.stages.hand_self_test import GRASPS, READY, Best, failed, self_test
+from graspd.worker.stages.hand_self_test import GRASPS, READY, BestGrasp, failed, self_test
 
 PACKAGES = "airo-models example-robot-data robosuite robosuite-models robopianist"
 #: Under the folder of the docs.
@@ -174,14 +174,16 @@ def main() -> None:
     for entry in HANDS:
         if entry.name in wanted:
             picture = pictures / f"{entry.name}.png"
-            row = tried(entry, asked.sources, asked.grasps, done.get(entry.name), picture)
+            row = candidates(entry, asked.sources, asked.grasps, done.get(entry.name), picture)
             done[entry.name] = row
             sys.stderr.write(f"{entry.title}: {row['self_test']['says']}\n")
             keep(done, results)
     (asked.out / PAGE).write_text(page(done))
 
 
-def tried(entry: Entry, sources: Path, grasps: int, before: dict[str, Any] | None, picture: Path) -> dict[str, Any]:
+def candidates(
+    entry: Entry, sources: Path, grasps: int, before: dict[str, Any] | None, picture: Path
+) -> dict[str, Any]:
     """The row of a hand: from before where hand and planner are the same and it has a picture."""
     try:
         hand = hand_from_path(sources / entry.path if entry.path else entry.name, entry.options)
@@ -205,7 +207,7 @@ def tried(entry: Entry, sources: Path, grasps: int, before: dict[str, Any] | Non
     }
 
 
-def draw(hand: HandModel, best: Best, picture: Path, azimuths: tuple[float, float]) -> None:
+def draw(hand: HandModel, best: BestGrasp, picture: Path, azimuths: tuple[float, float]) -> None:
     """The grasp from two sides, beside each other, in few colours: pages of many pictures stay light."""
     sides = grasp_pictures(
         hand, best.obj, best.grasp.hand_pose, best.grasp.joint_positions, (EDGE, EDGE), azimuths=azimuths
@@ -228,8 +230,8 @@ def page(done: dict[str, Any]) -> str:
         "# Gallery of hands",
         "",
         "Real hands and grippers, read from the files in which they are published. Each was tried as",
-        "`graspd hands check HAND` does: 64 raw grasps of a sphere, a box and a cylinder of a size that",
-        f"suits it, judged by the certificate; from {100 * READY:.0f} % on a hand is *ready*. The picture shows the",
+        "`graspd hands check HAND` does: 64 candidates of a sphere, a box and a cylinder of a size that",
+        f"suits it, validated at level standard; from {100 * READY:.0f} % on a hand is *ready*. The picture shows the",
         "best of them, from two sides.",
         "",
         "```sh",

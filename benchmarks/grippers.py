@@ -1,4 +1,4 @@
-"""What grippers hold of objects that they were not tuned on: raw grasps of each object that fits, judged.
+"""What grippers hold of objects that they were not tuned on: candidates of each object that fits, validated.
 
     python -m benchmarks.grippers DATA --sources /tmp/hands
 
@@ -21,7 +21,7 @@ from benchmarks.gallery import HANDS
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError
 from graspd.service.model.version import STAGE_REVISIONS
-from graspd.worker.certified import certified_grasps
+from graspd.worker.generation import validated_grasps
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
@@ -68,11 +68,11 @@ def main() -> None:
 
 
 def cell(hand: HandModel, mesh: Path, grasps: int) -> float | str:
-    """Share of raw grasps that hold by the certificate, or why there are none."""
+    """Share of candidates that hold at level standard, or why there are none."""
     obj = object_from_path(str(mesh), face_error_m=3e-4)
-    request = JobOptions(want="raw", grasps=grasps, seed=SEED, referee="certificate")
+    request = JobOptions(want="candidates", grasps=grasps, seed=SEED, validation="standard")
     try:
-        found = certified_grasps(hand, obj, request, count=grasps)
+        found = validated_grasps(hand, obj, request, count=grasps)
     except InputError as error:
         return str(error)
     return float(np.mean(found.columns["quality/success"] == 1))
@@ -92,7 +92,7 @@ def page(done: dict[str, Any]) -> str:
     rows = [
         "# Grippers on objects that fit",
         "",
-        "`python -m benchmarks.grippers DATA --sources /tmp/hands`: share of raw grasps that hold by the certificate, "
+        "`python -m benchmarks.grippers DATA --sources /tmp/hands`: share of candidates that hold at level standard, "
         f"{done[names[0]]['grasps']} a cell, standard fidelity, seed {SEED}; no object was used to choose a setting. "
         "The title tells how far a gripper opens; *too wide*: said before any work. The mean is over objects that fit.",
         "",

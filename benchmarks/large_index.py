@@ -30,7 +30,7 @@ from graspd.service.model.domain import JobRequest
 from graspd.service.model.metrics import Indexed, indexed
 from graspd.service.model.planning import PlannedTask, plan
 from graspd.service.model.records import AttemptRecord, JobRecord
-from graspd.service.model.states import AssetKind, Lane, Stage, State
+from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from graspd.service.settings import Settings
 from graspd.service.store.library import publish_builtins
@@ -109,7 +109,7 @@ class _Maker:
             hand_digest=hand.digest,
             object_digest=obj.digest,
             revisions=dict(STAGE_REVISIONS),
-            lane=Lane.BULK,
+            priority=Priority.BULK,
             created=self._at(number, 0.0),
         )
         return record, state
@@ -179,9 +179,9 @@ class _Maker:
             seconds=2.5,
             worker="worker-0",
             valid=int(_validity(task).sum()),
-            tried=task.count if kind == "base" else 0,
-            audited=0,
-            audit_held=0,
+            candidates=task.count if kind == "base" else 0,
+            rechecked=0,
+            recheck_held=0,
             index_threshold_m=0.005,
             grasps=(),
             info={},

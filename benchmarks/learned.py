@@ -5,8 +5,8 @@ usage: python -m benchmarks.learned --network NET.npz [OTHER.npz ...] [--data DA
        DATA_DIR holds objects/; without it objects are files or names of built-in ones
 
 On a table, at standard fidelity, certified: both methods get the same scenes, seeds and convex pieces, in turn, on one
-thread. A second is one of processor time, referee and metrics included; what a pair is made ready with once is none of
-it. Whether a network has seen the objects is for whoever chooses them to say. Hands are the built-in ones.
+thread. A second is one of processor time, validator and metrics included; what a pair is made ready with once is none
+of it. Whether a network has seen the objects is for whoever chooses them to say. Hands are the built-in ones.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.worker.certified import certified_grasps
+from graspd.worker.execution_context import ExecutionContext
+from graspd.worker.generation import validated_grasps
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners.known_networks import keep_file, kept
-from graspd.worker.run import Run
-from graspd.worker.scenes.beside import scenes_of
-from graspd.worker.simulation.surroundings import Scenes
+from graspd.worker.scenes.placement import scenes_of
+from graspd.worker.simulation.environment import Scenes
 from graspd.worker.validation.decomposition import decompose
 
 #: Not a seed that any setting was chosen with.
@@ -66,29 +66,29 @@ def study(
     batch = {}
 
     def made(name: str, count: int, scenes: Scenes, seed: int, want: str = "valid") -> tuple[int, int, float]:
-        """Valid grasps, grasps tried, processor time."""
+        """Valid grasps, candidates, processor time."""
         request = JobOptions(
             method=name.split()[0],
             options=methods[name],
             fidelity=FIDELITY,
             seed=seed,
             want=want,
-            audits=0,
+            rechecks=0,
             budget=BUDGET if count == 1 else 4.0,
         )
         began = time.process_time()
-        done = certified_grasps(
-            hand, obj, request, count=count, scenes=scenes, pieces=lambda _: pieces, run=Run(threads=1)
+        done = validated_grasps(
+            hand, obj, request, count=count, scenes=scenes, pieces=lambda _: pieces, run=ExecutionContext(threads=1)
         )
-        return int(done.columns["quality/valid"].sum()), done.tried, time.process_time() - began
+        return int(done.columns["quality/valid"].sum()), done.candidates, time.process_time() - began
 
     for name in methods:
-        made(name, 1, tables[0], SEED - 1, "raw")  # makes ready what is kept
+        made(name, 1, tables[0], SEED - 1, "candidates")  # makes ready what is kept
     for number, scenes in enumerate(tables):
         for name in methods:
             found[name].append(made(name, 1, scenes, SEED + number))
     for name in methods:
-        batch[name] = made(name, many, tables[0], SEED, "raw")
+        batch[name] = made(name, many, tables[0], SEED, "candidates")
     own = batch["fast_graspd"][0] / batch["fast_graspd"][2]
     return [
         {

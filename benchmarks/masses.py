@@ -4,7 +4,7 @@ usage: python -m benchmarks.masses DATA_DIR [--hands allegro ...] [--objects 025
            [--seed 1200] [--page OUT.md]
        DATA_DIR holds hands/ and objects/; objects without a mass in their meta.json are left out
 
-Shares are of raw candidates of fidelity standard on the faces that drops end on, planned for that mass.
+Shares are of candidates of fidelity standard on the faces that drops end on, planned for that mass.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from graspd.worker.files.synthesis import synthesized
 SEED = 1200
 HEAD = """# Table lifts of objects with their own masses
 
-`python -m benchmarks.masses DATA`: shares of raw candidates that lift an object of its published mass off a table, and
+`python -m benchmarks.masses DATA`: shares of candidates that lift an object of its published mass off a table, and
 that do at half the friction, beside the same for 0.1 kg. {grasps} candidates a pair, {scenes} scenes, seed {seed}.
 
 """
@@ -72,9 +72,15 @@ def masses(data: Path) -> dict[str, float]:
 
 
 def lifts(given: Any, hand: str, name: str, mass: float) -> tuple[float, float]:
-    """Shares of raw candidates that lift the object, and that do at half the friction."""
+    """Shares of candidates that lift the object, and that do at half the friction."""
     request = JobOptions(
-        grasps=given.grasps, want="raw", audits=0, seed=given.seed, scene="table", scenes=given.scenes, mass=mass
+        grasps=given.grasps,
+        want="candidates",
+        rechecks=0,
+        seed=given.seed,
+        scene="table",
+        scenes=given.scenes,
+        mass=mass,
     )
     made = synthesized(
         str(given.data / "hands" / HANDS[hand]),

@@ -41,7 +41,7 @@ _POLL_S: Final = 2.0
 
 
 @dataclass
-class Run:
+class ExecutionContext:
     """A service that can be killed, and what was seen of it."""
 
     folder: Path
@@ -137,7 +137,7 @@ def main(
 ) -> None:
     """Run it and write the page. What is not done after so many minutes is gone on with by the same command."""
     data_dir.mkdir(parents=True, exist_ok=True)
-    run = Run(data_dir, {k: v for k, v in os.environ.items() if not k.startswith("GRASPD_")})
+    run = ExecutionContext(data_dir, {k: v for k, v in os.environ.items() if not k.startswith("GRASPD_")})
     kept = Kept.load(data_dir / "run.json")
     end = time.monotonic() + 60 * minutes
     run.up()
@@ -187,14 +187,14 @@ def main(
     typer.echo(out.read_text())
 
 
-def follow(run: Run, *, until: float, end: float) -> float:
+def follow(run: ExecutionContext, *, until: float, end: float) -> float:
     """Wait until a share of the tasks is done, the dataset has ended, or the time is over; returns the share."""
     said = 0.0
     while True:
         found = run.client().dataset(DATASET)
         if found.progress - said > 0.02:
             said = found.progress
-            typer.echo(f"{time.strftime('%H:%M:%S')} {100 * found.progress:.0f} % {found.valid} of {found.tried}")
+            typer.echo(f"{time.strftime('%H:%M:%S')} {100 * found.progress:.0f} % {found.valid} of {found.candidates}")
         if found.state.is_final or found.tasks_done >= until * found.tasks or time.monotonic() > end:
             return found.tasks_done / found.tasks
         time.sleep(_POLL_S)
@@ -216,7 +216,7 @@ def page(found: DatasetView, cells: list[CellView], facts: dict[str, str], optio
         "| --- | --- |",
         *(f"| {name} | {value} |" for name, value in facts.items()),
         "",
-        "Each cell: valid grasps of those asked for, valid share of the tries, seconds of a worker per valid grasp.",
+        "Each cell: valid grasps of those asked for, valid share of the candidates, seconds of a worker per valid grasp.",
         "",
         f"| object | {' | '.join(found.hands)} |",
         "| --- " * (len(found.hands) + 1) + "|",
@@ -241,9 +241,9 @@ def _cell(cell: CellView) -> str:
 
 
 def _sum(cells: list[CellView]) -> str:
-    valid, tried = sum(c.valid for c in cells), max(1, sum(c.tried for c in cells))
+    valid, candidates = sum(c.valid for c in cells), max(1, sum(c.candidates for c in cells))
     each = f"{sum(c.seconds for c in cells) / valid:.2f} s" if valid else "-"
-    return f"{valid}/{sum(c.asked for c in cells)}, {100 * valid / tried:.0f} %, {each}"
+    return f"{valid}/{sum(c.asked for c in cells)}, {100 * valid / candidates:.0f} %, {each}"
 
 
 if __name__ == "__main__":

@@ -3,8 +3,9 @@
 usage: python -m benchmarks.on_gpu DATA_DIR [--device cuda:0] [--batches 32 256 1024] [--grasps 64]
            [--json OUT] [--page OUT]
 
-DATA_DIR holds hands/ and objects/. Accuracy: grasps of both devices from the same seeds, judged by the same referee and
-measured by the same table, on the CPU. Speed: wall time of each stage of a launch, after one that is not timed.
+DATA_DIR holds hands/ and objects/. Accuracy: grasps of both devices from the same seeds, validated by the same
+validator and measured by the same table, on the CPU. Speed: wall time of each stage of a launch, after one that is not
+timed.
 """
 
 from __future__ import annotations
@@ -29,24 +30,24 @@ from graspd.service.model.version import PACKAGE_VERSION
 from graspd.studies.bench import device_name
 from graspd.studies.timing import kernel_shares
 from graspd.worker.engines.devices import Device
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners.fast_graspd import planner
-from graspd.worker.planners.port import Wanted
+from graspd.worker.planners.port import PlanRequest
 from graspd.worker.quality.table import measure
-from graspd.worker.run import Run
 from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.validator import validate
 
 T = TypeVar("T")
 OBJECTS: Final = ("025_mug", "006_mustard_bottle", "003_cracker_box", "024_bowl", "077_rubiks_cube", "048_hammer")
 #: Not a seed that any setting was chosen with.
 SEED: Final = 808
 FIDELITY: Final = FIDELITIES["standard"]
-#: Grasps of a launch that are judged and measured.
-JUDGED: Final = 128
+#: Grasps of a launch that are validated and measured.
+VALIDATED: Final = 128
 #: What both devices are compared by, a mean over the grasps each, and its digits in the report.
 COLUMNS: Final = {"epsilon": 3, "penetration_depth_mm": 2, "contact_area_cm2": 1}
 SHOWN: Final = {"gsr": 2, **COLUMNS}
@@ -67,9 +68,9 @@ def timed(work: Callable[[], T]) -> tuple[T, float]:
 
 def quality(hand: HandModel, obj: ObjectModel, device: str, count: int) -> dict[str, float]:
     """Success and quality of `count` grasps that were made on a device."""
-    run = Run(device)
-    grasps = planner.plan(hand, obj, Wanted(count, FIDELITY, SEED), run)
-    held = judge(hand, obj, grasps, pieces=decompose(obj)).success == 1
+    run = ExecutionContext(device)
+    grasps = planner.plan(hand, obj, PlanRequest(count, FIDELITY, SEED), run)
+    held = validate(hand, obj, grasps, pieces=decompose(obj)).success == 1
     table = measure(hand, obj, grasps)
     found = {name: float(np.mean(np.asarray(table[f"quality/{name}"], dtype=float))) for name in COLUMNS}
     return {"gsr": float(held.mean()), **found}
@@ -78,7 +79,7 @@ def quality(hand: HandModel, obj: ObjectModel, device: str, count: int) -> dict[
 def stages(hand: HandModel, obj: ObjectModel, device: str, batch: int) -> dict[str, float]:
     """Wall milliseconds of each stage for one of `batch` grasps, the share that holds, and how far a hand is moved when
     the same launch is made again [mm]."""
-    run, wanted = Run(device), Wanted(batch, FIDELITY, SEED)
+    run, wanted = ExecutionContext(device), PlanRequest(batch, FIDELITY, SEED)
     parts = planner.optimise_batch(hand, obj, wanted, run)
     again, planned = timed(lambda: planner.optimise_batch(hand, obj, wanted, run))
     moved = max(
@@ -86,17 +87,17 @@ def stages(hand: HandModel, obj: ObjectModel, device: str, batch: int) -> dict[s
     )
     planner.grasps_of(hand, obj, parts, 0.0, device=device)
     grasps, around = timed(lambda: planner.grasps_of(hand, obj, again, 0.0, device=device))
-    few, pieces = grasps.take(np.arange(min(batch, JUDGED))), decompose(obj)
-    # Compiled models of the referee and kernels of the table are kept: a first call makes them.
+    few, pieces = grasps.take(np.arange(min(batch, VALIDATED))), decompose(obj)
+    # Compiled models of the validator and kernels of the table are kept: a first call makes them.
     warm = grasps.take(np.arange(min(batch, 16)))
-    judge(hand, obj, warm, pieces=pieces)
+    validate(hand, obj, warm, pieces=pieces)
     measure(hand, obj, warm)
-    verdicts, judged = timed(lambda: judge(hand, obj, few, pieces=pieces))
+    verdicts, validated = timed(lambda: validate(hand, obj, few, pieces=pieces))
     _, measured = timed(lambda: measure(hand, obj, few))
     return {
         "planner_ms": 1e3 * planned / batch,
         "postures_ms": 1e3 * around / batch,
-        "judge_ms": 1e3 * judged / len(few),
+        "validation_ms": 1e3 * validated / len(few),
         "quality_ms": 1e3 * measured / len(few),
         "gsr": float((verdicts.success == 1).mean()),
         "moved_mm": 1e3 * moved,
@@ -116,11 +117,11 @@ def page(result: dict[str, Any]) -> str:
         f"    {result['command']}",
         "",
         f"{result['date']}: {result['device']}, {result['cores']} cores, {result['versions']}. Fidelity *standard*, "
-        f"seed {SEED}. Wall milliseconds for one grasp of a launch on {result['hands_object']}, by one process; judge "
-        f"and table on the CPU's cores, of at most {JUDGED} grasps. *Moved*: how far any hand lies from where the same "
+        f"seed {SEED}. Wall milliseconds for one grasp of a launch on {result['hands_object']}, by one process; validate "
+        f"and table on the CPU's cores, of at most {VALIDATED} grasps. *Moved*: how far any hand lies from where the same "
         "launch put it before.",
         "",
-        "| hand | a launch | planner ms | postures ms | raw grasps/s | judge ms | table ms | hold | moved mm |",
+        "| hand | a launch | planner ms | postures ms | candidates/s | validate ms | table ms | hold | moved mm |",
         "| --- | --: | --: | --: | --: | --: | --: | --: | --: |",
     ]
     for hand, rows in result["speed"].items():
@@ -128,11 +129,11 @@ def page(result: dict[str, Any]) -> str:
             each = row["planner_ms"] + row["postures_ms"]
             lines.append(
                 f"| {hand} | {row['batch']} | {row['planner_ms']:.2f} | {row['postures_ms']:.3f} | {1e3 / each:.0f} | "
-                f"{row['judge_ms']:.1f} | {row['quality_ms']:.1f} | {row['gsr']:.2f} | {row['moved_mm']:.1f} |"
+                f"{row['validation_ms']:.1f} | {row['quality_ms']:.1f} | {row['gsr']:.2f} | {row['moved_mm']:.1f} |"
             )
     lines += [
         "",
-        "The grasps are as good as the CPU's: GPU / CPU of the same seeds, judged and measured by the same code "
+        "The grasps are as good as the CPU's: GPU / CPU of the same seeds, validated and measured by the same code "
         f"({result['grasps']} grasps of a pair; a share is good to {1.96 * (0.25 / result['grasps']) ** 0.5:.2f}).",
         "",
         "| hand | object | hold | ε | depth mm | contact cm² |",

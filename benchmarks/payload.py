@@ -4,8 +4,8 @@ usage: python -m benchmarks.payload DATA_DIR [--hands allegro ...] [--objects 02
            [--seed 1500] [--free] [--page OUT.md]
        DATA_DIR holds hands/ and objects/; free: objects are pushed six ways instead of lifted off a table
 
-Grasps are valid for objects of their published masses. The whole lift rises and holds as the referee's, or holds under
-each push, for each mass of a bisection to 3 %. The bound is the largest load capacity of a pair's grasps over the
+Grasps are valid for objects of their published masses. The whole lift rises and holds as the validator's, or holds
+under each push, for each mass of a bisection to 3 %. The bound is the largest load capacity of a pair's grasps over the
 largest payload of them, squeezed with 50 to 1000 N.
 """
 
@@ -24,21 +24,21 @@ from benchmarks.masses import arguments, masses
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.scene_spec import parse_scene
-from graspd.worker.certified import Certified, certified_grasps
 from graspd.worker.control.postures import squeeze
+from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.grasps import GraspSet, joined
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.scenes.beside import scenes_of
-from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.scenes.placement import scenes_of
+from graspd.worker.simulation.environment import Placed
 from graspd.worker.validation.compiled import scene_of
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.lift import LiftOutcome
 from graspd.worker.validation.model import MujocoOptions
 from graspd.worker.validation.payload import LIFTING, LiftPayload, PushPayload, limit_of
-from graspd.worker.validation.protocol import DIRECTIONS, Outcome, Trial
+from graspd.worker.validation.protocol import DIRECTIONS, Outcome, Rollout
 
 SEED: Final = 1500
 #: Sums of normal forces [N].
@@ -56,7 +56,7 @@ Floats = NDArray[np.float64]
 
 
 class WholeLifts(LiftPayload):
-    """Payload by the referee's rise and hold."""
+    """Payload by the validator's rise and hold."""
 
     def payload(self, grasps: GraspSet, row: int) -> float:
         self._weigh(self._own)
@@ -70,14 +70,14 @@ class WholeLifts(LiftPayload):
             self._goal = np.zeros(3)
             self.data.xfrc_applied[self.scene.object_body, :3] = -self.scene.push * self._up
             self._rise(grasps, row)
-            trial = Trial()
-            return self._judge(trial) is Outcome.HELD and self._hold(trial) is Outcome.HELD
+            rollout = Rollout()
+            return self._validate(rollout) is Outcome.HELD and self._hold(rollout) is Outcome.HELD
 
         return self._heaviest(bears, self._own)
 
 
 class WholePushes(PushPayload):
-    """Payload by the referee's pushes."""
+    """Payload by the validator's pushes."""
 
     def payload(self, grasps: GraspSet, row: int) -> float:
         self._weigh(self._own)
@@ -90,7 +90,7 @@ class WholePushes(PushPayload):
             for direction in range(len(DIRECTIONS)):
                 self._restore()
                 self._push(direction)
-                if self._hold(Trial()) is not Outcome.HELD:
+                if self._hold(Rollout()) is not Outcome.HELD:
                     return False
             return True
 
@@ -169,11 +169,11 @@ def every(grasps: GraspSet) -> NDArray[np.intp]:
 def valid_grasps(given: Any, hand: HandModel, mesh: Path, mass: float) -> tuple[GraspSet, ObjectModel, Placed | None]:
     """Grasps of an object about its centre, and their scenes; None: the object is free."""
     obj = object_from_path(str(mesh), face_error_m=FIDELITIES["standard"].face_error_m).weighing(mass=mass)
-    request = JobOptions(grasps=given.grasps, audits=0, seed=given.seed)
+    request = JobOptions(grasps=given.grasps, rechecks=0, seed=given.seed)
     scenes = None
     if not given.free:
         scenes, _ = scenes_of(parse_scene("table"), obj, [], count=given.scenes, seed=given.seed)
-    made: Certified = certified_grasps(hand, obj, request, count=given.grasps, scenes=scenes)
+    made: ValidatedBatch = validated_grasps(hand, obj, request, count=given.grasps, scenes=scenes)
     grasps = made.grasps.moved(np.negative(obj.centre))
     if scenes is None or grasps.scene is None:
         return grasps, obj.centred, None

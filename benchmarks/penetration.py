@@ -21,7 +21,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
-from graspd.worker.planners.port import Wanted
+from graspd.worker.planners.port import PlanRequest
 from graspd.worker.quality.table import measure
 
 COMPACT = ("061_foam_brick", "005_tomato_soup_can", "006_mustard_bottle", "011_banana", "056_tennis_ball")
@@ -44,7 +44,7 @@ def row(hand: HandModel, path: Path, label: str, polish: bool, grasps: int) -> s
     if not polish:
         fidelity = fidelity.model_copy(update={"polish_iterations": 0})
     obj = object_from_path(path, face_error_m=fidelity.face_error_m)
-    found = synthesize(hand, obj, Wanted(count=grasps, fidelity=fidelity, seed=2))
+    found = synthesize(hand, obj, PlanRequest(count=grasps, fidelity=fidelity, seed=2))
     quality = measure(hand, obj, found, friction=1.0)
     depth, own = quality["quality/penetration_depth_mm"], quality["quality/self_penetration_depth_mm"]
     column = int(np.argmin(np.abs(quality["quality/thresholds_m"] - 0.005)))

@@ -33,7 +33,7 @@ spent = []
 for _ in range(4):
     began = time.process_time()
     from graspd.worker.rendering import render
-    from graspd.worker.run import Run
+    from graspd.worker.execution_context import Run
     made = render(
         obj, poses, views=int(sys.argv[2]), stereo=False, width=320, height=240, seed=0, run=Run(threads=1)
     )

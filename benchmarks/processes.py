@@ -2,12 +2,13 @@
 
 usage: python -m benchmarks.processes DATA_DIR [--grasps 256] [--hand allegro] [--object mug] [--ways 1t 2t 2p]
 
-DATA_DIR holds hands/. A way is a number of threads (t) or processes (p). Raw grasps of a pair are planned once, and
-judged and measured in each way, the processes started and the models built before. Told are wall and processor time for
-a raw grasp, of all processes together, the memory of a process, and whether all came out bit for bit as by one thread.
+DATA_DIR holds hands/. A way is a number of threads (t) or processes (p). Candidates of a pair are planned once, and
+validated and measured in each way, the processes started and the models built before. Told are wall and processor time
+for a candidate, of all processes together, the memory of a process, and whether all came out bit for bit as by one
+thread.
 
 How much of its time one thread holds Python's lock: the samples of `py-spy record --gil -f raw`, over those without
-`--gil`, of `--ways 1t --only judge` or `table`.
+`--gil`, of `--ways 1t --only validate` or `table`.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from graspd.service.model.fidelity import FIDELITIES
 from graspd.worker.grasps import GraspSet, joined
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.planners import Run, Wanted, synthesize
+from graspd.worker.planners import ExecutionContext, PlanRequest, synthesize
 from graspd.worker.pool.pool import MODULES, Pool
 from graspd.worker.quality.table import measure
 from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.validator import validate
 
 #: Clock ticks and bytes as /proc tells them.
 _TICK_S: Final = 1 / os.sysconf("SC_CLK_TCK")
@@ -41,7 +42,7 @@ _FIELDS: Final = ("VmRSS", "RssAnon")
 
 
 @dataclass(frozen=True)
-class Way:
+class Trajectory:
     """Threads of this process, or processes beside it."""
 
     name: str
@@ -73,7 +74,7 @@ def memory_mib(pid: int) -> list[float]:
 
 
 class Pair:
-    """Raw grasps of a hand on an object, and what is made of them."""
+    """Candidates of a hand on an object, and what is made of them."""
 
     def __init__(self, data: Path, hand: str, obj: str, count: int) -> None:
         (urdf, *_) = sorted((data / "hands" / hand).glob("*.urdf"))
@@ -81,14 +82,14 @@ class Pair:
         self.hand, self.obj = hand_from_path(str(urdf)), object_from_path(obj, face_error_m=fidelity.face_error_m)
         self.pieces = decompose(self.obj)
         batches = range(count // BATCH_SIZE)
-        made = [synthesize(self.hand, self.obj, Wanted(BATCH_SIZE, fidelity, 19, batch)) for batch in batches]
+        made = [synthesize(self.hand, self.obj, PlanRequest(BATCH_SIZE, fidelity, 19, batch)) for batch in batches]
         self.grasps: GraspSet = joined(made)
 
-    def judged(self, run: Run, grasps: GraspSet) -> dict[str, Any]:
-        found = judge(self.hand, self.obj, grasps, pieces=self.pieces, run=run)
+    def validated(self, run: ExecutionContext, grasps: GraspSet) -> dict[str, Any]:
+        found = validate(self.hand, self.obj, grasps, pieces=self.pieces, run=run)
         return {name: getattr(found, name) for name in ("success", "outcome", "margin", "penetration_depth_mm")}
 
-    def measured(self, run: Run, grasps: GraspSet) -> dict[str, Any]:
+    def measured(self, run: ExecutionContext, grasps: GraspSet) -> dict[str, Any]:
         return measure(self.hand, self.obj, grasps, run=run)
 
 
@@ -99,18 +100,18 @@ def main() -> None:
     parser.add_argument("--hand", default="allegro")
     parser.add_argument("--object", default="mug")
     parser.add_argument("--ways", nargs="*", default=["1t", "2t", "2p"])
-    parser.add_argument("--only", choices=["judge", "table"])
+    parser.add_argument("--only", choices=["validate", "table"])
     given = parser.parse_args()
     pair = Pair(given.data, given.hand, given.object, given.grasps)
-    parts = {"judge": pair.judged, "table": pair.measured}
+    parts = {"validate": pair.validated, "table": pair.measured}
     parts = {name: work for name, work in parts.items() if given.only in (None, name)}
     first: dict[str, dict[str, Any]] = {}
     heads = [f"{name}: {what} ms" for name in parts for what in ("wall", "core")]
     lines = ["| | " + " | ".join([*heads, "as by one thread", "MiB a process"]) + " |"]
     lines += ["| --- |" + " --: |" * (len(heads) + 2)]
-    for way in map(Way, given.ways):
+    for way in map(Trajectory, given.ways):
         pool = Pool(way.number, MODULES) if way.name.endswith("p") else None
-        run, cells, same = Run(threads=way.number, pool=pool), list[str](), True
+        run, cells, same = ExecutionContext(threads=way.number, pool=pool), list[str](), True
         for name, work in parts.items():
             work(run, pair.grasps.take(slice(0, 64)))
             pids = pool.pids if pool is not None else []

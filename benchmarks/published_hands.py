@@ -25,14 +25,14 @@ from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import GraspdError
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.version import STAGE_REVISIONS
-from graspd.worker.certified import certified_grasps
+from graspd.worker.generation import validated_grasps
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.oppositions import oppositions_of
+from graspd.worker.hands.pinch_postures import oppositions_of
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.planners.fast_graspd.across import crossings_of
-from graspd.worker.scenes.beside import scenes_of
+from graspd.worker.planners.fast_graspd.antipodal_starts import crossings_of
+from graspd.worker.scenes.placement import scenes_of
 from graspd.worker.stages.hand_self_test import TABLE_READY, tried_softly
 
 #: Beside those of the gallery; LEAP stands in DIR as MuJoCo Menagerie has it.
@@ -87,7 +87,7 @@ def main() -> None:
         if done.get(entry.name, {}).get("key") == key:
             continue
         began = time.perf_counter()
-        tried = tried_softly(lambda hand=hand: hand)  # type: ignore[misc]
+        candidates = tried_softly(lambda hand=hand: hand)  # type: ignore[misc]
         seconds = time.perf_counter() - began
         lifts = {name: lift_share(hand, asked.data / "objects" / name, asked.grasps) for name in OBJECTS}
         done[entry.name] = {
@@ -96,25 +96,25 @@ def main() -> None:
             "source": entry.source,
             "dofs": hand.dofs,
             "grasps": asked.grasps,
-            "self_test": tried,
+            "self_test": candidates,
             "seconds": round(seconds, 1),
             "lifts": lifts,
         }
         results.write_text(json.dumps(done, indent=1) + "\n")
         (asked.out / "published_hands.md").write_text(page(done))
-        sys.stderr.write(f"{entry.title}: {tried['says']}; {lifts}\n")
+        sys.stderr.write(f"{entry.title}: {candidates['says']}; {lifts}\n")
 
 
 def lift_share(hand: HandModel, folder: Path, grasps: int) -> float | None:
-    """Share of raw grasps that lift an object off a table; None where it does not fit, see `FITTING`."""
+    """Share of candidates that lift an object off a table; None where it does not fit, see `FITTING`."""
     obj, jaws = object_from_path(folder / "clean.stl"), jaws_of(hand)
     widest = oppositions_of(hand).widest if jaws is None else jaws.opening
     if np.mean(crossings_of(obj).width <= widest) < FITTING:
         return None
     scenes, _ = scenes_of(SceneSpec(kind="table"), obj, count=SCENES, seed=SEED)
-    request = JobOptions(want="raw", grasps=grasps, seed=SEED)
+    request = JobOptions(want="candidates", grasps=grasps, seed=SEED)
     try:
-        found = certified_grasps(hand, obj, request, count=grasps, scenes=scenes)
+        found = validated_grasps(hand, obj, request, count=grasps, scenes=scenes)
     except GraspdError:
         return None
     return round(found.shares["lift_share"], 4)
@@ -125,14 +125,14 @@ def page(done: dict[str, Any]) -> str:
     rows, agreeing = [], 0
     for row in done.values():
         known = [share for share in row["lifts"].values() if share is not None]
-        mean, tried = float(np.mean(known)) if known else 0.0, row["self_test"]
-        ready = tried["says"].startswith("ready")
+        mean, candidates = float(np.mean(known)) if known else 0.0, row["self_test"]
+        ready = candidates["says"].startswith("ready")
         agrees = ready == (mean >= TABLE_READY)
         agreeing += agrees
         cells = ["too wide" if share is None else f"{share:.2f}" for share in row["lifts"].values()]
         rows.append(
             f"| {row['title']} | {row['source']} | {row['dofs']} | {'ready' if ready else 'suspicious'} "
-            f"| {tried['gsr']:.2f} | {tried['table']:.2f} | {' | '.join(cells)} | **{mean:.2f}** "
+            f"| {candidates['gsr']:.2f} | {candidates['table']:.2f} | {' | '.join(cells)} | **{mean:.2f}** "
             f"| {'yes' if agrees else 'no'} | {row['seconds']:.0f} |"
         )
     grasps = next(iter(done.values()))["grasps"]
@@ -140,7 +140,7 @@ def page(done: dict[str, Any]) -> str:
     return (
         "# Published hands: the self-test's verdict, and what they lift\n\n"
         "`python -m benchmarks.published_hands DIR --data DATA`: for each hand as published its self-test (*free* "
-        "and *table*: the shares that hold and that lift), and beside it the share of raw grasps that lift an object "
+        "and *table*: the shares that hold and that lift), and beside it the share of candidates that lift an object "
         f"off a table, {grasps} of each object, standard fidelity, seed {SEED}. *Too wide*: the hand opens to less "
         f"than {FITTING:.0%} of the pairs of opposite places. The verdict agrees where a hand is "
         f"ready and lifts {TABLE_READY:.0%} or more, or neither: {agreeing} of {len(done)} do. Of earlier "

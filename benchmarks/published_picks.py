@@ -1,12 +1,12 @@
-"""Published picks of an Allegro hand, judged by the six pushes, by the lift, and on terms ever nearer to the published
-ones; and holds that are none, which the pushes must refuse.
+"""Published picks of an Allegro hand, validated by the six pushes, by the lift, and on terms ever nearer to the
+published ones; and holds that are none, which the pushes must refuse.
 
 usage: python -m benchmarks.published_picks DATA_DIR [--work DIR] [--objects NAME ...] [--out STEM]
 DATA_DIR/reference_grasps has the grasps published with FRoGGeR (IROS 2023) and whether each was picked. Their pick, as
 its authors' program has it (facts, MIT): the hand starts at the grasp itself around an object of 150 kg/m^3 on a table;
 contact forces follow from a QP over the measured pose of the object, at least 1 N a finger, friction 0.5; 10 cm up in
 1 s, shaken by 3 mm, held for 1.5 s; lost is what is 7.5 cm from its height or turned by 30 degrees.
-Prints Markdown; `--out` gets it and the same as JSON. What was judged once is read from `--work` again.
+Prints Markdown; `--out` gets it and the same as JSON. What was validated once is read from `--work` again.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from benchmarks.cells import write_json
-from graspd.exchange.cases import Case, load_case
+from graspd.exchange.inputs import Case, load_case
 from graspd.service.model.digests import digest_json
 from graspd.service.model.transforms import quat_rotate
 from graspd.worker.control.postures import TOTAL_NORMAL_FORCE, squeeze
@@ -35,14 +35,14 @@ from graspd.worker.engines.mujoco_warnings import void
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.quality.intervals import wilson
 from graspd.worker.quality.table import measure
-from graspd.worker.scenes.way import plan_way
-from graspd.worker.simulation.surroundings import RISE_M, Obstacle, Placed
+from graspd.worker.scenes.trajectory import plan_way
+from graspd.worker.simulation.environment import RISE_M, Obstacle, Placed
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.lift import Lift, LiftOutcome
-from graspd.worker.validation.lifting import judge_lifts
+from graspd.worker.validation.lifting import validate_lifts
 from graspd.worker.validation.model import MujocoOptions, build
-from graspd.worker.validation.protocol import STAGE_S, Outcome, Trial
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.protocol import STAGE_S, Outcome, Rollout
+from graspd.worker.validation.validator import validate
 
 Floats = NDArray[np.float64]
 
@@ -104,7 +104,7 @@ class Pick(Lift):
             return "lost while closing", self._excess()
         self._up_slowly(grasps, row) if self.terms.slowly else self._rise(grasps, row)
         self._goal = RISE_M * self._up
-        outcome = self._judge(Trial())
+        outcome = self._validate(Rollout())
         return ("lifted" if outcome is Outcome.HELD else outcome.name.lower()), self._excess()
 
     def _up_slowly(self, grasps: GraspSet, row: int) -> None:
@@ -121,9 +121,9 @@ class Pick(Lift):
         moved, turned = self._motion()
         return bool(void(self.data) or moved > 2 * FALLEN_M or turned > 2 * TURNED)
 
-    def _judge(self, trial: Trial) -> Outcome:
+    def _validate(self, rollout: Rollout) -> Outcome:
         if not self.terms.published_limits:
-            return super()._judge(trial)
+            return super()._validate(rollout)
         if void(self.data):
             return Outcome.DIVERGED
         if abs(float(self._offset() @ self._up)) >= FALLEN_M:
@@ -170,7 +170,7 @@ def finite(value: float) -> float:
 
 
 def pushed(case: Case, pieces: ConvexPieces, **terms: Any) -> dict[str, Any]:
-    found = judge(case.hand, case.obj, case.grasps, pieces=pieces, **terms)
+    found = validate(case.hand, case.obj, case.grasps, pieces=pieces, **terms)
     return {
         "held": (found.success == 1).tolist(),
         "reasons": found.reasons,
@@ -183,7 +183,7 @@ def lifted(case: Case, pieces: ConvexPieces) -> dict[str, Any]:
     placed = on_table(case)
     way = plan_way(case.hand, case.obj, case.grasps, placed)
     grasps = replace(case.grasps, approach=way.approach, coming=way.open, lift=way.lift)
-    found = judge_lifts(case.hand, case.obj, grasps, placed, pieces=pieces)
+    found = validate_lifts(case.hand, case.obj, grasps, placed, pieces=pieces)
     return {
         "held": (found.success == 1).tolist(),
         "reasons": found.reasons,
@@ -207,7 +207,7 @@ def no_holds(case: Case, pieces: ConvexPieces) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for name, one in sets.items():
         epsilon = measure(hand, obj, one, friction=0.6, thresholds_m=[0.005])["quality/epsilon"][:, 0]
-        found = judge(hand, obj, one, pieces=pieces)
+        found = validate(hand, obj, one, pieces=pieces)
         out[name] = {"held": (found.success == 1).tolist(), "reasons": found.reasons, "epsilon": epsilon.tolist()}
     return out
 
@@ -361,7 +361,7 @@ def markdown(
         f"| {one['object']} | {one['n']} | {one['picked']:.2f} | {' | '.join(f'{one[words]:.2f}' for words in SHOWN)} |"
         for one in objects
     ]
-    lines.append("\nHolds that are none, judged by the six pushes:\n")
+    lines.append("\nHolds that are none, validated by the six pushes:\n")
     for name, one in nothing.items():
         why = ", ".join(f"{count} {reason}" for reason, count in one["reasons"].items())
         lines.append(f"- {name}: {one['held']} of {one['n']} hold; {why}.")

@@ -14,15 +14,15 @@ import numpy as np
 
 from graspd.service.model.cores import available_cores
 from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
-from graspd.worker.planners.port import Wanted
+from graspd.worker.planners.port import PlanRequest
 from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
 from graspd.worker.quality.table import DEFAULT_THRESHOLDS_M, measure
 from graspd.worker.quality.volume import SharedVolume
-from graspd.worker.run import Run
 
 SAMPLE = 64
 
@@ -40,9 +40,11 @@ def main() -> None:
     args = parser.parse_args()
     fidelity = FIDELITIES["standard"]
     hand, obj = hand_from_path(args.hand), object_from_path(args.object, face_error_m=fidelity.face_error_m)
-    grasps = synthesize(hand, obj, Wanted(count=args.grasps, fidelity=fidelity, seed=1), Run(progress=show))
+    grasps = synthesize(
+        hand, obj, PlanRequest(count=args.grasps, fidelity=fidelity, seed=1), ExecutionContext(progress=show)
+    )
     wall, cpu = time.perf_counter(), time.process_time()
-    table = measure(hand, obj, grasps, run=Run(progress=show))
+    table = measure(hand, obj, grasps, run=ExecutionContext(progress=show))
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     sys.stderr.write("\n")
     probe = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)

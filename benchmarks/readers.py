@@ -35,7 +35,7 @@ PICTURE = ("image/rgb", "image/depth", "image/segmentation", "camera/intrinsics"
 
 
 @dataclass(frozen=True)
-class Way:
+class Trajectory:
     """A way to read: a pass that counts its samples, and the name of the plain way it is held against."""
 
     work: Callable[[], int]
@@ -91,13 +91,13 @@ def _row_by_row(shards: Shards, kind: str, columns: Sequence[str]) -> int:
     return count
 
 
-def ways(shards: Shards) -> dict[str, Way]:
+def ways(shards: Shards) -> dict[str, Trajectory]:
     """All ways there are to read these shards."""
     found = {
-        "h5py, whole columns": Way(lambda: plain_columns(shards), "h5py, whole columns"),
-        "Grasps.arrays": Way(lambda: sum(map(arrays_of, by_hand(shards))), "h5py, whole columns"),
-        "h5py, grasp by grasp": Way(lambda: plain_rows(shards), "h5py, grasp by grasp"),
-        "Grasps, one by one": Way(lambda: sum(1 for _ in Grasps(shards, valid=False)), "h5py, grasp by grasp"),
+        "h5py, whole columns": Trajectory(lambda: plain_columns(shards), "h5py, whole columns"),
+        "Grasps.arrays": Trajectory(lambda: sum(map(arrays_of, by_hand(shards))), "h5py, whole columns"),
+        "h5py, grasp by grasp": Trajectory(lambda: plain_rows(shards), "h5py, grasp by grasp"),
+        "Grasps, one by one": Trajectory(lambda: sum(1 for _ in Grasps(shards, valid=False)), "h5py, grasp by grasp"),
     }
     if shards.of("views"):
         found |= of_pictures(shards)
@@ -108,22 +108,22 @@ def ways(shards: Shards) -> dict[str, Way]:
         return found
 
 
-def of_pictures(shards: Shards) -> dict[str, Way]:
+def of_pictures(shards: Shards) -> dict[str, Trajectory]:
     """Ways to read pictures without PyTorch."""
     pictures = Pictures(shards, PICTURE)
     order = np.random.default_rng(0).permutation(len(pictures)).tolist()
     bulk = "h5py, pictures in bulk"
     return {
-        bulk: Way(lambda: plain_bulk(shards), bulk),
-        "h5py, picture by picture": Way(lambda: plain_pictures(shards), bulk),
-        "Pictures, in turn": Way(lambda: sum(1 for _ in pictures), bulk),
-        "prefetched(Pictures), 2 threads": Way(lambda: sum(1 for _ in prefetched(pictures)), bulk),
-        "h5py, drawn one by one": Way(lambda: plain_drawn(shards, order, pictures.places), bulk),
-        "Pictures, drawn one by one": Way(lambda: sum(1 for i in order if pictures[i]), bulk),
+        bulk: Trajectory(lambda: plain_bulk(shards), bulk),
+        "h5py, picture by picture": Trajectory(lambda: plain_pictures(shards), bulk),
+        "Pictures, in turn": Trajectory(lambda: sum(1 for _ in pictures), bulk),
+        "prefetched(Pictures), 2 threads": Trajectory(lambda: sum(1 for _ in prefetched(pictures)), bulk),
+        "h5py, drawn one by one": Trajectory(lambda: plain_drawn(shards, order, pictures.places), bulk),
+        "Pictures, drawn one by one": Trajectory(lambda: sum(1 for i in order if pictures[i]), bulk),
     }
 
 
-def loaders(shards: Shards) -> dict[str, Way]:
+def loaders(shards: Shards) -> dict[str, Trajectory]:
     """The same through PyTorch's DataLoader."""
     import torch
     from torch.utils.data import DataLoader
@@ -137,10 +137,12 @@ def loaders(shards: Shards) -> dict[str, Way]:
             DataLoader(ShuffledShards(own, valid=False), batch_size=64, num_workers=processes)
             for own in by_hand(shards)
         ]
-        found[f"ShuffledShards, {processes} processes"] = Way(rows_of(streams), "h5py, grasp by grasp")
+        found[f"ShuffledShards, {processes} processes"] = Trajectory(rows_of(streams), "h5py, grasp by grasp")
         if shards.of("views"):
             pictures = DataLoader(Samples(Pictures(shards)), 8, num_workers=processes, collate_fn=collate)
-            found[f"Pictures, DataLoader, {processes} processes"] = Way(rows_of([pictures]), "h5py, pictures in bulk")
+            found[f"Pictures, DataLoader, {processes} processes"] = Trajectory(
+                rows_of([pictures]), "h5py, pictures in bulk"
+            )
     return found
 
 
@@ -159,7 +161,7 @@ def rows_of(loaders: list[Any]) -> Callable[[], int]:
     return lambda: sum(len(batch["row"]) for batch in itertools.chain.from_iterable(loaders))
 
 
-def streamed(local: Shards, url: str, scratch: Path) -> dict[str, Way]:
+def streamed(local: Shards, url: str, scratch: Path) -> dict[str, Trajectory]:
     """Pictures of a store, read ahead by four threads, against the same on disk; of the store nothing is held when a
     pass begins."""
     store = open_store(url)
@@ -178,11 +180,11 @@ def streamed(local: Shards, url: str, scratch: Path) -> dict[str, Way]:
         return sum(1 for _ in prefetched(there, order, workers=4, ahead=16))
 
     return {
-        "disk, in turn": Way(lambda: sum(1 for _ in here), "disk, in turn"),
-        "disk, in turn, 2 threads": Way(lambda: sum(1 for _ in prefetched(here)), "disk, in turn"),
-        "S3, in turn": Way(fresh, "disk, in turn"),
-        "disk, drawn": Way(lambda: sum(1 for i in order if here[i]), "disk, drawn"),
-        "S3, drawn": Way(lambda: fresh(order), "disk, drawn"),
+        "disk, in turn": Trajectory(lambda: sum(1 for _ in here), "disk, in turn"),
+        "disk, in turn, 2 threads": Trajectory(lambda: sum(1 for _ in prefetched(here)), "disk, in turn"),
+        "S3, in turn": Trajectory(fresh, "disk, in turn"),
+        "disk, drawn": Trajectory(lambda: sum(1 for i in order if here[i]), "disk, drawn"),
+        "S3, drawn": Trajectory(lambda: fresh(order), "disk, drawn"),
     }
 
 
@@ -195,7 +197,7 @@ class Rate:
     """Of the processor time of this process alone."""
 
 
-def run(chosen: dict[str, Way]) -> dict[str, Rate]:
+def run(chosen: dict[str, Trajectory]) -> dict[str, Rate]:
     """The best of each way."""
     for way in chosen.values():
         way.work()  # warms the files
@@ -224,7 +226,7 @@ def main() -> None:
     tell(chosen, run(chosen))
 
 
-def tell(chosen: dict[str, Way], found: dict[str, Rate]) -> None:
+def tell(chosen: dict[str, Trajectory], found: dict[str, Rate]) -> None:
     """The table, or its figures."""
     if "--json" in sys.argv:
         typer.echo(json.dumps({name: round(rate.by_clock, 1) for name, rate in found.items()}))

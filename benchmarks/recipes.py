@@ -20,8 +20,8 @@ from graspd.service.model.fidelity import FIDELITIES, Fidelity
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
-from graspd.worker.planners.port import Wanted
-from graspd.worker.validation.validator import judge
+from graspd.worker.planners.port import PlanRequest
+from graspd.worker.validation.validator import validate
 
 OBJECTS = ("003_cracker_box", "011_banana", "006_mustard_bottle", "048_hammer", "077_rubiks_cube", "035_power_drill")
 SEED = 101
@@ -59,15 +59,17 @@ def main() -> None:
         object_from_path(given.data / "objects" / name / "clean.stl", face_error_m=error) for name in given.objects
     ]
     # Kernels and pieces are there before anything is timed.
-    judge(hand, objects[0], synthesize(hand, objects[0], Wanted(count=2, fidelity=FIDELITIES["standard"], seed=1)))
+    validate(
+        hand, objects[0], synthesize(hand, objects[0], PlanRequest(count=2, fidelity=FIDELITIES["standard"], seed=1))
+    )
     sys.stdout.write(f"| recipe | success | core seconds for {given.grasps} grasps |\n| --- | --: | --: |\n")
     for name, fidelity in recipes().items():
         rates, seconds = [], 0.0
         for obj in objects:
             began = time.process_time()
-            found = synthesize(hand, obj, Wanted(count=given.grasps, fidelity=fidelity, seed=SEED))
+            found = synthesize(hand, obj, PlanRequest(count=given.grasps, fidelity=fidelity, seed=SEED))
             seconds += time.process_time() - began
-            rates.append(float(judge(hand, obj, found).success.mean()))
+            rates.append(float(validate(hand, obj, found).success.mean()))
         sys.stdout.write(f"| {name} | {np.mean(rates):.2f} | {seconds / len(objects):.1f} |\n")
         sys.stdout.flush()
 

@@ -1,4 +1,4 @@
-"""Quality of raw standard grasps of the three hands on all objects, by the letter of the referee's protocol.
+"""Quality of standard candidates of the three hands on all objects, under the unmodified DexGraspBench protocol.
 
 usage: python -m benchmarks.results_tables DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out DIR]
 DATA_DIR holds hands/ and objects/. Writes quality-HAND.json and quality-HAND.md to `--out`. Stopped runs go on: every
@@ -74,8 +74,8 @@ def metrics(cell: Cell) -> dict[str, Any]:
 
 
 def in_models(cell: Cell) -> dict[str, Any]:
-    """Of each grasp that the certificate holds: the share of models around the nominal one in which it does."""
-    held = np.array(cell.verdicts("certificate", False)["success"])
+    """Of each grasp that the standard level holds: the share of models around the nominal one in which it does."""
+    held = np.array(cell.verdicts("standard", False)["success"])
     found = robust(
         cell.hand, cell.obj, cell.grasps, held=held, models=ROBUST_MODELS, seed=SEED, pieces=decompose(cell.obj)
     )
@@ -84,54 +84,54 @@ def in_models(cell: Cell) -> dict[str, Any]:
 
 def row(cell: Cell) -> dict[str, Any]:
     """The numbers of one object; seconds are of two cores."""
-    letter, hard = (np.array(cell.verdicts("letter", h)["success"]) == 1 for h in (False, True))
-    certificate = cell.verdicts("certificate", False)
+    dexgraspbench, hard = (np.array(cell.verdicts("dexgraspbench", h)["success"]) == 1 for h in (False, True))
+    standard = cell.verdicts("standard", False)
     quality = cell.kept("metrics", lambda: metrics(cell))
     shares = np.array(cell.kept(f"models-{ROBUST_MODELS}", lambda: in_models(cell))["shares"])
     top = np.argsort(-np.array(quality["epsilon"]))[:TOP]
-    made, judged = cell.cpu_seconds / CORES, certificate["cpu_seconds"] / CORES
+    made, validated = cell.cpu_seconds / CORES, standard["cpu_seconds"] / CORES
     return {
         "object": cell.object_name,
-        "n": len(letter),
-        "gsr": float(letter.mean()),
+        "n": len(dexgraspbench),
+        "gsr": float(dexgraspbench.mean()),
         "gsr_hard": float(hard.mean()),
         "robust": float(shares.mean()) if len(shares) else None,
         "robust_n": len(shares),
         "robust_many": int(reaches(shares, SHARE).sum()),
-        "osr": float(letter.any()),
+        "osr": float(dexgraspbench.any()),
         "osr_hard": float(hard.any()),
-        "held": int(letter.sum()),
+        "held": int(dexgraspbench.sum()),
         "seconds": made,
-        "referee_seconds": judged,
-        "sgs": float(letter.sum() / (made + judged)),
-        "sgs_without_referee": float(letter.sum() / made),
+        "validation_seconds": validated,
+        "sgs": float(dexgraspbench.sum() / (made + validated)),
+        "sgs_without_validation": float(dexgraspbench.sum() / made),
         **{key: float(np.median(quality[key])) for key in (*COLUMNS, "cdc_mm", "sd_cm")},
         "diversity": quality["diversity"],
         "top": {key: float(np.array(quality[key])[top].mean()) for key in PAPER["allegro"]},
-        "top_held": float(letter[top].mean()),
-        **{key: cell.verdicts("letter", False)[key] for key in ("pieces", "volume_ratio", "excess_mm", "terms")},
+        "top_held": float(dexgraspbench[top].mean()),
+        **{key: cell.verdicts("dexgraspbench", False)[key] for key in ("pieces", "volume_ratio", "excess_mm", "terms")},
     }
 
 
 def whole(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """All objects in one row: rates over all grasps, means of the objects' medians."""
     n, held = sum(r["n"] for r in rows), sum(r["held"] for r in rows)
-    made, judged = sum(r["seconds"] for r in rows), sum(r["referee_seconds"] for r in rows)
+    made, validated = sum(r["seconds"] for r in rows), sum(r["validation_seconds"] for r in rows)
     out = {key: float(np.mean([r[key] for r in rows])) for key, _, _ in PRINTED if key != "robust"}
-    certified = sum(r["robust_n"] for r in rows)
+    validated_batch = sum(r["robust_n"] for r in rows)
     known = [r for r in rows if r["robust_n"]]
     return out | {
         "object": "all",
         "n": n,
         "gsr": held / n,
         "gsr_hard": sum(r["gsr_hard"] * r["n"] for r in rows) / n,
-        "robust": sum(r["robust"] * r["robust_n"] for r in known) / certified if certified else None,
-        "robust_n": certified,
+        "robust": sum(r["robust"] * r["robust_n"] for r in known) / validated_batch if validated_batch else None,
+        "robust_n": validated_batch,
         "robust_many": sum(r["robust_many"] for r in rows),
         "osr": float(np.mean([r["osr"] for r in rows])),
         "osr_hard": float(np.mean([r["osr_hard"] for r in rows])),
-        "sgs": held / (made + judged),
-        "sgs_without_referee": held / made,
+        "sgs": held / (made + validated),
+        "sgs_without_validation": held / made,
         "top": {key: float(np.mean([r["top"][key] for r in rows])) for key in PAPER["allegro"]},
         "top_held": float(np.mean([r["top_held"] for r in rows])),
     }
@@ -156,13 +156,13 @@ def markdown(hand: str, rows: list[dict[str, Any]], total: dict[str, Any], comma
         [
             f"# Quality of {hand.capitalize()} grasps",
             "",
-            f"graspd {PACKAGE_VERSION}, `{command}`: {rows[0]['n']} raw grasps on each of {len(rows)} objects, "
-            f"real URDF, standard fidelity, seed {SEED}. Referee: MuJoCo, DexGraspBench protocol, level *letter*.",
+            f"graspd {PACKAGE_VERSION}, `{command}`: {rows[0]['n']} candidates on each of {len(rows)} objects, "
+            f"real URDF, standard fidelity, seed {SEED}. Validator: MuJoCo, DexGraspBench protocol, level *letter*.",
             "",
             f"**GSR {total['gsr']:.3f}, hard {total['gsr_hard']:.3f}; OSR {total['osr']:.2f}, hard "
             f"{total['osr_hard']:.2f}; {total['sgs']:.1f} holding grasps per second of two cores, "
-            f"{total['sgs_without_referee']:.1f} without the referee. {total['robust_many']} of {total['robust_n']} "
-            f"that the certificate holds do in {SHARE} of {ROBUST_MODELS} models around the nominal one.**",
+            f"{total['sgs_without_validation']:.1f} without the validator. {total['robust_many']} of {total['robust_n']} "
+            f"that the standard level holds do in {SHARE} of {ROBUST_MODELS} models around the nominal one.**",
             "",
             head,
             "| --- |" + " --: |" * len(PRINTED),
@@ -170,8 +170,8 @@ def markdown(hand: str, rows: list[dict[str, Any]], total: dict[str, Any], comma
             "",
             f"GSR: share that holds, normal and at half the friction. robust: share of {ROBUST_MODELS} models around "
             "the "
-            "nominal one in which a grasp that the certificate holds does, on average. SGS: holding grasps per second, "
-            "made and judged (level *certificate*), seconds being CPU time over two cores. PD, SPD: penetration, "
+            "nominal one in which a grasp that the standard level holds does, on average. SGS: holding grasps per second, "
+            "made and validated (level *certificate*), seconds being CPU time over two cores. PD, SPD: penetration, "
             "self-penetration mm. CDC: contact distance consistency mm. CA cm², ε, Vol at a contact threshold of 5 mm "
             "and μ = 1. IV cm³. SD: simulated displacement cm. D: variance explained by the first component. Medians; "
             "the last row has rates over all grasps and means of the medians.",
@@ -181,7 +181,7 @@ def markdown(hand: str, rows: list[dict[str, Any]], total: dict[str, Any], comma
             "| | graspd | Fast-Grasp'D |",
             "| --- | --: | --: |",
             *versus,
-            f"| held by the letter | {total['top_held']:.2f} | - |",
+            f"| held under the DexGraspBench protocol | {total['top_held']:.2f} | - |",
             "",
         ]
     )

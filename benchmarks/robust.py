@@ -1,9 +1,9 @@
 """How far a verdict can be trusted: what each way in which a hand's model may be wrong costs in success.
 
 usage: python -m benchmarks.robust DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out FOLDER]
-DATA_DIR holds hands/ and objects/. Raw standard grasps are judged by the certificate; those that hold are judged again
-in models that differ along one axis (`--draws` for each), along all axes at once, and as a job does it. `--out` gets
-robust.json and robust.md. Stopped runs go on (see cells.py).
+DATA_DIR holds hands/ and objects/. Raw standard grasps are validated at level standard; those that hold are validated
+again in models that differ along one axis (`--draws` for each), along all axes at once, and as a job does it. `--out`
+gets robust.json and robust.md. Stopped runs go on (see cells.py).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import numpy as np
 
 from benchmarks.cells import Cell, cell_parser, cells, write_json
 from graspd.service.model.metrics import AXIS_MEANINGS, ROBUST_MODELS, Axis
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.quality.intervals import wilson
-from graspd.worker.run import Run
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions
 from graspd.worker.validation.refit import fits_of
@@ -37,7 +37,7 @@ WORDS = {"hull": "one hull a link", "primitive": "primitives", "capsule": "capsu
 
 
 def kinds(cell: Cell, draws: int) -> dict[str, list[Callable[[np.random.Generator], Variant]]]:
-    """Rows of the table: how to draw the variants that a grasp is judged in."""
+    """Rows of the table: how to draw the variants that a grasp is validated in."""
     hand = cell.hand
     found: dict[str, list[Callable[[np.random.Generator], Variant]]] = {}
     for fit, grown in SHAPES:
@@ -54,35 +54,43 @@ def kinds(cell: Cell, draws: int) -> dict[str, list[Callable[[np.random.Generato
 
 
 def study(cell: Cell, draws: int) -> dict[str, Any]:
-    """Of one cell: for each row how often a grasp that holds nominally holds, and what judging as a job does costs."""
+    """Of one cell: for each row how often a grasp that holds nominally holds, and what validating as a job does
+    costs."""
     pieces = decompose(cell.obj)
-    held = np.array(cell.verdicts("certificate", False)["success"]) == 1
+    held = np.array(cell.verdicts("standard", False)["success"]) == 1
     around = Models(cell.hand, cell.obj, pieces, MujocoOptions())
     rows: dict[str, list[int]] = {}
     for place, (name, ways) in enumerate(kinds(cell, draws).items()):
-        trials = [
-            around.certificate(cell.grasps, int(row), way(np.random.default_rng((SEED, place, k, int(row))))).success
+        rollouts = [
+            around.standard(cell.grasps, int(row), way(np.random.default_rng((SEED, place, k, int(row))))).success
             for row in np.flatnonzero(held)
             for k, way in enumerate(ways)
         ]
-        rows[name] = [int(sum(trials)), len(trials)]
+        rows[name] = [int(sum(rollouts)), len(rollouts)]
     jobs: dict[str, Any] = {}
     for wanted in (0.0, *SHARES):
         began = time.process_time()
         found = robust(
-            cell.hand, cell.obj, cell.grasps, held=held, wanted=wanted, seed=SEED, pieces=pieces, run=Run(threads=1)
+            cell.hand,
+            cell.obj,
+            cell.grasps,
+            held=held,
+            wanted=wanted,
+            seed=SEED,
+            pieces=pieces,
+            run=ExecutionContext(threads=1),
         )
-        jobs[f"{wanted:g}"] = {"cpu_seconds": time.process_time() - began, "judged": int((found.held >= 0).sum())}
+        jobs[f"{wanted:g}"] = {"cpu_seconds": time.process_time() - began, "validated": int((found.held >= 0).sum())}
         if not wanted:
             share, weakest = found.share[held], found.weakest[held]
     return {
-        "raw": len(held),
+        "candidates": len(held),
         "held": int(held.sum()),
         "rows": rows,
         "jobs": jobs,
         "shares": [round(float(one), 6) for one in share],
         "weakest": [int(one) for one in weakest],
-        "nominal_cpu_seconds": cell.verdicts("certificate", False)["cpu_seconds"],
+        "nominal_cpu_seconds": cell.verdicts("standard", False)["cpu_seconds"],
     }
 
 
@@ -95,24 +103,26 @@ def summed(hand: str, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
             rows[name] = [held + rows.get(name, [0, 0])[0], n + rows.get(name, [0, 0])[1]]
     shares = np.concatenate([np.array(cell["shares"]) for cell in every])
     weakest = Counter(AXIS_MEANINGS[Axis(one)] for cell in every for one in cell["weakest"] if one)
-    tried = len(shares)
+    candidates = len(shares)
     reached = {f"{wanted:g}": int(reaches(shares, wanted).sum()) for wanted in SHARES}
     return {
         "hand": hand,
-        "raw": sum(cell["raw"] for cell in every),
-        "held": tried,
+        "candidates": sum(cell["candidates"] for cell in every),
+        "held": candidates,
         "rows": rows,
         "share": float(shares.mean()),
         "reached": reached,
         "weakest": dict(weakest.most_common()),
         "cpu_ms": {
-            wanted: 1e3 * sum(cell["jobs"][wanted]["cpu_seconds"] for cell in every) / tried
+            wanted: 1e3 * sum(cell["jobs"][wanted]["cpu_seconds"] for cell in every) / candidates
             for wanted in every[0]["jobs"]
         },
-        "judged": {
-            wanted: sum(cell["jobs"][wanted]["judged"] for cell in every) / tried for wanted in every[0]["jobs"]
+        "validated": {
+            wanted: sum(cell["jobs"][wanted]["validated"] for cell in every) / candidates for wanted in every[0]["jobs"]
         },
-        "nominal_cpu_ms": 1e3 * sum(cell["nominal_cpu_seconds"] for cell in every) / sum(c["raw"] for c in every),
+        "nominal_cpu_ms": 1e3
+        * sum(cell["nominal_cpu_seconds"] for cell in every)
+        / sum(c["candidates"] for c in every),
         "cells": found,
     }
 
@@ -125,8 +135,8 @@ def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
         "# How far a verdict can be trusted",
         "",
         f"Made by `python -m benchmarks.robust`. Raw standard grasps on {', '.join(objects)}, "
-        f"{done[0]['raw'] // len(objects)} on each; those that the certificate holds in the nominal model ({held}) "
-        f"were judged again in models that differ in one thing, {draws} draws of each for every grasp "
+        f"{done[0]['candidates'] // len(objects)} on each; those that the standard level holds in the nominal model ({held}) "
+        f"were validated again in models that differ in one thing, {draws} draws of each for every grasp "
         "(collision shapes and couplings: each kind once). A hundred percent would be a verdict that no such "
         "difference moves. Cells: share "
         "that still holds, 95 % interval of Wilson taken as if all verdicts were independent.",
@@ -139,7 +149,7 @@ def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
     lines += [f"| {name} | {' | '.join(_cell(one['rows'].get(name)) for one in done)} |" for name in names]
     lines += [
         "",
-        f"As `--robust` judges: {ROBUST_MODELS} models a grasp, each along one axis, the axes in an order at random. "
+        f"As `--robust` validates: {ROBUST_MODELS} models a grasp, each along one axis, the axes in an order at random. "
         "*First "
         "lost to*: what differed in the first model in which a grasp failed, of those that failed in any.",
         "",
@@ -154,11 +164,11 @@ def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
         "| first lost to | "
         + " | ".join(", ".join(f"{name} {n}" for name, n in list(one["weakest"].items())[:4]) for one in done)
         + " |",
-        "| core-ms a raw grasp, nominal verdict | " + " | ".join(f"{one['nominal_cpu_ms']:.0f}" for one in done) + " |",
+        "| core-ms a candidate, nominal verdict | " + " | ".join(f"{one['nominal_cpu_ms']:.0f}" for one in done) + " |",
     ]
     for wanted in ("0", *(f"{share:g}" for share in SHARES)):
         what = "all models" if wanted == "0" else f"until {wanted} is sure"
-        each = " | ".join(f"{one['cpu_ms'][wanted]:.0f} ({one['judged'][wanted]:.1f} models)" for one in done)
+        each = " | ".join(f"{one['cpu_ms'][wanted]:.0f} ({one['validated'][wanted]:.1f} models)" for one in done)
         lines.append(f"| core-ms a grasp that holds, {what} | {each} |")
     return "\n".join([*lines, "", "CPU time beside other programs: good to some ten percent.", ""])
 

@@ -1,10 +1,10 @@
 """Verdicts of two checkouts on the same grasps, number by number, and what each costs; prints Markdown.
 
 usage: python -m benchmarks.same_verdicts BEFORE AFTER DATA_DIR [--hands allegro barrett shadow] [--objects mug bottle]
-                                          [--grasps 64] [--level certificate]
+                                          [--grasps 64] [--level standard]
 
 BEFORE and AFTER are checkouts of graspd; AFTER plans the grasps. An object is a built-in one or a folder of
-DATA_DIR/objects. A shortcut of the referee that moves no bit shows as many equal rows as there are grasps.
+DATA_DIR/objects. A shortcut of the validator that moves no bit shows as many equal rows as there are grasps.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from graspd.service.model.domain import JobOptions
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.run import Run
+from graspd.worker.execution_context import Run
 
 fidelity, run = JobOptions(fidelity="standard").knobs, Run(threads=1)
 hand = hand_from_path(sys.argv[1])
@@ -41,15 +41,15 @@ parts = dict(grasp=grasps.grasp, pregrasp=grasps.pregrasp, squeeze=grasps.squeez
 arrays = {{f"{{n}}_{{k}}": v for n, p in parts.items() for k, v in vars(p).items()}}
 np.savez(sys.argv[3], loss=grasps.stability_loss, **arrays)
 """
-JUDGE: Final = f"""{_COMMON}
+VALIDATE: Final = f"""{_COMMON}
 from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.validator import validate
 kept = np.load(sys.argv[3])
 names = ("grasp", "pregrasp", "squeeze")
 parts = {{n: Posture(kept[n + "_hand_pose"], kept[n + "_joint_positions"]) for n in names}}
 grasps, pieces = GraspSet(**parts, stability_loss=kept["loss"]), decompose(obj)
 began = time.process_time()
-found = judge(hand, obj, grasps, level=sys.argv[5], pieces=pieces, run=run)
+found = validate(hand, obj, grasps, level=sys.argv[5], pieces=pieces, run=run)
 spent = time.process_time() - began
 names = ("outcome", "margin", "penetration_depth_mm", "self_penetration_depth_mm")
 np.savez(sys.argv[4], spent=spent, steps=found.steps, **{{name: getattr(found, name) for name in names}})
@@ -84,7 +84,7 @@ def main() -> None:
     parser.add_argument("--hands", nargs="*", default=["allegro", "barrett", "shadow"])
     parser.add_argument("--objects", nargs="*", default=["mug", "bottle"])
     parser.add_argument("--grasps", type=int, default=64)
-    parser.add_argument("--level", default="certificate")
+    parser.add_argument("--level", default="standard")
     given = parser.parse_args()
     lines = [
         "| pair | grasps | same outcomes | all numbers the same | ms before | ms after |",
@@ -100,7 +100,7 @@ def main() -> None:
                 pair = (str(urdf.resolve()), name, f"{work}/grasps.npz")
                 run(given.after.resolve(), PLAN, *pair, str(given.grasps))
                 for number, root in enumerate((given.before, given.after)):
-                    run(root.resolve(), JUDGE, *pair, f"{work}/{number}.npz", given.level)
+                    run(root.resolve(), VALIDATE, *pair, f"{work}/{number}.npz", given.level)
                 found = [dict(np.load(f"{work}/{number}.npz")) for number in range(2)]
             exact = ("outcome", "margin", "penetration_depth_mm", "self_penetration_depth_mm")
             count = len(found[0]["outcome"])

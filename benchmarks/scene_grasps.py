@@ -5,7 +5,7 @@ usage: python -m benchmarks.scene_grasps DATA_DIR [--work W] [--hands allegro ..
        DATA_DIR holds hands/ and objects/
 
 Scenes: each stable resting face of the object that at least 3 % of drops end on, on a table: `--grasps` a pair, or
-`--per-face` for each face if that is more. Free grasps are put into the same scenes and judged alike: as many, or
+`--per-face` for each face if that is more. Free grasps are put into the same scenes and validated alike: as many, or
 `--filtered` a pair if that is more, for few of them lift.
 A second is one of CPU time of one thread: other programs on the machine change the ratios little. What a pair has found
 lies under W: a run that was stopped goes on, and several may run beside one another with other hands.
@@ -29,19 +29,19 @@ from graspd.service.model.version import PACKAGE_VERSION
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.oppositions import oppositions_of
+from graspd.worker.hands.pinch_postures import oppositions_of
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.planners import Run, Wanted, synthesize
-from graspd.worker.planners.fast_graspd.across import Openings
+from graspd.worker.planners import ExecutionContext, PlanRequest, synthesize
+from graspd.worker.planners.fast_graspd.antipodal_starts import Openings
 from graspd.worker.scenes.clearance import MARGIN_M
 from graspd.worker.scenes.kinds import rest_poses, supports_of
-from graspd.worker.scenes.trial import trial_on
-from graspd.worker.scenes.way import plan_way
-from graspd.worker.simulation.surroundings import Placed, Scenes
+from graspd.worker.scenes.rollout import rollout_on
+from graspd.worker.scenes.trajectory import plan_way
+from graspd.worker.simulation.environment import Placed, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
-from graspd.worker.validation.lifting import judge_lifts
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.lifting import validate_lifts
+from graspd.worker.validation.validator import validate
 
 COMMAND = (
     "python -m benchmarks.scene_grasps DATA --work W --grasps 16 --per-face 2 --filtered 96 "
@@ -57,7 +57,7 @@ TITLES = {
     "clear_contact": "clear at contact",
     "clear_way": "clear on the way",
     "pushes_of_clear": "of these six pushes",
-    "letter": "letter, clear",
+    "dexgraspbench": "letter, clear",
     "lift": "lift",
     "hard": "lift, half friction",
     "faces_held": "faces with one",
@@ -81,24 +81,24 @@ def study(
     touch: float = TOUCH,
     seed: int = SEED,
 ) -> dict[str, Any]:
-    """The numbers of one pair; shares are of all raw grasps."""
+    """The numbers of one pair; shares are of all candidates."""
     spec = SceneSpec(kind="table", faces="all", touch=touch)
     poses = rest_poses(spec, obj, count=1, seed=seed)["scene/object_pose"]
     count = max(least, per_face * len(poses))
     placed = Scenes(supports_of(spec), poses).placed(np.arange(count) % len(poses))
-    wanted, run = Wanted(count, FIDELITY, seed), Run(threads=1)
-    lifts, pushes = (trial_on(run, hand, obj, lambda: pieces, in_scenes=where) for where in (True, False))
+    wanted, run = PlanRequest(count, FIDELITY, seed), ExecutionContext(threads=1)
+    lifts, pushes = (rollout_on(run, hand, obj, lambda: pieces, in_scenes=where) for where in (True, False))
     # What a pair is made ready with once is none of a grasp's cost, on either side.
-    for where, trial in ((placed.take(slice(0, 1)), lifts), (None, pushes)):
-        synthesize(hand, obj, Wanted(1, FIDELITY, SEED, placed=where, trial=trial), run)
-    planned, seconds = _timed(lambda: synthesize(hand, obj, replace(wanted, placed=placed, trial=lifts), run))
+    for where, rollout in ((placed.take(slice(0, 1)), lifts), (None, pushes)):
+        synthesize(hand, obj, PlanRequest(1, FIDELITY, SEED, placed=where, rollout=rollout), run)
+    planned, seconds = _timed(lambda: synthesize(hand, obj, replace(wanted, placed=placed, rollout=lifts), run))
     many = max(count, filtered)
-    free, free_seconds = _timed(lambda: synthesize(hand, obj, replace(wanted, count=many, trial=pushes), run))
+    free, free_seconds = _timed(lambda: synthesize(hand, obj, replace(wanted, count=many, rollout=pushes), run))
     free_seconds *= count / many
-    found = _judged(hand, obj, planned, placed, pieces)
+    found = _validated(hand, obj, planned, placed, pieces)
     scenes = Scenes(supports_of(spec), poses).placed(np.arange(many) % len(poses))
-    free_lift = _judged(hand, obj, free, scenes, pieces, only_lift=True)["lift"]
-    free_held = judge(hand, obj, free.take(np.arange(count)), pieces=pieces).success.mean()
+    free_lift = _validated(hand, obj, free, scenes, pieces, only_lift=True)["lift"]
+    free_held = validate(hand, obj, free.take(np.arange(count)), pieces=pieces).success.mean()
     rate, free_rate = found["lift"] / seconds, free_lift / free_seconds
     held = np.asarray(found.pop("rows"))
     faces = np.array([held[placed.index == s].any() for s in range(len(poses))])
@@ -123,7 +123,7 @@ def study(
     }
 
 
-def _judged(
+def _validated(
     hand: HandModel,
     obj: ObjectModel,
     grasps: GraspSet,
@@ -138,15 +138,19 @@ def _judged(
     share = {"clear_contact": float((way.contact >= MARGIN_M).mean()), "clear_way": float(way.clear.mean())}
     mine, where = grasps.take(clear), placed.take(clear)
     lifted = np.zeros(len(grasps), bool)
-    levels: dict[str, dict[str, Any]] = {"lift": {}, "hard": {"hard": True}, "letter": {"level": "letter"}}
+    levels: dict[str, dict[str, Any]] = {
+        "lift": {},
+        "hard": {"hard": True},
+        "dexgraspbench": {"level": "dexgraspbench"},
+    }
     for name, options in list(levels.items())[: 1 if only_lift else None]:
-        verdicts = judge_lifts(hand, obj, mine, where, pieces=pieces, **options)
+        verdicts = validate_lifts(hand, obj, mine, where, pieces=pieces, **options)
         share[name] = float(verdicts.success.sum() / len(grasps))
         if name == "lift":
             lifted[clear[verdicts.success == 1]] = True
     if only_lift:
         return share
-    pushes = judge(hand, obj, mine, pieces=pieces).success.sum() if len(clear) else 0
+    pushes = validate(hand, obj, mine, pieces=pieces).success.sum() if len(clear) else 0
     return {**share, "pushes": float(pushes / len(grasps)), "rows": lifted.tolist()}
 
 
@@ -185,7 +189,7 @@ def page(results: dict[str, list[dict[str, Any]]]) -> str:
         "# Grasps planned in scenes",
         "",
         f"graspd {PACKAGE_VERSION}, `{COMMAND}`: real URDFs, {FIDELITY.name} fidelity, seed {SEED}; a table, each "
-        "stable resting face that at least 3 % of drops end on. Shares are of all raw grasps unless it says otherwise; "
+        "stable resting face that at least 3 % of drops end on. Shares are of all candidates unless it says otherwise; "
         "seconds are CPU time of planning. A face is in reach if two points of the object that look away from each "
         "other lie 4 mm clear of the table, less than 30 degrees from level, and no farther apart than the hand's "
         "opposed fingers open. Where no filtered grasp lifts, the gain is counted as if one had: it is more.",

@@ -1,4 +1,4 @@
-"""A second opinion on table grasps that are called valid: lifted by a test that shares no code with the referee.
+"""A second opinion on table grasps that are called valid: lifted by a test that shares no code with the validator.
 
 usage: python -m benchmarks.second_lift DATA_DIR [--hands allegro ...] [--objects 025_mug ...] [--grasps 16]
            [--scenes 4] [--seed 1400] [--mass KG] [--page OUT.md]
@@ -69,7 +69,9 @@ def line(hand: str, obj: str, mass: str, valid: int, lifted: int) -> str:
 def again(given: Any, name: str, hand: HandModel, obj: str, mass: float) -> tuple[int, int]:
     """Valid grasps of a pair, and those of them that this test lifts."""
     mesh_file = given.data / "objects" / obj / "clean.stl"
-    request = JobOptions(grasps=given.grasps, audits=0, seed=given.seed, scene="table", scenes=given.scenes, mass=mass)
+    request = JobOptions(
+        grasps=given.grasps, rechecks=0, seed=given.seed, scene="table", scenes=given.scenes, mass=mass
+    )
     made = synthesized(
         str(given.data / "hands" / HANDS[name]),
         str(mesh_file),

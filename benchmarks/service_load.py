@@ -28,7 +28,7 @@ from graspd.service.index.index import Index
 from graspd.service.model import names
 from graspd.service.model.planning import message_of, plan, task_id
 from graspd.service.model.records import JobRecord
-from graspd.service.model.states import Lane, Stage, State
+from graspd.service.model.states import Priority, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.run.supervisor import Supervisor
@@ -85,7 +85,7 @@ def running(*, workers: int, task_s: float, api: bool, **settings: Any) -> Itera
 def run(services: Services, batches: int, seed: int) -> float:
     """Seconds from the submission of a bulk job to its end."""
     start = time.perf_counter()
-    job = job_actions.submit(services, request(grasps=32 * batches, seed=seed), lane=Lane.BULK)[0].id
+    job = job_actions.submit(services, request(grasps=32 * batches, seed=seed), priority=Priority.BULK)[0].id
     while services.index.jobs.get(job).state is not State.SUCCEEDED:
         time.sleep(0.05)
     return time.perf_counter() - start
@@ -104,7 +104,7 @@ def queue() -> None:
                 spent.append(time.perf_counter() - start)
 
     with service(workers=0) as services:
-        job_actions.submit(services, request(grasps=32 * 500), lane=Lane.BULK)
+        job_actions.submit(services, request(grasps=32 * 500), priority=Priority.BULK)
         engine.Runner = Timed  # type: ignore[misc]
         start = time.perf_counter()
         worker_main.run_worker(services.settings, start=engine_of(fake_stages()), max_tasks=400)

@@ -4,7 +4,7 @@ usage: python -m benchmarks.standing_off DATA_DIR [--hands allegro ...] [--objec
            [--seed 1500] [--page OUT.md]
        DATA_DIR holds hands/ and objects/
 
-Raw candidates of fidelity standard. Free ones are judged again at half the friction and by DexGraspBench's letter.
+Raw candidates of fidelity standard. Free ones are validated again at half the friction and by DexGraspBench's letter.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from benchmarks.cells import HANDS, cell_parser
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.scene_spec import SceneSpec
-from graspd.worker.certified import certified_grasps
+from graspd.worker.generation import validated_grasps
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.quality.contact import finger_of_body
 from graspd.worker.quality.probe import HAND_POINTS, probe_of
-from graspd.worker.scenes.beside import scenes_of
-from graspd.worker.validation.validator import judge
+from graspd.worker.scenes.placement import scenes_of
+from graspd.worker.validation.validator import validate
 
 #: Not a seed that any setting was chosen with.
 SEED, SCENES = 1500, 4
@@ -36,7 +36,7 @@ PLACES: Final = ("free", "table")
 OFF_M: Final = (0.005, 0.008, 0.05)
 HEAD = """# Fingers that stand off
 
-`python -m benchmarks.standing_off DATA`: of {grasps} raw candidates on each of {objects} objects those that are valid,
+`python -m benchmarks.standing_off DATA`: of {grasps} candidates on each of {objects} objects those that are valid,
 those of them with a finger more than 5 and 8 mm off the object at the grasp, and which fingers are more than 5 mm off,
 counted from the first. Of free grasps how many hold at half the friction and by DexGraspBench's letter, of those whose
 fingers all touch and of the others; seed {seed}.
@@ -57,7 +57,7 @@ def main() -> None:
         for place in PLACES:
             parts = [counts(given, hand, given.data / "objects" / obj / "clean.stl", place) for obj in given.objects]
             gaps, held = (np.concatenate(part) for part in zip(*parts, strict=True))
-            rows.append(f"| {name} | {place} | {line(gaps, held, judged=place == 'free')} |")
+            rows.append(f"| {name} | {place} | {line(gaps, held, validated=place == 'free')} |")
             print(rows[-1], flush=True)  # noqa: T201
     if given.page:
         said = {"grasps": given.grasps, "objects": len(given.objects), "seed": given.seed}
@@ -69,13 +69,13 @@ def counts(given: Any, hand: HandModel, mesh: Path, place: str) -> tuple[Any, An
     obj, scenes = object_from_path(mesh, face_error_m=FIDELITIES["standard"].face_error_m), None
     if place != "free":
         scenes, _ = scenes_of(SceneSpec(kind=place), obj, count=SCENES, seed=given.seed)
-    request = JobOptions(want="raw", grasps=given.grasps, seed=given.seed, audits=0)
-    found = certified_grasps(hand, obj, request, count=given.grasps, scenes=scenes)
+    request = JobOptions(want="candidates", grasps=given.grasps, seed=given.seed, rechecks=0)
+    found = validated_grasps(hand, obj, request, count=given.grasps, scenes=scenes)
     grasps = found.grasps.take(np.flatnonzero(found.columns["quality/valid"]))
     held = np.zeros((len(grasps), 2), bool)
     if scenes is None:
-        for column, terms in enumerate(({"hard": True}, {"level": "letter"})):
-            held[:, column] = judge(hand, obj, grasps, **terms).success == 1  # type: ignore[arg-type]
+        for column, terms in enumerate(({"hard": True}, {"level": "dexgraspbench"})):
+            held[:, column] = validate(hand, obj, grasps, **terms).success == 1  # type: ignore[arg-type]
     return finger_gaps(hand, obj, grasps.grasp), held
 
 
@@ -86,7 +86,7 @@ def finger_gaps(hand: HandModel, obj: ObjectModel, grasp: Any) -> Any:
     return np.stack([gaps[:, finger == f].min(axis=1) for f in range(finger.max() + 1)], axis=1)
 
 
-def line(gaps: Any, held: Any, *, judged: bool) -> str:
+def line(gaps: Any, held: Any, *, validated: bool) -> str:
     """The cells of a hand."""
     off = gaps.max(axis=1) > OFF_M[0]
     cells = [
@@ -96,7 +96,9 @@ def line(gaps: Any, held: Any, *, judged: bool) -> str:
         ", ".join(map(str, (gaps > OFF_M[0]).sum(axis=0))),
     ]
     parts = [held[some].sum(axis=0) for some in (~off, off)]
-    cells += [f"{a}, {b} of {n}" if judged else "" for (a, b), n in zip(parts, ((~off).sum(), off.sum()), strict=True)]
+    cells += [
+        f"{a}, {b} of {n}" if validated else "" for (a, b), n in zip(parts, ((~off).sum(), off.sum()), strict=True)
+    ]
     return " | ".join(map(str, cells))
 
 

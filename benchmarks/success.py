@@ -1,7 +1,7 @@
 """Success of the planner's grasps in the independent engine and their quality, per hand and object, as Markdown.
 
 usage: python -m benchmarks.success DATA_DIR [GRASPS [HAND ...]]     DATA_DIR holds hands/ and objects/
-The referee is MuJoCo with the DexGraspBench protocol, level `certificate` (see worker/validation).
+The validator is MuJoCo with the DexGraspBench protocol, level `standard` (see worker/validation).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.quality.table import measure
 from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.validator import validate
 
 HANDS = {
     "Allegro": "allegro/allegro_hand_right.urdf",
@@ -50,8 +50,8 @@ class Results:
         pieces = decompose(obj)
         found = planned(hand, obj, count=count, seed=SEED)
         self.seconds += found.seconds
-        self.success.append(judge(hand, obj, found, pieces=pieces).success)
-        self.hard.append(judge(hand, obj, found, hard=True, pieces=pieces).success)
+        self.success.append(validate(hand, obj, found, pieces=pieces).success)
+        self.hard.append(validate(hand, obj, found, hard=True, pieces=pieces).success)
         table = measure(hand, obj, found, friction=FRICTION, thresholds_m=[THRESHOLD_M])
         self.depth.append(table["quality/penetration_depth_mm"])
         order = np.argsort(table["quality/epsilon"][:, 0])[::-1][:BEST]

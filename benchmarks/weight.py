@@ -31,7 +31,7 @@ EXTRAS: Final = ("", "api", "worker", "all", "dev")
 LARGEST: Final = 6
 _COMMAND: Final = "import sys; sys.argv = ['graspd', {}]; import graspd.cli; graspd.cli.main()"
 _OURS: Final = "from graspd.service.model.libraries import imports, own_process; own_process()\nwith imports(): {}"
-_ENGINE: Final = "import graspd.worker.certified, graspd.worker.planners.fast_graspd.planner"
+_ENGINE: Final = "import graspd.worker.generation, graspd.worker.planners.fast_graspd.planner"
 #: What somebody waits for, and what does it.
 STARTS: Final = {
     "Python alone": "pass",

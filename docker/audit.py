@@ -18,13 +18,13 @@ PINS = Path(__file__).parent / "constraints.txt"
 def main() -> int:
     """Audit the environment, then the versions that the images install."""
     found = [
-        _audit("this environment", "--skip-editable", "--local"),
-        _audit("the images", "--requirement", str(PINS), "--no-deps", "--disable-pip"),
+        _recheck("this environment", "--skip-editable", "--local"),
+        _recheck("the images", "--requirement", str(PINS), "--no-deps", "--disable-pip"),
     ]
     return max(found)
 
 
-def _audit(what: str, *options: str) -> int:
+def _recheck(what: str, *options: str) -> int:
     command = [sys.executable, "-m", "pip_audit", "--format", "json", "--progress-spinner", "off", *options]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     try:
@@ -36,8 +36,8 @@ def _audit(what: str, *options: str) -> int:
     bad = [package for package in asked if package["vulns"]]
     for package in bad:
         for flaw in package["vulns"]:
-            mend = ", ".join(flaw["fix_versions"]) or "no release mends it yet"
-            _say(f"{package['name']} {package['version']}: {flaw['id']}; {mend}")
+            fix = ", ".join(flaw["fix_versions"]) or "no release fixes it yet"
+            _say(f"{package['name']} {package['version']}: {flaw['id']}; {fix}")
     if not asked:
         _say(f"{what}: nothing was audited: the advisory database cannot be reached from here")
         return 1

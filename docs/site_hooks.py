@@ -58,12 +58,12 @@ def on_page_markdown(markdown: str, *, page: Any, files: Files, **_: Any) -> str
             return None
         return os.path.relpath(inside, posixpath.dirname(place) or ".") + mark + anchor
 
-    def mended(found: re.Match[str]) -> str:
+    def fixed(found: re.Match[str]) -> str:
         if found[4]:
             return f'{found[4]}="{of_site(found[5]) or found[5]}"'
-        text = _LINK.sub(mended, found[2])
+        text = _LINK.sub(fixed, found[2])
         link = of_site(found[3])
         return f"{found[1]}[{text}]({link})" if link else text
 
     parts = _CODE.split(markdown)
-    return "".join(part if number % 2 else _LINK.sub(mended, part) for number, part in enumerate(parts))
+    return "".join(part if number % 2 else _LINK.sub(fixed, part) for number, part in enumerate(parts))

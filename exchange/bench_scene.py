@@ -21,7 +21,7 @@ from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, inve
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.scenes.kinds import supports_of
-from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.simulation.environment import Placed
 
 Row = dict[str, Any]
 

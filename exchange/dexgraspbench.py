@@ -1,4 +1,4 @@
-"""DexGraspBench's layout: one pickled dictionary a grasp, and the files that its evaluator needs to judge it.
+"""DexGraspBench's layout: one pickled dictionary a grasp, and the files that its evaluator needs to validate it.
 
 Fields: `obj_path`, `obj_scale`, `obj_pose` (7,), and `pregrasp_qpos`, `grasp_qpos`, `squeeze_qpos` (7 + J,) each: root
 position, root quaternion w x y z, joints. Root and object stand in one world frame. Root and order of the joints are
@@ -35,15 +35,15 @@ from graspd.exchange.bench_scene import (
     tabletop_fields,
     with_way,
 )
-from graspd.exchange.imported import Imported, load_npy, scaled_object
-from graspd.exchange.lots import plain_name
+from graspd.exchange.imported import ImportedGrasps, load_npy, scaled_object
+from graspd.exchange.plan import plain_name
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.simulation.environment import Placed
 
 Row = dict[str, Any]
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
@@ -51,7 +51,7 @@ POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 NAME: Final = "graspd"
 
 
-def read(path: Path, *, hand: str, obj: str) -> list[Imported]:
+def read(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
     """Grasps of one hand on one object, a set for each scale of the object, those on tables apart from the others.
 
     Args:
@@ -209,7 +209,7 @@ def _set(
     mapping: HandMapping | None,
     *,
     on_table: bool,
-) -> Imported:
+) -> ImportedGrasps:
     pose = np.array([np.ravel(row.get("obj_pose", IDENTITY_POSE)) for row in rows], float)
     parts = {name: _posture(path, hand, name, rows, pose, mapping) for name in POSTURES}
     grasps = GraspSet(parts["grasp"], parts["pregrasp"], parts["squeeze"], np.full(len(rows), np.nan))
@@ -218,7 +218,7 @@ def _set(
     placed = placed_of(pose) if on_table else None
     if placed is not None:
         grasps = replace(with_way(hand, grasps, rows, pose, mapping), scene=placed.index)
-    return Imported(hand, obj, grasps, name, scale, published, placed)
+    return ImportedGrasps(hand, obj, grasps, name, scale, published, placed)
 
 
 def _posture(

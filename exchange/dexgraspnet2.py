@@ -32,8 +32,8 @@ import scipy.io
 from numpy.typing import NDArray
 
 from graspd.exchange.dexgraspnet2_graspness import SceneGraspness, surface_samples
-from graspd.exchange.imported import Imported, completed, joints_by_name, scaled_object, verdicts
-from graspd.exchange.lots import Look, Lot, Written, by_scene, looks, plain_name
+from graspd.exchange.imported import ImportedGrasps, completed, joints_by_name, scaled_object, verdicts
+from graspd.exchange.plan import ExportPart, ExportSummary, Look, by_scene, looks, plain_name
 from graspd.service.model.base import why
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, apply, compose, invert, pose_from_matrix, pose_to_matrix
@@ -67,8 +67,8 @@ _MEMBERS: Final = 1024
 
 
 def write(
-    lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
-) -> Written:
+    lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
+) -> ExportSummary:
     """Write each scene that has pictures and grasps.
 
     Args:
@@ -97,7 +97,7 @@ def write(
                 "no grasp is valid and clear in the scenes of the pictures; plan them in scenes: synth --scene"
             )
         raise InputError("no picture shows a scene with grasps; put views beside the grasps: graspd render")
-    done = Written({"grasps": 0, "scenes": len(scenes), "views": 0, "files": len(scenes)})
+    done = ExportSummary({"grasps": 0, "scenes": len(scenes), "views": 0, "files": len(scenes)})
     numbers = {held: _numbers(held, scenes, known, out) for held in (False, True)}
     samples: dict[str, Floats] = {}
     for some in scenes:
@@ -115,7 +115,7 @@ def write(
     return done
 
 
-def _numbers(held: bool, scenes: list[list[Look]], known: dict[str, Lot], out: frozenset[str]) -> Iterator[int]:
+def _numbers(held: bool, scenes: list[list[Look]], known: dict[str, ExportPart], out: frozenset[str]) -> Iterator[int]:
     """Of the scenes of one side, as its splits have them."""
     count = sum((known[some[0].base].name in out) is held for some in scenes)
     room = [number for numbers in (HELD_OUT if held else TRAIN) for number in numbers]
@@ -175,7 +175,7 @@ def _camera(look: Look) -> Floats:
     return invert(pose_from_matrix(look.extrinsics))
 
 
-def _write_grasps(look: Look, lot: Lot, folder: Path, graspness: SceneGraspness) -> None:
+def _write_grasps(look: Look, lot: ExportPart, folder: Path, graspness: SceneGraspness) -> None:
     names = lot.hand.joint_names
     if taken := set(names) & {*_PLACE, *_OURS, *_NUMPYS}:
         raise InputError(f"{lot.hand.name} has a joint {sorted(taken)[0]!r}, which is a key of DexGraspNet 2.0's files")
@@ -196,7 +196,7 @@ def _write_grasps(look: Look, lot: Lot, folder: Path, graspness: SceneGraspness)
     np.savez_compressed(folder / f"{lot.name}.npz", **arrays)
 
 
-def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[Imported]:
+def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGrasps]:
     """The grasps of one object in one scene, in the object's frame.
 
     Args:
@@ -228,7 +228,7 @@ def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[Imported]:
     published = found.get("success")
     set_ = _with_ours(path, model, found, grasp, away)
     return [
-        Imported(
+        ImportedGrasps(
             model,
             thing,
             completed(model, thing, grasp) if set_ is None else set_,

@@ -25,7 +25,7 @@ from graspd.exchange.bench_hand import COLLECTED, HandMapping
 from graspd.exchange.bench_object import SET, write_object, write_table
 from graspd.exchange.bench_scene import TABLETOP, check_table
 from graspd.exchange.dexgraspbench import POSTURES, experiment, models_of, postures
-from graspd.exchange.lots import Look, Lot, Written, looks, object_points
+from graspd.exchange.plan import ExportPart, ExportSummary, Look, looks, object_points
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, invert
 from graspd.service.readers import DepthNoise, Pictures
@@ -40,8 +40,8 @@ _FREE: Final = -1
 
 
 def write(
-    lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
-) -> Written:
+    lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
+) -> ExportSummary:
     """Write grasps and what their cameras see.
 
     Args:
@@ -65,7 +65,7 @@ def write(
             check_table(lot.placed)
     scenes = _scenes(lots, folder)
     clouds, bare = _clouds(pictures, lots, scenes, folder, noise)
-    done = Written({"grasps": 0, "scenes": len({*scenes.values()}), "clouds": clouds, "files": 0})
+    done = ExportSummary({"grasps": 0, "scenes": len({*scenes.values()}), "clouds": clouds, "files": 0})
     if not clouds:
         done.notes.append("there are no pictures, so no clouds: put views beside the grasps (graspd render) to train")
     elif bare:
@@ -81,10 +81,10 @@ def write(
 #: The scene's file below the folder, by shard and scene; free grasps have the one of their object.
 _Scenes = dict[tuple[str, int], Path]
 #: Rows of a lot that are of one scene and one type.
-_Part = tuple[Lot, Path, int, NDArray[np.intp]]
+_Part = tuple[ExportPart, Path, int, NDArray[np.intp]]
 
 
-def _scenes(lots: Sequence[Lot], folder: Path) -> _Scenes:
+def _scenes(lots: Sequence[ExportPart], folder: Path) -> _Scenes:
     """Write objects and scenes; scenes of several shards of an object are numbered through."""
     scenes: _Scenes = {}
     free: dict[str, Path] = {}
@@ -103,7 +103,7 @@ def _scenes(lots: Sequence[Lot], folder: Path) -> _Scenes:
 
 
 def _clouds(
-    pictures: Pictures, lots: Sequence[Lot], scenes: _Scenes, folder: Path, noise: DepthNoise | None
+    pictures: Pictures, lots: Sequence[ExportPart], scenes: _Scenes, folder: Path, noise: DepthNoise | None
 ) -> tuple[int, int]:
     """Write what each picture shows of its object; the numbers of clouds, and of scenes that are left without."""
     on_table = {lot.id: lot.placed is not None for lot in lots}
@@ -133,16 +133,16 @@ def _scene_id(scene: Path) -> Path:
     return scene.relative_to(SET / "scene_cfg").with_suffix("")
 
 
-def _groups(lots: Sequence[Lot]) -> Iterable[list[Lot]]:
+def _groups(lots: Sequence[ExportPart]) -> Iterable[list[ExportPart]]:
     """Lots of one hand that are all free or all on tables: a data set of their own."""
-    groups: dict[tuple[str, bool], list[Lot]] = {}
+    groups: dict[tuple[str, bool], list[ExportPart]] = {}
     for lot in lots:
         groups.setdefault((lot.hand.digest, lot.placed is None), []).append(lot)
     return groups.values()
 
 
 def _write_group(
-    lots: list[Lot], scenes: _Scenes, folder: Path, out: frozenset[str], done: Written, *, seen: bool
+    lots: list[ExportPart], scenes: _Scenes, folder: Path, out: frozenset[str], done: ExportSummary, *, seen: bool
 ) -> None:
     parts = [(lot, *part) for lot in lots for part in _rows_of(lot, scenes, folder, seen=seen)]
     listed = sorted({kind for _, _, kind, _ in parts if _in_both(kind, parts, out)})
@@ -162,7 +162,9 @@ def _write_group(
         _configure(folder, name, lots[0], [TYPES[kind] for kind in listed])
 
 
-def _rows_of(lot: Lot, scenes: _Scenes, folder: Path, *, seen: bool) -> Iterator[tuple[Path, int, NDArray[np.intp]]]:
+def _rows_of(
+    lot: ExportPart, scenes: _Scenes, folder: Path, *, seen: bool
+) -> Iterator[tuple[Path, int, NDArray[np.intp]]]:
     """The lot's rows by the file of their scene and their type; without those of scenes that nobody sees, where others
     are seen."""
     index = np.full(len(lot.grasps), _FREE) if lot.placed is None else np.asarray(lot.placed.index)
@@ -183,7 +185,7 @@ def _in_both(kind: int, parts: Sequence[_Part], out: frozenset[str]) -> bool:
     return not out or bool(names & out and names - out)
 
 
-def _untyped(parts: Sequence[_Part]) -> Iterator[tuple[Lot, Path, NDArray[np.intp]]]:
+def _untyped(parts: Sequence[_Part]) -> Iterator[tuple[ExportPart, Path, NDArray[np.intp]]]:
     together: dict[tuple[str, Path], list[_Part]] = {}
     for part in parts:
         together.setdefault((part[0].id, part[1]), []).append(part)
@@ -191,7 +193,7 @@ def _untyped(parts: Sequence[_Part]) -> Iterator[tuple[Lot, Path, NDArray[np.int
         yield some[0][0], scene, np.sort(np.concatenate([part[3] for part in some]))
 
 
-def _record(mapping: HandMapping, lot: Lot, rows: NDArray[np.intp], scene: Path) -> dict[str, Any]:
+def _record(mapping: HandMapping, lot: ExportPart, rows: NDArray[np.intp], scene: Path) -> dict[str, Any]:
     grasps: GraspSet = lot.grasps
     record: dict[str, Any] = {"scene_path": scene.as_posix(), "scene_scale": np.ones(len(rows))}
     poses = [None if lot.placed is None else np.asarray(lot.placed.object_pose[lot.placed.index[row]]) for row in rows]
@@ -207,7 +209,7 @@ def _save(file: Path, record: dict[str, Any]) -> None:
     np.save(file, np.array(record, dtype=object), allow_pickle=True)
 
 
-def _configure(folder: Path, name: str, lot: Lot, types: list[str]) -> None:
+def _configure(folder: Path, name: str, lot: ExportPart, types: list[str]) -> None:
     """DexLearn's configuration of the data."""
     values: dict[str, Any] = {
         "num_workers": 8,
@@ -230,7 +232,7 @@ def _configure(folder: Path, name: str, lot: Lot, types: list[str]) -> None:
     file.write_text("".join(f"{key}: {json.dumps(value)}\n" for key, value in values.items()))
 
 
-def _splits(folder: Path, names: set[str], out: frozenset[str], done: Written) -> None:
+def _splits(folder: Path, names: set[str], out: frozenset[str], done: ExportSummary) -> None:
     if not out:
         done.notes.append("one object: train.json and test.json both name it, so the test tells nothing of unseen ones")
     for split, some in (("train", names - out), ("test", out or names)):

@@ -25,10 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.baselines.autograsp import kernels
-from graspd.baselines.autograsp.method import Closer
+from graspd.baselines.autograsp.method import HandCloser
 from graspd.baselines.common import ground_of
-from graspd.exchange.imported import Imported, completed, joints_by_name, mesh_file, scaled_object
-from graspd.exchange.lots import Lot, Written, plain_name
+from graspd.exchange.imported import ImportedGrasps, completed, joints_by_name, mesh_file, scaled_object
+from graspd.exchange.plan import ExportPart, ExportSummary, plain_name
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, apply, pose_from_matrix, pose_to_matrix, quat_from_matrix
 from graspd.service.store import validity
@@ -56,11 +56,11 @@ _ROTATION: Final = 1e-3
 _AT_ONCE: Final = 256
 
 
-def write(lots: Sequence[Lot], folder: Path, out: frozenset[str]) -> Written:
-    """Write all judged grasps of each hand, good ones and bad ones.
+def write(lots: Sequence[ExportPart], folder: Path, out: frozenset[str]) -> ExportSummary:
+    """Write all validated grasps of each hand, good ones and bad ones.
 
     Args:
-        lots: grasps; their `rows` are those that were judged.
+        lots: grasps; their `rows` are those that were validated.
         folder: where to; made if absent.
         out: objects that are held out: `valid.txt`.
 
@@ -72,7 +72,7 @@ def write(lots: Sequence[Lot], folder: Path, out: frozenset[str]) -> Written:
     """
     if (folder / "grasps").exists():
         raise InputError(f"{folder} holds grasps already; give another folder as --output")
-    done = Written({"grasps": 0, "good": 0, "objects": 0, "files": 0})
+    done = ExportSummary({"grasps": 0, "good": 0, "objects": 0, "files": 0})
     meshes = {uuid_of(lot): lot.obj for lot in lots}
     (folder / "objects").mkdir(parents=True, exist_ok=True)
     for uuid, obj in meshes.items():
@@ -86,12 +86,12 @@ def write(lots: Sequence[Lot], folder: Path, out: frozenset[str]) -> Written:
     return done
 
 
-def uuid_of(lot: Lot) -> str:
+def uuid_of(lot: ExportPart) -> str:
     """The object's name there. WebDataset ends a key at the first dot."""
     return lot.name.replace(".", "-")
 
 
-def _write_hand(hand: HandModel, lots: list[Lot], folder: Path, out: set[str], done: Written) -> None:
+def _write_hand(hand: HandModel, lots: list[ExportPart], folder: Path, out: set[str], done: ExportSummary) -> None:
     name = plain_name(hand.name)
     records = {uuid: _record(hand, list(some)) for uuid, some in _by_object(lots)}
     (folder / "grasps" / name).mkdir(parents=True)
@@ -125,12 +125,12 @@ def _write_hand(hand: HandModel, lots: list[Lot], folder: Path, out: set[str], d
         )
 
 
-def _by_object(lots: list[Lot]) -> Iterator[tuple[str, list[Lot]]]:
+def _by_object(lots: list[ExportPart]) -> Iterator[tuple[str, list[ExportPart]]]:
     for uuid in sorted({uuid_of(lot) for lot in lots}):
         yield uuid, [lot for lot in lots if uuid_of(lot) == uuid]
 
 
-def _record(hand: HandModel, lots: list[Lot]) -> dict[str, Any]:
+def _record(hand: HandModel, lots: list[ExportPart]) -> dict[str, Any]:
     parts: dict[str, Any] = {}
     for name in POSTURES:
         some: list[Posture] = [getattr(lot.grasps, name).take(lot.rows) for lot in lots]
@@ -176,7 +176,7 @@ def convention(hand: HandModel) -> dict[str, Any]:
     }
 
 
-def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Imported]:
+def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
     """The grasps of one object. Where the record has no joints, fingers close until they touch.
 
     Args:
@@ -207,7 +207,7 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
     if set_ is None:
         set_ = completed(model, thing, closed_at(model, thing, pose_from_matrix(matrices)))
     name = object_name or Path(str(record["object"].get("file", ""))).stem or thing.name
-    return [Imported(model, thing, set_, name, scale, held.astype(np.int8))]
+    return [ImportedGrasps(model, thing, set_, name, scale, held.astype(np.int8))]
 
 
 def _grasps(file: str, hand: HandModel, record: dict[str, Any], pose: Floats) -> GraspSet | None:
@@ -278,6 +278,6 @@ def closed_at(hand: HandModel, obj: ObjectModel, hand_pose: NDArray[np.float64])
         pose = hand_pose[first : first + _AT_ONCE]
         palm = apply(pose, hand.palm.centre) - obj.centre_of_mass
         state = HandState(palm, pose[:, 3:], np.tile(hand.preshape, (len(pose), 1)))
-        closed = Closer(pair, len(pose)).close(state).state
+        closed = HandCloser(pair, len(pose)).close(state).state
         joints[first : first + len(pose)] = posture_of(hand, obj, closed).joint_positions
     return Posture(hand_pose, joints)

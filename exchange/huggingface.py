@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from graspd.exchange.bench_scene import placed_of
-from graspd.exchange.imported import Imported, joints_by_name, scaled_object, verdicts
-from graspd.exchange.lots import Lot, Written
+from graspd.exchange.imported import ImportedGrasps, joints_by_name, scaled_object, verdicts
+from graspd.exchange.plan import ExportPart, ExportSummary
 from graspd.service import parquet
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats
 from graspd.service.readers import DepthNoise, Pictures
 from graspd.service.readers.clouds import CloudView
-from graspd.service.readers.ways import scene_spec_of
+from graspd.service.readers.trajectories import scene_spec_of
 from graspd.service.store.manifests import INDEX_THRESHOLD_M
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.load import hand_from_path
@@ -78,8 +78,8 @@ _PICTURES_AT_ONCE: Final = 50
 
 
 def write(
-    lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
-) -> Written:
+    lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
+) -> ExportSummary:
     """Write both tables, of training and of held-out objects.
 
     Args:
@@ -95,7 +95,7 @@ def write(
     parquet.arrow()
     if (folder / "grasps").exists():
         raise InputError(f"{folder} holds a table of grasps already; give another folder as --output")
-    done = Written({"grasps": 0, "pictures": 0, "files": 0})
+    done = ExportSummary({"grasps": 0, "pictures": 0, "files": 0})
     sides = {"train": {lot.name for lot in lots} - out, "test": set(out)}
     names = {lot.id: lot.name for lot in lots}
     for split, some in sides.items():
@@ -116,7 +116,7 @@ def write(
     return done
 
 
-def _grasps(lot: Lot) -> list[dict[str, Any]]:
+def _grasps(lot: ExportPart) -> list[dict[str, Any]]:
     said, arrays = lot.shard.attributes, lot.shard.arrays
     thresholds = np.asarray(arrays["quality/thresholds_m"], float)
     at = int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))
@@ -211,7 +211,7 @@ def _card(splits: list[str], *, seen: bool) -> str:
     )
 
 
-def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Imported]:
+def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
     """The grasps of one object, those of free objects apart from those on tables.
 
     Args:
@@ -250,7 +250,7 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
 
 def _set(
     path: Path, hand: str, obj: str, name: str, columns: dict[str, list[Any]], rows: list[int], *, on_table: bool
-) -> Imported:
+) -> ImportedGrasps:
     model, thing = hand_from_path(hand), scaled_object(obj)
     try:
         joints = {tuple(columns["joint_names"][k]) for k in rows}
@@ -268,4 +268,4 @@ def _set(
     placed = None if place is None else placed_of(place)
     if placed is not None:
         grasps.scene = placed.index
-    return Imported(model, thing, grasps, name, 1.0, verdict, placed)
+    return ImportedGrasps(model, thing, grasps, name, 1.0, verdict, placed)

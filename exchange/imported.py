@@ -24,7 +24,7 @@ from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.simulation.environment import Placed
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Origin:
 
 
 @dataclass(frozen=True)
-class Imported:
+class ImportedGrasps:
     """Grasps of one hand on one object, all three postures."""
 
     hand: HandModel

@@ -24,14 +24,14 @@ from numpy.typing import NDArray
 
 from graspd.exchange.bench_scene import placed_of
 from graspd.exchange.huggingface import png
-from graspd.exchange.imported import Imported, joints_by_name, scaled_object, verdicts
-from graspd.exchange.lots import Look, Lot, Written, by_scene, looks
+from graspd.exchange.imported import ImportedGrasps, joints_by_name, scaled_object, verdicts
+from graspd.exchange.plan import ExportPart, ExportSummary, Look, by_scene, looks
 from graspd.service import parquet
 from graspd.service.model.base import why
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import POSE_PARTS, Floats, compose, invert
 from graspd.service.readers import Pictures
-from graspd.service.readers.ways import way_of
+from graspd.service.readers.trajectories import way_of
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.load import hand_from_path
 
@@ -70,7 +70,7 @@ _INDEXED: Final = {
 }
 
 
-def write(lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[str]) -> Written:
+def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str]) -> ExportSummary:
     """Write an episode for each grasp whose scene has a picture; of several pictures each takes the next one.
 
     Args:
@@ -100,13 +100,13 @@ def write(lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[
     for first in range(0, len(episodes), _EPISODES):
         writer.file(episodes[first : first + _EPISODES])
     writer.meta(sum(lot.name not in out for lot, _, _ in episodes))
-    done = Written({"grasps": len(episodes), "frames": writer.frames, "files": -(-len(episodes) // _EPISODES)})
+    done = ExportSummary({"grasps": len(episodes), "frames": writer.frames, "files": -(-len(episodes) // _EPISODES)})
     if left := sum(len(lot.rows) for lot in lots) - len(episodes):
         done.notes.append(f"{left} grasps are left out: they are free, or no picture shows their scene")
     return done
 
 
-def _seen(lot: Lot, seen: Mapping[tuple[str, int], list[Look]]) -> Iterator[tuple[int, Look]]:
+def _seen(lot: ExportPart, seen: Mapping[tuple[str, int], list[Look]]) -> Iterator[tuple[int, Look]]:
     """The lot's rows with a picture of their scene."""
     assert lot.placed is not None
     for k, row in enumerate(lot.rows.tolist()):
@@ -114,7 +114,7 @@ def _seen(lot: Lot, seen: Mapping[tuple[str, int], list[Look]]) -> Iterator[tupl
             yield row, found[k % len(found)]
 
 
-def postures_of(lot: Lot, row: int) -> Floats:
+def postures_of(lot: ExportPart, row: int) -> Floats:
     """(W, 7 + J) root and joints on the way of a grasp, in the frame of its table."""
     assert lot.placed is not None
     rest = np.asarray(lot.placed.object_pose[lot.placed.index[row]], float)
@@ -125,13 +125,13 @@ def postures_of(lot: Lot, row: int) -> Floats:
 class _Writer:
     """Files of frames, and what is told of all of them."""
 
-    def __init__(self, folder: Path, lot: Lot, pictures: Pictures, tasks: dict[str, int]) -> None:
+    def __init__(self, folder: Path, lot: ExportPart, pictures: Pictures, tasks: dict[str, int]) -> None:
         self.folder, self.hand, self.pictures, self.tasks = folder, lot.hand, pictures, tasks
         self.frames, self.episodes = 0, list[dict[str, Any]]()
         self._size: tuple[int, ...] = ()
         self._values: dict[str, list[NDArray[Any]]] = {}
 
-    def file(self, episodes: Sequence[tuple[Lot, int, Look]]) -> None:
+    def file(self, episodes: Sequence[tuple[ExportPart, int, Look]]) -> None:
         """Write a file, each episode a row group."""
         number = len(self.episodes) // _EPISODES
         width = 7 + len(self.hand.joint_names)
@@ -150,7 +150,7 @@ class _Writer:
         )
         parquet.write(path, parquet.schema_of(columns | NUMBERS), (self._episode(*one, place) for one in episodes))
 
-    def _episode(self, lot: Lot, row: int, look: Look, place: Mapping[str, int]) -> list[dict[str, Any]]:
+    def _episode(self, lot: ExportPart, row: int, look: Look, place: Mapping[str, int]) -> list[dict[str, Any]]:
         way = postures_of(lot, row).astype(np.float32)
         colour = np.asarray(self.pictures[look.index]["image/rgb"])
         if self._size not in ((), colour.shape):
@@ -269,7 +269,7 @@ _STOPS = 4
 _LARGEST = 2**22
 
 
-def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Imported]:
+def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
     """The grasps on one object, on tables, with their ways as far as all episodes have as many waypoints.
 
     Args:
@@ -302,7 +302,7 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
         coming = [posture(np.array([way[k] for way in ways])) for k in range(len(ways[0]) - _STOPS)]
         grasps.approach = np.stack([at.hand_pose for at in coming], axis=1)
         grasps.coming = coming[-1].joint_positions
-    return [Imported(model, thing, grasps, object_name or thing.name, 1.0, _verdicts(path, numbers), placed)]
+    return [ImportedGrasps(model, thing, grasps, object_name or thing.name, 1.0, _verdicts(path, numbers), placed)]
 
 
 def _names(path: Path) -> list[str]:

@@ -29,7 +29,7 @@ from typing import Any, Final
 import numpy as np
 from pydantic_core import from_json
 
-from graspd.exchange.imported import Imported, completed, joints_by_name, load_npy, scaled_object
+from graspd.exchange.imported import ImportedGrasps, completed, joints_by_name, load_npy, scaled_object
 from graspd.service.model.base import why
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import (
@@ -52,7 +52,7 @@ ROLES: Final = tuple(
 )
 
 
-def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[Imported]:
+def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGrasps]:
     """The grasps of one object of a scene.
 
     Args:
@@ -76,7 +76,7 @@ def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[Impor
     model, thing = hand_from_path(hand), scaled_object(obj)
     pose = np.concatenate([place[:, :3], place[:, 6:], place[:, 3:6]], axis=1)
     grasp = Posture(pose, joints_by_name(model, _names(model), values * _signs(model), what=str(path)))
-    return [Imported(model, thing, completed(model, thing, grasp), thing.name)]
+    return [ImportedGrasps(model, thing, completed(model, thing, grasp), thing.name)]
 
 
 def _names(hand: HandModel) -> list[str]:
@@ -106,7 +106,7 @@ _ROTATION: Final = ("WRJRx", "WRJRy", "WRJRz")
 _MUJOCO: Final = "robot0:"
 
 
-def read_dexgraspnet(path: Path, *, hand: str, obj: str, root_offset: np.ndarray | None = None) -> list[Imported]:
+def read_dexgraspnet(path: Path, *, hand: str, obj: str, root_offset: np.ndarray | None = None) -> list[ImportedGrasps]:
     """Grasps of one object, a set for each scale.
 
     Args:
@@ -131,7 +131,7 @@ def read_dexgraspnet(path: Path, *, hand: str, obj: str, root_offset: np.ndarray
     for scale, some in sorted(by_scale.items()):
         thing = scaled_object(obj, scale)
         grasps = completed(model, thing, _grasp(path, model, some, root_offset))
-        sets.append(Imported(model, thing, grasps, path.stem, scale))
+        sets.append(ImportedGrasps(model, thing, grasps, path.stem, scale))
     return sets
 
 
@@ -159,7 +159,7 @@ def _urdf_name(name: str, hand: HandModel) -> str:
     return next((joint for joint in hand.joint_names if joint == urdf or joint.endswith(f"_{urdf}")), urdf)
 
 
-def read_multidex(path: Path, *, hand: str, obj: str, robot: str, object_name: str) -> list[Imported]:
+def read_multidex(path: Path, *, hand: str, obj: str, robot: str, object_name: str) -> list[ImportedGrasps]:
     """The grasps of one robot on one object.
 
     Args:
@@ -182,7 +182,7 @@ def read_multidex(path: Path, *, hand: str, obj: str, robot: str, object_name: s
         raise InputError(f"{path}: q has {q.shape[1]} numbers, {model.name} needs 9 + {joints} or 6 + {joints}")
     turn = rotation_of_columns(q[:, 3:9]) if q.shape[1] == 9 + joints else rotation_of_angles(q[:, 3:6])
     grasp = Posture(np.concatenate([q[:, :3], turn], axis=1), q[:, -joints:])
-    return [Imported(model, thing, completed(model, thing, grasp), object_name.rpartition("+")[2])]
+    return [ImportedGrasps(model, thing, completed(model, thing, grasp), object_name.rpartition("+")[2])]
 
 
 def rotation_of_columns(columns: Floats) -> Floats:
@@ -218,7 +218,7 @@ def _metadata(path: Path) -> list[Any]:
         raise InputError(f"{path} is no MultiDex file that can be read safely: {reason}") from None
 
 
-def read_reference(path: Path, *, hand: str | None = None, obj: str | None = None) -> list[Imported]:
+def read_reference(path: Path, *, hand: str | None = None, obj: str | None = None) -> list[ImportedGrasps]:
     """The grasps of one file; hand and object by default those beside it that the file names.
 
     Raises:
@@ -238,7 +238,7 @@ def read_reference(path: Path, *, hand: str | None = None, obj: str | None = Non
         raise InputError(f"{path} is no file of reference grasps: {error!r}") from None
     published = np.array([_flag(row.get("pick_success_published")) for row in rows], np.int8)
     grasps = completed(model, thing, Posture(pose, joints))
-    return [Imported(model, thing, grasps, str(stored["object"]), published=published)]
+    return [ImportedGrasps(model, thing, grasps, str(stored["object"]), published=published)]
 
 
 def friction(path: Path) -> float | None:

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.exchange.lots import prim_name
+from graspd.exchange.plan import prim_name
 from graspd.service.model.transforms import Floats
 from graspd.service.store.shards import Shard
 from graspd.worker.rendering.annotate import BACKGROUND, OBJECT, TABLE

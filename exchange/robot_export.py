@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.exchange.cases import load_case
-from graspd.exchange.lots import Written
+from graspd.exchange.inputs import load_case
+from graspd.exchange.plan import ExportSummary
 from graspd.exchange.robots.arm import Description, describe, read_arm
 from graspd.exchange.robots.bundle import Bundle, Carrier
 from graspd.exchange.robots.execution import (
@@ -18,7 +18,7 @@ from graspd.exchange.robots.execution import (
     ASSUMED_RAD_S,
     Executions,
     Limits,
-    Trajectory,
+    RobotTrajectory,
     executions,
     hand_limits,
     parse_pose,
@@ -26,14 +26,14 @@ from graspd.exchange.robots.execution import (
     timed,
     tool_frame,
 )
-from graspd.exchange.robots.reach import Reach
+from graspd.exchange.robots.reach import ReachSearch
 from graspd.service.model.errors import InputError, one_of
 from graspd.service.model.transforms import IDENTITY_POSE
 from graspd.service.store.shards import Shard, read_shard
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.files.provenance import hand_files_of_shard
 from graspd.worker.files.subsets import choose
 from graspd.worker.rendering.sheets import best as best_of
-from graspd.worker.run import ALONE, Run
 from graspd.worker.validation.decomposition import decompose
 
 FORMATS: Final = ("mujoco", "usd", "glb", "moveit", "isaac", "csv")
@@ -42,12 +42,12 @@ ALIASES: Final = {"urdf+yaml": "moveit"}
 
 
 @dataclass(frozen=True)
-class Wishes:
+class RobotExportOptions:
     """What a user asks for, as the command line has it."""
 
     hand: str | None = None
     obj: str | None = None
-    unjudged: bool = False
+    unvalidated: bool = False
     every: bool = False
     best: int = 0
     """At most so many, the best by epsilon first; 0: all, in the order of the shard."""
@@ -61,7 +61,9 @@ class Wishes:
     mount_pose: str | None = None
 
 
-def export_grasps(source: Path, format_: str, wishes: Wishes, folder: Path, run: Run = ALONE) -> Written:
+def export_grasps(
+    source: Path, format_: str, wishes: RobotExportOptions, folder: Path, run: ExecutionContext = DEFAULT_CONTEXT
+) -> ExportSummary:
     """Write grasps of a base shard as a robot or its simulator reads them.
 
     Raises:
@@ -77,7 +79,7 @@ def export_grasps(source: Path, format_: str, wishes: Wishes, folder: Path, run:
     shard = read_shard(source, kind="base")
     files = hand_files_of_shard(shard, wishes.hand)
     description = describe(files.files, files.options)
-    written = Written({})
+    written = ExportSummary({})
     found = _found(source, shard, description, wishes, written)
     limits = hand_limits(found.hand)
     written.notes += _assumptions(limits)
@@ -92,7 +94,7 @@ def export_grasps(source: Path, format_: str, wishes: Wishes, folder: Path, run:
     return written
 
 
-def _check_arm(wishes: Wishes) -> None:
+def _check_arm(wishes: RobotExportOptions) -> None:
     """Raises InputError where an arm lacks its mount or base, or they lack an arm."""
     if wishes.arm is None:
         if wishes.mount or wishes.base or wishes.mount_pose:
@@ -103,14 +105,19 @@ def _check_arm(wishes: Wishes) -> None:
 
 
 def _carried(
-    found: Executions, description: Description, limits: Limits, wishes: Wishes, written: Written, run: Run
+    found: Executions,
+    description: Description,
+    limits: Limits,
+    wishes: RobotExportOptions,
+    written: ExportSummary,
+    run: ExecutionContext,
 ) -> Bundle:
     """The grasps that the arm carries out, with its trajectories."""
     assert wishes.arm is not None and wishes.mount is not None
     base = IDENTITY_POSE if wishes.base is None else parse_pose(wishes.base, "--base")
     mount_pose = IDENTITY_POSE if wishes.mount_pose is None else parse_pose(wishes.mount_pose, "--mount-pose")
     arm = read_arm(wishes.arm, wishes.mount, mount_pose)
-    reach = Reach(arm, base, found, decompose(found.obj))
+    reach = ReachSearch(arm, base, found, decompose(found.obj))
     reached = reach.all(wishes.best, run)
     why = ", ".join(f"{count} {reason}" for reason, count in reached.refused.most_common(3))
     if not reached.rows:
@@ -129,9 +136,11 @@ def _carried(
     return Bundle(kept, trajectories, description, Carrier(arm, base, reach.world, reached.paths))
 
 
-def _found(source: Path, shard: Shard, description: Description, wishes: Wishes, written: Written) -> Executions:
+def _found(
+    source: Path, shard: Shard, description: Description, wishes: RobotExportOptions, written: ExportSummary
+) -> Executions:
     case = load_case(source, hand=wishes.hand, obj=wishes.obj)
-    mask, word = choose(shard, unjudged=wishes.unjudged, every=wishes.every)
+    mask, word = choose(shard, unvalidated=wishes.unvalidated, every=wishes.every)
     rows = best_of(shard.arrays, len(mask), mask) if wishes.best else np.flatnonzero(mask)
     tool = tool_frame(wishes.tool, case.hand.root_link, description.links)
     found = executions(
@@ -156,7 +165,7 @@ def _quality(shard: Shard, rows: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
     return {"valid": np.asarray(arrays["quality/valid"])[rows], "success": success[rows], "epsilon": epsilon[rows]}
 
 
-def _trajectory(found: Executions, row: int, limits: Limits, speed: float) -> Trajectory:
+def _trajectory(found: Executions, row: int, limits: Limits, speed: float) -> RobotTrajectory:
     return timed(straight_paths(found, row), found.hand.joint_names, limits.velocity, speed=speed)
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from graspd.exchange.imported import Imported, Origin, mesh_file
-from graspd.exchange.lots import plain_name
+from graspd.exchange.imported import ImportedGrasps, Origin, mesh_file
+from graspd.exchange.plan import plain_name
 from graspd.service.model.digests import digest_files, digest_json
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import InputError
@@ -15,17 +15,24 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.states import AssetKind
 from graspd.service.store.columns import Attribute
 from graspd.service.store.shards import json_attribute, write_shard
-from graspd.worker.certified import scored
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.files.provenance import base_attributes
+from graspd.worker.generation import scored
 from graspd.worker.objects.options import as_asked
 from graspd.worker.objects.prepare import files_from_path
-from graspd.worker.run import ALONE, Run
 
 
 def write_scored(
-    found: Imported, origin: Origin, folder: Path, *, referee: str, friction: float, ordinal: int = 0, run: Run = ALONE
+    found: ImportedGrasps,
+    origin: Origin,
+    folder: Path,
+    *,
+    validation: str,
+    friction: float,
+    ordinal: int = 0,
+    run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Path:
-    """Judge and measure a set of grasps and write it as a base shard, its object's mesh beside it.
+    """Validate and measure a set of grasps and write it as a base shard, its object's mesh beside it.
 
     Grasps in scenes are lifted out of them; the way of the hand is planned anew, as for grasps of our own.
 
@@ -33,7 +40,7 @@ def write_scored(
         found: the grasps.
         origin: goes into the shard's attributes.
         folder: where to; made if absent.
-        referee: level of the verdicts, or none.
+        validator: level of the verdicts, or none.
         friction: Coulomb coefficient of the metrics.
         ordinal: number of the set, part of the file's name.
         run: told of the share that is done; asked often whether to stop.
@@ -43,7 +50,7 @@ def write_scored(
 
     Raises:
         InputError: unknown level, or the file is there already.
-        MeshError: the object has no convex pieces that the referee could use.
+        MeshError: the object has no convex pieces that the validator could use.
     """
     name = plain_name(found.name)
     path = folder / f"{plain_name(found.hand.name)}-{name}-{ordinal:03}.h5"
@@ -54,13 +61,13 @@ def write_scored(
             hand=plain_name(found.hand.name),
             object=name,
             grasps=max(1, len(found.grasps)),
-            want="raw",
-            referee=referee,
+            want="candidates",
+            validation=validation,
             friction=friction,
-            audits=0,
+            rechecks=0,
         )
     except ValueError:
-        raise InputError(f"unknown level {referee!r}; choose letter, certificate, screen or none") from None
+        raise InputError(f"unknown level {validation!r}; choose dexgraspbench, standard, fast or none") from None
     scenes = None if found.placed is None else found.placed.everywhere
     obj = as_asked(found.obj, request)
     made = scored(found.hand, obj, found.grasps, request, scenes=scenes, run=run)
@@ -79,7 +86,7 @@ def write_scored(
         "shard_id": digest_json([origin.source, found.hand.digest, _digest(mesh), ordinal, len(found.grasps)]),
         "batch": ordinal,
     }
-    attributes |= base_attributes(found.hand, obj, request, tried=made.tried, verdict_key=made.verdict_key)
+    attributes |= base_attributes(found.hand, obj, request, candidates=made.candidates, verdict_key=made.verdict_key)
     arrays = {**made.grasps.to_columns(), **made.columns}
     if found.published is not None and (found.published >= 0).any():
         arrays["quality/published"] = found.published

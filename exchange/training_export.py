@@ -13,8 +13,8 @@ from typing import Final
 
 import numpy as np
 
-from graspd.exchange.cases import load_case
-from graspd.exchange.lots import Lot, Written, held_out, plain_name
+from graspd.exchange.inputs import load_case
+from graspd.exchange.plan import ExportPart, ExportSummary, held_out, plain_name
 from graspd.service.model.errors import InputError, one_of
 from graspd.service.model.transforms import Floats
 from graspd.service.readers import Pictures, Shards, open_shards
@@ -32,12 +32,12 @@ LABELLED: Final = ("graspgen",)
 
 
 @dataclass(frozen=True)
-class TrainingWishes:
+class TrainingExportOptions:
     """What a user asks for, as the command line has it."""
 
     hand: str | None = None
     obj: str | None = None
-    unjudged: bool = False
+    unvalidated: bool = False
     every: bool = False
     held_out: float = 0.2
     """Share of the objects that a network is tested on."""
@@ -45,7 +45,7 @@ class TrainingWishes:
     """Name of a depth camera; nothing: perfect depth."""
 
 
-def export_training(source: Path, format_: str, wishes: TrainingWishes, folder: Path) -> Written:
+def export_training(source: Path, format_: str, wishes: TrainingExportOptions, folder: Path) -> ExportSummary:
     """Write the grasps of a folder of shards as others train on them.
 
     Raises:
@@ -62,23 +62,28 @@ def export_training(source: Path, format_: str, wishes: TrainingWishes, folder: 
 
 
 def _write(
-    format_: str, lots: list[Lot], shards: Shards, wishes: TrainingWishes, folder: Path, out: frozenset[str]
-) -> Written:
+    format_: str,
+    lots: list[ExportPart],
+    shards: Shards,
+    wishes: TrainingExportOptions,
+    folder: Path,
+    out: frozenset[str],
+) -> ExportSummary:
     from graspd.exchange import dexgraspnet2, dexlearn, graspgen, huggingface, lerobot
 
     if format_ == "graspgen":
         return graspgen.write(lots, folder, out)
     columns = COLUMNS if format_ in ("dexlearn", "dexgraspnet2") else (*COLUMNS, "image/rgb")
-    pictures = Pictures(shards, columns, grasp_quality=(), valid=not wishes.every, unjudged=wishes.unjudged)
+    pictures = Pictures(shards, columns, grasp_quality=(), valid=not wishes.every, unvalidated=wishes.unvalidated)
     if format_ == "lerobot":
         return lerobot.write(lots, pictures, folder, out)
     writer = {"dexlearn": dexlearn.write, "dexgraspnet2": dexgraspnet2.write, "huggingface": huggingface.write}[format_]
     return writer(lots, pictures, folder, out, noise_of(wishes.noise or None))
 
 
-def _lots(shards: Shards, format_: str, wishes: TrainingWishes) -> list[Lot]:
+def _lots(shards: Shards, format_: str, wishes: TrainingExportOptions) -> list[ExportPart]:
     """Grasps of all base shards that have some of the kind that is asked for."""
-    lots: list[Lot] = []
+    lots: list[ExportPart] = []
     digests: dict[str, str] = {}
     refused: InputError | None = None
     for file in shards.of("base"):
@@ -95,22 +100,22 @@ def _lots(shards: Shards, format_: str, wishes: TrainingWishes) -> list[Lot]:
             name = f"{name}-{case.obj.digest[:8]}"
         verdict = np.asarray(shard.arrays.get("quality/success", np.full(len(mask), -1)), np.int8)
         rows = np.flatnonzero(mask)
-        lots.append(Lot(file.id, name, case.hand, case.obj, case.grasps, rows, verdict, shard, case.placed))
+        lots.append(ExportPart(file.id, name, case.hand, case.obj, case.grasps, rows, verdict, shard, case.placed))
     if not lots:
         raise refused or InputError("there is no base shard, so there are no grasps")
     return lots
 
 
-def _chosen(shard: Shard, format_: str, wishes: TrainingWishes) -> np.ndarray:
+def _chosen(shard: Shard, format_: str, wishes: TrainingExportOptions) -> np.ndarray:
     """(N,) grasps that go into the export. A format that labels grasps gets good ones and bad ones."""
     if format_ not in LABELLED:
-        return choose(shard, unjudged=wishes.unjudged, every=wishes.every)[0]
-    judged = validity.judged(shard.arrays)
-    if wishes.unjudged or not judged.any():
+        return choose(shard, unvalidated=wishes.unvalidated, every=wishes.every)[0]
+    validated = validity.validated(shard.arrays)
+    if wishes.unvalidated or not validated.any():
         raise InputError(
-            f"{format_} says of each grasp whether it holds; judge them first: graspd synth without --referee none"
+            f"{format_} says of each grasp whether it holds; validate them first: graspd synth without --validation none"
         )
-    return judged
+    return validated
 
 
 #: Pairs of points, and quantiles of their distances that are kept.

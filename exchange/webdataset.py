@@ -25,7 +25,7 @@ _COLUMNS: Final = ("image/rgb", "image/depth", "image/segmentation", "camera/int
 
 
 def write(
-    shards: Shards, folder: Path, *, pictures_a_file: int = 1000, valid: bool = True, unjudged: bool = False
+    shards: Shards, folder: Path, *, pictures_a_file: int = 1000, valid: bool = True, unvalidated: bool = False
 ) -> list[Path]:
     """Write `pictures-NNNNNN.tar` files.
 
@@ -34,7 +34,7 @@ def write(
         folder: where to; made if absent.
         pictures_a_file: samples in one tar file.
         valid: only valid grasps; False: all of them.
-        unjudged: instead of valid ones those that are sound and that nobody judged.
+        unvalidated: instead of valid ones those that are feasible and that are not validated.
 
     Returns:
         the files.
@@ -43,7 +43,7 @@ def write(
         InputError: no picture in the shards, or tar files in the folder already.
     """
     pictures = Pictures(
-        shards, _COLUMNS, grasp_quality=("quality/epsilon", "quality/success"), valid=valid, unjudged=unjudged
+        shards, _COLUMNS, grasp_quality=("quality/epsilon", "quality/success"), valid=valid, unvalidated=unvalidated
     )
     if not len(pictures):
         raise InputError("the shards hold no picture; ask for views when you submit, or run graspd render")

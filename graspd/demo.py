@@ -15,7 +15,7 @@ from rich.table import Table
 from graspd.api.formatting import count, duration, metric
 from graspd.api.models import GraspQuery, JobDetail
 from graspd.client.client import Client
-from graspd.client.job_options import validated
+from graspd.client.job_options import parsed_options
 from graspd.client.reports import JobDisplay, job_summary, means_of, yield_of
 from graspd.service.cli import JsonFlag, emit, load_settings, plain_console, reporting_errors, write_output
 from graspd.service.index.views import GraspView
@@ -65,7 +65,7 @@ def demo(
     json: JsonFlag = False,
 ) -> None:
     """Make grasps, scenes and pictures from built-in data, and a page that shows them."""
-    request = validated(
+    request = parsed_options(
         JobRequest,
         {
             "hand": hand,
@@ -178,7 +178,7 @@ def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     pictures = grasp_pictures(hand, obj, poses, joints, samples=_SAMPLES)[:, 0]
     # The sheet's typeface has neither Greek letters nor a multiplication sign.
     title = f"{job.hand} on {job.object}"
-    subtitle = f"the best {len(rows)} of {job.grasps} valid grasps by epsilon, of {job.tried} tried"
+    subtitle = f"the best {len(rows)} of {job.grasps} valid grasps by epsilon, of {job.candidates} tried"
     return contact_sheet(pictures, figures(base.arrays, rows), title=title, subtitle=subtitle)
 
 

@@ -108,8 +108,8 @@ def _chosen(checks: list[Check], only: str | None) -> list[Check]:
 def _show(finding: Finding) -> None:
     mark = typer.style(f"{finding.condition.value:8}", fg=_COLOURS[finding.condition])
     typer.echo(f"{mark} {finding.name:17} {finding.message}")
-    if finding.mend:
-        typer.echo(f"{'':26} mend: {finding.mend}")
+    if finding.fix:
+        typer.echo(f"{'':26} fix: {finding.fix}")
 
 
 #: A whole comparison reads every record of the store.

@@ -92,7 +92,7 @@ class Grasps:
         return f"<{len(self)} grasps of {self.hand} on {names or 'nothing'}, {int(self.is_valid.sum())} valid>"
 
     def _repr_html_(self) -> str:
-        from graspd.showing import html_of
+        from graspd.display import html_of
 
         return html_of(self)
 
@@ -201,9 +201,9 @@ class Grasps:
         return validity.valid(self._columns)
 
     @property
-    def is_sound(self) -> NDArray[np.bool_]:
+    def is_feasible(self) -> NDArray[np.bool_]:
         """(N,) feasible: within the limits of penetration and contact."""
-        return validity.sound(self._columns)
+        return validity.feasible(self._columns)
 
     @property
     def metrics(self) -> list[str]:
@@ -279,7 +279,7 @@ class Grasps:
         Raises:
             InputError: pandas is not installed.
         """
-        from graspd.showing import frame_of
+        from graspd.display import frame_of
 
         return frame_of(self)
 
@@ -295,7 +295,7 @@ class Grasps:
                 the address cannot be used.
             NotFoundError: the file of the hand or the object is not found.
         """
-        from graspd.showing import viewer_of
+        from graspd.display import viewer_of
 
         return viewer_of(self, host=host, port=port)
 

@@ -27,10 +27,10 @@ def synthesize(
     faces: Literal["drawn", "all"] = "drawn",
     touch: float | None = None,
     beside: Sequence[str | Path] = (),
-    want: Literal["valid", "raw"] = "valid",
+    want: Literal["valid", "candidates"] = "valid",
     budget: float = 4.0,
     min_distance: float = MIN_DISTANCE_M,
-    referee: Literal["letter", "certificate", "screen", "none"] = "certificate",
+    validation: Literal["dexgraspbench", "standard", "fast", "none"] = "standard",
     robust: float = 0.0,
     robust_models: int = 0,
     method: str = "fast_graspd",
@@ -68,7 +68,7 @@ def synthesize(
         want: valid: `count` valid grasps; raw: `count` candidates.
         budget: candidates for each grasp wanted, at most.
         min_distance: no two grasps are nearer [m]: mean distance of the same points of the hand, in the object's frame.
-        referee: level of the validation in MuJoCo; none: no validation, no valid grasps.
+        validator: level of the validation in MuJoCo; none: no validation, no valid grasps.
         robust: share of perturbed models in which a grasp must hold to count (docs/explanation/quality.md).
         robust_models: number of such models; 0: 8 if a share is wanted, else none.
         method: the planner.
@@ -108,13 +108,13 @@ def synthesize(
             grasps=count,
             want=want,
             budget=budget,
-            referee=referee,
+            validation=validation,
             method=method,
             seed=seed,
             friction=friction,
             options=of_this_machine(method, options),
             min_distance=min_distance,
-            audits=0,
+            rechecks=0,
             robust=robust,
             robust_models=robust_models,
             mass=mass,

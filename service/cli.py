@@ -89,14 +89,14 @@ def _refusal(error: OSError | MemoryError) -> str:
         return "there is not enough memory; give it more, or ask for less at once"
     what = ", ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
     said = f"{what}: {error.strerror}" if what and error.strerror else error.strerror or str(error)
-    mends = {
+    fixes = {
         errno.ENOSPC: "make room, or name another place",
         errno.EDQUOT: "make room, or name another place",
         errno.EACCES: "name another place, or let this user write there",
         errno.EROFS: "name another place",
         errno.ENOENT: "see whether the name is right",
     }
-    return without_secrets(f"{said}; {mends[error.errno]}" if error.errno in mends else said)
+    return without_secrets(f"{said}; {fixes[error.errno]}" if error.errno in fixes else said)
 
 
 def _silence(stream: TextIO | None) -> None:
@@ -192,9 +192,9 @@ def load_settings(**overrides: Any) -> Settings:
 
 @dataclass(frozen=True)
 class EngineSettings:
-    """The settings that a command follows which plans and judges itself, and their defaults."""
+    """The settings that a command follows which plans and validates itself, and their defaults."""
 
-    first_judge: Literal["auto", "on", "off"] = "auto"
+    prefilter: Literal["auto", "on", "off"] = "auto"
     processes: int = 0
 
 
@@ -204,7 +204,7 @@ def engine_settings() -> EngineSettings:
     if not any(name.upper().startswith("GRASPD_") for name in os.environ):
         return EngineSettings()
     found = load_settings()
-    return EngineSettings(found.first_judge, found.processes)
+    return EngineSettings(found.prefilter, found.processes)
 
 
 def log_to_stderr(settings: Settings, process: str = "graspd") -> None:

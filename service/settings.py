@@ -79,7 +79,7 @@ class Settings(BaseSettings):
     worker_number: int | None = Field(
         None, ge=0, description="of a worker among those of its machine: with device auto, number k takes the k-th GPU"
     )
-    first_judge: Literal["auto", "on", "off"] = Field(
+    prefilter: Literal["auto", "on", "off"] = Field(
         "auto", description="whether MuJoCo Warp gives the clear verdicts; auto: on a GPU, where it is installed"
     )
     threads: int = Field(0, ge=0, description="CPU threads of a worker; 0: one per core")
@@ -87,7 +87,7 @@ class Settings(BaseSettings):
         0,
         ge=0,
         le=1024,
-        description="processes of a worker that judge and measure; 1: its own; 0: on a GPU one a core less one, else 1",
+        description="processes of a worker that validate and measure; 1: its own; 0: on a GPU one a core less one, else 1",
     )
     workers_here: int = Field(1, ge=1, description="workers of this machine that share its cores and memory")
     join: str = Field(
@@ -118,7 +118,7 @@ class Settings(BaseSettings):
         64 * 2**20, gt=0, description="largest hand, object or network taken over HTTP [bytes]"
     )
     queue_window: int = Field(
-        1000, ge=1, description="tasks kept waiting in a lane, or two a worker; the rest waits in the index"
+        1000, ge=1, description="tasks kept waiting in a priority, or two a worker; the rest waits in the index"
     )
     shard_grace_s: float = Field(
         7 * 86400.0,

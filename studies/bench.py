@@ -18,13 +18,13 @@ from graspd.service.model.cores import available_cores
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.studies.timing import host_ms, kernel_shares
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd import pairs
 from graspd.worker.planners.fast_graspd.batches import Batches
 from graspd.worker.planners.fast_graspd.planner import optimise, optimise_batch
-from graspd.worker.planners.port import Asked, Wanted
-from graspd.worker.run import Run
+from graspd.worker.planners.port import BatchRequest, PlanRequest
 
 #: Grasps of a launch, at most, that the time of the host is told for.
 LARGE: Final = 1024
@@ -94,7 +94,12 @@ def _start_times(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: 
     seconds = []
     for seed in (0, 1):
         began = time.perf_counter()
-        optimise_batch(hand, obj, Wanted(count=1, fidelity=fidelity, seed=seed, batch=0), Run(threads=1, device=device))
+        optimise_batch(
+            hand,
+            obj,
+            PlanRequest(count=1, fidelity=fidelity, seed=seed, batch=0),
+            ExecutionContext(threads=1, device=device),
+        )
         seconds.append(round(time.perf_counter() - began, 3))
     return {"first_grasp_s": seconds[0], "next_grasp_s": seconds[1]}
 
@@ -109,10 +114,10 @@ def _run(
     device: str,
     repeats: int,
 ) -> dict[str, Any]:
-    seconds, run = [], Run(threads=threads, device=device)
+    seconds, run = [], ExecutionContext(threads=threads, device=device)
     for seed in range(repeats + 1):
         began = time.perf_counter()
-        asked = [Asked(Wanted(batch, fidelity, seed, number), run) for number in range(join)]
+        asked = [BatchRequest(PlanRequest(batch, fidelity, seed, number), run) for number in range(join)]
         optimise(pairs.pair_of(hand, obj, fidelity, device), Batches(asked, obj), run)
         seconds.append(time.perf_counter() - began)
     typical = median(seconds[1:])

@@ -1,4 +1,4 @@
-"""The numbers of a set of grasps in one row: success by the referee, and medians of every metric."""
+"""The numbers of a set of grasps in one row: success by the validator, and medians of every metric."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from typing import Any, Final, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.exchange.cases import Case
+from graspd.exchange.inputs import Case
 from graspd.service.model.errors import InputError, MeshError
 from graspd.service.model.metrics import axis_word
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.same_hand import SameHand
 from graspd.worker.quality.contact import contact_distance_consistency_mm
 from graspd.worker.quality.diversity import explained_variance, hand_points, nearest
 from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
 from graspd.worker.quality.table import DEFAULT_FRICTION, measure
-from graspd.worker.run import ALONE, Run
-from graspd.worker.scenes.way import plan_way
-from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.scenes.trajectory import plan_way
+from graspd.worker.simulation.environment import Placed
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.foreign import foreign_verdicts, share_counts
 from graspd.worker.validation.key import Level
 from graspd.worker.validation.lift import LiftOutcome
-from graspd.worker.validation.lifting import LiftLevel, LiftVerdicts, judge_lifts
+from graspd.worker.validation.lifting import LiftLevel, LiftVerdicts, validate_lifts
 from graspd.worker.validation.protocol import Outcome
 from graspd.worker.validation.robust import Robustness, robust
-from graspd.worker.validation.validator import Verdicts, judge
+from graspd.worker.validation.validator import Verdicts, validate
 
 Protocol = Literal["dexgraspbench", "displacement", "lift"]
 #: Judges grasps in models around the nominal one: `_in_others` but for its first argument.
@@ -49,26 +49,26 @@ def evaluate(
     case: Case,
     *,
     protocol: Protocol = "dexgraspbench",
-    level: Level | LiftLevel = "certificate",
+    level: Level | LiftLevel = "standard",
     hard: bool = False,
     friction: float | None = None,
     models: int = 0,
-    judge_hand: SameHand | None = None,
+    validation_hand: SameHand | None = None,
     tell: Callable[[Robustness], None] = lambda found: None,
     cache: Path | None = None,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> dict[str, Any]:
     """One row of numbers, None where a number does not exist: too thin an object has no verdict.
 
     Level letter has the protocol's own mass and friction, the others the object's.
 
     Keys: n, protocol, level, hard, mu, mass_kg, object_friction; gsr (share that holds), osr (1 if any holds), sgs
-    (holding grasps per second of making and judging them; of making them alone: sgs_without_referee), pd_mm and spd_mm
-    (penetration, self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity: variance
-    explained by the first principal component; nearest_mm: distance of the two grasps that are most alike.
-    verdicts, where somebody judged: see `told`. Judged in `models` models around the nominal one, by the same protocol:
-    robust_share, the mean of those that hold in it, robust_n, how many, robust_axes, the share by axis; `tell` gets
-    what became of each grasp.
+    (holding grasps per second of making and validating them; of making them alone: sgs_without_referee), pd_mm and
+    spd_mm (penetration, self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity:
+    variance explained by the first principal component; nearest_mm: distance of the two grasps that are most alike.
+    verdicts, where somebody validated: see `told`. Validated in `models` models around the nominal one, by the same
+    protocol: robust_share, the mean of those that hold in it, robust_n, how many, robust_axes, the share by axis;
+    `tell` gets what became of each grasp.
     With protocol lift also clear_share (free of what stands in the scene, coming, closing and lifting). With another
     model of the hand as `judge_hand` also what `ForeignVerdicts.facts` tells, and in the verdicts held_foreign and
     reason_foreign.
@@ -79,7 +79,7 @@ def evaluate(
     if protocol == "lift" and case.placed is None:
         raise InputError(f"{case.name} has grasps around a free object: `graspd synth --scene` makes some to lift")
     case = case.centred
-    if level == "letter":
+    if level == "dexgraspbench":
         case = replace(case, obj=case.obj.published)
     mu = friction or case.friction or DEFAULT_FRICTION
     table = measure(case.hand, case.obj, case.grasps, friction=mu, thresholds_m=[THRESHOLD_M], run=run)
@@ -99,12 +99,12 @@ def evaluate(
         row["note"] = str(error)
         sd = None
     else:
-        judged = partial(_in_others, case, models=models, hard=hard, pieces=pieces, tell=tell, run=run)
+        validated = partial(_in_others, case, models=models, hard=hard, pieces=pieces, tell=tell, run=run)
         if protocol == "dexgraspbench":
-            row |= _pushed(case, cast(Level, level), judge_hand, judged, hard=hard, pieces=pieces, run=run)
+            row |= _pushed(case, cast(Level, level), validation_hand, validated, hard=hard, pieces=pieces, run=run)
         if protocol == "lift" and case.placed is not None:
-            chosen: LiftLevel = "letter" if level == "letter" else "lift"
-            row |= _lifted_out(case, case.placed, chosen, judged, hard=hard, pieces=pieces, run=run)
+            chosen: LiftLevel = "dexgraspbench" if level == "dexgraspbench" else "lift"
+            row |= _lifted_out(case, case.placed, chosen, validated, hard=hard, pieces=pieces, run=run)
         sd = simulated_displacement_cm(case.hand, case.obj, case.grasps.grasp, pieces=pieces, run=run)
         row |= pieces.facts
     return row | _medians(case, table, sd)
@@ -113,19 +113,19 @@ def evaluate(
 def _pushed(
     case: Case,
     level: Level,
-    judge_hand: SameHand | None,
+    validation_hand: SameHand | None,
     in_others: InOthers,
     *,
     hard: bool,
     pieces: ConvexPieces,
-    run: Run,
+    run: ExecutionContext,
 ) -> dict[str, Any]:
     """What six pushes say, in the nominal model and in others."""
-    verdicts = judge(case.hand, case.obj, case.grasps, level=level, hard=hard, pieces=pieces, run=run)
+    verdicts = validate(case.hand, case.obj, case.grasps, level=level, hard=hard, pieces=pieces, run=run)
     row = _success(case, verdicts, verdicts.seconds)
     row |= in_others(case.grasps, row.get("verdicts", []), held=verdicts.success)
-    if judge_hand is not None:
-        both = foreign_verdicts(judge_hand, case.obj, case.grasps, verdicts, pieces=pieces, run=run)
+    if validation_hand is not None:
+        both = foreign_verdicts(validation_hand, case.obj, case.grasps, verdicts, pieces=pieces, run=run)
         row |= both.facts()
         for one, held, reason in zip(row["verdicts"], both.foreign.success, both.foreign.reasons, strict=True):
             one |= {"held_foreign": bool(held), "reason_foreign": reason}
@@ -133,11 +133,18 @@ def _pushed(
 
 
 def _lifted_out(
-    case: Case, placed: Placed, level: LiftLevel, in_others: InOthers, *, hard: bool, pieces: ConvexPieces, run: Run
+    case: Case,
+    placed: Placed,
+    level: LiftLevel,
+    in_others: InOthers,
+    *,
+    hard: bool,
+    pieces: ConvexPieces,
+    run: ExecutionContext,
 ) -> dict[str, Any]:
     """What the lift out of their scenes says, in the nominal model and in others."""
     grasps, clear = _with_ways(case, placed)
-    lifts = judge_lifts(case.hand, case.obj, grasps, placed, level=level, hard=hard, pieces=pieces, run=run)
+    lifts = validate_lifts(case.hand, case.obj, grasps, placed, level=level, hard=hard, pieces=pieces, run=run)
     row = _lifted(lifts, clear)
     return row | in_others(grasps, row["verdicts"], held=lifts.success, placed=placed, level=level)
 
@@ -161,17 +168,17 @@ def _in_others(
 
 def _success(case: Case, verdicts: Verdicts | None, seconds: float) -> dict[str, Any]:
     if verdicts is None or not len(case.grasps):
-        return dict.fromkeys(("gsr", "osr", "sgs", "sgs_without_referee", "agreement_published"))
+        return dict.fromkeys(("gsr", "osr", "sgs", "sgs_without_validation", "agreement_published"))
     held = int(verdicts.success.sum())
     made = case.seconds
-    whole = None if made is None else made + (0.0 if case.judged else seconds)
+    whole = None if made is None else made + (0.0 if case.validated else seconds)
     row: dict[str, Any] = {
         "level": verdicts.level,
         "gsr": _plain(held / len(case.grasps)),
         "osr": float(held > 0),
         "sgs": _plain(held / whole) if whole else None,
-        "sgs_without_referee": _plain(held / made) if made and not case.judged else None,
-        "referee_seconds": _plain(seconds),
+        "sgs_without_validation": _plain(held / made) if made and not case.validated else None,
+        "validation_seconds": _plain(seconds),
         "published": 0,
         "reasons": dict(Counter(verdicts.reasons).most_common()),
         "verdict_key": verdicts.terms,
@@ -201,7 +208,7 @@ def _lifted(verdicts: LiftVerdicts, clear: NDArray[np.bool_]) -> dict[str, Any]:
         "gsr": _plain(held / max(1, count)),
         "osr": float(held > 0),
         "clear_share": _plain(float(clear.mean())) if len(clear) else None,
-        "referee_seconds": _plain(verdicts.seconds),
+        "validation_seconds": _plain(verdicts.seconds),
         "reasons": dict(Counter(verdicts.reasons).most_common()),
         "verdict_key": verdicts.terms,
         "verdicts": [
@@ -291,21 +298,21 @@ def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
     for key in ("protocol", "level", "hard", "mu"):
         # What the rows do not agree on has no one value.
         out[key] = rows[0][key] if all(row[key] == rows[0][key] for row in rows) else None
-    judged = [row for row in rows if row["gsr"] is not None]
-    out["gsr"] = _rate(judged, "gsr", "n")
+    validated = [row for row in rows if row["gsr"] is not None]
+    out["gsr"] = _rate(validated, "gsr", "n")
     if any("clear_share" in row for row in rows):
         out["clear_share"] = _rate([row for row in rows if row.get("clear_share") is not None], "clear_share", "n")
-    out["osr"] = _plain(float(np.mean([row["osr"] for row in judged]))) if judged else None
-    out["agreement_published"] = _rate(judged, "agreement_published", "published")
+    out["osr"] = _plain(float(np.mean([row["osr"] for row in validated]))) if validated else None
+    out["agreement_published"] = _rate(validated, "agreement_published", "published")
     if any("robust_share" in row for row in rows):
         out |= _models([row for row in rows if "robust_share" in row])
     counted = [row["foreign_held"] for row in rows if "foreign_held" in row]
     if counted:
         out |= share_counts({key: sum(one[key] for one in counted) for key in counted[0]})
         out["fingertips_mm"] = max(row["fingertips_mm"] for row in rows if "foreign_held" in row)
-    for key in ("sgs", "sgs_without_referee"):
+    for key in ("sgs", "sgs_without_validation"):
         # Held grasps over the seconds of all rows together.
-        timed = [row for row in judged if row[key]]
+        timed = [row for row in validated if row[key]]
         seconds = sum(row["gsr"] * row["n"] / row[key] for row in timed)
         out[key] = _plain(sum(row["gsr"] * row["n"] for row in timed) / seconds) if timed else None
     for key in _MEDIANS:

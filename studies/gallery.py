@@ -11,16 +11,16 @@ from PIL import Image
 
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.transforms import Floats, apply
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners import Wanted, synthesize
+from graspd.worker.planners import PlanRequest, synthesize
 from graspd.worker.rendering.cameras import FIELD_OF_VIEW, GivenCameras, distance_to_fill, look_at
 from graspd.worker.rendering.hands import DrawnHand
 from graspd.worker.rendering.sheets import label_page, scene_cells, with_palette
 from graspd.worker.rendering.views import Extras, render
-from graspd.worker.run import Run
 from graspd.worker.scenes import Neighbours, drop, drop_together, transfer
 
 Say = Callable[[str], None]
@@ -64,7 +64,13 @@ def _views(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes:
         poses = drop(obj, count=1, seed=seed + k)["scene/object_pose"]
         options: dict[str, Any] = {**_VIEW, "stereo": True}
         seen = render(
-            obj, poses, views=1, seed=seed + k, extras=Extras(channels=("normals",)), **options, run=Run(device=device)
+            obj,
+            poses,
+            views=1,
+            seed=seed + k,
+            extras=Extras(channels=("normals",)),
+            **options,
+            run=ExecutionContext(device=device),
         )
         rows.append(scene_cells(seen))
         names.append([obj.name])
@@ -92,7 +98,7 @@ def _hands(hands: Sequence[HandModel], objects: Sequence[ObjectModel], device: s
                 seed=seed + k,
                 extras=Extras(cameras=GivenCameras(extrinsics=camera[None]), drawn=drawn),
                 **_VIEW,
-                run=Run(device=device),
+                run=ExecutionContext(device=device),
             )
             cells.append(Image.fromarray(np.asarray(seen["image/rgb_hand"][0], np.uint8)))
             below.append(f"{obj.name}: {kept} of {tried} fit")
@@ -112,7 +118,7 @@ def _fitting(hand: HandModel, obj: ObjectModel, device: str, seed: int) -> tuple
     scenes = drop(obj, count=SCENES, seed=seed)["scene/object_pose"]
     kept, tried, best = 0, 0, -np.inf
     for batch in range(ROUNDS):
-        found = synthesize(hand, obj, Wanted(GRASPS, FIDELITIES["draft"], seed, batch), Run(device))
+        found = synthesize(hand, obj, PlanRequest(GRASPS, FIDELITIES["draft"], seed, batch), ExecutionContext(device))
         placed = transfer(hand, found.grasp, found.pregrasp, scenes)
         clearance = np.asarray(placed["grasp/table_clearance_m"], float)
         kept, tried = kept + int(placed["grasp/valid"].sum()), tried + len(clearance)
@@ -158,7 +164,9 @@ def _neighbours(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes
         poses, beside = scene["scene/object_pose"], Neighbours(others, scene["scene/neighbour_pose"])
         extras = Extras(channels=("normals", "occlusion"), cameras=_past(poses, first, beside), neighbours=beside)
         options: dict[str, Any] = {**_VIEW, "stereo": True}
-        seen = render(first, poses, views=1, seed=seed + k, extras=extras, **options, run=Run(device=device))
+        seen = render(
+            first, poses, views=1, seed=seed + k, extras=extras, **options, run=ExecutionContext(device=device)
+        )
         rows.append(scene_cells(seen))
         hidden = float(np.asarray(seen["box/occlusion_ratio"])[0])
         names.append([f"{first.name}, {100 * hidden:.0f} % hidden"])

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from graspd.service.model.domain import EXTRA_CHANNELS
 from graspd.service.store.shards import write_shard
 from graspd.studies.clock import clock_of
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.scene_setup import CameraPlan, Setting
 from graspd.worker.rendering.views import SAMPLES, Extras, render
-from graspd.worker.run import Run
 from graspd.worker.scenes.simulate import drop
 
 SCENES: Final = 2
@@ -67,14 +67,14 @@ def bench_render(
             height=height,
             seed=seed,
             extras=extras,
-            run=Run(device=device, threads=1),
+            run=ExecutionContext(device=device, threads=1),
         )
 
     arrays = whole()
     timer = _Timer(device, repeats)
     stage = setting.stage(device)
-    bare = timer(lambda: stage.shoot(bare_shot, Run(device, 1)))
-    plain = timer(lambda: setting.shoot(Run(device, 1)))
+    bare = timer(lambda: stage.shoot(bare_shot, ExecutionContext(device, 1)))
+    plain = timer(lambda: setting.shoot(ExecutionContext(device, 1)))
     rendered = timer(whole)
     packed = timer(lambda: write_shard("views", arrays, {}))
     stored = {name: _store(arrays, options, timer) for name, options in COMPRESSIONS.items()}

@@ -9,14 +9,14 @@ import numpy as np
 import warp as wp
 
 from graspd.service.model.fidelity import Fidelity
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
 from graspd.worker.planners.fast_graspd.planner import plan
 from graspd.worker.planners.fast_graspd.schedule import coarse_schedule, fine_schedule
 from graspd.worker.planners.fast_graspd.starts import sample_starts
-from graspd.worker.planners.port import Wanted
-from graspd.worker.run import Run
+from graspd.worker.planners.port import PlanRequest
 from graspd.worker.simulation.data import Data, HandState, Schedule
 from graspd.worker.simulation.launches import kernel_seconds
 from graspd.worker.simulation.model import Model
@@ -97,7 +97,7 @@ def _timed(
 
 
 def host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int) -> float:
-    """Processor time of one thread outside the planner's kernels for a raw grasp on the CPU [ms]: starts, merits,
+    """Processor time of one thread outside the planner's kernels for a candidate on the CPU [ms]: starts, merits,
     projection, the postures around the grasp, copies, launches.
 
     Args:
@@ -106,10 +106,10 @@ def host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int) -
         fidelity: the knobs.
         count: grasps of the batch; another one before it warms caches up.
     """
-    run = Run("cpu", threads=1)
-    plan(hand, obj, Wanted(count, fidelity, seed=1), run)
+    run = ExecutionContext("cpu", threads=1)
+    plan(hand, obj, PlanRequest(count, fidelity, seed=1), run)
     with kernel_seconds() as elsewhere:
         began = time.thread_time()
-        plan(hand, obj, Wanted(count, fidelity, seed=0), run)
+        plan(hand, obj, PlanRequest(count, fidelity, seed=0), run)
         total = time.thread_time() - began
     return 1e3 * (total - sum(elsewhere)) / count

@@ -22,7 +22,7 @@ from graspd.service.model.domain import JobRequest
 from graspd.service.model.messages import TaskMessage
 from graspd.service.model.planning import message_of, plan
 from graspd.service.model.records import JobRecord
-from graspd.service.model.states import AssetKind, Lane, Stage
+from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.model.version import STAGE_REVISIONS
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.integrity import put_document
@@ -65,7 +65,7 @@ def _batch_of_grasps(message: TaskMessage, context: TaskContext) -> Output:
         "quality/contact_links": rng.integers(0, 5, n),
         "quality/stability_loss": np.full(n, np.nan),
         "quality/valid": (valid := rng.integers(0, 2, n)),
-        "quality/sound": np.ones(n),
+        "quality/feasible": np.ones(n),
         "quality/success": valid,
     }
     if message.request.in_scene:
@@ -134,7 +134,7 @@ def message_for(stage: Stage = Stage.SYNTHESIZE, *, attempt: int = 1, **changes:
     """The message of the first task of that stage of such a job."""
     wanted = request(**changes)
     digests = {"hand_digest": "a" * 32, "object_digest": "b" * 32}
-    job = JobRecord(id="c" * 32, request=wanted, lane=Lane.BULK, created=timestamp(), **digests)
+    job = JobRecord(id="c" * 32, request=wanted, priority=Priority.BULK, created=timestamp(), **digests)
     task = next(task for task in plan(job) if task.stage is stage)
     return message_of(job, task, attempt=attempt, max_attempt=3)
 

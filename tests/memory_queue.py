@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from graspd.service.model.states import Lane, Stage
+from graspd.service.model.states import Priority, Stage
 from graspd.service.model.workers import WorkerBeat
 from graspd.service.queue.port import (
     Event,
@@ -17,7 +17,7 @@ from graspd.service.queue.port import (
     Message,
     QueueNow,
     Report,
-    lane_order,
+    priority_order,
 )
 from graspd.service.queue.rq_queue import RqQueue
 
@@ -37,7 +37,7 @@ class MemoryQueue(RqQueue):
     """The queue without Redis. `take`, `beat` and `finish` are the worker's side."""
 
     clock: Callable[[], float] = time.monotonic
-    _lanes: dict[Lane, list[Message]] = field(default_factory=lambda: {lane: [] for lane in Lane})
+    _priorities: dict[Priority, list[Message]] = field(default_factory=lambda: {priority: [] for priority in Priority})
     _held: dict[str, Delivery] = field(default_factory=dict)
     _cancelled: set[str] = field(default_factory=set)
     _stream: list[Event] = field(default_factory=list)
@@ -56,26 +56,32 @@ class MemoryQueue(RqQueue):
     def ping(self) -> float:
         return 0.0
 
-    def enqueue(self, messages: Sequence[Message], lane: Lane, *, again: bool = False, apart: bool = False) -> int:
+    def enqueue(
+        self, messages: Sequence[Message], priority: Priority, *, again: bool = False, apart: bool = False
+    ) -> int:
         # Its workers are those of a test, which take what they want.
-        known = {(m.task_id, m.attempt) for waiting in self._lanes.values() for m in waiting}
+        known = {(m.task_id, m.attempt) for waiting in self._priorities.values() for m in waiting}
         if not again:
             known |= {(held.message.task_id, held.message.attempt) for held in self._held.values()}
         fresh = [m for m in messages if (m.task_id, m.attempt) not in known]
         self._cancelled -= {m.task_id for m in messages}
-        self._lanes[lane] += fresh
+        self._priorities[priority] += fresh
         return len(fresh)
 
     def discard(self, task_ids: Collection[str]) -> None:
         self._cancelled |= set(task_ids)
-        for lane, waiting in self._lanes.items():
-            self._lanes[lane] = [m for m in waiting if m.task_id not in set(task_ids)]
+        for priority, waiting in self._priorities.items():
+            self._priorities[priority] = [m for m in waiting if m.task_id not in set(task_ids)]
 
     def waiting(self) -> set[str]:
-        return {m.task_id for waiting in self._lanes.values() for m in waiting}
+        return {m.task_id for waiting in self._priorities.values() for m in waiting}
 
-    def depths(self) -> dict[tuple[Lane, Stage], int]:
-        return {(lane, s): sum(m.stage is s for m in waiting) for lane, waiting in self._lanes.items() for s in Stage}
+    def depths(self) -> dict[tuple[Priority, Stage], int]:
+        return {
+            (priority, s): sum(m.stage is s for m in waiting)
+            for priority, waiting in self._priorities.items()
+            for s in Stage
+        }
 
     def clear_untaken(self, present: Collection[WorkerBeat]) -> None:
         pass
@@ -161,7 +167,7 @@ class MemoryQueue(RqQueue):
                 self._lease = ("", 0.0)
 
     def now(self, *, lease_s: float) -> QueueNow:
-        running = Counter((Lane.BULK, held.message.stage) for held in self._held.values())
+        running = Counter((Priority.BULK, held.message.stage) for held in self._held.values())
         pulses = {name: (beat, 0.0) for name, beat in self._workers.items()}
         return QueueNow(depth=self.depths(), running=running, workers=pulses)
 
@@ -182,10 +188,10 @@ class MemoryQueue(RqQueue):
         """The next task, in the order of `lane_order`; it is leased to the worker."""
         deadline = time.monotonic() + wait_s
         while True:
-            for lane in lane_order(self._taken[worker]):
-                if self._lanes[lane]:
+            for priority in priority_order(self._taken[worker]):
+                if self._priorities[priority]:
                     self._taken[worker] += 1
-                    message = self._lanes[lane].pop(0)
+                    message = self._priorities[priority].pop(0)
                     delivery = Delivery(message, worker, f"{message.task_id}/{next(self._numbers)}")
                     self._held[delivery.key] = delivery
                     return delivery

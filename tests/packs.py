@@ -14,7 +14,7 @@ from graspd.service.model.domain import JobRequest
 from graspd.service.model.messages import TaskMessage
 from graspd.service.model.planning import message_of, plan
 from graspd.service.model.records import JobRecord
-from graspd.service.model.states import Lane, Stage
+from graspd.service.model.states import Priority, Stage
 from graspd.service.store.manifests import ShardManifest
 from graspd.service.store.store import Store, open_store
 from tests.fakes import make_shard, request
@@ -24,7 +24,7 @@ def batches(count: int, **changes: object) -> list[TaskMessage]:
     """The first tasks of a job of so many batches."""
     wanted: JobRequest = request(grasps=32 * count, **changes)
     digests = {"hand_digest": "a" * 32, "object_digest": "b" * 32}
-    return tasks_of(JobRecord(id="c" * 32, request=wanted, lane=Lane.BULK, created=timestamp(), **digests))
+    return tasks_of(JobRecord(id="c" * 32, request=wanted, priority=Priority.BULK, created=timestamp(), **digests))
 
 
 def tasks_of(job: JobRecord) -> list[TaskMessage]:

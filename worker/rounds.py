@@ -18,7 +18,7 @@ Arrays = dict[str, NDArray[Any]]
 
 #: Rounds of one batch draw their grasps where no batch of a job does: a job has at most 31,250 batches.
 ROUND_STRIDE: Final = 1 << 20
-#: Fewest grasps worth a round, and a lane.
+#: Fewest grasps worth a round, and a priority.
 SMALLEST_ROUND: Final = 8
 LANE: Final = 8
 #: What a round expects to be valid at least, however bad the rounds before were: rounds stay finite and few.
@@ -36,7 +36,7 @@ class Round:
     in_scene: dict[str, int]
     """In scenes: how many were clear, lifted, lifted_hard."""
     seconds: dict[str, float]
-    """Wall time of planning, judging and measuring [s]."""
+    """Wall time of planning, validating and measuring [s]."""
     repeated: int = 0
     """In scenes: how often its grasps set out again."""
     planned: list[GraspSet] = field(default_factory=list)
@@ -58,7 +58,7 @@ class Round:
         )
 
 
-def next_round(wanted: int, valid: int, tried: int, budget: int) -> int:
+def next_round(wanted: int, valid: int, candidates: int, budget: int) -> int:
     """Grasps to plan next: as many as the rate so far promises to be enough, and a tenth more.
 
     Args:
@@ -70,18 +70,18 @@ def next_round(wanted: int, valid: int, tried: int, budget: int) -> int:
     Returns:
         0 when enough are found or the budget is used up.
     """
-    if valid >= wanted or tried >= budget:
+    if valid >= wanted or candidates >= budget:
         return 0
-    if tried == 0:
+    if candidates == 0:
         return min(wanted, budget)
-    return min(max(SMALLEST_ROUND, enough(wanted, valid, tried)), BATCH_SIZE, budget - tried)
+    return min(max(SMALLEST_ROUND, enough(wanted, valid, candidates)), BATCH_SIZE, budget - candidates)
 
 
-def enough(wanted: int, valid: int, tried: int) -> int:
+def enough(wanted: int, valid: int, candidates: int) -> int:
     """Grasps that the rate so far promises to be enough, and a tenth more; see `next_round`."""
-    if tried == 0:
+    if candidates == 0:
         return wanted
-    return math.ceil(1.1 * (wanted - valid) / max(valid / tried, _LEAST_RATE))
+    return math.ceil(1.1 * (wanted - valid) / max(valid / candidates, _LEAST_RATE))
 
 
 def lanes_of(rows: range, cores: int) -> list[range]:

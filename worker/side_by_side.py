@@ -1,4 +1,4 @@
-"""Parts of one piece of work side by side, each in a lane of its own."""
+"""Parts of one piece of work side by side, each in a priority of its own."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar
 
-from graspd.worker.run import Lanes, Progress, Run
+from graspd.worker.execution_context import ExecutionContext, Lanes, Progress
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -35,7 +35,9 @@ class Shares:
         return tell
 
 
-def side_by_side(parts: Sequence[T], work: Callable[[T, Run], R], run: Run, *, size: Callable[[T], int]) -> list[R]:
+def side_by_side(
+    parts: Sequence[T], work: Callable[[T, ExecutionContext], R], run: ExecutionContext, *, size: Callable[[T], int]
+) -> list[R]:
     """`work` of every part, in order. Each is given a run of its own: its share of the cores, and of the progress by
     `size`; the first that fails stops the others.
 

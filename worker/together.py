@@ -11,23 +11,23 @@ import numpy as np
 
 from graspd.service.model.domain import BATCH_SIZE, JobOptions
 from graspd.service.model.errors import TaskCancelled
-from graspd.worker.certified import Certified, certified_grasps
 from graspd.worker.engines.joins import PER_LAUNCH
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.hands.model import HandModel
 from graspd.worker.meeting import Meeting
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.diversity import distinct, hand_points
 from graspd.worker.rounds import taken
-from graspd.worker.run import ALONE, Run
 from graspd.worker.side_by_side import Shares, in_threads
-from graspd.worker.simulation.surroundings import Scenes
+from graspd.worker.simulation.environment import Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 
 #: Times that batches are made for grasps that were too like those of another batch.
 _REFILLS: Final = 3
 
 
-def certified_batches(
+def validated_batches(
     hand: HandModel,
     obj: ObjectModel,
     request: JobOptions,
@@ -37,11 +37,11 @@ def certified_batches(
     join: int = 1,
     scenes: Scenes | Sequence[Scenes] | None = None,
     pieces: Callable[[ObjectModel], ConvexPieces] = decompose,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
     partial: bool = False,
-    checked: Callable[[int, Certified], None] | None = None,
+    checked: Callable[[int, ValidatedBatch], None] | None = None,
     empty_on: tuple[type[Exception], ...] = (),
-) -> list[Certified]:
+) -> list[ValidatedBatch]:
     """Batches of a job that follow each other; see `certified_grasps`, which makes the same of each.
 
     Args:
@@ -54,7 +54,7 @@ def certified_batches(
         scenes: see `certified_grasps`; those of all batches, or of each.
         pieces: gives the object's convex pieces; asked once.
         run: told of the grasps that are done.
-        partial: if it is stopped, the batches that were judged before are the result, the last one maybe in part.
+        partial: if it is stopped, the batches that were validated before are the result, the last one maybe in part.
         checked: called with the number of each batch as it is made, and with what came of it; may raise.
         empty_on: where one of these becomes of a batch, it has no grasps; not of a job's first batch, nor of all.
 
@@ -71,11 +71,11 @@ def certified_batches(
 
     refused: list[Exception] = []
 
-    def batch(number: int, own: Run) -> Certified | None:
+    def batch(number: int, own: ExecutionContext) -> ValidatedBatch | None:
         own = replace(own, progress=shares.of(number))
         where = scenes if scenes is None or isinstance(scenes, Scenes) else scenes[number]
         try:
-            made = certified_grasps(
+            made = validated_grasps(
                 hand,
                 obj,
                 request,
@@ -96,13 +96,13 @@ def certified_batches(
         own.progress(1.0, 1.0, "done")
         return made
 
-    found: dict[int, Certified | None] = {}
+    found: dict[int, ValidatedBatch | None] = {}
     try:
         if join == 1 or len(sizes) == 1:
             for number in range(len(sizes)):
                 found[number] = batch(number, run)
         else:
-            if request.referee != "none":
+            if request.validation != "none":
                 pieces_once(obj.centred)  # not by every batch at the same time
             _together(batch, len(sizes), join, run, found)
     except TaskCancelled:
@@ -114,27 +114,30 @@ def certified_batches(
     return [one or _nothing(made[0]) for _, one in sorted(found.items())]
 
 
-def _nothing(like: Certified) -> Certified:
+def _nothing(like: ValidatedBatch) -> ValidatedBatch:
     """A batch without grasps, and nothing tried."""
     grasps, columns = taken(like.grasps, like.columns, np.zeros(0, int))
     seconds, shares = (dict.fromkeys(counts, 0.0) for counts in (like.seconds, like.shares))
-    return Certified(grasps, columns, 0, dict.fromkeys(like.rejected, 0), {}, like.verdict_key, 0, seconds, shares)
+    return ValidatedBatch(grasps, columns, 0, dict.fromkeys(like.rejected, 0), {}, like.verdict_key, 0, seconds, shares)
 
 
 def distinct_batches(
-    hand: HandModel, request: JobOptions, batches: list[Certified], more: Callable[[int, int], Certified | None]
-) -> list[Certified]:
+    hand: HandModel,
+    request: JobOptions,
+    batches: list[ValidatedBatch],
+    more: Callable[[int, int], ValidatedBatch | None],
+) -> list[ValidatedBatch]:
     """The batches without grasps too like one of an earlier batch, and further batches in their place.
 
     A job's tasks know nothing of each other, so this is for whoever has all batches at hand.
 
     Args:
         hand: the hand.
-        request: `min_distance` says what is too like; raw grasps are all kept.
+        request: `min_distance` says what is too like; candidates are all kept.
         batches: the batches of a job, from the first.
         more: makes a batch of so many grasps, of that number within the job; None: there are to be no more.
     """
-    if request.want == "raw" or request.min_distance <= 0:
+    if request.want == "candidates" or request.min_distance <= 0:
         return batches
     points = hand_points(hand, batches[0].grasps.grasp)
     kept = [batches[0]]
@@ -155,7 +158,11 @@ def distinct_batches(
 
 
 def _together(
-    work: Callable[[int, Run], Certified | None], count: int, join: int, run: Run, found: dict[int, Certified | None]
+    work: Callable[[int, ExecutionContext], ValidatedBatch | None],
+    count: int,
+    join: int,
+    run: ExecutionContext,
+    found: dict[int, ValidatedBatch | None],
 ) -> None:
     """Puts each batch under its number as soon as it is made."""
     members = min(count, PER_LAUNCH * join)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import Box, HalfSpace, SceneSpec, supports_in
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
-from graspd.service.readers.ways import Waypoint, point_at, scene_spec_of, stop_places, way_of, wrists_of
+from graspd.service.readers.trajectories import Waypoint, point_at, scene_spec_of, stop_places, way_of, wrists_of
 from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
@@ -183,7 +183,7 @@ def missing() -> str:
 
 
 @dataclass(frozen=True)
-class Shown:
+class ViewerContent:
     """What a viewer shows: a base shard with its hand, its object and what stands beside it."""
 
     shard: Shard
@@ -195,7 +195,7 @@ class Shown:
 class Viewer:
     """Serves one file until it is closed. `url` is where; `place` and `row` say what is shown."""
 
-    def __init__(self, shown: Shown, *, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(self, shown: ViewerContent, *, host: str = "127.0.0.1", port: int = 8080) -> None:
         """Start to serve on a port (0: any free one; else the first free one from there on).
 
         Raises:
@@ -366,9 +366,9 @@ def _served(host: str, port: int) -> Any:
 
 
 def _choices(shard: Shard) -> dict[str, NDArray[np.intp]]:
-    """Rows of each kind of grasps that the file has: valid, lifted at half the friction, sound, all."""
+    """Rows of each kind of grasps that the file has: valid, lifted at half the friction, feasible, all."""
     found: dict[str, NDArray[np.intp]] = {}
-    for name in ("valid", "lift_hard", "sound"):
+    for name in ("valid", "lift_hard", "feasible"):
         column = shard.arrays.get(f"quality/{name}")
         if column is not None and (rows := np.flatnonzero(np.asarray(column) > 0)).size:
             found["lifts at half friction" if name == "lift_hard" else f"{name} only"] = rows

@@ -52,7 +52,7 @@ def project_scope() -> ProjectScope:
     return EVERYTHING if key is None else ProjectScope(key.project, everything=key.scope.includes(Scope.ADMIN))
 
 
-class NotYours(ApiError):
+class ForeignResource(ApiError):
     """A thing that another key submitted."""
 
 
@@ -116,7 +116,7 @@ def must_own(owner: str, what: str, project: str = "") -> None:
     if not may_change(owner, project):
         key = caller.get()
         assert key is not None
-        raise NotYours(
+        raise ForeignResource(
             403,
             f"{what} was not submitted with the key {key.name!r}; the key that submitted it can do this, or one with "
             "scope admin",

@@ -100,7 +100,7 @@ end
 
 
 @dataclass
-class Claim:
+class SubmissionClaim:
     """What a submission may say of itself: False, if it found a job that was there already."""
 
     counts: bool = True
@@ -168,7 +168,7 @@ class Quotas:
         self._unfinished = unfinished
 
     @contextmanager
-    def claim(self, key: Key | None, job: str, grasps: int, *, is_new: bool = True) -> Iterator[Claim]:
+    def claim(self, key: Key | None, job: str, grasps: int, *, is_new: bool = True) -> Iterator[SubmissionClaim]:
         """Count a job that is submitted or retried within; it is not counted if that fails or made nothing new.
 
         Args:
@@ -178,7 +178,7 @@ class Quotas:
         Raises:
             QuotaError: the key, or its project, has all it may have.
         """
-        claim = Claim()
+        claim = SubmissionClaim()
         if key is None:
             yield claim
             return
@@ -212,7 +212,9 @@ class Quotas:
         return [holder for holder in found if holder.is_limited]
 
     @contextmanager
-    def _counted(self, holder: _Holder, claim: Claim, job: str, grasps: int, *, is_new: bool) -> Iterator[None]:
+    def _counted(
+        self, holder: _Holder, claim: SubmissionClaim, job: str, grasps: int, *, is_new: bool
+    ) -> Iterator[None]:
         number = uuid.uuid4().hex
         met = self._claim(holder, job, grasps, number, is_new=is_new)
         try:

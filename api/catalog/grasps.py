@@ -1,6 +1,6 @@
 """Grasps: found by their metrics, counted into the distributions of a job, and shown whole from their base shard.
 
-What a base shard says of one grasp: postures, quality at every threshold, the referee's verdict push by push; of its
+What a base shard says of one grasp: postures, quality at every threshold, the validator's verdict push by push; of its
 scene, and of its way there: approach, grasp, lift.
 """
 
@@ -27,7 +27,7 @@ from graspd.api.models import (
     Waypoint,
 )
 from graspd.service.index.queries.grasps import GraspFilter, GraspSort, Metric
-from graspd.service.index.queries.statistics import Kinds
+from graspd.service.index.queries.statistics import GraspKinds
 from graspd.service.index.views import GraspView, JobView, Page, ShardView
 from graspd.service.model.errors import InputError, LimitError, NotFoundError
 from graspd.service.model.metrics import (
@@ -42,7 +42,7 @@ from graspd.service.model.metrics import (
 from graspd.service.model.records import MOST_TAGGED, Grasp
 from graspd.service.model.scene_spec import supports_in
 from graspd.service.pipeline.backends import Services
-from graspd.service.readers.ways import scene_spec_of, stop_places, way_of
+from graspd.service.readers.trajectories import scene_spec_of, stop_places, way_of
 from graspd.service.store.columns import SCHEMAS
 from graspd.service.store.integrity import read_checked
 from graspd.service.store.shards import Shard, read_shard
@@ -103,16 +103,16 @@ class Grasps:
         return self._files.detail(grasp, shard)
 
     def histograms(self, job: JobView | JobDetail, *, bins: int = 20) -> list[Histogram]:
-        """Distribution of each metric over a job's valid grasps, or over all that it kept where nobody judged them.
+        """Distribution of each metric over a job's valid grasps, or over all that it kept where not validated.
 
         While their number stays, the answer does.
         """
-        judged = job.request.referee != "none"
-        key = (job.id, count := job.valid if judged else job.grasps)
+        validated = job.request.validation != "none"
+        key = (job.id, count := job.valid if validated else job.grasps)
         if not count:
             return []
         if (found := self._histograms.get(key)) is None:
-            where = GraspFilter(job=job.id, valid=True if judged else None)
+            where = GraspFilter(job=job.id, valid=True if validated else None)
             found = [
                 Histogram(
                     metric=metric,
@@ -128,19 +128,19 @@ class Grasps:
 
     def diversity(self, job: JobView | JobDetail) -> Diversity | None:
         """Types and directions of the grasps whose distributions `histograms` gives."""
-        judged = job.request.referee != "none"
-        key = (job.id, count := job.valid if judged else job.grasps)
+        validated = job.request.validation != "none"
+        key = (job.id, count := job.valid if validated else job.grasps)
         if not count:
             return None
         if key not in self._diversities:
             if len(self._diversities) >= _KEPT_HISTOGRAMS:
                 self._diversities.clear()
-            where = GraspFilter(job=job.id, valid=True if judged else None)
+            where = GraspFilter(job=job.id, valid=True if validated else None)
             self._diversities[key] = _told(self._index.statistics.kinds(where))
         return self._diversities[key]
 
 
-def _told(kinds: Kinds) -> Diversity | None:
+def _told(kinds: GraspKinds) -> Diversity | None:
     if not kinds.cells:
         return None
     return Diversity(
@@ -174,7 +174,7 @@ def _bounded(query: GraspQuery) -> GraspFilter:
         scene=query.scene,
         neighbours=query.neighbours,
         lift_hard=query.lift_hard,
-        judged=query.judged,
+        validated=query.validated,
         robust_weakest=query.robust_weakest,
         at_least=bounds["min"],
         at_most=bounds["max"],
@@ -229,8 +229,8 @@ class GraspFiles:
             scene=scene(file, row),
             pushes=_pushes(file, row),
             verdict_margin=_value(file, "quality/verdict_margin", row),
-            judged_by=judged_by(file, row),
-            audit=_verdict(file, "quality/audit", row),
+            validated_by=validated_by(file, row),
+            recheck=_verdict(file, "quality/recheck", row),
             friction=_number(file.attributes.get("mu")),
         )
 
@@ -247,12 +247,12 @@ def _posture(file: Shard, name: str, row: int) -> Posture:
     return Posture(hand_pose=pose.tolist(), joint_positions=joints.tolist())
 
 
-def judged_by(file: Shard, row: int) -> Literal["mujoco", "mujoco_warp"] | None:
-    """Whose verdict a grasp of a base shard has; None: nobody judged it."""
+def validated_by(file: Shard, row: int) -> Literal["mujoco", "mujoco_warp"] | None:
+    """Whose verdict a grasp of a base shard has; None: not validated."""
     if "quality/success" not in file.arrays:
         return None
-    judged = file.arrays.get("quality/judged_by")
-    return "mujoco_warp" if judged is not None and judged[row] == 1 else "mujoco"
+    validated = file.arrays.get("quality/validated_by")
+    return "mujoco_warp" if validated is not None and validated[row] == 1 else "mujoco"
 
 
 def _pushes(file: Shard, row: int) -> list[Push]:

@@ -43,7 +43,7 @@ class Jobs:
         self._idempotency = idempotency
         self._grasps = grasps
         self._shards = shards
-        self._paces = Paces()
+        self._paces = TaskRates()
         self._losses: dict[str, tuple[int, list[float]] | None] = {}
 
     def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobDetail:
@@ -160,8 +160,8 @@ class Jobs:
             choice=job.choice,
             note=job.note,
             outcomes=job.outcomes,
-            audited=job.audited,
-            audit_held=job.audit_held,
+            rechecked=job.rechecked,
+            recheck_held=job.recheck_held,
             hand_digest=job.hand_digest,
             object_digest=job.object_digest,
             attempts=self._services.index.jobs.attempts(job=job.id, limit=50),
@@ -183,8 +183,8 @@ class Jobs:
             requested=job.request.grasps,
             grasps=job.grasps,
             valid=job.valid,
-            tried=job.tried,
-            judged=job.judged,
+            candidates=job.candidates,
+            validated=job.validated,
             standing=job.request.standing,
             progress=progress_of_job(job),
             eta_s=eta_of_job(job, stages),
@@ -211,7 +211,7 @@ _LEAST_SHARE: Final = 0.03
 _KEPT_TASKS: Final = 4096
 
 
-class Paces:
+class TaskRates:
     """How fast running tasks move, from the first and the latest sight of each.
 
     This is memory of one process that may be lost: then the paces are unknown for a second.
@@ -235,7 +235,7 @@ class Paces:
         return (share - start) / (now - since)
 
 
-def stage_statuses(job: JobView, tasks: Sequence[TaskView], paces: Paces) -> list[StageStatus]:
+def stage_statuses(job: JobView, tasks: Sequence[TaskView], paces: TaskRates) -> list[StageStatus]:
     """The stages of a job in their order, each with its state and, where it can be told, its rate and end.
 
     Args:
@@ -260,7 +260,7 @@ def eta_of_job(job: JobView, stages: Sequence[StageStatus]) -> float | None:
     return sum(stage.eta_s or 0.0 for stage in remaining)
 
 
-def _status(stage: StageProgress, tasks: list[TaskView], paces: Paces) -> StageStatus:
+def _status(stage: StageProgress, tasks: list[TaskView], paces: TaskRates) -> StageStatus:
     state = stage_state(stage)
     running = [task for task in tasks if task.state is State.RUNNING]
     rate = None if state.is_final else _rate(stage, running, paces)
@@ -275,7 +275,7 @@ def _status(stage: StageProgress, tasks: list[TaskView], paces: Paces) -> StageS
     )
 
 
-def _rate(stage: StageProgress, running: list[TaskView], paces: Paces) -> float | None:
+def _rate(stage: StageProgress, running: list[TaskView], paces: TaskRates) -> float | None:
     """Batches per second: of the running tasks by their own progress, else from the time the finished ones took."""
     known = [pace for task in running if (pace := paces.of(task)) is not None]
     if known:

@@ -29,7 +29,7 @@ from graspd.service.model.errors import (
     UnavailableError,
 )
 from graspd.service.model.projects import ProjectScope
-from graspd.service.model.states import Lane, Stage
+from graspd.service.model.states import Priority, Stage
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.identity import check_queue
 from graspd.service.pipeline.leading import PART
@@ -98,7 +98,7 @@ class Overview:
     def failures(self, *, limit: int = 5) -> list[FailureGroup]:
         return self._services.index.overview.failures(limit=limit, scope=project_scope())
 
-    def depths(self) -> dict[tuple[Lane, Stage], int]:
+    def depths(self) -> dict[tuple[Priority, Stage], int]:
         """Waiting tasks by lane and stage."""
         return self._services.queue.depths()
 

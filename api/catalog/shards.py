@@ -9,7 +9,7 @@ from graspd.api.access.auth import project_scope
 from graspd.api.models import Shard
 from graspd.service.index.views import Page, ShardView
 from graspd.service.pipeline.backends import Services
-from graspd.service.store.integrity import Checked
+from graspd.service.store.integrity import CheckedObjects
 
 
 class Shards:
@@ -17,7 +17,7 @@ class Shards:
 
     def __init__(self, services: Services) -> None:
         self._services = services
-        self._checked = Checked(services.store)
+        self._checked = CheckedObjects(services.store)
 
     def page(
         self,

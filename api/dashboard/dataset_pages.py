@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData
 
-from graspd.api.access.auth import NotYours
+from graspd.api.access.auth import ForeignResource
 from graspd.api.catalog.assets import Assets
 from graspd.api.catalog.datasets import Datasets
 from graspd.api.catalog.jobs import Jobs
@@ -195,7 +195,7 @@ def _each(do: Callable[[Any], Any], wanted: Iterable[Any]) -> tuple[int, int]:
         try:
             do(one)
             done += 1
-        except (ConflictError, NotYours):
+        except (ConflictError, ForeignResource):
             left += 1
     return done, left
 

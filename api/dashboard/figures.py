@@ -159,8 +159,8 @@ _ROWS: Final = 60
 
 @dataclass(frozen=True)
 class Tile:
-    """One hand on one object. `made` counts grasps of its `standing`; `share` is the valid part of the judged; `value`
-    is what its checkbox sends, `href` where it leads."""
+    """One hand on one object. `made` counts grasps of its `standing`; `share` is the valid part of the validated;
+    `value` is what its checkbox sends, `href` where it leads."""
 
     hand: str
     object: str
@@ -168,7 +168,7 @@ class Tile:
     href: str
     state: str
     made: int
-    tried: int
+    candidates: int
     share: float | None
     standing: str = "valid"
     jobs: int = 0
@@ -179,7 +179,7 @@ class Tile:
 
     @property
     def shade(self) -> str:
-        """Class of the cell's colour: by yield, or none while there is nothing to judge."""
+        """Class of the cell's colour: by yield, or none while there is nothing to validate."""
         return "none" if self.share is None else f"y{min(STEPS, int(STEPS * self.share + 0.5))}"
 
 
@@ -202,7 +202,7 @@ def of_dataset(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
             href=f"/jobs/{cell.job_id}" if cell.planned else "",
             state=cell.state.value,
             made=cell.counted(dataset.options),
-            tried=cell.tried,
+            candidates=cell.candidates,
             share=cell.valid_yield,
             standing=dataset.options.standing,
             progress=cell.progress if cell.state is State.RUNNING else None,
@@ -223,10 +223,10 @@ def of_service(cells: Iterable[MatrixCell], hands: Sequence[str], objects: Seque
             value=f"{cell.hand}|{cell.object}",
             href=f"/grasps?hand={cell.hand}&object={cell.object}",
             state=_state(cell),
-            made=cell.valid if cell.judged else cell.grasps,
-            tried=cell.tried,
+            made=cell.valid if cell.validated else cell.grasps,
+            candidates=cell.candidates,
             share=cell.valid_yield,
-            standing="valid" if cell.judged else "kept",
+            standing="valid" if cell.validated else "kept",
             jobs=cell.jobs,
         )
         for cell in cells
@@ -300,7 +300,7 @@ class Share:
 
 
 @dataclass(frozen=True)
-class Drawn:
+class MapDrawing:
     """One map with what is said beneath it."""
 
     map: StabilityMap
@@ -319,9 +319,9 @@ def load(store: Store) -> Stability | None:
         return None
 
 
-def draw(one: StabilityMap) -> Drawn:
+def draw(one: StabilityMap) -> MapDrawing:
     """A map as panels and numbers."""
-    return Drawn(
+    return MapDrawing(
         map=one,
         panels=[_panel(one, name) for name in one.panels],
         counts={outcome: number for outcome, number in counts(one.cells).items() if number},

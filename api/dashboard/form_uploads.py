@@ -63,7 +63,7 @@ class Refusal:
 
 
 @dataclass(frozen=True)
-class Chosen:
+class AssetChoice:
     """What a form says of its hand or its object."""
 
     name: str = ""
@@ -80,23 +80,23 @@ class Chosen:
         return FILE_FIELDS[kind] if self.file else kind.value
 
 
-def chosen(request: Request, assets: Assets, fields: FormData, kind: AssetKind) -> Chosen:
+def chosen(request: Request, assets: Assets, fields: FormData, kind: AssetKind) -> AssetChoice:
     """The hand or object that a submitted form means: its file, else the file that it holds, else the known one."""
     file, known = fields.get(FILE_FIELDS[kind]), _text(fields, kind.value)
     if isinstance(file, UploadFile) and file.filename:
         try:
             asset = _store(request, assets, kind, file, _units(fields))
         except InputError as error:
-            return Chosen(refused=Refusal(str(error)), file=file.filename)
+            return AssetChoice(refused=Refusal(str(error)), file=file.filename)
         return _checked(assets, asset)
     if known:
-        return Chosen(name=known)
+        return AssetChoice(name=known)
     if held := _text(fields, f"{kind.value}_held"):
         try:
             return _checked(assets, _again(assets, kind, held, fields))
         except InputError as error:
-            return Chosen(refused=Refusal(str(error)), file=held, held=held)
-    return Chosen(refused=Refusal(f"choose a known {kind.value}, or a file"))
+            return AssetChoice(refused=Refusal(str(error)), file=held, held=held)
+    return AssetChoice(refused=Refusal(f"choose a known {kind.value}, or a file"))
 
 
 def refusal_of(asset: AssetView) -> Refusal:
@@ -184,18 +184,18 @@ def pressed(fields: FormData, kind: AssetKind) -> dict[str, Any]:
     return said
 
 
-def _checked(assets: Assets, asset: AssetView) -> Chosen:
+def _checked(assets: Assets, asset: AssetView) -> AssetChoice:
     """Give a worker a moment to check an upload, so that one press of the button is enough."""
     deadline = time.monotonic() + _CHECK_WAIT_S
     while asset.verdict is None and time.monotonic() < deadline:
         time.sleep(0.2)
         asset = assets.one(asset.kind, asset.digest)
     if asset.verdict == "refuse":
-        return Chosen(refused=refusal_of(asset), file=asset.name, held=asset.digest)
-    return Chosen(name=asset.name)
+        return AssetChoice(refused=refusal_of(asset), file=asset.name, held=asset.digest)
+    return AssetChoice(name=asset.name)
 
 
-def choices(assets: Assets, kind: AssetKind, shown: str, one: Chosen) -> list[tuple[str, str]]:
+def choices(assets: Assets, kind: AssetKind, shown: str, one: AssetChoice) -> list[tuple[str, str]]:
     """Names to choose from, the one that the form shows always among them."""
     known = asset_choices(assets, kind)
     if one.refused:

@@ -18,7 +18,7 @@ from starlette.datastructures import FormData, UploadFile
 from graspd.api.access.auth import project_scope
 from graspd.api.catalog.assets import Assets
 from graspd.api.catalog.jobs import Jobs
-from graspd.api.dashboard.form_uploads import FILE_FIELDS, UNITS, Chosen, choices, chosen, refusal_of
+from graspd.api.dashboard.form_uploads import FILE_FIELDS, UNITS, AssetChoice, choices, chosen, refusal_of
 from graspd.api.dashboard.rendering import render
 from graspd.api.routes.dependencies import AssetsOf, JobsOf, may_read, may_submit
 from graspd.service.index.index import Index
@@ -55,7 +55,7 @@ DEFAULTS: Final[dict[str, Any]] = {
     "width": 320,
     "height": 240,
     "want": "valid",
-    "referee": "certificate",
+    "validation": "standard",
     "min_distance": 0.005,
     "robust": 0.0,
 }
@@ -152,12 +152,12 @@ def _form(
     assets: Assets,
     form: dict[str, Any],
     *,
-    things: dict[AssetKind, Chosen] | None = None,
+    things: dict[AssetKind, AssetChoice] | None = None,
     errors: dict[str, str] | None = None,
     problem: dict[str, str] | None = None,
     status: int = 200,
 ) -> HTMLResponse:
-    things = things or {kind: Chosen(name=str(form[kind.value])) for kind in FILE_FIELDS}
+    things = things or {kind: AssetChoice(name=str(form[kind.value])) for kind in FILE_FIELDS}
     return render(
         request,
         "submit.html",
@@ -186,7 +186,7 @@ WORDS: Final = {
 
 
 @dataclass(frozen=True)
-class Expected:
+class FidelityPrice:
     """A fidelity and its price."""
 
     name: str
@@ -212,7 +212,7 @@ class Expectations:
         self._index = index
         self._costs = _RememberedCosts(index.costs)
 
-    def of(self, form: Mapping[str, Any]) -> list[Expected]:
+    def of(self, form: Mapping[str, Any]) -> list[FidelityPrice]:
         """Every offered fidelity for what a form says; without numbers where it cannot be estimated."""
         # An empty field says nothing.
         wanted = {
@@ -221,15 +221,15 @@ class Expectations:
         wanted["neighbours"] = listed(str(form.get("neighbours", "")))
         return [self._one(name, wanted, str(form["hand"]), str(form["object"])) for name in OFFERED]
 
-    def _one(self, name: str, wanted: dict[str, Any], hand: str, obj: str) -> Expected:
+    def _one(self, name: str, wanted: dict[str, Any], hand: str, obj: str) -> FidelityPrice:
         try:
             matrix = Matrix.model_validate(wanted | {"hands": (hand,), "objects": (obj,), "fidelity": name})
             cost = estimate(self._index, matrix, costs=self._costs.of_batches, scope=project_scope())
         except (ValidationError, GraspdError):
-            return Expected(name, WORDS[name], None, None, None, None, "")
+            return FidelityPrice(name, WORDS[name], None, None, None, None, "")
         rate = cost.rates[0] if cost.rates else None
         share, origin = (rate.valid_yield, rate.origin) if rate else (None, "")
-        return Expected(name, WORDS[name], cost.seconds, cost.seconds_low, cost.seconds_high, share, origin)
+        return FidelityPrice(name, WORDS[name], cost.seconds, cost.seconds_low, cost.seconds_high, share, origin)
 
 
 class _RememberedCosts:

@@ -35,10 +35,10 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
     job = jobs.one(job_id)
     pictures = _pictures(job)
     shown = {key: (label, unit) for key, label, unit in COLUMNS}
-    judged = job.request.referee != "none"
-    query = GraspQuery(job=job_id, valid=True if judged else None)
-    rows = grasps.page(query, limit=_SHOWN_GRASPS).items if (job.valid if judged else job.grasps) else []
-    where = {"job": job_id} | ({"valid": "true"} if judged else {})
+    validated = job.request.validation != "none"
+    query = GraspQuery(job=job_id, valid=True if validated else None)
+    rows = grasps.page(query, limit=_SHOWN_GRASPS).items if (job.valid if validated else job.grasps) else []
+    where = {"job": job_id} | ({"valid": "true"} if validated else {})
     return render(
         request,
         "job.html",
@@ -54,7 +54,7 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
         rows=rows,
         did=did(dict(request.query_params)),
         **choice_of(tags, rows, tags.all(), where),
-        all_said=f"all {'valid ' if judged else ''}grasps of this job",
+        all_said=f"all {'valid ' if validated else ''}grasps of this job",
         here=f"/jobs/{job_id}",
         view="",
         models=dict.fromkeys((grasp.shard_id for grasp in rows), (job.hand_digest, job.object_digest)),

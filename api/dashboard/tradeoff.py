@@ -43,15 +43,15 @@ class Axis:
 #: Accuracies of grasps around free objects, and of grasps in scenes; the first one is drawn where none is chosen.
 FREE: Final[dict[str, Axis]] = {
     "gsr": Axis("Success in MuJoCo"),
-    "letter": Axis("Success by the letter"),
+    "dexgraspbench": Axis("Success under the DexGraspBench protocol"),
     "hard": Axis("Success at half the friction"),
     "robust": Axis("Robust share of those that hold"),
     "epsilon": Axis("ε", "", factor=1.0),
     "pd_mm": Axis("Penetration", "mm", more_is_better=False, factor=1.0),
 }
 IN_SCENES: Final[dict[str, Axis]] = {
-    "lift": Axis("Lifted, of all tries"),
-    "lift_letter": Axis("Lifted by the letter"),
+    "lift": Axis("Lifted, of all candidates"),
+    "lift_dexgraspbench": Axis("Lifted under the DexGraspBench protocol"),
     "lift_hard": Axis("Lifted at half the friction"),
     "robust": Axis("Robust share of those lifted"),
 }
@@ -74,13 +74,13 @@ class Run(BaseModel):
     seconds_to_first_valid: float | None = None
     seconds_to_first: float | None = None
     gsr: float | None = None
-    letter: float | None = None
+    dexgraspbench: float | None = None
     hard: float | None = None
     robust: float | None = None
     epsilon: float | None = None
     pd_mm: float | None = None
     lift: float | None = None
-    lift_letter: float | None = None
+    lift_dexgraspbench: float | None = None
     lift_hard: float | None = None
 
     @property

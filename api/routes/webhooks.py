@@ -21,7 +21,7 @@ WebhookId = Annotated[str, Path(max_length=64)]
 Since = Annotated[int, Query(ge=0, lt=2**62, description="`seq` of the last end that is known; 0: from the first on")]
 
 
-class EndsPage(BaseModel):
+class DeliveryPage(BaseModel):
     """The next ends, and where to go on."""
 
     items: list[EndView]
@@ -37,17 +37,17 @@ class WebhookRequest(BaseModel):
     states: tuple[End, ...] = Field(("succeeded", "failed", "cancelled"), min_length=1, max_length=3)
 
 
-class MadeWebhook(WebhookView):
+class CreatedWebhook(WebhookView):
     """A webhook, and what its bodies are signed with."""
 
     secret: str = Field(description="told this once")
 
 
 @router.get("/v1/events", dependencies=[Depends(may_read)], responses=responses(401, 403, 422, 503))
-def list_ends(webhooks: WebhooksOf, since: Since = 0, limit: Limit = 50) -> EndsPage:
+def list_ends(webhooks: WebhooksOf, since: Since = 0, limit: Limit = 50) -> DeliveryPage:
     """Jobs and datasets that ended, in this order. Ends are kept for 30 days; none is left out, one may come twice."""
     items = webhooks.ends(since, limit=limit)
-    return EndsPage(items=items, next=items[-1].seq if items else since)
+    return DeliveryPage(items=items, next=items[-1].seq if items else since)
 
 
 @router.get(
@@ -74,11 +74,11 @@ async def stream_ends(
     dependencies=[Depends(may_submit)],
     responses=responses(400, 401, 403, 409, 413, 422, 503),
 )
-def add_webhook(body: WebhookRequest, response: Response, webhooks: WebhooksOf) -> MadeWebhook:
+def add_webhook(body: WebhookRequest, response: Response, webhooks: WebhooksOf) -> CreatedWebhook:
     """Tell an address when jobs and datasets of the key's project end. The answer holds its secret, this once."""
     hook, secret = webhooks.add(body.url, body.states)
     response.headers["Location"] = f"/v1/webhooks/{hook.id}/deliveries"
-    return MadeWebhook(**hook.model_dump(), secret=secret)
+    return CreatedWebhook(**hook.model_dump(), secret=secret)
 
 
 @router.get("/v1/webhooks", dependencies=[Depends(may_submit)], responses=responses(401, 403, 503))

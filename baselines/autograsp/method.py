@@ -19,14 +19,14 @@ from pydantic import Field
 from graspd.baselines.autograsp import kernels
 from graspd.baselines.common import free_starts, grasp_set, ground_of, joined
 from graspd.service.model.transforms import Floats, quat_rotate
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.kinematics import ancestors
 from graspd.worker.hands.model import HandModel, JointType, SurfacePoints
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
-from graspd.worker.planners.port import Method, Options, Planner, Wanted
+from graspd.worker.planners.port import Method, Options, Planner, PlanRequest
 from graspd.worker.planners.threads import Steps, cut, run_parts
-from graspd.worker.run import Run
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import Model
@@ -45,7 +45,7 @@ class Autograsp:
     def __init__(self, options: AutograspOptions) -> None:
         self.options = options
 
-    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
+    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
         began = time.perf_counter()
         pair = ground_of(hand, obj, run.device, kernels)
         steps = Steps(3 * wanted.count, run)
@@ -54,7 +54,7 @@ class Autograsp:
             n = len(indices)
             state = free_starts(pair, seed=wanted.seed, batch=wanted.batch, indices=indices)
             steps(n, "starts")
-            closer = Closer(pair, n)
+            closer = HandCloser(pair, n)
             state = closer.approach(state, self.options.standoff_m)
             steps(n, "approach")
             state = closer.close(state).state
@@ -119,14 +119,14 @@ def finger_groups(moves: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 
 @dataclass(frozen=True)
-class Closed:
+class ClosedHands:
     """Hands after closing, and what stopped each dof: (B, D) 0 nothing, 1 contact, 2 its limit."""
 
     state: HandState
     stopped: NDArray[np.int32]
 
 
-class Closer:
+class HandCloser:
     """Approach and closing of up to `capacity` hands."""
 
     def __init__(self, pair: Pair, capacity: int) -> None:
@@ -179,7 +179,7 @@ class Closer:
                 break
         return self.data.state(n)
 
-    def close(self, state: HandState) -> Closed:
+    def close(self, state: HandState) -> ClosedHands:
         """Fingers closed until contact or limits; the root and dofs that do not close (spreads) stay."""
         n, data = len(state.pivot), self.data
         data.set_state(state)
@@ -196,7 +196,7 @@ class Closer:
             )
             if not data.active.numpy().any():
                 break
-        return Closed(data.state(n), self.stopped.numpy()[:n].astype(np.int32))
+        return ClosedHands(data.state(n), self.stopped.numpy()[:n].astype(np.int32))
 
     def distances(self, state: HandState) -> Floats:
         """(n, L) least distance of each body from the object, at most `REACH_M` [m]."""

@@ -23,15 +23,15 @@ from graspd.service.model.transforms import (
     quat_from_matrix,
     quat_multiply,
 )
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.distance import sample_faces
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
-from graspd.worker.planners.port import Method, Options, Planner, Wanted
+from graspd.worker.planners.port import Method, Options, Planner, PlanRequest
 from graspd.worker.planners.threads import Steps, cut, run_parts
-from graspd.worker.run import Run
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.kernels import optimizers
 from graspd.worker.simulation.launches import Launches
@@ -60,7 +60,7 @@ class Dfc:
     def __init__(self, options: DfcOptions) -> None:
         self.options = options
 
-    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
+    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
         began = time.perf_counter()
         pair = ground_of(hand, obj, run.device, kernels)
         steps = Steps(wanted.count * (self.options.steps + 1), run)

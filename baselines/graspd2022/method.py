@@ -19,14 +19,14 @@ from graspd.baselines.common import Kept, free_starts, grasp_set, ground_of, joi
 from graspd.baselines.graspd2022 import kernels
 from graspd.service.model.cores import available_cores
 from graspd.service.model.transforms import Floats, quat_rotate
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
-from graspd.worker.planners.port import Method, Options, Planner, Wanted
+from graspd.worker.planners.port import Method, Options, Planner, PlanRequest
 from graspd.worker.planners.threads import Steps, cut, run_parts
-from graspd.worker.run import Run
 from graspd.worker.simulation.data import Data, HandState, Schedule
 from graspd.worker.simulation.device import DeviceObject
 from graspd.worker.simulation.kernels import surface
@@ -70,7 +70,7 @@ class Graspd2022:
     def __init__(self, options: Graspd2022Options) -> None:
         self.options = options
 
-    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
+    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
         began = time.perf_counter()
         pair: Pair = ground_of(hand, obj, run.device, kernels)
         search = _searches(pair, self.options.grid)

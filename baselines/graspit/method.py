@@ -20,20 +20,20 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from graspd.baselines.autograsp import kernels as closing_kernels
-from graspd.baselines.autograsp.method import Closer
+from graspd.baselines.autograsp.method import HandCloser
 from graspd.baselines.common import Kept, grasp_set, ground_of, inside_points, joined
 from graspd.baselines.graspit import kernels
 from graspd.baselines.graspit.schedule import FIRST_STEP
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, quat_from_matrix
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.kinematics import ancestors
 from graspd.worker.hands.model import HandModel, SurfacePoints
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
-from graspd.worker.planners.port import Method, Options, Planner, Wanted
+from graspd.worker.planners.port import Method, Options, Planner, PlanRequest
 from graspd.worker.planners.threads import Steps, cut, run_parts
-from graspd.worker.run import Run
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.device import to_wxyz, to_xyzw
 from graspd.worker.simulation.model import body_points
@@ -138,7 +138,7 @@ class Graspit:
     def __init__(self, options: GraspitOptions) -> None:
         self.options = options
 
-    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
+    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
         began = time.perf_counter()
         pair = ground_of(hand, obj, run.device, kernels, closing_kernels)
         search = _searches(pair)
@@ -149,7 +149,7 @@ class Graspit:
         def work(indices: range) -> HandState:
             seeds = [[wanted.seed, wanted.batch, chain] for chain in indices]
             state = search.run(seeds, steps=self.options.steps, keep=keep, tell=steps)
-            return Closer(pair, len(state.pivot)).close(state).state
+            return HandCloser(pair, len(state.pivot)).close(state).state
 
         states = joined(run_parts(cut(chains, run), work))
         return grasp_set(pair, states[: wanted.count], began, {"chains": chains, "moves": moves})

@@ -18,6 +18,7 @@ from graspd.service.model.errors import InputError, SceneError
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.scene_spec import UPRIGHT
 from graspd.service.model.transforms import Floats, compose, cross, invert, quat_conjugate, quat_rotate
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -25,11 +26,10 @@ from graspd.worker.planners.fast_graspd.planner import plan, plan_joined
 from graspd.worker.planners.fast_graspd.scene_starts import ROOM, clear_scene_starts
 from graspd.worker.planners.fast_graspd.starts import CLEAR, Probe
 from graspd.worker.planners.known_networks import keep_file, kept
-from graspd.worker.planners.port import Asked, Method, Options, Wanted
-from graspd.worker.run import Run
+from graspd.worker.planners.port import BatchRequest, Method, Options, PlanRequest
 from graspd.worker.simulation.data import HandState
+from graspd.worker.simulation.environment import UP, Obstacle, Placed
 from graspd.worker.simulation.model import Model
-from graspd.worker.simulation.surroundings import UP, Obstacle, Placed
 
 
 class LearnedOptions(Options):
@@ -39,17 +39,17 @@ class LearnedOptions(Options):
     starts: int = Field(4, ge=1, le=32, description="proposals of each grasp that set out")
 
 
-class Learned:
+class LearnedPlanner:
     """fast_graspd from a network's proposals."""
 
     def __init__(self, options: LearnedOptions) -> None:
         self.options = options
 
-    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
+    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
         """See `worker.planners.Planner`."""
         return plan(hand, obj, wanted, run, warm=self._seeds(hand))
 
-    def joined(self, hand: HandModel, obj: ObjectModel, asked: Sequence[Asked]) -> list[GraspSet | Exception]:
+    def joined(self, hand: HandModel, obj: ObjectModel, asked: Sequence[BatchRequest]) -> list[GraspSet | Exception]:
         """See `worker.planners.Joined`."""
         return plan_joined(hand, obj, asked, warm=self._seeds(hand))
 
@@ -66,8 +66,8 @@ class Learned:
 METHOD: Final = Method(
     summary="fast_graspd from the proposals of a network that saw the object on its table",
     source="unpublished; PointNet, CVPR 2017, and flow matching, ICLR 2023",
-    planner=Learned,
-    joined=lambda options: Learned(options).joined,
+    planner=LearnedPlanner,
+    joined=lambda options: LearnedPlanner(options).joined,
     in_scenes=True,
     in_parts=True,
     free=False,
@@ -123,7 +123,7 @@ class Seeds:
         """Hands (n * draws) as proposed, open, those of a start side by side, and (n * draws, 3) ways out; object
         frame."""
         hand, obj, table = model.hand.model, model.obj.model, table_height(placed.supports)
-        seen, draws = Seen.of(obj), max(1, PROPOSALS // each)
+        seen, draws = SurfaceView.of(obj), max(1, PROPOSALS // each)
         pivot, rotation, q, away = [], [], [], []
         for number, scene in enumerate(placed.index.tolist()):
             mine = generators[number * each : (number + 1) * each]
@@ -202,7 +202,7 @@ PIXELS: Final = 48
 
 
 @dataclass(frozen=True)
-class Seen:
+class SurfaceView:
     """The surface of an object as cameras look at it."""
 
     obj: ObjectModel
@@ -212,7 +212,7 @@ class Seen:
     """(DENSE, 3) unit, outward."""
 
     @classmethod
-    def of(cls, obj: ObjectModel) -> Seen:
+    def of(cls, obj: ObjectModel) -> SurfaceView:
         """Points even over the area, the same for the same object."""
         rng = np.random.default_rng(0)
         corners = obj.vertices[obj.faces]

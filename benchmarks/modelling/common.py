@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
-from graspd.worker.planners.port import Wanted
+from graspd.worker.planners.port import PlanRequest
 from graspd.worker.quality.intervals import wilson
-from graspd.worker.run import Run
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.model import Scene
 from graspd.worker.validation.protocol import Test
@@ -64,7 +64,9 @@ class Subject:
 
     @cached_property
     def grasps(self) -> GraspSet:
-        return synthesize(self.hand, self.obj, Wanted(count=self.count, fidelity=PLAIN, seed=SEED), Run(threads=1))
+        return synthesize(
+            self.hand, self.obj, PlanRequest(count=self.count, fidelity=PLAIN, seed=SEED), ExecutionContext(threads=1)
+        )
 
     @cached_property
     def pieces(self) -> ConvexPieces:
@@ -83,9 +85,9 @@ def object_of(data: Path | None, name: str, face_error_m: float = FIDELITIES["st
 
 
 def verdicts(scene: Scene, grasps: GraspSet) -> Bools:
-    """(N,) whether each grasp holds, by the certificate in any physics; one thread."""
+    """(N,) whether each grasp holds, at level standard in any physics; one thread."""
     test = Test(scene)
-    return np.array([test.certificate(grasps, row).success for row in range(len(grasps))], bool)
+    return np.array([test.standard(grasps, row).success for row in range(len(grasps))], bool)
 
 
 def share(good: int, total: int) -> Row:

@@ -104,7 +104,7 @@ def forearm(root: Floats, palm: Floats) -> tuple[Floats, Floats]:
 
 def arm(subjects: list[Subject], scenes: int) -> Row:
     """Share of the grasps kept on a table through which a forearm would run, at contact."""
-    kept, hit, down, tried, distinct = 0, 0, 0, 0, 0
+    kept, hit, down, candidates, distinct = 0, 0, 0, 0, 0
     for s in subjects:
         poses = simulate.drop(s.obj, count=scenes, seed=SEED)["scene/object_pose"]
         found = transfer(s.hand, s.grasps.grasp, s.grasps.pregrasp, poses)
@@ -113,12 +113,12 @@ def arm(subjects: list[Subject], scenes: int) -> Row:
         base = s.grasps.grasp.hand_pose[found["grasp/base_index"][valid]]
         root = compose(poses[found["grasp/scene_index"][valid]], base)
         lowest, slope = forearm(root, s.hand.palm.centre)
-        kept, tried = kept + len(valid), tried + len(found["grasp/valid"])
+        kept, candidates = kept + len(valid), candidates + len(found["grasp/valid"])
         hit, down = hit + int((lowest < 0).sum()), down + int((slope < 0).sum())
     if not kept:
-        return {"tried": tried, "kept": 0}
+        return {"candidates": candidates, "kept": 0}
     return {
-        "tried": tried,
+        "candidates": candidates,
         "kept": kept,
         "distinct_grasps": distinct,
         "in_the_table": share(hit, kept),

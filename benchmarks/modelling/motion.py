@@ -1,7 +1,7 @@
 """How much of the hand's and the object's motion must be simulated, and how stiff, to say whether a grasp holds.
 
-Reference is the certificate: fingers driven by actuators, hand root on a weld, rigid bodies. Everything is asked of the
-same plain grasps.
+Reference is the standard level: fingers driven by actuators, hand root on a weld, rigid bodies. Everything is asked of
+the same plain grasps.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 from scipy.stats import rankdata
 
 from benchmarks.modelling.common import Bools, Floats, Row, Subject, cpu, ranking, share, verdicts
-from benchmarks.modelling.steps import rollout
+from benchmarks.modelling.steps import forward_simulation
 from graspd.worker.control.postures import hold_forces
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.objects.convex import union_volume
 from graspd.worker.planners.fast_graspd.candidates import FRICTION
 from graspd.worker.quality.probe import probe_of
 from graspd.worker.quality.table import measure
-from graspd.worker.run import Run
 from graspd.worker.simulation.reference import World
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.displacement import simulated_displacement_cm
@@ -36,7 +36,7 @@ NO_PATCH = 1e-4
 
 
 def predictors(subjects: list[Subject], held: list[Bools], spent: float) -> list[Row]:
-    """Cheap figures of a hand that stands still, by how well they rank grasps; costs relative to the certificate."""
+    """Cheap figures of a hand that stands still, by how well they rank grasps; costs relative to the standard level."""
     rows = []
     rolled, seconds = _rollouts(subjects)
     for k, count in enumerate(STEPS):
@@ -52,7 +52,7 @@ def predictors(subjects: list[Subject], held: list[Bools], spent: float) -> list
     rows[-1]["steps_ratio"] = float(STEPS[-1])
     with cpu() as clock:
         slips = [
-            -simulated_displacement_cm(s.hand, s.obj, s.grasps.grasp, pieces=s.pieces, run=Run(threads=1))
+            -simulated_displacement_cm(s.hand, s.obj, s.grasps.grasp, pieces=s.pieces, run=ExecutionContext(threads=1))
             for s in subjects
         ]
     rows.append(_row("static hand, 35 steps of MuJoCo (simulated displacement)", slips, held, clock.seconds, spent))
@@ -71,7 +71,7 @@ def _rollouts(subjects: list[Subject]) -> tuple[list[Floats], float]:
         for s in subjects:
             probe = probe_of(s.hand, s.obj, hand_points=POINTS, object_points=64)
             world = World(inertia=s.obj.inertia, gyration=s.obj.gyration_radius)
-            found.append(rollout(probe, s.grasps.grasp, world, STEPS))
+            found.append(forward_simulation(probe, s.grasps.grasp, world, STEPS))
     return found, clock.seconds
 
 
@@ -93,11 +93,11 @@ def _hull(subject: Subject) -> ConvexPieces:
 
 
 def engines() -> dict[str, tuple[MujocoOptions, Callable[[Scene], None] | None, bool]]:
-    """Variants of the referee: physics, what is done to the compiled scene, whether the object is one hull."""
+    """Variants of the validator: physics, what is done to the compiled scene, whether the object is one hull."""
     base = MujocoOptions()
     slide, _ = base.friction
     return {
-        "certificate": (base, None, False),
+        "standard": (base, None, False),
         "hand root fixed": (replace(base, root="fixed"), None, False),
         "pads that give 2 mm": (base, _soft(2e-3), False),
         "no contact patch": (replace(base, friction=(slide, NO_PATCH)), None, False),
@@ -105,8 +105,9 @@ def engines() -> dict[str, tuple[MujocoOptions, Callable[[Scene], None] | None, 
     }
 
 
-def judged(subjects: list[Subject]) -> tuple[list[Row], list[Bools], float]:
-    """Each variant's rate, agreement with the certificate, cost over the certificate's; the certificate's verdicts."""
+def validated(subjects: list[Subject]) -> tuple[list[Row], list[Bools], float]:
+    """Each variant's rate, agreement with the standard level, cost over the standard level's; the standard level's
+    verdicts."""
     rows: list[Row] = []
     reference: list[Bools] = []
     spent = 0.0
@@ -127,7 +128,7 @@ def judged(subjects: list[Subject]) -> tuple[list[Row], list[Bools], float]:
                 "held": share(int(now.sum()), len(now)),
                 "agreement": share(int((now == then).sum()), len(now)),
                 "only_here": int((now & ~then).sum()),
-                "only_certificate": int((~now & then).sum()),
+                "only_standard": int((~now & then).sum()),
                 "cost_ratio": clock.seconds / spent,
                 "ms_per_grasp": 1e3 * clock.seconds / len(now),
             }
@@ -138,7 +139,14 @@ def judged(subjects: list[Subject]) -> tuple[list[Row], list[Bools], float]:
 def pads(subjects: list[Subject]) -> list[Row]:
     """Contact area and epsilon if all hand surface within a distance of the object touched it."""
     tables = [
-        measure(s.hand, s.obj, s.grasps.take(slice(0, 16)), friction=1.0, thresholds_m=PADS_M, run=Run(threads=1))
+        measure(
+            s.hand,
+            s.obj,
+            s.grasps.take(slice(0, 16)),
+            friction=1.0,
+            thresholds_m=PADS_M,
+            run=ExecutionContext(threads=1),
+        )
         for s in subjects
     ]
     area = np.concatenate([t["quality/contact_area_cm2"] for t in tables]).mean(axis=0)
@@ -155,9 +163,13 @@ def study(subjects: list[Subject]) -> dict[str, Any]:
         # Grasps, pieces and kernels are there before a clock starts.
         assert len(subject.grasps) and len(subject.pieces)
         simulated_displacement_cm(
-            subject.hand, subject.obj, subject.grasps.grasp.take(slice(0, 1)), pieces=subject.pieces, run=Run(threads=1)
+            subject.hand,
+            subject.obj,
+            subject.grasps.grasp.take(slice(0, 1)),
+            pieces=subject.pieces,
+            run=ExecutionContext(threads=1),
         )
-    rows, held, spent = judged(subjects)
+    rows, held, spent = validated(subjects)
     return {
         "objects": [s.obj.name for s in subjects],
         "engines": rows,

@@ -11,11 +11,11 @@ import trimesh
 
 from benchmarks.modelling.common import SEED, Row, cpu, object_of
 from graspd.service.model.transforms import apply, invert
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.rendering.cameras import Cameras
 from graspd.worker.rendering.scene_setup import CameraPlan, Setting
 from graspd.worker.rendering.scenery import Pictures
 from graspd.worker.rendering.views import SAMPLES as SAMPLES_DEFAULT
-from graspd.worker.run import Run
 from graspd.worker.scenes.simulate import drop
 
 SCENES, VIEWS = 2, 2
@@ -68,7 +68,7 @@ def study(data: Path | None, name: str, width: int = 160) -> dict[str, Any]:
 def _shoot(setting: Setting, samples: int) -> tuple[Pictures, float]:
     setting.shot = replace(setting.shot, samples=samples)
     with cpu() as clock:
-        pictures = setting.shoot(Run(threads=1))
+        pictures = setting.shoot(ExecutionContext(threads=1))
     return pictures, clock.seconds
 
 

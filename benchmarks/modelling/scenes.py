@@ -15,17 +15,17 @@ import numpy as np
 
 from benchmarks.modelling.common import PLAIN, SEED, Bools, Row, Subject, cpu, share
 from graspd.service.model.scene_spec import SceneSpec
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.planners import synthesize
-from graspd.worker.planners.port import Wanted
-from graspd.worker.run import Run
+from graspd.worker.planners.port import PlanRequest
 from graspd.worker.scenes.clearance import MARGIN_M
 from graspd.worker.scenes.kinds import rest_poses, supports_of
-from graspd.worker.scenes.way import Way, plan_way
-from graspd.worker.simulation.surroundings import Obstacle, Placed, Scenes
+from graspd.worker.scenes.trajectory import Trajectory, plan_way
+from graspd.worker.simulation.environment import Obstacle, Placed, Scenes
 from graspd.worker.validation.lift import Lift
 from graspd.worker.validation.model import MujocoOptions, Scene, build
-from graspd.worker.validation.protocol import Outcome, Trial
+from graspd.worker.validation.protocol import Outcome, Rollout
 
 #: A table of 1.2 x 0.9 m, 30 mm thick.
 SLAB = Obstacle.box([0, 0, -0.015, 1, 0, 0, 0], [1.2, 0.9, 0.03])
@@ -48,15 +48,15 @@ class OnTable:
         return self.scenes.placed(np.arange(self.subject.count) % len(self.scenes.object_pose))
 
     def planned(self, placed: Placed) -> GraspSet:
-        wanted = Wanted(self.subject.count, PLAIN, SEED, placed=placed)
-        return synthesize(self.subject.hand, self.subject.obj, wanted, Run(threads=1))
+        wanted = PlanRequest(self.subject.count, PLAIN, SEED, placed=placed)
+        return synthesize(self.subject.hand, self.subject.obj, wanted, ExecutionContext(threads=1))
 
     @cached_property
     def grasps(self) -> GraspSet:
         return self.planned(self.placed)
 
     @cached_property
-    def way(self) -> Way:
+    def way(self) -> Trajectory:
         return plan_way(self.subject.hand, self.subject.obj, self.grasps, self.placed)
 
     @cached_property
@@ -82,17 +82,17 @@ def _no_hold(test: Lift, grasps: GraspSet, row: int) -> bool:
     if not test._close(grasps, row, give_up=True):
         return False
     test._rise(grasps, row)
-    return test._judge(Trial()) is Outcome.HELD
+    return test._validate(Rollout()) is Outcome.HELD
 
 
 def variants() -> dict[str, tuple[Callable[[Scene], None], Callable[[Lift, GraspSet, int], bool]]]:
-    """What is done to the compiled scene, and how a grasp is judged in it."""
+    """What is done to the compiled scene, and how a grasp is validated in it."""
 
     def lift(test: Lift, grasps: GraspSet, row: int) -> bool:
         return test.lift(grasps, row).success
 
-    def letter(test: Lift, grasps: GraspSet, row: int) -> bool:
-        return test.letter(grasps, row).success
+    def dexgraspbench(test: Lift, grasps: GraspSet, row: int) -> bool:
+        return test.dexgraspbench(grasps, row).success
 
     def same(scene: Scene) -> None:
         return None
@@ -102,11 +102,11 @@ def variants() -> dict[str, tuple[Callable[[Scene], None], Callable[[Lift, Grasp
         "a table without friction": (lambda scene: _supports(scene, friction=1e-6), lift),
         "a table that gives 5 mm": (lambda scene: _supports(scene, width_m=SOFT_M), lift),
         "no hold of 2 s": (same, _no_hold),
-        "by the letter: no way in, no hold": (same, letter),
+        "under the DexGraspBench protocol: no way in, no hold": (same, dexgraspbench),
     }
 
 
-def judged(tables: list[OnTable]) -> list[Row]:
+def validated(tables: list[OnTable]) -> list[Row]:
     """Each variant's rate, agreement with the lift test, cost over the lift test's."""
     rows: list[Row] = []
     reference: Bools | None = None
@@ -172,5 +172,5 @@ def study(subjects: list[Subject], count: int) -> dict[str, Any]:
     tables = [OnTable(replace(subject, count=count)) for subject in subjects]
     for one in tables:
         _ = (one.clear, one.subject.pieces)  # grasps, ways and pieces are there before a clock starts
-    rows = judged(tables)
+    rows = validated(tables)
     return {"variants": rows, "straight_only": straight(tables), "slab": slabs(tables)}

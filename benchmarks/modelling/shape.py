@@ -9,11 +9,11 @@ import numpy as np
 
 from benchmarks.modelling.common import SEED, Row, cpu, hand_of, mean, object_of, share, verdicts
 from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.planners import synthesize
-from graspd.worker.planners.port import Wanted
+from graspd.worker.planners.port import PlanRequest
 from graspd.worker.quality.overlap import penetration_depth
 from graspd.worker.quality.probe import probe_of
-from graspd.worker.run import Run
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions, build
 
@@ -34,7 +34,7 @@ def study(data: Path | None, objects: list[str], count: int) -> dict[str, Any]:
     true = {name: object_of(data, name, 0.0) for name in objects}
     scenes = {}
     for name in objects:
-        # One judge for all settings: pieces of the standard object, whose digest is in the cache.
+        # One validate for all settings: pieces of the standard object, whose digest is in the cache.
         standard = object_of(data, name)
         scenes[name] = build(hand, standard, decompose(standard), MujocoOptions())
     rows: list[Row] = []
@@ -43,9 +43,11 @@ def study(data: Path | None, objects: list[str], count: int) -> dict[str, Any]:
         held, depth, seconds, faces = 0, [], 0.0, []
         for name in objects:
             obj = object_of(data, name, fidelity.face_error_m)
-            synthesize(hand, obj, Wanted(count=1, fidelity=fidelity, seed=1), Run(threads=1))
+            synthesize(hand, obj, PlanRequest(count=1, fidelity=fidelity, seed=1), ExecutionContext(threads=1))
             with cpu() as clock:
-                found = synthesize(hand, obj, Wanted(count=count, fidelity=fidelity, seed=SEED), Run(threads=1))
+                found = synthesize(
+                    hand, obj, PlanRequest(count=count, fidelity=fidelity, seed=SEED), ExecutionContext(threads=1)
+                )
             seconds += clock.seconds
             faces.append(len(obj.faces))
             held += int(verdicts(scenes[name], found).sum())

@@ -22,7 +22,7 @@ PASSES = 4
 VELOCITIES = 7
 
 
-def rollout(probe: Probe, grasp: Posture, world: World, steps: tuple[int, ...]) -> Floats:
+def forward_simulation(probe: Probe, grasp: Posture, world: World, steps: tuple[int, ...]) -> Floats:
     """(N, K) L_stable of N grasps after each of K numbers of steps: the mean over the velocities of the whole motion.
 
     The motion counts in units of what one free step is, whatever the number of steps; ranks do not depend on that.

@@ -13,7 +13,7 @@ def tables(found: dict[str, Any]) -> dict[str, str]:
     if "motion" in found:
         study = found["motion"]
         out["engines"] = _table(
-            "model|holds|same verdict (95 %)|holds only here / only by the certificate|cost",
+            "model|holds|same verdict (95 %)|holds only here / only at level standard|cost",
             map(_engine, study["engines"]),
         )
         out["predictors"] = _table("model|AUC (95 %)|cost", map(_predictor, study["predictors"]))
@@ -59,13 +59,13 @@ def _engine(row: Row) -> list[str]:
         row["model"],
         f"{100 * row['held']['value']:.0f} %",
         percent(row["agreement"]),
-        f"{row['only_here']} / {row['only_certificate']}",
+        f"{row['only_here']} / {row['only_standard']}",
         f"{row['cost_ratio']:.2f}",
     ]
 
 
 def _lift(row: Row) -> list[str]:
-    return _engine({**row, "only_certificate": row["only_lift"]})
+    return _engine({**row, "only_standard": row["only_lift"]})
 
 
 def _predictor(row: Row) -> list[str]:

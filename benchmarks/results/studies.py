@@ -15,7 +15,7 @@ PLANS: Final = ("synthesize",)
 IN_SCENES: Final = ("synthesize", "scene")
 ALL: Final = ("synthesize", "scene", "render")
 #: Beside DATA, SOURCES and BEFORE: what a study may need.
-SERVICE, BROWSER, GPU, TORCH, FIRST_JUDGE = "a service", "a browser", "a GPU", "PyTorch", "mujoco-warp"
+SERVICE, BROWSER, GPU, TORCH, PREFILTER = "a service", "a browser", "a GPU", "PyTorch", "mujoco-warp"
 #: What is written beside the pages and pictures that readers see: not in git, made again by the study.
 RAW: Final = frozenset({".json", ".csv", ".svg", ".sha256"})
 #: Written by hand, so kept.
@@ -163,32 +163,34 @@ STUDIES: Final = (
     ),
     Study(
         "quality",
-        "every metric of raw grasps, by the letter of the protocol",
+        "every metric of candidates, under the unmodified DexGraspBench protocol",
         ("results/quality-*",),
         ("python -m benchmarks.results_tables DATA --work WORK/cells --out OUT/results",),
         (f"python -m benchmarks.results_tables DATA --work WORK/cells {_LITTLE} --out OUT/results",),
         seeds=(7001,),
     ),
     Study(
-        "certificate",
-        "what the referee's cheap levels cost and say",
+        "standard",
+        "what the validator's cheap levels cost and say",
         ("results/certificate.*",),
         (
-            f"python -m benchmarks.certificate DATA --work WORK/cells --objects {_EIGHT} "
+            f"python -m benchmarks.validation_levels DATA --work WORK/cells --objects {_EIGHT} "
             "--out OUT/results/certificate.json",
         ),
-        (f"python -m benchmarks.certificate DATA --work WORK/cells {_LITTLE} --out OUT/results/certificate.json",),
+        (
+            f"python -m benchmarks.validation_levels DATA --work WORK/cells {_LITTLE} --out OUT/results/certificate.json",
+        ),
         seeds=(7001,),
         prints="results/certificate.md",
     ),
     Study(
-        "first-judge",
-        "what the first judge says beside the certificate",
-        ("results/first-judge.*",),
-        ("python -m benchmarks.first_judge DATA --work WORK/cells --out OUT/results/first-judge",),
-        (f"python -m benchmarks.first_judge DATA --work WORK/cells {_LITTLE} --out OUT/results/first-judge",),
+        "prefilter",
+        "what the prefilter says beside the standard level",
+        ("results/first-validate.*",),
+        ("python -m benchmarks.prefilter DATA --work WORK/cells --out OUT/results/first-validate",),
+        (f"python -m benchmarks.prefilter DATA --work WORK/cells {_LITTLE} --out OUT/results/first-validate",),
         seeds=(7001,),
-        needs=(FIRST_JUDGE,),
+        needs=(PREFILTER,),
     ),
     Study(
         "robust",
@@ -200,7 +202,7 @@ STUDIES: Final = (
     ),
     Study(
         "foreign",
-        "planned with one model of a hand, judged in another",
+        "planned with one model of a hand, validated in another",
         ("results/foreign.*",),
         (
             f"python -m benchmarks.foreign DATA --sources SOURCES --work WORK --objects {_SEVEN} "
@@ -240,11 +242,11 @@ STUDIES: Final = (
         prints="results/recipes.md",
     ),
     Study(
-        "tried",
+        "candidates",
         "hands chosen by merit, and by a short test",
         ("results/tried.*",),
-        ("python -m benchmarks.tried DATA --work WORK --out OUT/results",),
-        (f"python -m benchmarks.tried DATA --work WORK {_LITTLE} --out OUT/results",),
+        ("python -m benchmarks.rollouts DATA --work WORK --out OUT/results",),
+        (f"python -m benchmarks.rollouts DATA --work WORK {_LITTLE} --out OUT/results",),
         seeds=(2027,),
     ),
     Study(
@@ -257,7 +259,7 @@ STUDIES: Final = (
     ),
     Study(
         "diversity",
-        "how different raw grasps are",
+        "how different candidates are",
         ("results/diversity.md",),
         (f"python -m benchmarks.diversity DATA --work WORK/cells --objects {_EIGHT}",),
         (f"python -m benchmarks.diversity DATA --work WORK/cells {_LITTLE}",),
@@ -392,7 +394,7 @@ STUDIES: Final = (
             "graspd datasets create --spec examples/tables/tables.toml --objects DATA/objects --yes --wait",
             "graspd datasets export tables -o WORK/tables",
             "bash examples/train_grasp_predictor/data.sh DATA/objects WORK",
-            "graspd datasets create tables-raw --hands barrett --objects DATA/objects --grasps 256 --want raw "
+            "graspd datasets create tables-raw --hands barrett --objects DATA/objects --grasps 256 --want candidates "
             "--scene table --faces all --views 2 --yes --wait",
             "graspd datasets export tables-raw -o WORK/raw",
             f"{_TRAIN} --hand barrett --network WORK/barrett.npz --sheet OUT/results/predictor-barrett.png "
@@ -429,8 +431,8 @@ STUDIES: Final = (
         "scene-ways",
         "what stands in the way of grasps in scenes",
         ("results/scene-ways.md",),
-        ("python -m benchmarks.scene_ways",),
-        ("python -m benchmarks.scene_ways --count 1",),
+        ("python -m benchmarks.scene_trajectories",),
+        ("python -m benchmarks.scene_trajectories --count 1",),
         IN_SCENES,
         prints="results/scene-ways.md",
     ),

@@ -16,7 +16,7 @@ ROWS: dict[str, list[tuple[str, str, int, dict[str, str]]]] = {
     "Now": [
         ("Valid grasps a second", "short", 4, {"": 'max(graspd_grasps_per_second{verdict="valid"})'}),
         ("Workers", "short", 4, {"": 'max(sum without (state) (graspd_workers{state=~"idle|busy"}))'}),
-        ("Tasks that wait", "short", 4, {"": "sum(max by (lane, stage) (graspd_queue_depth))"}),
+        ("Tasks that wait", "short", 4, {"": "sum(max by (priority, stage) (graspd_queue_depth))"}),
         ("Unfinished jobs", "short", 4, {"": "sum(max by (state) (graspd_jobs_unfinished))"}),
         ("Controller", "bool_yes_no", 4, {"": "max(graspd_controller_up)"}),
         ("Damaged objects", "short", 4, {"": "max(graspd_store_damaged)"}),
@@ -29,18 +29,23 @@ ROWS: dict[str, list[tuple[str, str, int, dict[str, str]]]] = {
             {"{{verdict}}": "max by (verdict) (rate(graspd_grasps_total[$__rate_interval]))"},
         ),
         ("Shards a second", "short", 12, {"{{stage}}": "max by (stage) (rate(graspd_shards_total[$__rate_interval]))"}),
-        ("Tasks that wait", "short", 8, {"{{lane}} {{stage}}": "max by (lane, stage) (graspd_queue_depth)"}),
+        ("Tasks that wait", "short", 8, {"{{priority}} {{stage}}": "max by (priority, stage) (graspd_queue_depth)"}),
         (
             "Age of the oldest that waits",
             "s",
             8,
-            {"{{lane}} {{stage}}": "max by (lane, stage) (graspd_queue_oldest_task_seconds)"},
+            {"{{priority}} {{stage}}": "max by (priority, stage) (graspd_queue_oldest_task_seconds)"},
         ),
         ("Oldest job", "s", 8, {"{{state}}": "max by (state) (graspd_job_oldest_seconds)"}),
     ],
     "Workers": [
         ("Workers", "short", 8, {"{{state}}": "max by (state) (graspd_workers)"}),
-        ("Tasks in hand", "short", 8, {"{{stage}}": "sum by (stage) (max by (lane, stage) (graspd_tasks_running))"}),
+        (
+            "Tasks in hand",
+            "short",
+            8,
+            {"{{stage}}": "sum by (stage) (max by (priority, stage) (graspd_tasks_running))"},
+        ),
         ("Oldest signs of life", "s", 8, {"{{worker}}": "topk(5, max by (worker) (graspd_worker_lease_age_seconds))"}),
         (
             "Seconds of a task: half, and 95 of 100",

@@ -16,12 +16,12 @@ import typer
 from examples.train_grasp_predictor import sources
 from examples.train_grasp_predictor.evaluation import FACE, OBJECT, Exam, Proposer, Row, examined
 from examples.train_grasp_predictor.evaluator import Ensemble, learned
-from examples.train_grasp_predictor.practice import Practice
-from examples.train_grasp_predictor.refinement import Refined, joined
-from examples.train_grasp_predictor.samples import Sight, Taught, sights
+from examples.train_grasp_predictor.practice import TrainingRun
+from examples.train_grasp_predictor.refinement import RefinedHands, joined
+from examples.train_grasp_predictor.samples import Sight, TrainedModel, sights
 from examples.train_grasp_predictor.sheet import page
 from examples.train_grasp_predictor.table import markdown
-from examples.train_grasp_predictor.training import SHOWN, Lessons, Trained, train
+from examples.train_grasp_predictor.training import SHOWN, Trained, TrainingData, train
 from examples.train_grasp_predictor.without_network import SQUEEZE, Nearest, across
 from graspd.baselines.learned.network import ProposalNetwork, Proposals, propose, save
 from graspd.service.readers import Shards, open_shards
@@ -33,16 +33,16 @@ from graspd.worker.objects.prepare import object_from_path
 FREE, PEER = "free, filtered", "graspit, filtered"
 ACROSS, NEAREST = "no network: across", "no network: nearest"
 #: What becomes of the first row without its parts, and of the controls with its evaluator.
-ALONE, UNMOVED = "proposals alone", "chosen, not moved"
-JUDGED: Final = {ACROSS: "across, chosen and moved", NEAREST: "nearest, chosen and moved"}
-EXTRAS: Final = (ALONE, UNMOVED, *JUDGED.values())
+DEFAULT_CONTEXT, UNMOVED = "proposals alone", "chosen, not moved"
+VALIDATED: Final = {ACROSS: "across, chosen and moved", NEAREST: "nearest, chosen and moved"}
+EXTRAS: Final = (DEFAULT_CONTEXT, UNMOVED, *VALIDATED.values())
 #: Pictures of each unseen object, and of each unseen face.
 PICTURES: Final = (16, 4)
 #: Of the noise from which grasps are proposed, where nothing chooses among them: of 1, 0.3 and 0.1 what lifted most of
 #: the unseen faces; and where an evaluator does, for each half.
 SPREAD: Final = 0.3
 SPREADS: Final = (0.3, 1.0)
-#: Evaluators that judge together.
+#: Evaluators that validate together.
 MEMBERS: Final = 3
 #: Noise of the depth camera that all are shown.
 NOISE: Final = "stereo"
@@ -79,28 +79,28 @@ class Study:
             found.append(Exam.of(name, FACE, self.models[name], mine, PICTURES[1]))
         return [exam for exam in found if exam.seen]
 
-    def usual(self, obj: str) -> Taught:
+    def usual(self, obj: str) -> TrainedModel:
         return sources.in_scenes(self.shards, obj, self.held, self.count)
 
-    def put_into(self, free: str, obj: str) -> Taught:
+    def put_into(self, free: str, obj: str) -> TrainedModel:
         like, model = self.usual(obj), self.models[obj]
         return sources.put_into(self.others[free], self.hand, model, obj, like, self.held, seed=0)
 
-    def failed(self, obj: str) -> Taught:
+    def failed(self, obj: str) -> TrainedModel:
         own = sources.Held(self.others[sources.FAILED], [obj])
         return sources.with_failures(self.others[sources.FAILED], obj, own, self.count)
 
-    def makers(self) -> dict[str, Callable[[str], Taught]]:
+    def makers(self) -> dict[str, Callable[[str], TrainedModel]]:
         """From a source to what it teaches of an object; the first is what the others are compared with."""
-        made: dict[str, Callable[[str], Taught]] = {sources.SCENES: self.usual}
+        made: dict[str, Callable[[str], TrainedModel]] = {sources.SCENES: self.usual}
         made |= {name: partial(self.put_into, name) for name in (FREE, PEER) if name in self.others}
         return made
 
-    def ablations(self) -> dict[str, Callable[[str], Taught]]:
-        def spread(obj: str, *, alike: bool) -> Taught:
+    def ablations(self) -> dict[str, Callable[[str], TrainedModel]]:
+        def spread(obj: str, *, alike: bool) -> TrainedModel:
             return sources.spread(self.usual(obj), self.held, self.count // 4, alike=alike)
 
-        made: dict[str, Callable[[str], Taught]] = {
+        made: dict[str, Callable[[str], TrainedModel]] = {
             sources.QUARTER: lambda obj: sources.first(self.usual(obj), self.count // 4),
             sources.SIXTEENTH: lambda obj: sources.first(self.usual(obj), self.count // 16),
             sources.ALIKE: lambda obj: spread(obj, alike=True),
@@ -120,7 +120,9 @@ def main(
     hand: Annotated[str, Option(help="URDF or built-in hand of the data.")] = "barrett",
     free: Annotated[str, Option(help="Shards of valid grasps of free objects, to be put on tables and filtered.")] = "",
     peer: Annotated[str, Option(help="The same of the graspit baseline.")] = "",
-    raw: Annotated[str, Option(help="Shards planned on tables with `want raw`, with views: failures told.")] = "",
+    raw: Annotated[
+        str, Option(help="Shards planned on tables with `want candidates`, with views: failures told.")
+    ] = "",
     grasps: Annotated[int, Option(help="Grasps of each object, at most.")] = 256,
     steps: Annotated[int, Option(help="Training steps of each network.")] = 3000,
     seeds: Annotated[int, Option(help="Networks trained on each source.")] = 3,
@@ -164,7 +166,7 @@ def main(
 
 def _proposers(
     study: Study,
-    wanted: Mapping[str, Callable[[str], Taught]],
+    wanted: Mapping[str, Callable[[str], TrainedModel]],
     rows: Sequence[Row],
     *,
     seeds: int,
@@ -182,7 +184,7 @@ def _proposers(
         if not missing:
             continue
         given = [make(obj) for obj in study.objects]
-        lessons, judged = Lessons.of(study.pictures_for(source), given), None
+        lessons, validated = TrainingData.of(study.pictures_for(source), given), None
         controls = _without(study, given) if source == sources.SCENES and not plain else {}
         facts: Row = {"grasps": sum(map(len, given)), "views": len(lessons)}
         for seed in missing:
@@ -195,13 +197,13 @@ def _proposers(
                 yield source, seed, told, _by(made, (SPREAD,))
                 continue
             by = _by(made, SPREADS)
-            judged = judged or _judges(Practice(study.hand, study.models, given, study.seen, by))
-            refined = Refined(study.hand, judged[0], by)
-            told |= {"tries": judged[1]}
+            validated = validated or _validates(TrainingRun(study.hand, study.models, given, study.seen, by))
+            refined = RefinedHands(study.hand, validated[0], by)
+            told |= {"tries": validated[1]}
             whole: dict[str, Proposer] = {source: refined}
             if source == sources.SCENES:
-                whole |= {ALONE: _by(made, (SPREAD,)), UNMOVED: replace(refined, rounds=())}
-                whole |= {JUDGED[name]: replace(refined, source=other) for name, other in controls.items()}
+                whole |= {DEFAULT_CONTEXT: _by(made, (SPREAD,)), UNMOVED: replace(refined, rounds=())}
+                whole |= {VALIDATED[name]: replace(refined, source=other) for name, other in controls.items()}
             for name in parts:
                 if (study.hand.name, name, seed) not in done:
                     yield name, seed, told, whole[name]
@@ -211,13 +213,13 @@ def _proposers(
                     yield name, seed, {"grasps": facts["grasps"] if name == NEAREST else 0}, proposer
 
 
-def _judges(practice: Practice) -> tuple[Ensemble, int]:
-    """What a source's first network is practised with until it can judge them all, and by how many tries."""
+def _validates(practice: TrainingRun) -> tuple[Ensemble, int]:
+    """What a source's first network is practised with until it can validate them all, and by how many candidates."""
     tries = practice.tries(seed=0)
     return Ensemble(learned(practice.hand, tries, seed=seed) for seed in range(MEMBERS)), len(tries)
 
 
-def _without(study: Study, given: Sequence[Taught]) -> dict[str, Proposer]:
+def _without(study: Study, given: Sequence[TrainedModel]) -> dict[str, Proposer]:
     nearest = Nearest(study.seen, given)
     return {
         NEAREST: nearest.propose,

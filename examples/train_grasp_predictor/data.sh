@@ -11,6 +11,6 @@ for hand in barrett allegro; do
         [ -f "$out/free/$hand-$name.h5" ] ||
             graspd synth --hand $hand --object "$mesh" -n 160 -o "$out/free/$hand-$name.h5" || [ $? = 3 ] # fewer
         [ -f "$out/peer/$hand-$name.h5" ] || graspd synth --hand $hand --object "$mesh" --method graspit \
-            --option keep=20 --want raw -n 192 -o "$out/peer/$hand-$name.h5" || [ $? = 3 ]
+            --option keep=20 --want candidates -n 192 -o "$out/peer/$hand-$name.h5" || [ $? = 3 ]
     done
 done

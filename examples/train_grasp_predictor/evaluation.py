@@ -69,7 +69,7 @@ def examined(
             "object": exam.object,
             "kind": exam.kind,
             "pictures": len(exam.seen),
-            "tried": len(lifted.lift),
+            "candidates": len(lifted.lift),
             "lift": float(lifted.lift.mean()),
             "best": float(lifted.lift[best].mean()),
             "hard": float(lifted.hard.mean()),

@@ -79,7 +79,7 @@ class Hands:
 
 
 @dataclass(frozen=True)
-class Tries:
+class Attempts:
     """Hands that were carried out for some pictures, and what became of them."""
 
     points: torch.Tensor
@@ -93,7 +93,7 @@ class Tries:
     """(N,) 0 or 1."""
 
     @classmethod
-    def of(cls, hand: HandModel, seen: list[Sight], hands: list[Proposals], lifted: NDArray[np.bool_]) -> Tries:
+    def of(cls, hand: HandModel, seen: list[Sight], hands: list[Proposals], lifted: NDArray[np.bool_]) -> Attempts:
         """Hands of each picture, and whether each, in their order, lifted."""
         picture = np.repeat(np.arange(len(seen)), [len(one) for one in hands])
         parts = (np.concatenate([np.asarray(getattr(one, name)) for one in hands]) for name in vars(hands[0]))
@@ -102,7 +102,7 @@ class Tries:
         )
         return cls(points, normals, torch.from_numpy(picture), Hands.of(hand, Proposals(*parts)), _tensor(lifted))
 
-    def and_those(self, others: Tries) -> Tries:
+    def and_those(self, others: Attempts) -> Attempts:
         """These tries and others."""
         hands = Hands(
             *(
@@ -110,7 +110,7 @@ class Tries:
                 for part, more in zip(vars(self.hands).values(), vars(others.hands).values(), strict=True)
             )
         )
-        return Tries(
+        return Attempts(
             torch.cat([self.points, others.points]),
             torch.cat([self.normals, others.normals]),
             torch.cat([self.picture, others.picture + len(self.points)]),
@@ -176,8 +176,8 @@ class Ensemble(nn.Module):
         return torch.stack([member(points, normals, hands) for member in self.members]).mean(dim=0)
 
 
-def learned(hand: HandModel, tries: Tries, *, seed: int, steps: int = STEPS, rate: float = 2e-3) -> Evaluator:
-    """An evaluator that has seen so many batches of the tries."""
+def learned(hand: HandModel, tries: Attempts, *, seed: int, steps: int = STEPS, rate: float = 2e-3) -> Evaluator:
+    """An evaluator that has seen so many batches of the candidates."""
     torch.manual_seed(seed)
     evaluator = Evaluator(hand)
     optimiser = torch.optim.AdamW(evaluator.parameters(), lr=rate, weight_decay=1e-2)

@@ -1,7 +1,7 @@
 """From proposals to lifts: what a robot does that knows its hand, the table and what its camera saw, and nothing else.
 
 A proposal is carried out open loop: from a standoff along its way in, fingers opened wider than it says where the table
-has room for that, then to its grasp and its squeeze, then up. Only what the table forbids is mended before: a hand that
+has room for that, then to its grasp and its squeeze, then up. Only what the table forbids is fixed before: a hand that
 would stand in it is raised. The mesh of the object is the simulator's alone.
 """
 
@@ -23,11 +23,11 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.table import measure
+from graspd.worker.simulation.environment import CLEAR_M, RISE_M, STANDOFF_M, UP, Environment, Obstacle, Placed
 from graspd.worker.simulation.obstacles import obstacle_room
-from graspd.worker.simulation.surroundings import CLEAR_M, RISE_M, STANDOFF_M, UP, Obstacle, Placed, Surroundings
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import LiftOutcome
-from graspd.worker.validation.lifting import judge_lifts
+from graspd.worker.validation.lifting import validate_lifts
 
 #: Fingers open by the first of these shares of their range, beyond the proposed pregrasp, for which there is room.
 OPENED: Final = (0.15, 0.1, 0.05, 0.0)
@@ -116,10 +116,10 @@ def way_in(hands: Proposals) -> Floats:
     return poses
 
 
-def table() -> Surroundings:
+def table() -> Environment:
     """What the robot knows to stand around: a table whose top is z = 0, which fingertips may touch."""
     top = Obstacle.half_space([0.0, 0.0, 1.0], 0.0)
-    return Surroundings((Obstacle(top.planes, top.corners, tips_m=0.0),), UP)
+    return Environment((Obstacle(top.planes, top.corners, tips_m=0.0),), UP)
 
 
 def _room_on_the_way(hand: HandModel, hands: Proposals, opened: Floats) -> Floats:
@@ -190,11 +190,11 @@ def carried_out(
         scene=index,
     )
     placed = Placed(table().obstacles, lying, index)
-    lifts = judge_lifts(hand, obj, grasps, placed, pieces=pieces)
+    lifts = validate_lifts(hand, obj, grasps, placed, pieces=pieces)
     lift, hard = lifts.outcome == LiftOutcome.LIFTED, np.zeros(len(own), bool)
     rows = np.flatnonzero(lift)
     if len(rows):
-        again = judge_lifts(hand, obj, grasps.take(rows), placed.take(rows), hard=True, pieces=pieces)
+        again = validate_lifts(hand, obj, grasps.take(rows), placed.take(rows), hard=True, pieces=pieces)
         hard[rows] = again.success == 1
     found = np.full(len(own), np.nan)
     if epsilon:

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from examples.train_grasp_predictor.execution import table
-from examples.train_grasp_predictor.samples import Floats, Scene, Taught, rows_of
+from examples.train_grasp_predictor.samples import Floats, Scene, TrainedModel, rows_of
 from graspd.service.readers import Shards
 from graspd.service.store.shards import read_shard
 from graspd.worker.grasps import GraspSet, joined
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.scenes.way import plan_way
+from graspd.worker.scenes.trajectory import plan_way
+from graspd.worker.simulation.environment import Placed
 from graspd.worker.simulation.obstacles import MARGIN_M, obstacle_room
-from graspd.worker.simulation.surroundings import Placed
 
 #: Grasps whose way is planned at a time.
 _TOGETHER: Final = 32
@@ -44,7 +44,7 @@ def filtered(
     wanted: NDArray[np.intp],
     *,
     seed: int,
-) -> Taught:
+) -> TrainedModel:
     """As many grasps as other data have in the same scenes, as far as there are.
 
     What a scene has no grasp for is made up for in the others of the object.
@@ -81,14 +81,14 @@ def filtered(
     return _to_be_proposed([scenes[s] for s in owner], rows_of(joined(parts), object_pose[owner]))
 
 
-def nothing(hand: HandModel) -> Taught:
+def nothing(hand: HandModel) -> TrainedModel:
     """No grasp."""
     return _to_be_proposed([], np.zeros((0, 12 + 3 * len(hand.joint_names))))
 
 
-def _to_be_proposed(scenes: Sequence[Scene], rows: Floats) -> Taught:
+def _to_be_proposed(scenes: Sequence[Scene], rows: Floats) -> TrainedModel:
     """Grasps that nobody lifted, which all count alike."""
-    return Taught(scenes, rows, np.ones(len(rows)), np.zeros(len(rows), bool), np.ones(len(rows)))
+    return TrainedModel(scenes, rows, np.ones(len(rows)), np.zeros(len(rows), bool), np.ones(len(rows)))
 
 
 def _stands(free: GraspSet, order: NDArray[np.intp], pose: Floats, hand: HandModel) -> NDArray[np.bool_]:

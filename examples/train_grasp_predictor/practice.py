@@ -1,7 +1,7 @@
 """What an evaluator learns from: hands that are carried out for pictures that its network was trained on.
 
-First proposals of the network and moved grasps of its data; then, round by round, what an evaluator of the tries so
-far chooses and moves: where it believes most, its errors cost most (policies, too, are taught where they themselves
+First proposals of the network and moved grasps of its data; then, round by round, what an evaluator of the candidates
+so far chooses and moves: where it believes most, its errors cost most (policies, too, are taught where they themselves
 lead to: DAgger, Ross et al., AISTATS 2011).
 """
 
@@ -15,10 +15,10 @@ from typing import Final
 import numpy as np
 
 from examples.train_grasp_predictor.evaluation import Proposer
-from examples.train_grasp_predictor.evaluator import Tries, learned
+from examples.train_grasp_predictor.evaluator import Attempts, learned
 from examples.train_grasp_predictor.execution import carried_out, made_ready
-from examples.train_grasp_predictor.refinement import Refined, joined, moved
-from examples.train_grasp_predictor.samples import Floats, Sight, Taught, each_scene
+from examples.train_grasp_predictor.refinement import RefinedHands, joined, moved
+from examples.train_grasp_predictor.samples import Floats, Sight, TrainedModel, each_scene
 from graspd.baselines.learned.network import Proposals, decode
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -43,29 +43,29 @@ _HandsFor = Callable[[Floats, Sight, np.random.Generator], Proposals]
 
 
 @dataclass(frozen=True)
-class Practice:
+class TrainingRun:
     """Hands carried out in the scenes of one source's data."""
 
     hand: HandModel
     models: Mapping[str, ObjectModel]
     """Objects by name."""
-    given: Sequence[Taught]
+    given: Sequence[TrainedModel]
     """The data, object by object."""
     seen: Sequence[Sight]
     """Pictures; those whose scene has grasps are practised with."""
     source: Proposer
     """What the network proposes."""
 
-    def tries(self, *, seed: int) -> Tries:
+    def tries(self, *, seed: int) -> Attempts:
         """All rounds."""
         rng = np.random.default_rng(seed)
-        tries = self.tried(self.beginning, PICTURES, rng)
+        tries = self.candidates(self.beginning, PICTURES, rng)
         for _ in range(AGAIN):
-            refined = Refined(self.hand, learned(self.hand, tries, seed=seed), self.source, begun=AMONG)
-            tries = tries.and_those(self.tried(partial(_chosen, refined), LATER, rng))
+            refined = RefinedHands(self.hand, learned(self.hand, tries, seed=seed), self.source, begun=AMONG)
+            tries = tries.and_those(self.candidates(partial(_chosen, refined), LATER, rng))
         return tries
 
-    def tried(self, hands_for: _HandsFor, pictures: int, rng: np.random.Generator) -> Tries:
+    def candidates(self, hands_for: _HandsFor, pictures: int, rng: np.random.Generator) -> Attempts:
         """What becomes of hands for so many pictures of each object."""
         sights: list[Sight] = []
         hands: list[Proposals] = []
@@ -82,7 +82,7 @@ class Practice:
             lifted.append(carried_out(self.hand, obj, decompose(obj), ready, chosen, epsilon=False).lift)
             sights += chosen
             hands += [one.hands for one in ready]
-        return Tries.of(self.hand, sights, hands, np.concatenate(lifted))
+        return Attempts.of(self.hand, sights, hands, np.concatenate(lifted))
 
     def beginning(self, rows: Floats, sight: Sight, rng: np.random.Generator) -> Proposals:
         """What the first round tries: proposals, then moved grasps of the scene."""
@@ -90,5 +90,5 @@ class Practice:
         return joined(self.source(sight, PROPOSED, rng), moved(self.hand, drawn, np.resize(SIZES, GRASPS), rng))
 
 
-def _chosen(refined: Refined, rows: Floats, sight: Sight, rng: np.random.Generator) -> Proposals:
+def _chosen(refined: RefinedHands, rows: Floats, sight: Sight, rng: np.random.Generator) -> Proposals:
     return refined(sight, CHOSEN, rng)

@@ -33,7 +33,7 @@ BEGUN: Final = 96
 
 
 @dataclass(frozen=True)
-class Refined:
+class RefinedHands:
     """A `Proposer` of what an evaluator has chosen."""
 
     hand: HandModel

@@ -72,7 +72,7 @@ def sights(shards: Shards, *, noise: str) -> list[Sight]:
 
 
 @dataclass(frozen=True)
-class Taught:
+class TrainedModel:
     """Grasps of one object in its scenes."""
 
     scenes: Sequence[Scene]
@@ -89,12 +89,12 @@ class Taught:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def take(self, which: NDArray[np.intp]) -> Taught:
+    def take(self, which: NDArray[np.intp]) -> TrainedModel:
         scenes = [self.scenes[i] for i in which]
-        return Taught(scenes, self.rows[which], self.label[which], self.hard[which], self.weight[which])
+        return TrainedModel(scenes, self.rows[which], self.label[which], self.hard[which], self.weight[which])
 
 
-def taught(shards: Shards, obj: str, *, valid: bool = True) -> Taught:
+def taught(shards: Shards, obj: str, *, valid: bool = True) -> TrainedModel:
     """The grasps of an object that were planned in its scenes, in the order of their batches."""
     scenes: list[Scene] = []
     rows, label, hard = [], [], []
@@ -109,7 +109,7 @@ def taught(shards: Shards, obj: str, *, valid: bool = True) -> Taught:
         rows.append(rows_of(GraspSet.from_columns(shard.arrays).take(kept), poses_of(shard)[number]))
         label.append(np.asarray(shard["quality/valid"], float)[kept])
         hard.append(np.asarray(shard["quality/lift_hard"])[kept] == 1)
-    return Taught(scenes, np.concatenate(rows), np.concatenate(label), np.concatenate(hard), np.ones(len(scenes)))
+    return TrainedModel(scenes, np.concatenate(rows), np.concatenate(label), np.concatenate(hard), np.ones(len(scenes)))
 
 
 def poses_of(shard: Shard) -> Floats:
@@ -136,7 +136,7 @@ def apart(faces: Floats) -> int:
     return int(np.argmin(cosine.max(axis=1)))
 
 
-def each_scene(taught_here: Taught) -> Iterator[tuple[Scene, NDArray[np.intp]]]:
+def each_scene(taught_here: TrainedModel) -> Iterator[tuple[Scene, NDArray[np.intp]]]:
     """Scenes with the rows of their grasps."""
     rows: dict[Scene, list[int]] = {}
     for row, scene in enumerate(taught_here.scenes):

@@ -9,13 +9,13 @@ from typing import Final
 import numpy as np
 
 from examples.train_grasp_predictor.filtered import filtered, nothing, valid_grasps
-from examples.train_grasp_predictor.samples import Floats, Scene, Taught, apart, each_scene, poses_of, taught
+from examples.train_grasp_predictor.samples import Floats, Scene, TrainedModel, apart, each_scene, poses_of, taught
 from graspd.service.model.transforms import quat_conjugate, quat_rotate
 from graspd.service.readers import Shards
 from graspd.service.store.shards import read_shard
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.simulation.surroundings import UP
+from graspd.worker.simulation.environment import UP
 
 #: Sizes of the ablation beside the usual one, and other quarters than the first.
 QUARTER, SIXTEENTH = "scenes, a quarter", "scenes, a sixteenth"
@@ -45,23 +45,23 @@ class Held:
     def back(self, scene: Scene) -> bool:
         return self.face.get(scene.object) == scene.number
 
-    def trained(self, given: Taught) -> Taught:
+    def trained(self, given: TrainedModel) -> TrainedModel:
         return given.take(np.array([i for i, scene in enumerate(given.scenes) if not self.back(scene)], np.intp))
 
 
-def in_scenes(shards: Shards, obj: str, held: Held, count: int) -> Taught:
+def in_scenes(shards: Shards, obj: str, held: Held, count: int) -> TrainedModel:
     """The first grasps of an object that were planned in its scenes."""
     return first(held.trained(taught(shards, obj)), count)
 
 
-def first(given: Taught, count: int) -> Taught:
+def first(given: TrainedModel, count: int) -> TrainedModel:
     """The first grasps; all, where there are fewer."""
     return given.take(np.arange(min(count, len(given))))
 
 
 def put_into(
-    free: Shards, hand: HandModel, obj: ObjectModel, name: str, like: Taught, held: Held, *, seed: int
-) -> Taught:
+    free: Shards, hand: HandModel, obj: ObjectModel, name: str, like: TrainedModel, held: Held, *, seed: int
+) -> TrainedModel:
     """As many free grasps as `like` has, put into its scenes and filtered."""
     scenes, counts = zip(*((scene, len(rows)) for scene, rows in each_scene(like)), strict=True)
     poses = np.array([held.poses[scene] for scene in scenes])
@@ -69,7 +69,7 @@ def put_into(
     return filtered(hand, obj, grasps, scenes, poses, np.array(counts), seed=seed) if grasps else nothing(hand)
 
 
-def spread(given: Taught, held: Held, count: int, *, alike: bool) -> Taught:
+def spread(given: TrainedModel, held: Held, count: int, *, alike: bool) -> TrainedModel:
     """`count` grasps of an object that resemble one another, or do not: the nearest to the one in their middle, or each
     the farthest from those before it."""
     place = _of_object(given, held)
@@ -84,7 +84,7 @@ def spread(given: Taught, held: Held, count: int, *, alike: bool) -> Taught:
     return given.take(np.array(chosen, np.intp))
 
 
-def _of_object(given: Taught, held: Held) -> Floats:
+def _of_object(given: TrainedModel, held: Held) -> Floats:
     """(K, ...) hands' places in the object's frame: positions [m], columns of rotations and joints as lengths."""
     pose = np.array([held.poses[scene] for scene in given.scenes])
     back = quat_conjugate(pose[:, 3:])
@@ -94,11 +94,11 @@ def _of_object(given: Taught, held: Held) -> Floats:
     return np.concatenate([position, *(_RADIAN_M * part for part in (*columns, joints))], axis=1)
 
 
-def with_failures(shards: Shards, obj: str, held: Held, count: int) -> Taught:
-    """The first grasps of an object that were planned in its scenes and judged, whatever the verdict."""
+def with_failures(shards: Shards, obj: str, held: Held, count: int) -> TrainedModel:
+    """The first grasps of an object that were planned in its scenes and validated, whatever the verdict."""
     return first(held.trained(taught(shards, obj, valid=False)), count)
 
 
-def by_friction(given: Taught) -> Taught:
+def by_friction(given: TrainedModel) -> TrainedModel:
     """The same grasps, those shown more often that lift at half the friction."""
     return replace(given, weight=np.where(given.hard, HARD_WEIGHT, 1.0))

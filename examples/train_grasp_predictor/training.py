@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from examples.train_grasp_predictor.network import UNIT_M, Proposer
-from examples.train_grasp_predictor.samples import Sight, Taught, each_scene
+from examples.train_grasp_predictor.samples import Sight, TrainedModel, each_scene
 
 #: Clouds of a step, points that a network is shown of each, and grasps of each.
 BATCH: Final = 24
@@ -38,7 +38,7 @@ class Trained:
 
 
 @dataclass(frozen=True)
-class Lessons:
+class TrainingData:
     """All pictures that show a scene with grasps, as tensors."""
 
     points: torch.Tensor
@@ -52,7 +52,7 @@ class Lessons:
     weight: list[torch.Tensor]
 
     @classmethod
-    def of(cls, seen: Sequence[Sight], taught: Sequence[Taught]) -> Lessons:
+    def of(cls, seen: Sequence[Sight], taught: Sequence[TrainedModel]) -> TrainingData:
         """Pictures of scenes that have grasps."""
         of_scene = {scene: (part, which) for part in taught for scene, which in each_scene(part)}
         kept = [sight for sight in seen if sight.scene in of_scene]
@@ -73,7 +73,7 @@ class Lessons:
         return len(self.rows)
 
 
-def train(lessons: Lessons, *, steps: int, seed: int, rate: float = 1e-3) -> Trained:
+def train(lessons: TrainingData, *, steps: int, seed: int, rate: float = 1e-3) -> Trained:
     """A network that has seen so many batches of the lessons.
 
     Each time a cloud is shown it is turned about the vertical with its grasps, thinned anew and shaken a little.
@@ -110,7 +110,7 @@ def _weights(size: int) -> torch.Tensor:
     return weights / weights.mean()
 
 
-def _batch(lessons: Lessons) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+def _batch(lessons: TrainingData) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """Points (B, P, 7), heights (B,), rows (B G, D) and labels (B G,)."""
     chosen = torch.randint(len(lessons), (BATCH,))
     angle = _angles(BATCH)

@@ -9,12 +9,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from examples.train_grasp_predictor.execution import tighter, wider
-from examples.train_grasp_predictor.samples import Floats, Sight, Taught, each_scene
+from examples.train_grasp_predictor.samples import Floats, Sight, TrainedModel, each_scene
 from graspd.baselines.learned.network import Proposals, decode
 from graspd.service.model.transforms import quat_from_matrix, quat_rotate
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.oppositions import oppositions_of
-from graspd.worker.simulation.surroundings import UP
+from graspd.worker.hands.pinch_postures import oppositions_of
+from graspd.worker.simulation.environment import UP
 
 #: Draws for each hand that is kept, and the farthest that a hand leans from straight down [rad].
 DRAWS: Final = 8
@@ -72,7 +72,7 @@ def _frame(x: Floats, towards: Floats) -> Floats:
 class Nearest:
     """The grasps of the picture that looks most alike after a turn about the vertical."""
 
-    def __init__(self, seen: Sequence[Sight], taught: Sequence[Taught]) -> None:
+    def __init__(self, seen: Sequence[Sight], taught: Sequence[TrainedModel]) -> None:
         """
         Args:
             seen: pictures; those whose scene has grasps are kept.

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from graspd.exchange.lots import plain_name, prim_names
+from graspd.exchange.plan import plain_name, prim_names
 from graspd.exchange.robots.arm import Arm, Description
-from graspd.exchange.robots.execution import Executions, Path, Trajectory
+from graspd.exchange.robots.execution import Executions, Path, RobotTrajectory
 from graspd.exchange.robots.reach import World
 from graspd.service.model.transforms import Floats, compose, invert
 
@@ -33,7 +33,7 @@ class Bundle:
     """Grasps with their trajectories, ready to be written."""
 
     found: Executions
-    trajectories: list[Trajectory]
+    trajectories: list[RobotTrajectory]
     """One for each grasp; its joints are the arm's, if there is one, then the hand's."""
     description: Description
     carrier: Carrier | None = None

@@ -22,8 +22,8 @@ from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, JointType
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.scenes.way import plan_free_way
-from graspd.worker.simulation.surroundings import STANDOFF_M, Placed
+from graspd.worker.scenes.trajectory import plan_free_way
+from graspd.worker.simulation.environment import STANDOFF_M, Placed
 
 #: Postures of a grasp in their order. The hand comes from `standoff` to `arrival` with open fingers, takes the shape of
 #: `pregrasp`, closes to `grasp`, is commanded to `squeeze`, and rises to `lift`.
@@ -262,7 +262,7 @@ class Path:
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class RobotTrajectory:
     """K points of all motions of a grasp, in time."""
 
     joint_names: tuple[str, ...]
@@ -298,7 +298,7 @@ def straight_paths(found: Executions, row: int, points: int = 2) -> list[Path]:
     return paths
 
 
-def timed(paths: Sequence[Path], names: Sequence[str], velocity: Floats, *, speed: float) -> Trajectory:
+def timed(paths: Sequence[Path], names: Sequence[str], velocity: Floats, *, speed: float) -> RobotTrajectory:
     """Motions one after the other, each at rest at both ends.
 
     Args:
@@ -331,7 +331,7 @@ def timed(paths: Sequence[Path], names: Sequence[str], velocity: Floats, *, spee
     found, when = np.concatenate(joints), np.array(time)
     rate = np.gradient(found, when, axis=0)
     rate[[0, -1]] = 0.0
-    return Trajectory(tuple(names), tuple(phase), when, np.concatenate(pose), found, rate)
+    return RobotTrajectory(tuple(names), tuple(phase), when, np.concatenate(pose), found, rate)
 
 
 def _slowness(path: Path, velocity: Floats) -> float:

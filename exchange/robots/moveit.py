@@ -14,9 +14,9 @@ from typing import Any, Final
 import numpy as np
 
 from graspd.exchange.imported import mesh_file
-from graspd.exchange.lots import plain_name
+from graspd.exchange.plan import plain_name
 from graspd.exchange.robots.bundle import Bundle, dump_yaml, numbers
-from graspd.exchange.robots.execution import Trajectory
+from graspd.exchange.robots.execution import RobotTrajectory
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
 
@@ -120,7 +120,7 @@ def _duration(seconds: float) -> dict[str, int]:
     return {"sec": whole // 10**9, "nanosec": whole % 10**9}
 
 
-def _trajectory(bundle: Bundle, path: Trajectory) -> dict[str, Any]:
+def _trajectory(bundle: Bundle, path: RobotTrajectory) -> dict[str, Any]:
     """A RobotTrajectory: the joints, and beside them the way of the tool frame as that of a floating joint."""
     kept = [k for k, name in enumerate(path.joint_names) if name not in bundle.description.mimics]
     names = [path.joint_names[k] for k in kept]

@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
-from graspd.exchange.lots import plain_name
+from graspd.exchange.plan import plain_name
 from graspd.exchange.robots.bundle import Bundle, Carrier
 from graspd.exchange.robots.execution import POSTURES, Executions
 from graspd.service.model.matter import ACCELERATION
@@ -32,12 +32,12 @@ _SPEC_NAMES: Final = {"vertex": "uservert"}
 
 
 def write_scene(bundle: Bundle, folder: Path, pieces: ConvexPieces) -> list[Path]:
-    """Write `scene.xml`, which needs no other file, and `replay.py`, which plays and judges its grasps.
+    """Write `scene.xml`, which needs no other file, and `replay.py`, which plays and validates its grasps.
 
     Args:
         bundle: the grasps.
         folder: where to write.
-        pieces: the object's convex pieces, as the referee has them.
+        pieces: the object's convex pieces, as the validator has them.
     """
     found = bundle.found
     folder.mkdir(parents=True, exist_ok=True)
@@ -147,7 +147,7 @@ def _key(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, s
 
 
 def _names(hand: HandModel) -> Mapping[str, str]:
-    """The hand's own names for those of the referee's model; `object`, `supports`, `root` and `mocap` are taken."""
+    """The hand's own names for those of the validator's model; `object`, `supports`, `root` and `mocap` are taken."""
     taken = {"object", "supports", "root", "mocap", "world"}
     found: dict[str, str] = {}
     for prefix, names in (("body", enumerate(hand.body_names)), ("dof", enumerate(hand.dof_names))):

@@ -13,9 +13,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from graspd.exchange.lots import plain_name, prim_names
+from graspd.exchange.plan import plain_name, prim_names
 from graspd.exchange.robots.bundle import Bundle
-from graspd.exchange.robots.execution import Executions, Trajectory, posed_bodies
+from graspd.exchange.robots.execution import Executions, RobotTrajectory, posed_bodies
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, pose_to_matrix
 from graspd.worker.hands.kinematics import body_poses
@@ -25,7 +25,7 @@ from graspd.worker.hands.robot import Ints
 from graspd.worker.objects.glb_document import Document, plain
 from graspd.worker.objects.mesh_geometry import corner_normals
 from graspd.worker.rendering.hands import drawn_bodies, hand_parts
-from graspd.worker.simulation.surroundings import Obstacle
+from graspd.worker.simulation.environment import Obstacle
 
 #: From z up to glTF's y up: a quarter turn about x, as x y z w.
 _UPRIGHT: Final = [-float(np.sqrt(0.5)), 0.0, 0.0, float(np.sqrt(0.5))]
@@ -182,13 +182,13 @@ def write_usd(bundle: Bundle, folder: Path) -> list[Path]:
     return written
 
 
-def _bodies(found: Executions, trajectory: Trajectory) -> Floats:
+def _bodies(found: Executions, trajectory: RobotTrajectory) -> Floats:
     """(K, L, 7) bodies of the hand at each point; the hand's joints are the last of the trajectory's."""
     joints = trajectory.joints[:, -len(found.hand.joint_names) :]
     return body_poses(found.hand, trajectory.hand_pose, joints)
 
 
-def _object_poses(found: Executions, row: int, trajectory: Trajectory) -> Floats:
+def _object_poses(found: Executions, row: int, trajectory: RobotTrajectory) -> Floats:
     """(K, 7) of the object: at rest, then carried by the lift."""
     poses = np.tile(found.object_pose[row], (len(trajectory.time), 1))
     lifting = np.array([phase == "lift" for phase in trajectory.phase])

@@ -20,9 +20,9 @@ from graspd.exchange.robots.execution import Executions, Path, straight_paths
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
 from graspd.worker.engines.mujoco_warnings import ARENA
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.hands.model import HandModel, JointType
-from graspd.worker.run import ALONE, Run
-from graspd.worker.simulation.surroundings import Obstacle
+from graspd.worker.simulation.environment import Obstacle
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.model import add_shape
 
@@ -43,7 +43,7 @@ REASONS: Final = ("out of reach", "way not possible", "collision")
 
 
 @dataclass
-class Reached:
+class ReachResult:
     """What an arm can do of N grasps."""
 
     rows: list[int] = field(default_factory=list)
@@ -60,7 +60,7 @@ class Reached:
         return len(self.rows) / max(1, self.tried)
 
 
-class Reach:
+class ReachSearch:
     """Searches the ways of one arm with one hand around one object. Not for several threads at once."""
 
     def __init__(self, arm: Arm, base: Floats, found: Executions, pieces: ConvexPieces) -> None:
@@ -79,9 +79,9 @@ class Reach:
         self._limits = [mink.ConfigurationLimit(self._model)]
         self._order = np.array([int(self._model.joint(f"arm{b}").qposadr[0]) for b in arm.model.joint_body], np.intp)
 
-    def all(self, wanted: int = 0, run: Run = ALONE) -> Reached:
+    def all(self, wanted: int = 0, run: ExecutionContext = DEFAULT_CONTEXT) -> ReachResult:
         """All grasps, or in their order until so many are found."""
-        reached = Reached()
+        reached = ReachResult()
         for row in range(len(self.found)):
             run.check("the search of an arm's ways")
             reached.tried += 1

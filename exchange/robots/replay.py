@@ -1,4 +1,4 @@
-"""Replay exported grasps in MuJoCo and judge them: a script that needs mujoco and numpy, and nothing of graspd.
+"""Replay exported grasps in MuJoCo and validate them: a script that needs mujoco and numpy, and nothing of graspd.
 
     python replay.py scene.xml                 every grasp, a line each
     python replay.py scene.xml --view [NAME]   watch one
@@ -56,7 +56,7 @@ class Replay:
     def reset(self, grasp: str, posture: str) -> None:
         mujoco.mj_resetDataKeyframe(self.model, self.data, self.key(grasp, posture).id)
 
-    def judge(self, grasp: str) -> str:
+    def validate(self, grasp: str) -> str:
         """What becomes of a grasp: `held`, or what went wrong."""
         self.reset(grasp, "pregrasp")
         start = self.data.qpos[self.at : self.at + 7].copy()
@@ -109,7 +109,8 @@ class Replay:
             self.run(STAGE_S)
 
     def hold(self, goal: Any) -> str:
-        """As the referee holds: over as soon as the present rates keep the object in half of its limits to the end."""
+        """As the validator holds: over as soon as the present rates keep the object in half of its limits to the
+        end."""
         self.run(FIRST_LOOK_S - LOOK_S)
         elapsed, before = FIRST_LOOK_S - LOOK_S, self.offset(goal)
         while elapsed < HOLD_S - 1e-9:
@@ -210,7 +211,7 @@ def view(path: str, name: str) -> None:
 
         replay.watch = watch
         while window.is_running():
-            replay.judge(grasp)
+            replay.validate(grasp)
 
 
 def main() -> None:
@@ -224,7 +225,7 @@ def main() -> None:
         view(options.scene, options.view)
         return
     replay = Replay(options.scene, options.full)
-    found = {grasp: replay.judge(grasp) for grasp in replay.grasps}
+    found = {grasp: replay.validate(grasp) for grasp in replay.grasps}
     if options.json:
         print(json.dumps(found))
     else:

@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from graspd.exchange.lots import plain_name, prim_name
+from graspd.exchange.plan import plain_name, prim_name
 from graspd.exchange.robots.bundle import Bundle, dump_yaml, numbers
 from graspd.exchange.robots.execution import POSTURES
 from graspd.service.model.transforms import POSE_PARTS, compose, invert
@@ -59,14 +59,14 @@ def _grasps(bundle: Bundle) -> Iterable[list[Any]]:
     found = bundle.found
     for row in range(len(found)):
         scene = "" if found.placed is None else int(found.placed.index[row])
-        judged = [int(found.quality["valid"][row]), int(found.quality["success"][row])]
+        validated = [int(found.quality["valid"][row]), int(found.quality["success"][row])]
         yield [
             bundle.name(row),
             int(found.rows[row]),
             bundle.frame,
             found.tool.name,
             scene,
-            *judged,
+            *validated,
             *numbers(found.quality["epsilon"][row]),
             *numbers(bundle.seen(found.object_pose[row])),
         ]

@@ -307,13 +307,13 @@ def _matrix_body(matrix: Matrix) -> dict[str, Any]:
 
 
 def _address(url: str) -> httpx.URL:
-    mend = "give http://HOST:PORT or https://HOST/PATH, an IPv6 address in brackets: http://[::1]:8000"
+    fix = "give http://HOST:PORT or https://HOST/PATH, an IPv6 address in brackets: http://[::1]:8000"
     try:
         found = httpx.URL(url)
     except (httpx.InvalidURL, ValueError):
         found = httpx.URL()
     if found.scheme not in ("http", "https") or not found.host:
-        raise InputError(f"the address of the API {url!r} cannot be used; {mend}")
+        raise InputError(f"the address of the API {url!r} cannot be used; {fix}")
     return found
 
 

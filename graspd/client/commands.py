@@ -14,7 +14,7 @@ from graspd.api.uploads import MAIN_SUFFIXES, name_of_upload
 from graspd.client import access_commands, tag_commands
 from graspd.client.add_commands import add_hand, add_network, add_object
 from graspd.client.client import Client, path_of
-from graspd.client.job_options import pairs, validated
+from graspd.client.job_options import pairs, parsed_options
 from graspd.client.reports import (
     UrlOption,
     YesOption,
@@ -27,7 +27,7 @@ from graspd.client.reports import (
     watch,
 )
 from graspd.service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
-from graspd.service.model.domain import AUDITS, NETWORK_METHODS, JobRequest
+from graspd.service.model.domain import NETWORK_METHODS, RECHECKS, JobRequest
 from graspd.service.model.errors import InputError
 from graspd.service.model.metrics import MIN_DISTANCE_M
 from graspd.service.model.scene_spec import scene_option
@@ -54,19 +54,24 @@ def submit(
     object: Annotated[str, typer.Option(help="Name of an object, or a mesh file to upload.")],
     grasps: Annotated[int, typer.Option("--grasps", "-n", help="Number of grasps.")] = 32,
     want: Annotated[str, typer.Option(help="valid: that many valid grasps; raw: that many of any kind.")] = "valid",
-    budget: Annotated[float, typer.Option(help="Tries for each valid grasp, at most.")] = 4.0,
+    budget: Annotated[float, typer.Option(help="Candidates for each valid grasp, at most.")] = 4.0,
     min_distance: Annotated[
         float, typer.Option(help="No two grasps of a batch are nearer [m], by the mean distance of the hand's points.")
     ] = MIN_DISTANCE_M,
-    referee: Annotated[str, typer.Option(help="letter, certificate, screen or none.")] = "certificate",
-    audits: Annotated[
-        int, typer.Option(help="Valid grasps judged again by the letter; 8 are spread over the job, one of 64.")
-    ] = AUDITS,
+    validation: Annotated[str, typer.Option(help="dexgraspbench, standard, fast or none.")] = "standard",
+    rechecks: Annotated[
+        int,
+        typer.Option(
+            help="Valid grasps validated again under the DexGraspBench protocol; 8 are spread over the job, one of 64."
+        ),
+    ] = RECHECKS,
     robustness: Annotated[int, typer.Option(help="Verdicts under noise for each valid grasp.")] = 0,
     robust: Annotated[
         float, typer.Option(help="Share of models around the nominal one that a grasp must hold in.")
     ] = 0.0,
-    robust_models: Annotated[int, typer.Option(help="Models each valid grasp is judged in; 0: 8 with --robust.")] = 0,
+    robust_models: Annotated[
+        int, typer.Option(help="Models each valid grasp is validated in; 0: 8 with --robust.")
+    ] = 0,
     method: Annotated[str, typer.Option(help="Planner.")] = "fast_graspd",
     option: Annotated[
         list[str] | None, typer.Option(help="An option of the planner, such as steps=20000; several times.")
@@ -110,7 +115,7 @@ def submit(
         as_object = partial(_uploaded, client, AssetKind.OBJECT)
         if method in NETWORK_METHODS and "network" in options:
             options["network"] = _uploaded(client, AssetKind.NETWORK, str(options["network"]))
-        request = validated(
+        request = parsed_options(
             JobRequest,
             {
                 "hand": _uploaded(client, AssetKind.HAND, hand),
@@ -119,8 +124,8 @@ def submit(
                 "want": want,
                 "budget": budget,
                 "min_distance": min_distance,
-                "referee": referee,
-                "audits": audits,
+                "validation": validation,
+                "rechecks": rechecks,
                 "robustness": robustness,
                 "robust": robust,
                 "robust_models": robust_models,

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from graspd.api.formatting import count, minute, percent, size
 from graspd.client.add_commands import name_of_set, upload_set
 from graspd.client.client import Client, path_of
-from graspd.client.job_options import SpecOption, Wanted, validated, wanted, with_job_options
+from graspd.client.job_options import PlanRequest, SpecOption, parsed_options, wanted, with_job_options
 from graspd.client.reports import (
     UrlOption,
     YesOption,
@@ -70,7 +70,7 @@ def create(
         raise InputError("say a name: graspd datasets create NAME, or name in the file of --spec")
     with open_client(url) as client:
         files, matrix = _matrix(client, asked)
-        request = validated(DatasetRequest, {"name": asked.name, **matrix})
+        request = parsed_options(DatasetRequest, {"name": asked.name, **matrix})
         found = _estimate(client, matrix, files)
         print_estimate(found, console)
         if dry_run:
@@ -82,7 +82,7 @@ def create(
         if files is not None:
             refused = _upload(client, files, name_of_set(Path(asked.objects)), console)
             matrix = asked.shared_out(matrix, len(files) - len(refused))
-            request = validated(DatasetRequest, {"name": asked.name, **matrix, "objects": []})
+            request = parsed_options(DatasetRequest, {"name": asked.name, **matrix, "objects": []})
         dataset = client.create_dataset(request)
         if wait:
             dataset = watch_dataset(client, asked.name, plain_console(stderr=True))
@@ -269,7 +269,7 @@ def export(
         typer.echo(f"{out}: {count(len(taken.shards))} files, {size(taken.size_bytes)}, snapshot {taken.digest}")
 
 
-def _matrix(client: Client, asked: Wanted) -> tuple[Objects | None, dict[str, Any]]:
+def _matrix(client: Client, asked: PlanRequest) -> tuple[Objects | None, dict[str, Any]]:
     """Files of a set that is still to be uploaded, and the matrix that was asked for."""
     objects = asked.objects
     names = [word.strip() for word in objects.split(",") if word.strip()]
@@ -293,7 +293,7 @@ def _matrix(client: Client, asked: Wanted) -> tuple[Objects | None, dict[str, An
 def _estimate(client: Client, matrix: dict[str, Any], files: Objects | None) -> Estimate:
     """The cost; InputError for a name that nobody knows and that is not about to be uploaded."""
     asked = matrix | {"sets": []} if files is not None else matrix
-    found = client.estimate(validated(Matrix, asked))
+    found = client.estimate(parsed_options(Matrix, asked))
     unknown = [name for name in found.unknown if name not in (files or {})]
     if unknown:
         known = [one.name for kind in (AssetKind.HAND, AssetKind.OBJECT) for one in client.assets(kind)]

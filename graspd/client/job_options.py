@@ -79,7 +79,7 @@ def _number(text: str) -> str | int | float:
     return text
 
 
-def validated(model: type[ModelT], values: dict[str, Any]) -> ModelT:
+def parsed_options(model: type[ModelT], values: dict[str, Any]) -> ModelT:
     """A model of what was given; InputError names the first option that cannot be used."""
     try:
         return model.model_validate(values)
@@ -137,7 +137,7 @@ class Spec(JobOptions):
 
 
 @dataclass(frozen=True)
-class Wanted:
+class PlanRequest:
     """What a command was told, by a spec and by options."""
 
     name: str
@@ -155,7 +155,7 @@ class Wanted:
 
 def wanted(
     spec: Path | None, *, name: str | None, hands: str | None, objects: str | None, options: dict[str, Any]
-) -> Wanted:
+) -> PlanRequest:
     """Spec and options together; what an option says goes before.
 
     Args:
@@ -185,7 +185,7 @@ def wanted(
         if not found:
             raise InputError(f"say which {what}: --{what}, or {what} in the file of --spec")
     rest = {key: value for key, value in said.items() if key not in ("name", "hands", "objects")}
-    return Wanted(found_name, found_hands, found_objects, {**rest, **given}, total)
+    return PlanRequest(found_name, found_hands, found_objects, {**rest, **given}, total)
 
 
 def read_spec(file: Path) -> dict[str, Any]:
@@ -205,7 +205,7 @@ def read_spec(file: Path) -> dict[str, Any]:
             found["scene"] = scene_option(found["scene"], beside=file.parent)
         if isinstance(beside := found.get("neighbours"), list):
             found["neighbours"] = [known_name(one) if isinstance(one, str) else one for one in beside]
-        spec: Spec = validated(Spec, found)
+        spec: Spec = parsed_options(Spec, found)
     except InputError as error:
         raise InputError(f"{file}: {str(error).removeprefix('--')}") from None
     return spec.model_dump(mode="json", exclude_unset=True)

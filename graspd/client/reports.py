@@ -20,7 +20,7 @@ from graspd.api.formatting import count, duration, metric, percent, size, valid_
 from graspd.api.models import Diversity, Job, JobDetail, StageStatus
 from graspd.client.client import Client, path_of
 from graspd.service.cli import emit, load_settings, plain_console, plain_table
-from graspd.service.index.views import CellView, DatasetView, Judged
+from graspd.service.index.views import CellView, DatasetView, Validated
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError, TaskError
 from graspd.service.model.states import AssetKind, Stage, State
@@ -106,11 +106,11 @@ def job_summary(job: JobDetail) -> dict[str, Any]:
         "choice": job.choice and job.choice.model_dump(),
         "grasps": job.grasps,
         "valid": job.valid,
-        "tried": job.tried,
-        "judged": job.judged,
+        "candidates": job.candidates,
+        "validated": job.validated,
         "valid_yield": job.valid_yield,
-        "audited": job.audited,
-        "audit_held": job.audit_held,
+        "rechecked": job.rechecked,
+        "recheck_held": job.recheck_held,
         "note": job.note,
         "progress": job.progress,
         "reason": job.reason,
@@ -144,12 +144,16 @@ def show_asset(asset: dict[str, Any], *, json: bool) -> None:
 
 
 def yield_of(job: JobDetail) -> str:
-    """What was found among how many tries, and what the audit says, in a line."""
-    level = job.request.referee
+    """What was found among how many candidates, and what the recheck says, in a line."""
+    level = job.request.validation
     if level == "none":
-        return f"{count(job.grasps)} grasps kept in {count(job.tried)} tries; nobody judged them"
-    audit = f"; {job.audit_held} of {job.audited} audited hold by the letter" if job.audited else ""
-    return f"{count(job.valid)} valid grasps in {count(job.tried)} tries, {level} level{audit}"
+        return f"{count(job.grasps)} grasps kept in {count(job.candidates)} tries; not validated"
+    recheck = (
+        f"; {job.recheck_held} of {job.rechecked} rechecked hold under the DexGraspBench protocol"
+        if job.rechecked
+        else ""
+    )
+    return f"{count(job.valid)} valid grasps in {count(job.candidates)} tries, {level} level{recheck}"
 
 
 def means_of(job: JobDetail) -> str:
@@ -297,7 +301,7 @@ _STYLES: Final = {
 def print_estimate(found: Estimate, console: Console) -> None:
     """Time for some numbers of workers, storage, network, and what the rates are known from."""
     console.print(
-        f"{count(found.cells)} cells, {count(found.asked)} grasps asked for: about {count(found.tried)} tries, "
+        f"{count(found.cells)} cells, {count(found.asked)} grasps asked for: about {count(found.candidates)} tries, "
         f"{count(found.valid)} {found.counted}, {count(found.tasks)} tasks",
         soft_wrap=True,
     )
@@ -328,9 +332,9 @@ def print_dataset(dataset: DatasetView, console: Console) -> None:
     left = f", {duration(dataset.eta_s)} left" if dataset.eta_s is not None else ""
     console.print(f"{dataset.name}  {dataset.state.value}  {percent(dataset.progress)}{left}")
     console.print(f"cells: {states}")
-    tried = f" of {count(dataset.tried)} tried ({_yield(dataset)})" if dataset.tried else ""
+    candidates = f" of {count(dataset.candidates)} tried ({_yield(dataset)})" if dataset.candidates else ""
     console.print(
-        f"grasps: {count(dataset.counted)} {dataset.options.standing}{tried}, {count(dataset.asked)} asked for; "
+        f"grasps: {count(dataset.counted)} {dataset.options.standing}{candidates}, {count(dataset.asked)} asked for; "
         f"{count(dataset.shards)} shards, {size(dataset.size_bytes)}; worker time {duration(dataset.seconds)}",
         soft_wrap=True,
     )
@@ -380,9 +384,9 @@ def watch_dataset(client: Client, name: str, console: Console) -> DatasetView:
     return dataset
 
 
-def _yield(made: Judged) -> str:
-    """`at 94 % of the judged`, in short."""
-    return f"at {valid_yield(made)}" if made.judged else "not judged"
+def _yield(made: Validated) -> str:
+    """`at 94 % of the validated`, in short."""
+    return f"at {valid_yield(made)}" if made.validated else "not validated"
 
 
 def _styled(cell: CellView, options: JobOptions) -> Text:
@@ -393,7 +397,7 @@ def _words(cell: CellView, options: JobOptions) -> str:
     words = [cell.state.value]
     if cell.state is State.RUNNING:
         words.append(percent(cell.progress))
-    if cell.tried:
+    if cell.candidates:
         made = cell.counted(options)
         words.append(f"{count(made)}/{count(cell.asked)} {_yield(cell)}")
     if cell.tasks_failed:

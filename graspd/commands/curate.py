@@ -35,7 +35,7 @@ def grasps() -> None:
 @group.command(epilog='graspd grasps where "epsilon > 0.3 and lift and robust >= 0.75" --from kitchen -o subset')
 @reporting_errors
 def where(
-    expression: Annotated[str, typer.Argument(help="Metrics by name, valid, sound, held, lift; and, or, not.")],
+    expression: Annotated[str, typer.Argument(help="Metrics by name, valid, feasible, held, lift; and, or, not.")],
     out: OutOption,
     source: Annotated[
         str, typer.Option("--from", help="A file, a folder of shards, or a dataset of the store by its name.")
@@ -145,7 +145,9 @@ def clouds(
     graspness: Annotated[
         bool, typer.Option("--graspness", help="Of each point the share of grasps whose hand touches it.")
     ] = False,
-    unjudged: Annotated[bool, typer.Option("--unjudged", help="Grasps that are sound and that nobody judged.")] = False,
+    unvalidated: Annotated[
+        bool, typer.Option("--unvalidated", help="Grasps that are feasible and that are not validated.")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same clouds.")] = 0,
     json: JsonFlag = False,
 ) -> None:
@@ -153,7 +155,7 @@ def clouds(
 
     Who reads with graspd needs no files: `Pictures(shards).clouds()` makes the same when it is asked for.
     """
-    pictures = Pictures(shards_of(source), unjudged=unjudged)
+    pictures = Pictures(shards_of(source), unvalidated=unvalidated)
     if not len(pictures):
         raise InputError(f"{source} has no pictures; take some: graspd render")
     camera = None if noise == "none" else noise
@@ -170,7 +172,7 @@ def clouds(
         "scene": scene,
         "voxel_m": voxel,
         "graspness": graspness,
-        "unjudged": unjudged,
+        "unvalidated": unvalidated,
         "seed": seed,
     }
     done = write_clouds(found, out, said)

@@ -11,15 +11,15 @@ from rich.box import SIMPLE_HEAD
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from graspd.exchange.cases import expand, load_case
+from graspd.exchange.inputs import expand, load_case
 from graspd.service.cli import JsonFlag, emit, plain_console, reporting_errors
 from graspd.service.model.errors import InputError, one_of
 from graspd.service.model.metrics import AXIS_MEANINGS, MOST_ROBUST_MODELS
 from graspd.service.store.shards import carried, json_attribute, read_shard, write_shard
 from graspd.studies.evaluation import Protocol, combine, evaluate
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.same_hand import TOLERANCE_M, same_hand
-from graspd.worker.run import Run
 from graspd.worker.validation.key import Level
 from graspd.worker.validation.lifting import LiftLevel
 from graspd.worker.validation.robust import Robustness
@@ -42,7 +42,7 @@ _COLUMNS: Final = (
 )
 
 
-@app.command(name="evaluate", epilog="graspd evaluate grasps.h5 --level letter")
+@app.command(name="evaluate", epilog="graspd evaluate grasps.h5 --level dexgraspbench")
 @reporting_errors
 def evaluate_command(
     files: Annotated[
@@ -57,7 +57,8 @@ def evaluate_command(
         ),
     ] = "dexgraspbench",
     level: Annotated[
-        str, typer.Option(help="What a verdict costs: letter, certificate or screen; of a lift: letter or lift.")
+        str,
+        typer.Option(help="What a verdict costs: dexgraspbench, standard, or fast; of a lift: dexgraspbench or lift."),
     ] = "",
     hard: Annotated[bool, typer.Option("--hard", help="Half the friction, a tenth of the torsional.")] = False,
     hand: Annotated[
@@ -71,19 +72,20 @@ def evaluate_command(
         typer.Option(
             min=0,
             max=MOST_ROBUST_MODELS,
-            help="Models around the nominal one in which what holds is judged again, such as 8.",
+            help="Models around the nominal one in which what holds is validated again, such as 8.",
         ),
     ] = 0,
     friction: Annotated[
         float | None, typer.Option(min=0.01, max=3.0, help="Coulomb coefficient of ε; default: the file's.")
     ] = None,
-    judge_hand: Annotated[
-        str | None, typer.Option(help="Another model of the same hand, URDF or MJCF, that judges the grasps as well.")
+    validation_hand: Annotated[
+        str | None,
+        typer.Option(help="Another model of the same hand, URDF or MJCF, that validates the grasps as well."),
     ] = None,
     joint_map: Annotated[
         str | None, typer.Option(help="OURS=THEIRS,...: joints of the same meaning, where their names do not tell.")
     ] = None,
-    judge_tolerance: Annotated[
+    validation_tolerance: Annotated[
         float, typer.Option(min=0.0, help="Fingertips of the two models that differ by more are refused [mm].")
     ] = 1e3 * TOLERANCE_M,
     out: Annotated[
@@ -97,15 +99,15 @@ def evaluate_command(
     threads: Annotated[int, typer.Option(min=0, help="CPU threads, 0: one per core.")] = 0,
     json: JsonFlag = False,
 ) -> None:
-    """Measure grasps and let an independent engine judge them. Numbers are medians, ε and areas at 5 mm."""
+    """Measure grasps and let an independent engine validate them. Numbers are medians, ε and areas at 5 mm."""
     level = _checked_level(protocol, level)
     if robust and protocol == "displacement":
-        raise InputError("--robust judges pushes or lifts in other models: choose --protocol dexgraspbench or lift")
-    if judge_hand is None and joint_map:
-        raise InputError("--joint-map says which joints of --judge-hand are ours; name that hand")
-    if judge_hand is not None and protocol != "dexgraspbench":
-        raise InputError(f"--judge-hand judges by protocol dexgraspbench, not by {protocol}")
-    other = None if judge_hand is None else hand_from_path(judge_hand, drag=True)
+        raise InputError("--robust validates pushes or lifts in other models: choose --protocol dexgraspbench or lift")
+    if validation_hand is None and joint_map:
+        raise InputError("--joint-map says which joints of --validation-hand are ours; name that hand")
+    if validation_hand is not None and protocol != "dexgraspbench":
+        raise InputError(f"--validation-hand validates by protocol dexgraspbench, not by {protocol}")
+    other = None if validation_hand is None else hand_from_path(validation_hand, drag=True)
     twins = _joint_map(joint_map)
     rows: list[dict[str, Any]] = []
     columns = (
@@ -130,11 +132,11 @@ def evaluate_command(
                 hard=hard,
                 friction=friction,
                 models=robust,
-                judge_hand=None
+                validation_hand=None
                 if other is None
-                else same_hand(case.hand, other, twins, tolerance_m=judge_tolerance / 1e3),
+                else same_hand(case.hand, other, twins, tolerance_m=validation_tolerance / 1e3),
                 tell=partial(write_copy, file, copies[file]) if copies else lambda found: None,
-                run=Run(threads=threads, progress=partial(_show, bar, task, case.name)),
+                run=ExecutionContext(threads=threads, progress=partial(_show, bar, task, case.name)),
             )
             rows.append({"file": str(file), **row})
     _tell(rows, other.name if other else "", json=json)
@@ -145,7 +147,7 @@ def _checked_level(protocol: str, level: str) -> str:
     if protocol not in get_args(Protocol):
         raise InputError(f"unknown protocol {protocol!r}; choose {one_of(protocol, get_args(Protocol))}")
     levels = get_args(LiftLevel if protocol == "lift" else Level)
-    level = level or ("lift" if protocol == "lift" else "certificate")
+    level = level or ("lift" if protocol == "lift" else "standard")
     if level not in levels:
         raise InputError(f"unknown level {level!r} of protocol {protocol}; choose one of {one_of(level, levels)}")
     return level
@@ -229,7 +231,7 @@ def _foreign(whole: dict[str, Any], name: str) -> str:
     held = whole["foreign_held"]
     share = _cell(whole["foreign_share"], 2)
     return (
-        f"judged with {name}, fingertips within {whole['fingertips_mm']:.2f} mm: GSR {_cell(whole['foreign_gsr'], 2)}; "
+        f"validated with {name}, fingertips within {whole['fingertips_mm']:.2f} mm: GSR {_cell(whole['foreign_gsr'], 2)}; "
         f"of {held['both'] + held['nominal']} that hold nominally {held['both']} hold there ({share}); "
         f"agreement {_cell(whole['agreement'], 2)}"
     )

@@ -16,8 +16,8 @@ from graspd.service.model.errors import InputError, one_of
 from graspd.service.store import validity
 from graspd.service.store.shards import read_shard
 from graspd.service.store.store import open_store
-from graspd.worker.files.subsets import EveryOption, UnjudgedOption, choose
-from graspd.worker.run import Run
+from graspd.worker.execution_context import ExecutionContext
+from graspd.worker.files.subsets import EveryOption, UnvalidatedOption, choose
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -40,7 +40,7 @@ def export(
     object_: Annotated[
         str | None, typer.Option("--object", help="The shard's object; default: found by its digest.")
     ] = None,
-    unjudged: UnjudgedOption = False,
+    unvalidated: UnvalidatedOption = False,
     every: EveryOption = False,
     depth: Annotated[str, typer.Option(help="exr: metres as floats; png: 16 bits, steps of 0.1 mm.")] = "exr",
     best: Annotated[int, typer.Option(min=0, help="For robots: at most so many, the best by epsilon; 0: all.")] = 0,
@@ -72,21 +72,23 @@ def export(
     notes: list[str] = []
     with opened(output):
         if format_ in ROBOTS:
-            from graspd.exchange.robot_export import Wishes, export_grasps
+            from graspd.exchange.robot_export import RobotExportOptions, export_grasps
 
-            wishes = Wishes(hand, object_, unjudged, every, best, tool, speed, arm, mount, base, mount_pose)
+            wishes = RobotExportOptions(
+                hand, object_, unvalidated, every, best, tool, speed, arm, mount, base, mount_pose
+            )
             done = export_grasps(source, format_, wishes, output)
             written, notes = done.counts, done.notes
         elif format_ in TRAINING:
-            from graspd.exchange.training_export import TrainingWishes, export_training
+            from graspd.exchange.training_export import TrainingExportOptions, export_training
 
-            training = TrainingWishes(hand, object_, unjudged, every, held_out, noise)
+            training = TrainingExportOptions(hand, object_, unvalidated, every, held_out, noise)
             done = export_training(source, format_, training, output)
             written, notes = done.counts, done.notes
         elif format_ == "webdataset":
-            written = _webdataset(source, output, unjudged=unjudged, every=every)
+            written = _webdataset(source, output, unvalidated=unvalidated, every=every)
         elif format_ == "dexgraspbench":
-            written = _bench(source, hand, object_, output, unjudged=unjudged, every=every)
+            written = _bench(source, hand, object_, output, unvalidated=unvalidated, every=every)
         else:
             written = _pictures(source, format_, depth, output)
     if json:
@@ -111,13 +113,13 @@ def import_(
     robot: Annotated[str, typer.Option(help="multidex: name of the robot in the file.")] = "",
     name: Annotated[str, typer.Option(help="multidex, graspgen, huggingface, lerobot: name of the object.")] = "",
     number: Annotated[int, typer.Option(help="ddgc, dexgraspnet2: which object of the scene.")] = 0,
-    referee: Annotated[str, typer.Option(help="letter, certificate, screen or none.")] = "certificate",
+    validation: Annotated[str, typer.Option(help="dexgraspbench, standard, fast or none.")] = "standard",
     friction: Annotated[float, typer.Option(help="Coulomb coefficient of the metrics.")] = 1.0,
     threads: Annotated[int, typer.Option(help="CPU threads; 0: all cores.")] = 0,
     output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("imported"),
     json: JsonFlag = False,
 ) -> None:
-    """Read grasps of others, let the referee judge them, measure them, and write base shards.
+    """Read grasps of others, let the validator validate them, measure them, and write base shards.
 
     Nothing in the files is executed. The meshes go beside the shards, at the scale the grasps were made for.
     """
@@ -131,7 +133,15 @@ def import_(
     sets = read_sets(format_, source, hand, object_, options)
     said = Origin(format_, origin, licence)
     files = [
-        write_scored(one, said, output, referee=referee, friction=friction, ordinal=k, run=Run(threads=threads))
+        write_scored(
+            one,
+            said,
+            output,
+            validation=validation,
+            friction=friction,
+            ordinal=k,
+            run=ExecutionContext(threads=threads),
+        )
         for k, one in enumerate(sets)
     ]
     (output / "source.json").write_text(jsonlib.dumps(vars(said), indent=1) + "\n")
@@ -140,8 +150,8 @@ def import_(
         emit({"folder": str(output), "shards": found})
         return
     for one in found:
-        judged = "nobody judged them" if referee == "none" else f"{one['valid']} valid at level {referee}"
-        typer.echo(f"{one['file']}: {one['grasps']} grasps, {one['sound']} sound, {judged}{_compared(one)}")
+        validated = "not validated" if validation == "none" else f"{one['valid']} valid at level {validation}"
+        typer.echo(f"{one['file']}: {one['grasps']} grasps, {one['feasible']} feasible, {validated}{_compared(one)}")
 
 
 def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, options: dict[str, Any]) -> list[Any]:
@@ -196,23 +206,23 @@ def _pictures(source: Path, format_: str, depth: str, output: Path) -> dict[str,
     return {"pictures": len(views["camera/eye"]), "files": len(written)}
 
 
-def _webdataset(source: Path, output: Path, *, unjudged: bool, every: bool) -> dict[str, int]:
+def _webdataset(source: Path, output: Path, *, unvalidated: bool, every: bool) -> dict[str, int]:
     from graspd.exchange import webdataset
     from graspd.service.readers import Pictures, open_shards
 
     shards = open_shards(source)
-    written = webdataset.write(shards, output, valid=not every, unjudged=unjudged)
+    written = webdataset.write(shards, output, valid=not every, unvalidated=unvalidated)
     return {"pictures": len(Pictures(shards)), "files": len(written)}
 
 
 def _bench(
-    source: Path, hand: str | None, obj: str | None, output: Path, *, unjudged: bool, every: bool
+    source: Path, hand: str | None, obj: str | None, output: Path, *, unvalidated: bool, every: bool
 ) -> dict[str, int]:
     from graspd.exchange import dexgraspbench
-    from graspd.exchange.cases import load_case
+    from graspd.exchange.inputs import load_case
 
     case = load_case(source, hand=hand, obj=obj)
-    mask, _ = choose(read_shard(source, kind="base"), unjudged=unjudged, every=every)
+    mask, _ = choose(read_shard(source, kind="base"), unvalidated=unvalidated, every=every)
     rows = np.flatnonzero(mask)
     written = dexgraspbench.write(case.hand, case.obj, case.grasps, rows.tolist(), output, case.placed)
     return {"grasps": len(written), "files": len(written)}
@@ -228,16 +238,16 @@ def _compared(one: dict[str, Any]) -> str:
 
 def _summary(file: Path) -> dict[str, Any]:
     shard = read_shard(file, kind="base")
-    valid, sound = validity.valid(shard.arrays), validity.sound(shard.arrays)
+    valid, feasible = validity.valid(shard.arrays), validity.feasible(shard.arrays)
     said = np.asarray(shard.arrays.get("quality/published", np.full(len(valid), -1)))
-    both = (said >= 0) & validity.judged(shard.arrays)
+    both = (said >= 0) & validity.validated(shard.arrays)
     agree = float((said == shard.arrays["quality/success"])[both].mean()) if both.any() else None
     return {
         "file": str(file),
         "object": shard.attributes["object"],
         "grasps": len(valid),
         "valid": int(valid.sum()),
-        "sound": int(sound.sum()),
+        "feasible": int(feasible.sum()),
         "published": int((said >= 0).sum()),
         "agreement_published": agree,
     }

@@ -13,7 +13,7 @@ from PIL import Image
 from graspd.exchange.robots.execution import (
     STEP_S,
     Executions,
-    Trajectory,
+    RobotTrajectory,
     executions,
     hand_limits,
     straight_paths,
@@ -22,16 +22,23 @@ from graspd.exchange.robots.execution import (
 )
 from graspd.service.model.scene_spec import SceneSpec, supports_in
 from graspd.service.model.transforms import compose, invert
-from graspd.service.readers.ways import Waypoint, scene_spec_of, way_of, wrists_of
+from graspd.service.readers.trajectories import Waypoint, scene_spec_of, way_of, wrists_of
 from graspd.service.store.shards import Shard
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.provenance import neighbours_of_shard, placed_of_shard
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.pictures import SAMPLES, THREE_SIDES, grasp_pictures
 from graspd.worker.rendering.sheets import contact_sheet, figures, label_page, three_sides_sheet
-from graspd.worker.rendering.way_pictures import FREE_STRIP, STRIP, Around, animation, animation_kind, way_pictures
-from graspd.worker.run import Run
+from graspd.worker.rendering.trajectory_pictures import (
+    FREE_STRIP,
+    STRIP,
+    PictureScenes,
+    animation,
+    animation_kind,
+    way_pictures,
+)
 
 Kind = Literal["one side", "three sides", "way"]
 #: Edge of a grasp's picture [px] and rays a pixel. Tracing costs what goes with both: three sides half of one alone.
@@ -47,7 +54,7 @@ class GraspSheet:
     obj: ObjectModel
     rows: NDArray[np.intp]
     kind: Kind
-    run: Run
+    run: ExecutionContext
     edge: int | None = None
     """Of one picture [px]; None: as `LOOKS` says."""
 
@@ -116,13 +123,13 @@ class GraspSheet:
         )
 
 
-def around_of(shard: Shard, rows: NDArray[np.intp]) -> Around:
+def around_of(shard: Shard, rows: NDArray[np.intp]) -> PictureScenes:
     """Where grasps of a base shard are: in the scenes that they were planned in, or around a free object."""
     if (spec := _scene_of(shard)) is None:
-        return Around()
+        return PictureScenes()
     poses = np.asarray(shard["scene/object_pose"], float)
     index = np.asarray(shard["grasp/scene_index"], np.intp)[rows]
-    return Around(supports_in(spec), poses, index, neighbours_of_shard(shard, []), wrists_of(shard, rows))
+    return PictureScenes(supports_in(spec), poses, index, neighbours_of_shard(shard, []), wrists_of(shard, rows))
 
 
 def _scene_of(shard: Shard) -> SceneSpec | None:
@@ -155,7 +162,7 @@ class GraspAnimation:
     hand: HandModel
     obj: ObjectModel
     rows: NDArray[np.intp]
-    run: Run
+    run: ExecutionContext
     width: int | None = None
     """[px]; None: `WIDTH`."""
     samples: int = FILM_SAMPLES
@@ -199,7 +206,7 @@ class GraspAnimation:
         return np.asarray(sides[0])
 
 
-def waypoints(found: Executions, way: Trajectory) -> list[Waypoint]:
+def waypoints(found: Executions, way: RobotTrajectory) -> list[Waypoint]:
     """The points of the trajectory of the first grasp, in the frame of the object at rest."""
     rest = found.object_pose[0]
     poses = compose(invert(rest), way.hand_pose)
@@ -209,12 +216,12 @@ def waypoints(found: Executions, way: Trajectory) -> list[Waypoint]:
     return [Waypoint("grasp" if k == closed else "", pose, way.joints[k], carried[k]) for k, pose in enumerate(poses)]
 
 
-def _timed(found: Executions) -> Trajectory:
+def _timed(found: Executions) -> RobotTrajectory:
     limits = hand_limits(found.hand)
     return timed(straight_paths(found, 0), found.hand.joint_names, limits.velocity, speed=SPEED)
 
 
-def _shown(way: Trajectory) -> list[float]:
+def _shown(way: RobotTrajectory) -> list[float]:
     seconds = [STEP_S, *np.diff(way.time).tolist()]
     seconds[0] += BEFORE_S
     seconds[-1] += AFTER_S

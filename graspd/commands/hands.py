@@ -29,11 +29,11 @@ from graspd.service.store.asset_options import (
 )
 from graspd.service.store.asset_summary import say_check, self_test_lines
 from graspd.service.store.descriptions import described
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.hands.check import check_hand
 from graspd.worker.hands.load import files_from_path, hand_from_path, main_file
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.options import parse_options
-from graspd.worker.run import ALONE, Run
 
 app = typer.Typer(add_completion=False)
 
@@ -109,7 +109,7 @@ def _tried(file: str, options: dict[str, Any], *, quiet: bool) -> dict[str, Any]
 
 
 @contextmanager
-def _bar(what: str, first: str = "", *, quiet: bool) -> Iterator[Run]:
+def _bar(what: str, first: str = "", *, quiet: bool) -> Iterator[ExecutionContext]:
     """A run that tells a terminal how far it is."""
     columns = (TextColumn(f"  {what}       {{task.description}}", markup=False), BarColumn(), TimeElapsedColumn())
     console = plain_console(stderr=True)
@@ -120,7 +120,7 @@ def _bar(what: str, first: str = "", *, quiet: bool) -> Iterator[Run]:
         def tell(done: float, total: float, message: str) -> None:
             bar.update(task, completed=done / total, description=message)
 
-        yield Run(progress=tell)
+        yield ExecutionContext(progress=tell)
 
 
 def _draw(hand: HandModel, picture: Path, *, collision: bool) -> None:
@@ -144,7 +144,9 @@ def _write(file: str, options: dict[str, Any], report: dict[str, Any], target: P
         raise InputError(f"{target} cannot be written: {error.strerror}") from None
 
 
-def report_hand(file: str, options: dict[str, Any] | None = None, run: Run = ALONE) -> dict[str, Any]:
+def report_hand(
+    file: str, options: dict[str, Any] | None = None, run: ExecutionContext = DEFAULT_CONTEXT
+) -> dict[str, Any]:
     """`check_hand` of a path; what cannot even be read is refused in the same form."""
     try:
         name, files, stated = files_from_path(file)

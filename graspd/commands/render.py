@@ -22,10 +22,11 @@ from graspd.service.cli import JsonFlag, emit, plain_console, reporting_errors, 
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import supports_in
 from graspd.service.model.transforms import compose
-from graspd.service.readers.ways import scene_spec_of, wrists_of
+from graspd.service.readers.trajectories import scene_spec_of, wrists_of
 from graspd.service.store import validity
 from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.worker.engines.devices import Device
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.provenance import (
     INHERITED,
     hand_of_shard,
@@ -34,16 +35,15 @@ from graspd.worker.files.provenance import (
     neighbours_of_shard,
     object_of_shard,
 )
-from graspd.worker.files.subsets import EveryOption, UnjudgedOption, choose
+from graspd.worker.files.subsets import EveryOption, UnvalidatedOption, choose
 from graspd.worker.rendering.annotate import parse_channels
 from graspd.worker.rendering.cameras import BASELINE_M, SAMPLED, read_cameras
 from graspd.worker.rendering.hands import DrawnHand
 from graspd.worker.rendering.scenery import TABLE
 from graspd.worker.rendering.sheets import best, best_in_scenes, best_kept, views_page, with_palette
+from graspd.worker.rendering.trajectory_pictures import animation_kind
 from graspd.worker.rendering.views import Extras
 from graspd.worker.rendering.views import render as render_views
-from graspd.worker.rendering.way_pictures import animation_kind
-from graspd.worker.run import Run
 
 app = typer.Typer(add_completion=False)
 
@@ -108,7 +108,7 @@ def render(
             seed=number,
             baseline_m=baseline,
             extras=extras,
-            run=Run(used, progress=partial(_show, bar, task)),
+            run=ExecutionContext(used, progress=partial(_show, bar, task)),
         )
     seconds = perf_counter() - started
     inherited = (*INHERITED, "neighbours", "neighbour_digests", "neighbour_sources")
@@ -149,7 +149,7 @@ def pictures(
     ] = None,
     hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
     object: _Object = None,
-    unjudged: UnjudgedOption = False,
+    unvalidated: UnvalidatedOption = False,
     every: EveryOption = False,
     device: _Device = "auto",
     output: Annotated[Path, typer.Option("--output", "-o", help="The PNG or film to write.")] = Path("grasps.png"),
@@ -161,14 +161,14 @@ def pictures(
     if animate:
         animation_kind(output.suffix)
     base = read_shard(grasps, kind="base")
-    chosen, word = choose(base, unjudged=unjudged, every=every)
+    chosen, word = choose(base, unvalidated=unvalidated, every=every)
     if row:
         rows = _named_rows(base, row, chosen, word)
     else:
         rows = best(base.arrays, count or (1 if animate else 4 if way else 12), chosen)
     among = int(chosen.sum())
     models = (hand_of_shard(base, hand), object_of_shard(base, object), rows)
-    run = Run(Device(device).resolve())
+    run = ExecutionContext(Device(device).resolve())
     if animate:
         page = GraspAnimation(base, *models, run, size).file(output.suffix)
     else:
@@ -203,9 +203,9 @@ def _scenes(path: Path) -> Shard:
 
 
 def _drawn_in(base: Shard, hand: str | None) -> DrawnHand | None:
-    """The best valid grasp of each scene that grasps were planned in; where nobody judged, the best sound one."""
-    judged = validity.valid(base.arrays).any()
-    rows = best_in_scenes(base.arrays, validity.chosen(base.arrays, unjudged=not judged))
+    """The best valid grasp of each scene that grasps were planned in; where not validated, the best feasible one."""
+    validated = validity.valid(base.arrays).any()
+    rows = best_in_scenes(base.arrays, validity.chosen(base.arrays, unvalidated=not validated))
     if not len(base["grasp/hand_pose"]):
         return None
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
@@ -262,14 +262,14 @@ def view(
     object: Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")] = None,
 ) -> None:
     """Show grasps in 3D in the browser: hand, object, scene, contacts, and the way as a slider. Ends with Ctrl-C."""
-    from graspd.worker.viewing import Shown, Viewer, missing
+    from graspd.worker.viewing import Viewer, ViewerContent, missing
 
     if said := missing():
         raise InputError(said)
     from graspd.worker.files.provenance import hand_of_shard, neighbours_of_shard, object_of_shard
 
     base = read_shard(grasps, kind="base")
-    shown = Shown(base, hand_of_shard(base, hand), object_of_shard(base, object), neighbours_of_shard(base, []))
+    shown = ViewerContent(base, hand_of_shard(base, hand), object_of_shard(base, object), neighbours_of_shard(base, []))
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())

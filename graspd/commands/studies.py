@@ -26,7 +26,7 @@ from graspd.service.model.scene_spec import SceneSpec, parse_scene
 from graspd.service.model.studies import Stability, from_json
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.worker.engines.devices import Device
-from graspd.worker.run import Run
+from graspd.worker.execution_context import ExecutionContext
 
 app = typer.Typer()
 
@@ -149,9 +149,9 @@ def _measured(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long:
     import warp as wp
 
     from graspd.studies.stability.studies import run
-    from graspd.worker.run import Run
+    from graspd.worker.execution_context import ExecutionContext
 
-    maps = run(names, hand, obj, quick=quick, long=long, work=Run(threads=threads), say=_say)
+    maps = run(names, hand, obj, quick=quick, long=long, work=ExecutionContext(threads=threads), say=_say)
     command = shlex.join(["graspd", *(Path(word).name if "/" in word else word for word in sys.argv[1:])])
     return Stability(timestamp(), command, {"graspd": PACKAGE_VERSION, "warp": wp.__version__}, maps)
 
@@ -232,7 +232,7 @@ def chart(
     data_dir: Annotated[Path | None, typer.Option(help="Folder of the store; GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Speed against accuracy: every method and fidelity on the same hands and objects, judged by MuJoCo."""
+    """Speed against accuracy: every method and fidelity on the same hands and objects, validated by MuJoCo."""
     from graspd.studies.chart.chart import settings_of
     from graspd.studies.chart.sweeps import sweep as turn
     from graspd.studies.chart.sweeps import turns
@@ -245,7 +245,7 @@ def chart(
     if scene != "free" and sweep:
         raise InputError("--sweep is of free objects' charts; leave out --scene")
     place = _place(scene)
-    on = Run(Device(device).resolve(), threads)
+    on = ExecutionContext(Device(device).resolve(), threads)
     batches, models_around = [_number(part) for part in _parts(batch)], ROBUST_MODELS
     if quick:
         hands, objects, fidelities = (_first(text) for text in (hands, objects, fidelities))
@@ -362,7 +362,7 @@ def known_fidelities(names: Sequence[str]) -> list[str]:
 
 
 def _things(objects: Sequence[str]) -> list[Any]:
-    from graspd.studies.chart.chart import Thing
+    from graspd.studies.chart.chart import ChartObject
     from graspd.worker.objects.prepare import name_of, object_from_path
 
     def load(text: str, error: float) -> Any:
@@ -370,7 +370,7 @@ def _things(objects: Sequence[str]) -> list[Any]:
 
     for text in objects:
         load(text, 1e-3)  # a wrong file is told before an hour of work
-    return [Thing(name_of(Path(text)), partial(load, text)) for text in objects]
+    return [ChartObject(name_of(Path(text)), partial(load, text)) for text in objects]
 
 
 def _publish_chart(result: dict[str, Any], data_dir: Path | None) -> None:

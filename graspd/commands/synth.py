@@ -42,11 +42,11 @@ from graspd.service.store.asset_options import (
     object_options,
 )
 from graspd.service.store.shards import write_shard
+from graspd.worker.execution_context import Progress as Report
 from graspd.worker.files.provenance import id_of_columns
 from graspd.worker.files.synthesis import chosen_fidelity, synthesized
 from graspd.worker.planners import PLANNERS
 from graspd.worker.planners.registry import of_this_machine, parsed_options
-from graspd.worker.run import Progress as Report
 from graspd.worker.scenes.rest import rolling_note
 from graspd.worker.validation.key import Level
 
@@ -64,16 +64,19 @@ def synth(
     grasps: Annotated[int, typer.Option("-n", "--grasps", help="number of grasps", min=1, max=100_000)] = 32,
     want: Annotated[str, typer.Option(help="valid: that many valid grasps; raw: that many of any kind.")] = "valid",
     budget: Annotated[float, typer.Option(help="Grasps tried for each one wanted, at most.", min=1.0, max=100.0)] = 4.0,
-    referee: Annotated[
-        str, typer.Option(help="letter, certificate, screen; none: nobody judges, grasps are sound, never valid.")
-    ] = "certificate",
+    validation: Annotated[
+        str,
+        typer.Option(
+            help="dexgraspbench, standard, fast; none: nothing is validated, grasps are feasible, never valid."
+        ),
+    ] = "standard",
     robust: Annotated[
         float, typer.Option(help="Share of models around the nominal one that a grasp must hold in.", min=0, max=1)
     ] = 0.0,
     robust_models: Annotated[
         int,
         typer.Option(
-            help=f"Models that each valid grasp is judged in; 0: {ROBUST_MODELS} with --robust.", min=0, max=64
+            help=f"Models that each valid grasp is validated in; 0: {ROBUST_MODELS} with --robust.", min=0, max=64
         ),
     ] = 0,
     method: Annotated[
@@ -129,17 +132,17 @@ def synth(
     ] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Make grasps of one hand on one object as a job does, judged and measured, into an HDF5 file.
+    """Make grasps of one hand on one object as a job does, validated and measured, into an HDF5 file.
 
     In a scene a grasp is valid if it comes, closes and lifts without touching anything else and holds what it lifts.
-    Exit code 3: fewer grasps were found than asked. Ctrl-C keeps those that are judged.
+    Exit code 3: fewer grasps were found than asked. Ctrl-C keeps those that are validated.
     """
     if not out.parent.is_dir():
         raise InputError(f"the folder {out.parent} does not exist; create it or choose another --out")
     if out.is_dir():
         raise InputError(f"{out} is a folder; name a file in it, such as --out {out / 'grasps.h5'}")
     if payload is None:
-        payload = scene != "free" and referee != "none" and (mass is not None or density is not None)
+        payload = scene != "free" and validation != "none" and (mass is not None or density is not None)
     matter = {
         "mass": mass,
         "density": density,
@@ -148,7 +151,7 @@ def synth(
         "min_payload": min_payload,
         "shake": shake,
     }
-    request = _request(want, budget, referee, robust, robust_models, matter).model_copy(
+    request = _request(want, budget, validation, robust, robust_models, matter).model_copy(
         update={
             "grasps": grasps,
             "method": method,
@@ -175,7 +178,7 @@ def synth(
                 mesh=mesh,
                 device=device,
                 threads=threads,
-                first_judge=settings.first_judge,
+                prefilter=settings.prefilter,
                 join=join,
                 processes=settings.processes,
                 progress=progress,
@@ -183,7 +186,7 @@ def synth(
                 partial=True,
             )
         except TaskCancelled:
-            fail(f"interrupted before any grasp was judged: {out} is not written", 128 + stop[0])
+            fail(f"interrupted before any grasp was validated: {out} is not written", 128 + stop[0])
         shard = write_shard("base", made.arrays, {**made.attributes, "shard_id": id_of_columns(made.arrays)})
         write_output(out, shard)
     found = {"file": str(out), **made.summary()}
@@ -197,16 +200,18 @@ def synth(
         raise typer.Exit(FEWER)
 
 
-def _request(want: str, budget: float, referee: str, robust: float, models: int, matter: dict[str, Any]) -> JobOptions:
+def _request(
+    want: str, budget: float, validation: str, robust: float, models: int, matter: dict[str, Any]
+) -> JobOptions:
     """Options of a job with these; InputError for a word that is none."""
-    if want not in ("valid", "raw"):
+    if want not in ("valid", "candidates"):
         raise InputError(f"unknown --want {want!r}; choose valid or raw")
-    if referee not in (levels := (*get_args(Level), "none")):
-        raise InputError(f"unknown referee {referee!r}; choose one of {one_of(referee, levels)}")
-    # An audit is a sample that watches over many jobs; a file can be judged by the letter whole.
+    if validation not in (levels := (*get_args(Level), "none")):
+        raise InputError(f"unknown validator {validation!r}; choose one of {one_of(validation, levels)}")
+    # A recheck is a sample that watches over many jobs; a file can be validated under the DexGraspBench protocol whole.
     try:
         return JobOptions(
-            want=want, budget=budget, referee=referee, audits=0, robust=robust, robust_models=models, **matter
+            want=want, budget=budget, validation=validation, rechecks=0, robust=robust, robust_models=models, **matter
         )
     except ValidationError as error:
         raise InputError(refusal(error, JobOptions)) from None
@@ -241,23 +246,25 @@ def _bar(*, quiet: bool) -> Iterator[Report]:
 
 def _said_of_models(found: dict[str, Any]) -> str:
     """How far the verdicts can be trusted, in a line."""
-    share, fragile = found["robust_share"], found["fragile"]
+    share, not_robust = found["robust_share"], found["not_robust"]
     if share is None:
-        return f"none is robust; {fragile} hold in the nominal model, and in too few of {found['robust_models']} others"
+        return (
+            f"none is robust; {not_robust} hold in the nominal model, and in too few of {found['robust_models']} others"
+        )
     models = f"of {found['robust_models']} models around the nominal one"
     if not (wanted := found["robust_wanted"]) or found["want"] != "valid":
         return f"they hold in {share:.0%} {models}"
-    return f"each holds in {wanted:.0%} {models} or more; {fragile} valid ones did not"
+    return f"each holds in {wanted:.0%} {models} or more; {not_robust} valid ones did not"
 
 
 def _said(found: dict[str, Any]) -> str:
     """The summary as a line; the second one tells what is missing."""
-    judged, mean = found["referee"] != "none", found["mean"]
-    word = "valid" if judged else "sound"
+    validated, mean = found["validation"] != "none", found["mean"]
+    word = "valid" if validated else "feasible"
     lines = [
-        f"{found['file']}: {found[word]} {word} of {found['tried']} grasps tried"
-        f"{', judged at level ' + found['referee'] if judged else '; nobody judged them (--referee none)'}"
-        f"{' with ' + format(found['mass_kg'], '.3g') + ' kg' if judged else ''}, "
+        f"{found['file']}: {found[word]} {word} of {found['candidates']} candidates"
+        f"{', validated at level ' + found['validation'] if validated else '; nobody validated them (--validation none)'}"
+        f"{' with ' + format(found['mass_kg'], '.3g') + ' kg' if validated else ''}, "
         f"{found['grasps_per_second']:.1f} grasps/s"
     ]
     if "robust_share" in found:
@@ -275,7 +282,7 @@ def _said(found: dict[str, Any]) -> str:
         lines.append(f"{found['shake_share']:.0%} survive the shake")
     if "scene" in found:
         lines.append(
-            f"{found['scene']}, {found['scenes']} scenes: {found['clear_share']:.0%} of the tries are clear of what "
+            f"{found['scene']}, {found['scenes']} scenes: {found['clear_share']:.0%} of the candidates are clear of what "
             f"stands there, {found['lift_share']:.0%} lift, {found['lift_hard_share']:.0%} at half the friction"
         )
         lines += [note for note in [rolling_note(found["rolling_scenes"], found["scenes"])] if note]

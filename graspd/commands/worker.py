@@ -32,7 +32,7 @@ def worker(
     ] = None,
     processes: Annotated[
         int | None,
-        typer.Option(min=0, help="Processes that judge and measure, 0: with a GPU one a core; GRASPD_PROCESSES."),
+        typer.Option(min=0, help="Processes that validate and measure, 0: with a GPU one a core; GRASPD_PROCESSES."),
     ] = None,
     burst: Annotated[bool, typer.Option("--burst", help="End when no task waits.")] = False,
     idle: Annotated[int, typer.Option(min=0, help="With --burst: end when none came for so long [s].")] = 0,

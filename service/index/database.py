@@ -74,7 +74,7 @@ class Database:
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """A connection for queries, which all see the same moment."""
-        with self._mended(), self._present().connect() as connection:
+        with self._fixed(), self._present().connect() as connection:
             if connection.dialect.name == "sqlite":
                 connection.exec_driver_sql("BEGIN")
             else:
@@ -91,7 +91,7 @@ class Database:
         if within is not None:
             yield within
             return
-        with self._mended(), self._write_lock, self._present().connect() as connection:
+        with self._fixed(), self._write_lock, self._present().connect() as connection:
             if connection.dialect.name == "sqlite":
                 # A transaction that reads first and writes later fails at once when another one wrote in between.
                 connection.exec_driver_sql("BEGIN IMMEDIATE")
@@ -145,7 +145,7 @@ class Database:
         return self._engine
 
     @contextmanager
-    def _mended(self) -> Iterator[None]:
+    def _fixed(self) -> Iterator[None]:
         """Errors as ours; a damaged file is put aside, so that the next call finds a new one."""
         try:
             with mapped():

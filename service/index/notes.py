@@ -25,7 +25,7 @@ _NAMED: Final = 50
 
 
 @dataclass(frozen=True)
-class Completeness:
+class IndexCompleteness:
     """How an index came to hold all that the store says, or all but what could not be read."""
 
     at: str
@@ -66,11 +66,11 @@ class Notes:
 
     database: Database
 
-    def completeness(self) -> Completeness | None:
+    def completeness(self) -> IndexCompleteness | None:
         """None while the index may lack what the store has: it is new, and was not made from the store yet."""
         with self.database.reading() as connection:
             value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _REBUILT))
-        return None if value is None else Completeness(value["at"], value["left_out"], tuple(value["names"]))
+        return None if value is None else IndexCompleteness(value["at"], value["left_out"], tuple(value["names"]))
 
     def set_complete(self, left_out: Sequence[str] = (), *, within: Connection | None = None) -> None:
         """From now on the index holds all that the store says, but for these records."""
@@ -174,12 +174,12 @@ class Damage:
 
 @dataclass(frozen=True)
 class KnownDamage:
-    """Objects of the store that were found damaged or missing, and not mended since."""
+    """Objects of the store that were found damaged or missing, and not fixed since."""
 
     database: Database
 
     def known(self, *, limit: int = 100) -> tuple[int, list[Damage]]:
-        """Number of damaged objects found so far and not mended, and the first of them."""
+        """Number of damaged objects found so far and not fixed, and the first of them."""
         query = select(damage).order_by(damage.c.found, damage.c.key).limit(limit)
         with self.database.reading() as connection:
             count = int(connection.scalar(select(func.count()).select_from(damage)) or 0)

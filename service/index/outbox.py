@@ -78,7 +78,7 @@ deliveries: Final = Table(
 
 
 @dataclass(frozen=True)
-class Due:
+class DueDelivery:
     """A delivery that shall be tried now."""
 
     hook: WebhookView
@@ -234,7 +234,7 @@ class Outbox:
                 seen = update(webhooks).where(webhooks.c.id == hook.id).values(seen=found[-1].seq)
                 connection.execute(seen)
 
-    def due(self, now: float) -> list[Due]:
+    def due(self, now: float) -> list[DueDelivery]:
         """Deliveries to try now, the oldest of each webhook."""
         hooks = {hook.id: hook for hook in self.hooks()}
         first = (
@@ -251,12 +251,14 @@ class Outbox:
         with self.database.reading() as connection:
             rows = connection.execute(query).mappings().all()
         return [
-            Due(hooks[row["webhook"]], EndView(**{name: row[name] for name in EndView.model_fields}), row["attempts"])
+            DueDelivery(
+                hooks[row["webhook"]], EndView(**{name: row[name] for name in EndView.model_fields}), row["attempts"]
+            )
             for row in rows
             if row["webhook"] in hooks
         ]
 
-    def settle(self, due: Due, *, status: int | None, detail: str, done: bool, final: bool = False) -> None:
+    def settle(self, due: DueDelivery, *, status: int | None, detail: str, done: bool, final: bool = False) -> None:
         """How an attempt ended. After a failure all that waits for the address rests as long as this delivery does;
         after a success it is due.
 

@@ -10,7 +10,7 @@ from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.metric_fields import values, with_fields
 from graspd.service.model.planning import shortfall
 from graspd.service.model.records import Choice
-from graspd.service.model.states import AssetKind, Lane, Stage, State
+from graspd.service.model.states import AssetKind, Priority, Stage, State
 
 T = TypeVar("T")
 
@@ -28,21 +28,23 @@ class Page(View, Generic[T]):
     next: str | None = None
 
 
-class Judged(View):
-    """What was made, and how much of it is valid. Grasps that nobody judged are no failures: they are left out."""
+class Validated(View):
+    """What was made, and how much of it is valid. Grasps that are not validated are no failures: they are left out."""
 
     grasps: int = Field(0, description="grasps kept so far")
     valid: int = Field(
-        0, description="of these, valid: past the geometric gate and judged to hold; 0 where nobody judges"
+        0, description="of these, valid: past the geometric gate and validated to hold; 0 where nothing is validated"
     )
-    tried: int = Field(0, description="grasps planned for them, kept or not")
-    judged: int = Field(0, description="of these, judged by the geometric gate and a referee; 0 where nobody judges")
+    candidates: int = Field(0, description="grasps planned for them, kept or not")
+    validated: int = Field(
+        0, description="of these, validated by the geometric gate and a validator; 0 where nothing is validated"
+    )
 
-    @computed_field(description="valid grasps per grasp judged; null: nobody judged")  # type: ignore[prop-decorator]
+    @computed_field(description="valid grasps per grasp validated; null: not validated")  # type: ignore[prop-decorator]
     @property
     def valid_yield(self) -> float | None:
-        """Share of the judged ones that are valid."""
-        return self.valid / self.judged if self.judged else None
+        """Share of the validated ones that are valid."""
+        return self.valid / self.validated if self.validated else None
 
 
 class StageProgress(View):
@@ -60,10 +62,10 @@ class StageProgress(View):
     seconds: float = Field(0.0, description="sum over the finished tasks, without the reused ones [s]")
 
 
-class JobView(Judged):
+class JobView(Validated):
     id: str
     state: State
-    lane: Lane
+    priority: Priority
     request: JobRequest
     hand_digest: str
     object_digest: str
@@ -74,19 +76,19 @@ class JobView(Judged):
     choice: Choice | None = Field(None, description="how a chart chose its fidelity, where the request said auto")
     reason: str | None = Field(None, description="why the job failed: the first failed task's last attempt")
     stages: list[StageProgress] = []
-    audited: int = Field(0, description="valid grasps judged again by the letter of the protocol")
-    audit_held: int = Field(0, description="of these, grasps that held")
+    rechecked: int = Field(0, description="valid grasps validated again under the unmodified DexGraspBench protocol")
+    recheck_held: int = Field(0, description="of these, grasps that held")
     outcomes: dict[str, int] = Field({}, description="candidates that were not kept, by what became of them")
 
     @computed_field(description="what a reader of the numbers should know")  # type: ignore[prop-decorator]
     @property
     def note(self) -> str | None:
-        """Says so where a job ended with fewer valid (unjudged: sound) grasps than it was asked for."""
+        """Says so where a job ended with fewer valid (unvalidated: feasible) grasps than it was asked for."""
         request = self.request
         found = self.valid if request.counted == "valid" else self.grasps
         if self.state is not State.SUCCEEDED or request.want != "valid":
             return None
-        return shortfall(found, request.grasps, request.counted, self.tried, request.budget, self.outcomes)
+        return shortfall(found, request.grasps, request.counted, self.candidates, request.budget, self.outcomes)
 
 
 class TaskView(View):
@@ -156,13 +158,13 @@ class GraspView(View):
     hand: str
     object: str
     valid: bool
-    success: bool | None = Field(description="verdict of the referee; None: not tested")
-    verdict_level: str | None = Field(description="level of the referee that gave it")
+    success: bool | None = Field(description="verdict of the validator; None: not tested")
+    verdict_level: str | None = Field(description="level of the validator that gave it")
     scene_kind: str = Field("free", description="kind of the scene it was planned in; free: around a floating object")
     neighbours: int = Field(0, description="other objects that stood in that scene")
     lift_hard: bool | None = Field(None, description="in a scene: lifted at half the friction; None: not tested")
     robust_weakest: str | None = Field(
-        None, description="axis of the first model in which it does not hold; None: held in all, or not judged there"
+        None, description="axis of the first model in which it does not hold; None: held in all, or not validated there"
     )
     created: str
 
@@ -216,7 +218,7 @@ class FailureGroup(View):
     last_seen: str
 
 
-class Stats(Judged):
+class Stats(Validated):
     """The whole service in a few numbers."""
 
     jobs: dict[State, int]
@@ -281,7 +283,7 @@ class DeliveryView(View):
     ended: str = Field(description="succeeded, failed or cancelled")
     state: str = Field(description="waiting, delivered or failed")
     attempts: int
-    tried: str | None = Field(description="when it was tried last")
+    candidates: str | None = Field(description="when it was tried last")
     status: int | None = Field(description="HTTP status of the last answer")
     detail: str = Field(description="how the last attempt ended")
 
@@ -298,7 +300,7 @@ class UsageDay(View):
     cpu_seconds: float = Field(description="time that CPU workers spent on them [s]")
 
 
-class MatrixCell(Judged):
+class MatrixCell(Validated):
     """One hand x object of the matrix."""
 
     hand: str
@@ -309,8 +311,8 @@ class MatrixCell(Judged):
     failed: int
 
 
-class DatasetView(Judged):
-    """A dataset in numbers. `grasps`, `valid` and `tried` count what base shards hold so far."""
+class DatasetView(Validated):
+    """A dataset in numbers. `grasps`, `valid` and `candidates` count what base shards hold so far."""
 
     name: str
     digest: str = Field(description="equal hands, objects and options have the same digest")
@@ -343,7 +345,7 @@ class DatasetView(Judged):
         if not self.state.is_final or self.options.want != "valid":
             return None
         options = self.options
-        return shortfall(self.counted, self.asked, options.counted, self.tried, options.budget, self.outcomes)
+        return shortfall(self.counted, self.asked, options.counted, self.candidates, options.budget, self.outcomes)
 
     @property
     def counted(self) -> int:
@@ -351,7 +353,7 @@ class DatasetView(Judged):
         return self.valid if self.options.standing == "valid" else self.grasps
 
 
-class CellView(Judged):
+class CellView(Validated):
     """One hand x object of a dataset: an ordinary job, or one that is still to be planned."""
 
     position: int = Field(description="hand by hand, and in each hand object by object, from 0")

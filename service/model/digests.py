@@ -92,7 +92,7 @@ def shard_id(
             "friction": request.friction,
             **({"options": request.options} if request.options else {}),
             **({"matter": request.matter} if request.matter else {}),
-            **_judgement(request, range(batch, batch + batches_of(count))),
+            **_verdict_text(request, range(batch, batch + batches_of(count))),
         }
     elif stage is Stage.SCENE:
         inputs_of |= {"scenes": request.scenes}
@@ -104,17 +104,17 @@ def shard_id(
     return digest_json(inputs_of)
 
 
-def _judgement(request: JobRequest, batches: range) -> dict[str, object]:
+def _verdict_text(request: JobRequest, batches: range) -> dict[str, object]:
     """What decides which grasps of some batches are kept, and what is known of them."""
     found: dict[str, object] = {}
     if request.want == "valid":
         found |= {"want": request.want, "budget": request.budget}
         # Its default is part of the stage's revision.
         found |= {} if request.min_distance == MIN_DISTANCE_M else {"min_distance": request.min_distance}
-    if request.referee != "none":
+    if request.validation != "none":
         found |= {
-            "referee": request.referee,
-            "audits": sum(map(request.audits_of, batches)),
+            "validation": request.validation,
+            "rechecks": sum(map(request.rechecks_of, batches)),
             "robustness": request.robustness,
         }
     if request.models:

@@ -40,10 +40,10 @@ BATCH_SIZE: Final = 32
 #: What pictures can show besides colour, depth and segmentation, in the order in which shards and digests name them.
 EXTRA_CHANNELS: Final = ("distance", "normals", "occlusion")
 
-#: Audits of a job that wants no other number of them, and batches for each: the letter takes as long over a grasp as
-#: planning, judging and measuring two or three valid ones.
-AUDITS: Final = 8
-_AUDIT_EVERY: Final = 2
+#: Rechecks of a job that wants no other number of them, and batches for each: the DexGraspBench protocol takes as long
+#: over a grasp as planning, validating and measuring two or three valid ones.
+RECHECKS: Final = 8
+_RECHECK_EVERY: Final = 2
 
 #: Methods of graspd's own that know no scene; what those of other packages know, a worker tells.
 FREE_ONLY_METHODS: Final = ("autograsp", "dfc", "graspd2022", "graspit")
@@ -69,7 +69,7 @@ class JobOptions(Model):
         "free",
         exclude_if=lambda value: value == "free",
         description="where the grasps are used: free (around an object that floats), table, bin, shelf, or a document "
-        "with supports. If not free they are planned, judged and rendered there, and `grasps` counts those valid there",
+        "with supports. If not free they are planned, validated and rendered there, and `grasps` counts those valid there",
     )
     faces: Literal["drawn", "all"] = Field(
         "drawn",
@@ -116,12 +116,12 @@ class JobOptions(Model):
         description="Coulomb coefficient of contacts in simulation; by default the object's own, "
         f"{FRICTION:g} where it has none",
     )
-    want: Literal["valid", "raw"] = Field(
+    want: Literal["valid", "candidates"] = Field(
         "valid",
-        description="whether `grasps` counts grasps that are valid (sound ones where the referee is none), or all that "
+        description="whether `grasps` counts grasps that are valid (feasible ones where the validator is none), or all that "
         "were tried",
     )
-    budget: float = Field(4.0, ge=1, le=100, description="tries for each valid grasp wanted, at most")
+    budget: float = Field(4.0, ge=1, le=100, description="candidates for each valid grasp wanted, at most")
     min_distance: float = Field(
         MIN_DISTANCE_M,
         ge=0,
@@ -131,16 +131,16 @@ class JobOptions(Model):
         description="a grasp that is nearer to an earlier one of its batch is not kept [m]: mean distance of the same "
         "points of the hand, in the object's frame; 0: all are. Goes with want valid",
     )
-    referee: Literal["letter", "certificate", "screen", "none"] = Field(
-        "certificate",
-        description="level at which MuJoCo judges the grasps (screen: on a GPU, MuJoCo Warp gives the clear verdicts); "
-        "none: nobody, grasps are sound at best",
+    validation: Literal["dexgraspbench", "standard", "fast", "none"] = Field(
+        "standard",
+        description="level at which MuJoCo validates the grasps (screen: on a GPU, MuJoCo Warp gives the clear verdicts); "
+        "none: nobody, grasps are feasible at best",
     )
-    audits: int = Field(
-        AUDITS,
+    rechecks: int = Field(
+        RECHECKS,
         ge=0,
         le=10_000,
-        description=f"valid grasps of the job that are judged again by the letter: the default, {AUDITS}, are "
+        description=f"valid grasps of the job that are validated again under the DexGraspBench protocol: the default, {RECHECKS}, are "
         "spread over the job, one of 64, and take a twentieth of its time; of any other number the first ones",
     )
     robustness: int = Field(0, ge=0, le=20, description="verdicts under noise that each valid grasp gets")
@@ -151,14 +151,14 @@ class JobOptions(Model):
         allow_inf_nan=False,
         exclude_if=lambda value: value == 0,
         description="share of models around the nominal one in which a grasp must hold to count; 0: none is wanted. "
-        "Where raw grasps are wanted all are kept, whatever their share",
+        "Where candidates are wanted all are kept, whatever their share",
     )
     robust_models: int = Field(
         0,
         ge=0,
         le=MOST_ROBUST_MODELS,
         exclude_if=lambda value: value == 0,
-        description=f"models in which each valid grasp is judged too; 0: {ROBUST_MODELS} where a share is wanted, "
+        description=f"models in which each valid grasp is validated too; 0: {ROBUST_MODELS} where a share is wanted, "
         "else none",
     )
     payload: bool = Field(
@@ -193,7 +193,7 @@ class JobOptions(Model):
         "",
         max_length=40,
         description="with fidelity `auto`: the accuracy wanted, such as gsr>=0.6, letter>=0.9, epsilon>=0.2 or "
-        "pd_mm<=1, with a scene lift>=0.9, lift_letter, lift_hard or robust; the cheapest fidelity that meets it in "
+        "pd_mm<=1, with a scene lift>=0.9, lift_dexgraspbench, lift_hard or robust; the cheapest fidelity that meets it in "
         "the stored chart of such grasps is taken when the job is submitted",
     )
 
@@ -230,10 +230,10 @@ class JobOptions(Model):
     def _one_mass(self) -> Self:
         if self.mass is not None and self.density is not None:
             raise ValueError("mass and density both: give one of them")
-        if self.referee == "letter" and self.matter:
+        if self.validation == "dexgraspbench" and self.matter:
             raise ValueError(
-                f"referee letter is DexGraspBench's protocol, which gives all objects {MASS_KG:g} kg and friction "
-                f"{FRICTION:g}: {', '.join(self.matter)} goes with certificate, screen or none"
+                f"validation dexgraspbench is DexGraspBench's protocol, which gives all objects {MASS_KG:g} kg and friction "
+                f"{FRICTION:g}: {', '.join(self.matter)} goes with standard, fast or none"
             )
         return self
 
@@ -273,15 +273,15 @@ class JobOptions(Model):
         return self
 
     @model_validator(mode="after")
-    def _noise_needs_a_referee(self) -> Self:
-        if self.robustness and self.referee == "none":
-            raise ValueError("robustness counts verdicts: choose a referee")
-        if self.models and self.referee == "none":
-            raise ValueError("robust counts verdicts: choose a referee")
-        if self.measures_payload and self.referee == "none":
-            raise ValueError("payload is what the referee sees lifted: choose one")
-        if self.shake and self.referee == "none":
-            raise ValueError("shake is of what the referee sees lifted: choose one")
+    def _noise_needs_validation(self) -> Self:
+        if self.robustness and self.validation == "none":
+            raise ValueError("robustness counts verdicts: choose a validator")
+        if self.models and self.validation == "none":
+            raise ValueError("robust counts verdicts: choose a validator")
+        if self.measures_payload and self.validation == "none":
+            raise ValueError("payload is what the validator sees lifted: choose one")
+        if self.shake and self.validation == "none":
+            raise ValueError("shake is of what the validator sees lifted: choose one")
         return self
 
     @property
@@ -297,7 +297,7 @@ class JobOptions(Model):
 
     @property
     def models(self) -> int:
-        """Models around the nominal one in which each valid grasp is judged; 0: none."""
+        """Models around the nominal one in which each valid grasp is validated; 0: none."""
         return self.robust_models or (ROBUST_MODELS if self.robust else 0)
 
     @property
@@ -342,35 +342,36 @@ class JobOptions(Model):
         return resolve_fidelity(self.fidelity)
 
     @property
-    def counted(self) -> Literal["valid", "sound"]:
-        """What the kept grasps are of a job that does not want raw ones: valid, or sound where nobody judges."""
-        return "sound" if self.referee == "none" else "valid"
+    def counted(self) -> Literal["valid", "feasible"]:
+        """What the kept grasps are of a job that does not want candidates ones: valid, or feasible where nothing is
+        validated."""
+        return "feasible" if self.validation == "none" else "valid"
 
     @property
-    def standing(self) -> Literal["valid", "sound", "kept"]:
-        """What tables and pages count of what was made: valid grasps; where nobody judges all that were kept, which are
-        sound unless raw ones were wanted."""
-        return "kept" if self.counted == "sound" and self.want == "raw" else self.counted
+    def standing(self) -> Literal["valid", "feasible", "kept"]:
+        """What tables and pages count of what was made: valid grasps; where nothing is validated all that were kept,
+        which are feasible unless candidates were wanted."""
+        return "kept" if self.counted == "feasible" and self.want == "candidates" else self.counted
 
-    def audits_of(self, batch: int) -> int:
-        """Grasps of a batch that are audited: the first batches share the job's audits, so that a longer job has the
-        same first batches as a shorter one.
+    def rechecks_of(self, batch: int) -> int:
+        """Grasps of a batch that are rechecked: the first batches share the job's rechecks, so that a longer job has
+        the same first batches as a shorter one.
 
         The default is spread: every other batch has one, and every other job begins with the first batch, so that a
-        dataset of short jobs is audited as well.
+        dataset of short jobs is rechecked as well.
         """
-        if self.referee in ("none", "letter"):
+        if self.validation in ("none", "dexgraspbench"):
             return 0
-        if self.audits == AUDITS:
+        if self.rechecks == RECHECKS:
             turn = batch + self._first_turn
-            return int(turn % _AUDIT_EVERY == 0 and batch // _AUDIT_EVERY < AUDITS)
-        return min(BATCH_SIZE, max(0, self.audits - batch * BATCH_SIZE))
+            return int(turn % _RECHECK_EVERY == 0 and batch // _RECHECK_EVERY < RECHECKS)
+        return min(BATCH_SIZE, max(0, self.rechecks - batch * BATCH_SIZE))
 
     @property
     def _first_turn(self) -> int:
-        """Where a job stands in the turns of audits."""
+        """Where a job stands in the turns of rechecks."""
         named = [getattr(self, name, "") for name in ("hand", "object")]
-        return zlib.crc32("/".join([*named, str(self.seed)]).encode()) % _AUDIT_EVERY
+        return zlib.crc32("/".join([*named, str(self.seed)]).encode()) % _RECHECK_EVERY
 
 
 class JobRequest(JobOptions):

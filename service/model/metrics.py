@@ -176,8 +176,8 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "robust_share",
         "1",
-        "share of the models around the nominal one in which it holds too; where judging ended "
-        "early, what it is at least, or at most below the wanted one; nan: not judged there",
+        "share of the models around the nominal one in which it holds too; where validating ended "
+        "early, what it is at least, or at most below the wanted one; nan: not validated there",
         title="Models survived",
         short="Robust",
         optional=True,
@@ -271,7 +271,7 @@ def indexed(least: Indexed = Indexed.KEPT) -> tuple[GraspMetric, ...]:
     return tuple(metric for metric in GRASP_METRICS if metric.indexed >= least)
 
 
-#: Models around the nominal one in which a grasp is judged, where nobody says how many.
+#: Models around the nominal one in which a grasp is validated, where nobody says how many.
 ROBUST_MODELS: Final = 8
 
 MOST_ROBUST_MODELS: Final = 64

@@ -59,7 +59,7 @@ def object_prepared(digest: str, key: str) -> str:
 
 
 def object_pieces(digest: str, key: str) -> str:
-    """Convex pieces of an object as the referee knows it; `key` is a digest of how they were made."""
+    """Convex pieces of an object as the validator knows it; `key` is a digest of how they were made."""
     return f"{ASSETS}/{AssetKind.OBJECT.value}/{digest}/pieces/{key}.npz"
 
 

@@ -18,7 +18,7 @@ from graspd.service.model.digests import digest_json, shard_id
 from graspd.service.model.domain import BATCH_SIZE, JobOptions, JobRequest, batches_of
 from graspd.service.model.messages import IngestMessage, TaskMessage
 from graspd.service.model.records import JobRecord
-from graspd.service.model.states import AssetKind, Lane, Stage, State
+from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.version import (
     OLDEST_TASK_SCHEMA,
     SCHEMA_OF_FIELD,
@@ -63,9 +63,9 @@ class TaskFacts:
     running: bool = False
 
 
-def lane_of(request: JobRequest) -> Lane:
+def priority_of(request: JobRequest) -> Priority:
     """Lane of a job submitted by itself; the jobs of a dataset always go in bulk."""
-    return Lane.INTERACTIVE if request.grasps <= INTERACTIVE_GRASPS else Lane.BULK
+    return Priority.INTERACTIVE if request.grasps <= INTERACTIVE_GRASPS else Priority.BULK
 
 
 def stages_of(request: JobOptions) -> tuple[Stage, ...]:
@@ -230,7 +230,7 @@ def share_of(project: str, key: str) -> str:
     return f"project {project}" if project else key
 
 
-class Turns:
+class RoundRobin:
     """Remembers who was served last. Lost with its process, which costs nobody more than one turn."""
 
     def __init__(self) -> None:
@@ -279,7 +279,7 @@ OUTCOMES: Final = {
     "gate_penetration": "too deep in the object (gate)",
     "gate_self_penetration": "hand too deep in itself (gate)",
     "gate_contacts": "did not oppose: fewer than two links in contact (gate)",
-    "fragile": "held in too few models",
+    "not_robust": "held in too few models",
     "weak": "lifted less than the wanted payload",
     "alike": "too similar to another",
     "repeated": "repeated attempts",
@@ -302,23 +302,23 @@ def told(outcomes: Mapping[str, int]) -> str:
 
 
 def shortfall(
-    found: int, wanted: int, counted: str, tried: int, budget: float, outcomes: Mapping[str, int], limit: str = ""
+    found: int, wanted: int, counted: str, candidates: int, budget: float, outcomes: Mapping[str, int], limit: str = ""
 ) -> str | None:
     """Why fewer grasps were found than wanted, in a sentence; None where all were.
 
     Args:
         found: grasps that count.
         wanted: grasps asked for.
-        counted: which grasps count: valid or sound.
+        counted: which grasps count: valid or feasible.
         tried: candidates planned.
-        budget: tries for each grasp wanted, at most: candidates and repeated attempts.
+        budget: candidates for each grasp wanted, at most: candidates and repeated attempts.
         outcomes: candidates that were not kept, by `OUTCOMES`, and the repeated attempts.
         limit: what the hand lifts at best, in place of the budget that ended.
     """
     if found >= wanted:
         return None
-    lost, tries = told(outcomes), tried + outcomes.get("repeated", 0)
-    ended = limit or f"the budget of {budget:g} tries for each ended first"
+    lost, tries = told(outcomes), candidates + outcomes.get("repeated", 0)
+    ended = limit or f"the budget of {budget:g} candidates for each ended first"
     return f"found {found:,} of {wanted:,} {counted} grasps in {tries:,} tries{': ' if lost else ''}{lost}; {ended}"
 
 

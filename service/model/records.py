@@ -20,7 +20,7 @@ from graspd.service.model.domain import Digest, JobOptions, JobRequest, Name, ch
 from graspd.service.model.fidelity import AUTO
 from graspd.service.model.messages import Origin
 from graspd.service.model.projects import Project
-from graspd.service.model.states import AssetKind, Lane, Stage
+from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.model.version import STAGE_REVISIONS
 
 #: Most batches of a task.
@@ -58,7 +58,7 @@ class JobRecord(Record):
     revisions: dict[str, int] = Field(default_factory=lambda: dict(STAGE_REVISIONS))
     hand_digest: Digest
     object_digest: Digest
-    lane: Lane
+    priority: Priority
     span: int = Field(
         1, ge=1, le=MOST_BATCHES, exclude_if=lambda value: value == 1, description="batches of each of its tasks"
     )
@@ -73,9 +73,9 @@ class JobRecord(Record):
     @model_validator(mode="before")
     @classmethod
     def _as_it_was_meant(cls, data: Any) -> Any:
-        # Records of version 1 knew neither a referee nor revisions.
+        # Records of version 1 knew neither a validator nor revisions.
         if isinstance(data, dict) and data.get("version") == 1:
-            request = {"want": "raw", "referee": "none", **data.get("request", {})}
+            request = {"want": "candidates", "validation": "none", **data.get("request", {})}
             return {**data, "request": request, "revisions": dict.fromkeys(STAGE_REVISIONS, 1)}
         return data
 
@@ -258,7 +258,7 @@ def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: st
         revisions=revisions,
         hand_digest=cell.hand.digest,
         object_digest=cell.object.digest,
-        lane=Lane.BULK,
+        priority=Priority.BULK,
         created=timestamp(),
         owner=owner,
         project=project,

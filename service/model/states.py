@@ -36,7 +36,7 @@ class AssetKind(StrEnum):
     NETWORK = "network"
 
 
-class Lane(StrEnum):
+class Priority(StrEnum):
     """Priority of a task: `interactive` goes first, but for every fourth task that a worker takes."""
 
     INTERACTIVE = "interactive"

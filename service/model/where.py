@@ -29,7 +29,7 @@ _SHORT: Final = {"robust": "robust_share"}
 _WORDS: Final = ("hand", "object", "type")
 _TYPES: Final = tuple(kind.name.lower() for kind in GraspType)
 #: What stands alone: true or not.
-FLAGS: Final = ("judged", "valid", "sound", "held", "lift", "lift_hard")
+FLAGS: Final = ("validated", "valid", "feasible", "held", "lift", "lift_hard")
 _COMPARISONS: Final = {"<": "<", "<=": "<=", ">": ">", ">=": ">=", "=": "=", "==": "=", "!=": "!="}
 _TOKEN: Final = re.compile(
     r"\s*(?:(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?![\w.])|(?P<op><=|>=|==|!=|[<>=()])"

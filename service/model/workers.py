@@ -46,9 +46,9 @@ class WorkerBeat:
     """Revision that it makes of each stage."""
 
     @property
-    def ability(self) -> Ability:
+    def ability(self) -> Capabilities:
         """What it can do."""
-        return Ability(self.schemas, self.revisions)
+        return Capabilities(self.schemas, self.revisions)
 
 
 #: The first schema with which messages carry a range.
@@ -56,7 +56,7 @@ FIRST_SCHEMA: Final = 2
 
 
 @dataclass(frozen=True)
-class Need:
+class Requirements:
     """What a task asks of its worker."""
 
     stage: Stage
@@ -69,7 +69,7 @@ class Need:
 
 
 @dataclass(frozen=True)
-class Ability:
+class Capabilities:
     """What a worker reads and makes."""
 
     schemas: tuple[int, int]
@@ -77,7 +77,7 @@ class Ability:
     revisions: Mapping[str, int]
     """Revision of each stage."""
 
-    def lacks(self, need: Need) -> str:
+    def lacks(self, need: Requirements) -> str:
         """Why such a worker cannot do a task; "" if it can."""
         oldest, newest = self.schemas
         if need.schema > newest:
@@ -90,12 +90,12 @@ class Ability:
         return ""
 
 
-def own_ability() -> Ability:
+def own_ability() -> Capabilities:
     """What this version of graspd reads and makes."""
-    return Ability((OLDEST_TASK_SCHEMA, TASK_SCHEMA), STAGE_REVISIONS)
+    return Capabilities((OLDEST_TASK_SCHEMA, TASK_SCHEMA), STAGE_REVISIONS)
 
 
-def need_of(message: TaskMessage | IngestMessage) -> Need:
+def need_of(message: TaskMessage | IngestMessage) -> Requirements:
     """What a message asks."""
     revision = message.revision if isinstance(message, TaskMessage) else 0
-    return Need(message.stage, message.schema_, message.newest_schema or message.schema_, revision)
+    return Requirements(message.stage, message.schema_, message.newest_schema or message.schema_, revision)

@@ -20,9 +20,9 @@ from graspd.service.index.rebuild import complete_if_new, rebuild
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import BusyError, DamagedError, NotFoundError, StoreUnavailable, UnavailableError
-from graspd.service.model.planning import Turns, ingest_id, ingest_message
+from graspd.service.model.planning import RoundRobin, ingest_id, ingest_message
 from graspd.service.model.records import JobRecord
-from graspd.service.model.states import Lane
+from graspd.service.model.states import Priority
 from graspd.service.model.workers import WorkerBeat, need_of
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets.rounds import DatasetRounds
@@ -74,7 +74,7 @@ class Controller:
         self._known: str | None = None
         """Mark that the index had when it was last compared with the store's."""
         self._has_plans = False
-        self._turns = Turns()
+        self._turns = RoundRobin()
         self._backlog: list[tuple[str, Event]] = []
         self._routes = Routes()
         self._seen: dict[str, tuple[float, WorkerBeat]] = {}
@@ -94,20 +94,20 @@ class Controller:
         interval_s = services.settings.controller_interval_s
         self._entered = ""
         """The large job whose next tasks were entered last."""
-        self._identify = Duty(clock, lambda: identify(services, holds_redis=True), _IDENTIFY_EVERY_S)
+        self._identify = PeriodicDuty(clock, lambda: identify(services, holds_redis=True), _IDENTIFY_EVERY_S)
         self._duties = [
-            Duty(clock, services.queue.tidy, _WORKERS_EVERY_S),
-            Duty(clock, self._mark, _WORKERS_EVERY_S),
-            Duty(clock, self._indexer.flush, _WORKERS_EVERY_S),
-            Duty(clock, self._look_after_workers, _WORKERS_EVERY_S, share=0.1),
+            PeriodicDuty(clock, services.queue.tidy, _WORKERS_EVERY_S),
+            PeriodicDuty(clock, self._mark, _WORKERS_EVERY_S),
+            PeriodicDuty(clock, self._indexer.flush, _WORKERS_EVERY_S),
+            PeriodicDuty(clock, self._look_after_workers, _WORKERS_EVERY_S, share=0.1),
             # Each lease is seen three times before it can be called lost.
-            Duty(clock, self._look_after_queue, interval_s, longest_s=services.settings.lease_s / 3),
-            Duty(clock, self._feed_news, 0.0),
-            Duty(clock, self._pass_on_reports, min(_REPORTS_EVERY_S, interval_s), share=0.1),
+            PeriodicDuty(clock, self._look_after_queue, interval_s, longest_s=services.settings.lease_s / 3),
+            PeriodicDuty(clock, self._feed_news, 0.0),
+            PeriodicDuty(clock, self._pass_on_reports, min(_REPORTS_EVERY_S, interval_s), share=0.1),
             # The index is free for at least as long as it was held.
-            Duty(clock, self._enter_large_job, _ENTERING_GAP_S, share=0.5),
-            Duty(clock, self._plan, interval_s),
-            Duty(clock, lambda: self._garbage.advance() or self._garbage.collect(), _COLLECT_EVERY_S),
+            PeriodicDuty(clock, self._enter_large_job, _ENTERING_GAP_S, share=0.5),
+            PeriodicDuty(clock, self._plan, interval_s),
+            PeriodicDuty(clock, lambda: self._garbage.advance() or self._garbage.collect(), _COLLECT_EVERY_S),
         ]
 
     def run(self, stop: threading.Event) -> None:
@@ -242,7 +242,7 @@ class Controller:
             self._indexer.made(manifest)
         complete_if_new(self._services.index, self._services.store)
         made = self._services.index.notes.completeness()
-        # What was left out may have been mended since.
+        # What was left out may have been fixed since.
         if made is None or made.left_out or self._is_stale():
             self._make_whole()
         else:
@@ -292,7 +292,7 @@ class Controller:
 
     def _look_after_queue(self) -> None:
         # While Redis can be read but not written, as on a full disk, no worker can give a sign of life: then this fails
-        # first, and nobody's silence is judged.
+        # first, and nobody's silence is validated.
         self._announce()
         # Waiting tasks are read before leases: one that a worker takes in between is then seen as held.
         waiting = self._services.queue.waiting()
@@ -325,9 +325,9 @@ class Controller:
         # Every worker finds a task waiting when it ends one.
         window = max(self._services.settings.queue_window, 2 * self._workers)
         held: set[str] = set()
-        for lane in Lane:
-            room = window - sum(n for (of, _), n in depths.items() if of is lane)
-            ready = self._ready(lane, now, room) if room > 0 else []
+        for priority in Priority:
+            room = window - sum(n for (of, _), n in depths.items() if of is priority)
+            ready = self._ready(priority, now, room) if room > 0 else []
             if present is None:
                 held |= queue_tasks(self._services, ready, routes=self._routes)
                 continue
@@ -342,8 +342,8 @@ class Controller:
         self._held = held
         self._feed_checks(present, missing, now)
 
-    def _ready(self, lane: Lane, now: float, room: int) -> list[ReadyTask]:
-        return self._services.index.feed.ready_tasks(lane, self._turns, now=now, limit=room)
+    def _ready(self, priority: Priority, now: float, room: int) -> list[ReadyTask]:
+        return self._services.index.feed.ready_tasks(priority, self._turns, now=now, limit=room)
 
     def _feed_checks(self, present: set[str] | None, missing: Collection[str], now: float) -> None:
         for check in self._services.index.feed.ready_checks(now=now, limit=self._services.settings.queue_window):
@@ -364,7 +364,7 @@ class Controller:
                     self._services.index.live.set_asset_waiting([check.digest], queued=False, not_before=now + HELD_S)
                 else:
                     again = message.task_id in missing
-                    self._services.queue.enqueue([message], Lane.INTERACTIVE, again=again, apart=place.apart)
+                    self._services.queue.enqueue([message], Priority.INTERACTIVE, again=again, apart=place.apart)
 
 
 @contextmanager
@@ -378,7 +378,7 @@ def _noted(away: list[UnavailableError]) -> Iterator[None]:
         log.warning("%s", error)
 
 
-class Duty:
+class PeriodicDuty:
     """What need not be done in every round: once in `every_s`, and no more than `share` of the time.
 
     It is called in each, and where the work breaks off, or answers True for something left to do, also does it in the

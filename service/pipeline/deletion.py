@@ -25,9 +25,9 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.recording import recording
 from graspd.service.store.library import load_asset, load_check
 from graspd.service.store.records import (
+    DeletedJob,
     Deletion,
     Put,
-    Released,
     What,
     dataset_events,
     deletions,
@@ -124,7 +124,7 @@ def put_away(services: Services, deletion: Deletion) -> None:
         folder = removed_folder(deletion)
         put_record(services.store, f"{folder}/deletion.json", deletion)
         if deletion.job is not None:
-            put_record(services.store, released_key(deletion), Released(at=deletion.at, job=deletion.job))
+            put_record(services.store, released_key(deletion), DeletedJob(at=deletion.at, job=deletion.job))
         attempts = [names.attempt(task, number) for task, number in deletion.attempts]
         for key in [*attempts, *_last(_below(services.store, record.rpartition("/")[0]), record)]:
             services.store.move(key, f"{folder}/{key}")

@@ -19,7 +19,7 @@ from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.deletion import delete_job, put_away
-from graspd.service.store.records import Deletion, Released, load_dataset, read_record, removed_before
+from graspd.service.store.records import DeletedJob, Deletion, load_dataset, read_record, removed_before
 
 log = logging.getLogger(__name__)
 #: Time for deletions in one round of the controller [s].
@@ -72,7 +72,7 @@ class GarbageCollector:
             return False  # a job whose record cannot be read may need one of them
         for entry in sorted(self._services.store.list(names.RELEASED), key=lambda one: one.key):
             try:
-                released = read_record(Released, self._services.store, entry.key)
+                released = read_record(DeletedJob, self._services.store, entry.key)
             except DamagedError as error:
                 log.warning("%s", error)
                 continue
@@ -121,7 +121,7 @@ class GarbageCollector:
                     log.info("job %s of the deleted dataset %s stays: %s", job, dataset, error)
         return True
 
-    def _unneeded(self, released: Released) -> Iterator[tuple[Stage, str]]:
+    def _unneeded(self, released: DeletedJob) -> Iterator[tuple[Stage, str]]:
         planned = [(task.stage, task.output) for task in plan(released.job)]
         for start in range(0, len(planned), _AT_ONCE):
             some = planned[start : start + _AT_ONCE]

@@ -30,7 +30,7 @@ from graspd.service.store.assets import ZipFiles
 from graspd.service.store.integrity import is_sealed
 from graspd.service.store.library import UNPACKED_LIMIT_BYTES, load_check
 from graspd.service.store.manifests import ShardManifest
-from graspd.service.store.records import CHARTS, IN_SCENES, STABILITY, Deletion, Released, parse_record
+from graspd.service.store.records import CHARTS, IN_SCENES, STABILITY, DeletedJob, Deletion, parse_record
 from graspd.service.store.store import Store
 
 #: What the key of a record looks like, and what it must hold.
@@ -44,7 +44,7 @@ _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
     (r"datasets/[^/]+/snapshots/[^/]+\.json", Snapshot),
     (r"object_sets/[^/]+/[^/]+\.json", ObjectSet),
     (r"deletions/[^/]+/[^/]+\.json", Deletion),
-    (r"released/[^/]+\.json", Released),
+    (r"released/[^/]+\.json", DeletedJob),
     (r"webhooks/[^/]+\.json", Webhook),
     (r"tags/[^/]+/[^/]+\.json", Tag),
 )

@@ -21,7 +21,7 @@ from graspd.service.pipeline.integrity import FOLDERS, examine, is_checked, is_o
 log = logging.getLogger(__name__)
 #: A small store is not read more often than this [s].
 ROUND_S: Final = 3600.0
-#: What is known to be damaged is looked at again this often, so that the mended is soon forgotten [s].
+#: What is known to be damaged is looked at again this often, so that the fixed is soon forgotten [s].
 _AGAIN_S: Final = 60.0
 _KNOWN: Final = 1000
 #: Keys held at once; the folder is listed anew for the next ones.

@@ -19,11 +19,11 @@ from graspd.service.model.digests import job_id
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.errors import ConflictError, NotFoundError, SceneError, UnavailableError
 from graspd.service.model.messages import Origin, TaskMessage
-from graspd.service.model.planning import lane_of, message_of
+from graspd.service.model.planning import message_of, priority_of
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import JobRecord
 from graspd.service.model.scene_spec import HalfSpace, Pose, Supports
-from graspd.service.model.states import AssetKind, Lane, State
+from graspd.service.model.states import AssetKind, Priority, State
 from graspd.service.model.transforms import quat_conjugate, quat_rotate
 from graspd.service.model.workers import need_of
 from graspd.service.pipeline.backends import Services
@@ -43,7 +43,7 @@ HELD_S: Final = 10.0
 _SUNK_M: Final = 1e-3
 
 
-def submit(services: Services, request: JobRequest, *, lane: Lane | None = None) -> tuple[JobView, bool]:
+def submit(services: Services, request: JobRequest, *, priority: Priority | None = None) -> tuple[JobView, bool]:
     """Record a job and queue its first tasks. The same request on the same hand and object is the same job.
 
     Args:
@@ -55,14 +55,14 @@ def submit(services: Services, request: JobRequest, *, lane: Lane | None = None)
     Raises:
         what `prepare` raises; nothing was recorded then.
     """
-    return enter(services, prepare(services, request, lane=lane))
+    return enter(services, prepare(services, request, priority=priority))
 
 
 def prepare(
     services: Services,
     request: JobRequest,
     *,
-    lane: Lane | None = None,
+    priority: Priority | None = None,
     owner: str = "",
     scope: ProjectScope = EVERYTHING,
 ) -> JobRecord:
@@ -92,7 +92,7 @@ def prepare(
         request=request,
         hand_digest=hand.digest,
         object_digest=obj.digest,
-        lane=lane or lane_of(request),
+        priority=priority or priority_of(request),
         created=timestamp(),
         origin=_present_origin(),
         owner=owner,
@@ -184,7 +184,7 @@ def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Route
     Returns:
         why tasks are held back.
     """
-    to_queue: dict[tuple[Lane, bool], list[TaskMessage]] = defaultdict(list)
+    to_queue: dict[tuple[Priority, bool], list[TaskMessage]] = defaultdict(list)
     held: dict[str, list[str]] = defaultdict(list)
     for task in ready:
         attempts = {
@@ -196,13 +196,13 @@ def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Route
         if place.held:
             held[place.held].append(task.task.id)
         else:
-            to_queue[task.lane, place.apart].append(message)
+            to_queue[task.priority, place.apart].append(message)
     for why, tasks in held.items():
         services.index.live.set_waiting(tasks, not_before=time.time() + HELD_S, message=why)
     if to_queue:
         services.index.live.set_queued([message.task_id for messages in to_queue.values() for message in messages])
-    for (lane, apart), messages in sorted(to_queue.items()):
-        services.queue.enqueue(messages, lane, again=again, apart=apart)
+    for (priority, apart), messages in sorted(to_queue.items()):
+        services.queue.enqueue(messages, priority, again=again, apart=apart)
     return set(held)
 
 

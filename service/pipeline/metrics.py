@@ -36,9 +36,9 @@ class Series:
 
 
 _ALL: Final = (
-    Series("graspd_queue_depth", "gauge", ("lane", "stage"), "tasks that wait in the queue", "queue"),
-    Series("graspd_queue_oldest_task_seconds", "gauge", ("lane", "stage"), "age of the oldest of them", "queue"),
-    Series("graspd_tasks_running", "gauge", ("lane", "stage"), "tasks in a worker's hands", "queue"),
+    Series("graspd_queue_depth", "gauge", ("priority", "stage"), "tasks that wait in the queue", "queue"),
+    Series("graspd_queue_oldest_task_seconds", "gauge", ("priority", "stage"), "age of the oldest of them", "queue"),
+    Series("graspd_tasks_running", "gauge", ("priority", "stage"), "tasks in a worker's hands", "queue"),
     Series(
         "graspd_workers",
         "gauge",
@@ -58,7 +58,7 @@ _ALL: Final = (
         "graspd_grasps_total",
         "counter",
         ("verdict",),
-        "grasps kept: all, valid; tried ones: judged",
+        "grasps kept: all, valid; tried ones: validated",
         "controller",
     ),
     Series("graspd_shards_total", "counter", ("stage",), "shards written", "controller"),
@@ -111,7 +111,7 @@ class Tally:
             if manifest.kind == "base":
                 self._add("graspd_grasps_total", "all", amount=manifest.count)
                 self._add("graspd_grasps_total", "valid", amount=manifest.valid)
-                self._add("graspd_grasps_total", "judged", amount=manifest.judged)
+                self._add("graspd_grasps_total", "validated", amount=manifest.validated)
 
     def failed(self, stage: str, kind: str) -> None:
         """An attempt of a task failed."""

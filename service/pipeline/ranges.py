@@ -11,7 +11,7 @@ from graspd.service.index.queries.overview import BatchCost
 from graspd.service.model.domain import JobRequest, batches_of
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import MOST_BATCHES, JobRecord
-from graspd.service.model.states import Lane, Stage
+from graspd.service.model.states import Priority, Stage
 from graspd.service.model.version import SCHEMA_OF_RANGES
 from graspd.service.model.workers import WorkerBeat
 from graspd.service.pipeline.backends import Services
@@ -59,7 +59,7 @@ class TaskRanges:
         if any(worker.ability.schemas[1] < SCHEMA_OF_RANGES for worker in able):
             return job
         # Somebody who watches a small job sees its grasps batch by batch; a GPU makes them all in one launch.
-        if job.lane is Lane.INTERACTIVE and not (able and all(one.device.startswith("cuda") for one in able)):
+        if job.priority is Priority.INTERACTIVE and not (able and all(one.device.startswith("cuda") for one in able)):
             return job
         by_time = int(wanted_s / max(1e-3, self._batch_s(job.request, {one.device for one in able}) or wanted_s))
         workers = -(-(len(able) or _EXPECTED) // among)

@@ -1,7 +1,7 @@
 """Seconds and bytes of a batch: measured on this service's finished batches where there are any, else stored.
 
 The nearest measurement counts: the same hand on the same object, else the same hand, else any hand; each at the same
-method, fidelity and referee and on the same kind of device. What is stored stands in `STORED` and `STORED_METHODS`,
+method, fidelity and validator and on the same kind of device. What is stored stands in `STORED` and `STORED_METHODS`,
 with its origin; as soon as anything was measured here, one factor, this machine's seconds over the stored ones, scales
 all of it, so that two fidelities are never compared by two machines' clocks.
 
@@ -82,7 +82,7 @@ STORED_SPREAD: Final = (1 / 3, 10.0)
 #: tenths of its time. docs/explanation/scaling.md has them.
 ORIGIN: Final = "stored default: 2 CPU cores, docs/explanation/scaling.md"
 #: Seconds per grasp tried, with postures, quality and verdict; valid yield of standard (its first matrix: 1,785
-#: of 2,542 tries), which stands for the others too.
+#: of 2,542 candidates), which stands for the others too.
 STORED: Final[dict[str, tuple[float, float]]] = {
     "draft": (0.13, 0.7),
     "standard": (0.16, 0.7),
@@ -100,8 +100,8 @@ _BYTES_PER_GRASP: Final = 1338.0
 STORED_SCENE: Final = StageRate(0.5, 240.0, ORIGIN, 0)
 #: The same of a scene that grasps are yet to be planned in.
 STORED_PLACE: Final = StageRate(0.5, 2200.0, ORIGIN, 0)
-#: A try in a scene over one around a free object, and the share of tries that is valid there: what built-in hands and
-#: objects have on tables, to within a factor of four.
+#: A try in a scene over one around a free object, and the share of candidates that is valid there: what built-in hands
+#: and objects have on tables, to within a factor of four.
 STORED_IN_SCENE: Final = (1.6, 0.5)
 #: Seconds of a valid grasp in each model around the nominal one, with as many cores: docs/results/robust.md, 25 to 70
 #: core-ms, and a lift 44 to 59. All of them count: a share that is missed ends sooner, and few are.
@@ -121,7 +121,7 @@ class Rates:
         self._options = options
         self._groups: dict[Hashable, list[BatchCost]] = defaultdict(list)
         recipe = recipe_of(options)
-        here = [batch for batch in batches if batch.tried and (not devices or batch.device in devices)]
+        here = [batch for batch in batches if batch.candidates and (not devices or batch.device in devices)]
         self.machine = machine_of(here)
         for batch in here:
             if recipe_of(batch.request) == recipe:
@@ -144,15 +144,15 @@ class Rates:
     def _measured(self, key: Hashable, words: str) -> Rate:
         if key not in self._known:
             batches = _whole(self._groups[key])
-            tried = sum(batch.tried for batch in batches)
+            candidates = sum(batch.candidates for batch in batches)
             devices = ", ".join(sorted({batch.device for batch in batches}))
             self._known[key] = Rate(
-                seconds_per_try=sum(batch.seconds for batch in batches) / tried,
-                valid_yield=sum(batch.kept for batch in batches) / tried,
+                seconds_per_try=sum(batch.seconds for batch in batches) / candidates,
+                valid_yield=sum(batch.kept for batch in batches) / candidates,
                 bytes_per_grasp=sum(b.size_bytes for b in batches) / max(1, sum(b.count for b in batches)),
                 origin=f"measured here: {words}, {devices}",
                 batches=len(batches),
-                spread=_spread([batch.seconds / batch.tried for batch in batches], MEASURED_SPREAD),
+                spread=_spread([batch.seconds / batch.candidates for batch in batches], MEASURED_SPREAD),
             )
         return self._known[key]
 
@@ -164,14 +164,14 @@ class Rates:
 
 def tries(rate: Rate, options: JobOptions) -> float:
     """Grasps that are tried for a job."""
-    if options.want == "raw":
+    if options.want == "candidates":
         return float(options.grasps)
     most = options.grasps * options.budget
     return min(most, options.grasps / rate.valid_yield) if rate.valid_yield > 0 else most
 
 
 def _stored_of(options: JobOptions) -> tuple[float, float, str]:
-    """Stored seconds per try, yield and origin."""
+    """Stored seconds per candidate, yield and origin."""
     if options.models:
         plain = options.model_copy(update={"robust": 0.0, "robust_models": 0})
         seconds, share, origin = _stored_of(plain)
@@ -196,9 +196,11 @@ def machine_of(batches: Iterable[BatchCost]) -> Machine:
 
     Only batches that have a stored number of their own count: as offered, without options.
     """
-    comparable = [batch for batch in batches if batch.tried and _is_stored(batch.request)]
+    comparable = [batch for batch in batches if batch.candidates and _is_stored(batch.request)]
     ratios = [
-        batch.seconds / batch.tried / _stored_of(batch.request)[0] for batch in _whole(comparable) if batch.seconds > 0
+        batch.seconds / batch.candidates / _stored_of(batch.request)[0]
+        for batch in _whole(comparable)
+        if batch.seconds > 0
     ]
     if not ratios:
         return Machine()
@@ -221,7 +223,7 @@ def _spread(values: list[float], least: tuple[float, float]) -> tuple[float, flo
 
 def _whole(batches: list[BatchCost]) -> list[BatchCost]:
     """Those of at least half a full batch, if there are any: a small one spends its time on loading."""
-    return [batch for batch in batches if 2 * batch.tried >= BATCH_SIZE] or batches
+    return [batch for batch in batches if 2 * batch.candidates >= BATCH_SIZE] or batches
 
 
 def recipe_of(options: JobOptions) -> Hashable:
@@ -231,7 +233,7 @@ def recipe_of(options: JobOptions) -> Hashable:
         tuple(sorted((name, str(value)) for name, value in options.options.items())),
         options.knobs.model_dump_json(exclude={"name"}),
         options.want,
-        options.referee,
+        options.validation,
         options.robustness,
         (options.models, options.robust),
         options.place.kind,

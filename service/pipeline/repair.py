@@ -13,7 +13,7 @@ from graspd.service.model import names
 from graspd.service.model.errors import DamagedError, NotFoundError
 from graspd.service.model.planning import PlannedTask, message_of, plan
 from graspd.service.model.records import JobRecord
-from graspd.service.model.states import AssetKind, Lane, Stage
+from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.model.version import STAGE_REVISIONS
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, STAGES, is_on_its_way
@@ -37,7 +37,7 @@ def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], l
     harmed = {one.shard for one in found if one.shard}
     repaired, left = [], []
     for one in found:
-        why = _mend(services, one, harmed)
+        why = _fix(services, one, harmed)
         if why:
             left.append(Damage(one.key, f"{one.what}; {why}", one.shard))
         else:
@@ -45,7 +45,7 @@ def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], l
     return repaired, left
 
 
-def _mend(services: Services, one: Damage, harmed: set[str]) -> str:
+def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
     """Repair one thing; why it cannot be, or nothing."""
     if one.what == FOREIGN:
         services.store.set_aside(one.key)
@@ -97,7 +97,7 @@ def _asset(services: Services, key: str, kind: AssetKind, digest: str, file: str
 def _queue(services: Services, job: JobRecord, task: PlannedTask) -> None:
     number = len(task_attempts(services.store, task.id)) + 1
     message = message_of(job, task, attempt=number, max_attempt=number)
-    services.queue.enqueue([message], Lane.BULK, again=True)
+    services.queue.enqueue([message], Priority.BULK, again=True)
 
 
 def _clear(services: Services, one: Damage, stage: Stage) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from graspd.service.model.states import Stage
-from graspd.service.model.workers import Ability, Need, WorkerBeat, own_ability
+from graspd.service.model.workers import Capabilities, Requirements, WorkerBeat, own_ability
 
 
 @dataclass(frozen=True)
@@ -24,13 +24,13 @@ class Routes:
     """What the living workers of each stage can do."""
 
     def __init__(self, present: Sequence[WorkerBeat] = ()) -> None:
-        self._here: dict[Stage, list[Ability]] = defaultdict(list)
+        self._here: dict[Stage, list[Capabilities]] = defaultdict(list)
         for beat in present:
             for stage in beat.stages:
                 if beat.ability not in self._here[stage]:
                     self._here[stage].append(beat.ability)
 
-    def place(self, need: Need) -> Place:
+    def place(self, need: Requirements) -> Place:
         """Of a task.
 
         What every worker of its stage can do goes to all of them, and what some can do to those. What none can do is

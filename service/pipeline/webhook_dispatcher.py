@@ -17,7 +17,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import zip_longest
 from typing import Final
 
-from graspd.service.index.outbox import Due
+from graspd.service.index.outbox import DueDelivery
 from graspd.service.index.views import EndView
 from graspd.service.model.errors import UnavailableError
 from graspd.service.model.webhooks import SIGNATURE, secret_of, signature
@@ -51,7 +51,7 @@ class WebhookDispatcher:
         self._allowed: Networks = networks(services.settings.webhook_networks or "")
         self._forget_again = -math.inf
         self._lock = threading.Lock()
-        self._under_way: dict[str, Due] = {}
+        self._under_way: dict[str, DueDelivery] = {}
         self._ended = threading.Event()
         #: Of each webhook: when it was tried last, and whether it took nothing then.
         self._last: dict[str, tuple[float, bool]] = {}
@@ -95,14 +95,14 @@ class WebhookDispatcher:
             started.append(self._pool.submit(self._try, due))
         return started
 
-    def _in_turn(self, found: list[Due]) -> list[Due]:
+    def _in_turn(self, found: list[DueDelivery]) -> list[DueDelivery]:
         """Projects, and keys without one, in turn; in each first what was not tried for the longest time."""
-        of_project: dict[str, list[Due]] = {}
+        of_project: dict[str, list[DueDelivery]] = {}
         for due in sorted(found, key=lambda one: self._last.get(one.hook.id, (0.0, False))):
             of_project.setdefault(due.hook.project or f"key {due.hook.owner}", []).append(due)
         return [due for turn in zip_longest(*of_project.values()) for due in turn if due is not None]
 
-    def _failed_last(self, due: Due) -> bool:
+    def _failed_last(self, due: DueDelivery) -> bool:
         return due.attempts > 0 or self._last.get(due.hook.id, (0.0, False))[1]
 
     def tell_datasets(self) -> None:
@@ -114,7 +114,7 @@ class WebhookDispatcher:
             row |= {"project": dataset.project, "owner": dataset.owner}
             self._services.index.outbox.tell_dataset(name, untold[name], row)
 
-    def _try(self, due: Due) -> None:
+    def _try(self, due: DueDelivery) -> None:
         is_settled = False
         try:
             self._deliver(due)
@@ -129,7 +129,7 @@ class WebhookDispatcher:
             if is_settled:
                 self._ended.set()
 
-    def _deliver(self, due: Due) -> None:
+    def _deliver(self, due: DueDelivery) -> None:
         body = body_of(due.end)
         at = int(time.time())
         headers = {

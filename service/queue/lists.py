@@ -1,4 +1,4 @@
-"""The lists in Redis that tasks wait in: one a lane and stage, so that a worker may serve some stages only.
+"""The lists in Redis that tasks wait in: one a priority and stage, so that a worker may serve some stages only.
 
 While workers of two versions are there, a task that only some of them can do waits apart: in a list whose name ends in
 what it asks of a worker, `bulk-synthesize.2.10` for schema 2 and revision 10. Who cannot do it never looks there.
@@ -20,10 +20,10 @@ from rq.job import Job
 from rq.registry import FailedJobRegistry, StartedJobRegistry
 from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
-from graspd.service.model.states import Lane, Stage
-from graspd.service.model.workers import FIRST_SCHEMA, Ability, Need
+from graspd.service.model.states import Priority, Stage
+from graspd.service.model.workers import FIRST_SCHEMA, Capabilities, Requirements
 from graspd.service.queue import entries
-from graspd.service.queue.port import lane_order
+from graspd.service.queue.port import priority_order
 
 #: Names of all lists that a task was ever put into, and of all workers.
 LISTS: Final[str] = Queue.redis_queues_keys
@@ -33,24 +33,24 @@ _STAGE_ORDER: Final = (Stage.INGEST, Stage.RENDER, Stage.SCENE, Stage.SYNTHESIZE
 #: Versions that can be told apart at once; a name beyond them is nobody's.
 _MOST_APART: Final = 64
 _APART: Final = re.compile(r"(.+)\.([0-9]{1,4})\.([0-9]{1,4})")
-_COMMON: Final = tuple(f"{lane.value}-{stage.value}" for lane, stage in product(Lane, Stage))
-_PLACES: Final = dict(zip(_COMMON, product(Lane, Stage), strict=True))
+_COMMON: Final = tuple(f"{priority.value}-{stage.value}" for priority, stage in product(Priority, Stage))
+_PLACES: Final = dict(zip(_COMMON, product(Priority, Stage), strict=True))
 
 
-def queue_name(lane: Lane, stage: Stage, need: Need | None = None) -> str:
-    """Name of the RQ queue of a lane and stage; of what waits apart, if there is a need."""
-    common = f"{lane.value}-{stage.value}"
+def queue_name(priority: Priority, stage: Stage, need: Requirements | None = None) -> str:
+    """Name of the RQ queue of a priority and stage; of what waits apart, if there is a need."""
+    common = f"{priority.value}-{stage.value}"
     return common if need is None else f"{common}.{need.schema}.{need.revision}"
 
 
-def queue_names(stages: Collection[Stage], taken: int = 0, *, ability: Ability | None = None) -> list[str]:
+def queue_names(stages: Collection[Stage], taken: int = 0, *, ability: Capabilities | None = None) -> list[str]:
     """Queues of a worker that serves these stages, in the order in which it takes its next task after `taken`.
 
     What waits apart comes first: others cannot do it.
     """
     return [
-        queue_name(lane, stage, need)
-        for lane in lane_order(taken)
+        queue_name(priority, stage, need)
+        for priority in priority_order(taken)
         for stage in _STAGE_ORDER
         if stage in stages
         for need in (*_needs(stage, ability), None)
@@ -69,7 +69,7 @@ def known_lists(connection: Any) -> list[str]:
     return [*_COMMON, *sorted(name for name in named if is_apart(name))[:_MOST_APART]]
 
 
-def place_of(name: str) -> tuple[Lane, Stage]:
+def place_of(name: str) -> tuple[Priority, Stage]:
     """Lane and stage of a list of `known_lists`."""
     return _PLACES[_common(name)]
 
@@ -79,7 +79,7 @@ def is_apart(name: str) -> bool:
     return name not in _PLACES and _common(name) in _PLACES
 
 
-def without_takers(names: Iterable[str], abilities: Collection[tuple[Stage, Ability]]) -> list[str]:
+def without_takers(names: Iterable[str], abilities: Collection[tuple[Stage, Capabilities]]) -> list[str]:
     """Lists apart that no worker looks into: none with such an ability serves their stage."""
     served = {name for stage, ability in abilities for name in queue_names([stage], ability=ability)}
     return [name for name in names if is_apart(name) and name not in served]
@@ -90,12 +90,12 @@ def _common(name: str) -> str:
     return found[1] if found else name
 
 
-def _needs(stage: Stage, ability: Ability | None) -> list[Need]:
+def _needs(stage: Stage, ability: Capabilities | None) -> list[Requirements]:
     """What a worker can do of what may wait apart."""
     if ability is None:
         return []
     revision = ability.revisions.get(stage.value, 0)
-    return [Need(stage, schema, schema, revision) for schema in range(FIRST_SCHEMA, ability.schemas[1] + 1)]
+    return [Requirements(stage, schema, schema, revision) for schema in range(FIRST_SCHEMA, ability.schemas[1] + 1)]
 
 
 def list_key(name: str) -> str:

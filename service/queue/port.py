@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, ConfigDict, Field
 from graspd.service.model.base import Model
 from graspd.service.model.domain import Word
 from graspd.service.model.messages import IngestMessage, TaskMessage
-from graspd.service.model.states import Lane, Stage
+from graspd.service.model.states import Priority, Stage
 from graspd.service.model.workers import Count, HostWord, WorkerBeat
 
 Message = TaskMessage | IngestMessage
@@ -22,10 +22,10 @@ Message = TaskMessage | IngestMessage
 BULK_EVERY: Final = 4
 
 
-def lane_order(taken: int) -> tuple[Lane, ...]:
+def priority_order(taken: int) -> tuple[Priority, ...]:
     """In which order a worker that took so many tasks before looks for the next one."""
-    lanes = (Lane.INTERACTIVE, Lane.BULK)
-    return lanes[::-1] if taken % BULK_EVERY == BULK_EVERY - 1 else lanes
+    priorities = (Priority.INTERACTIVE, Priority.BULK)
+    return priorities[::-1] if taken % BULK_EVERY == BULK_EVERY - 1 else priorities
 
 
 class EventKind(StrEnum):
@@ -103,7 +103,7 @@ class Lease:
     """Another one with every sign of life; only its change has a meaning."""
 
 
-Place = tuple[Lane, Stage]
+Place = tuple[Priority, Stage]
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """The queue on Redis: RQ for tasks and leases, a bounded stream for events.
 
-One RQ queue a lane and stage, so that a worker may serve some stages only. RQ's own retries, scheduler, maintenance and
-result storage are not used: each of them loses or repeats work in ways the controller does not.
+One RQ queue a priority and stage, so that a worker may serve some stages only. RQ's own retries, scheduler, maintenance
+and result storage are not used: each of them loses or repeats work in ways the controller does not.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rq.serializers import JSONSerializer
 
 from graspd.service.model.clock import age_of
 from graspd.service.model.errors import QueueUnavailable
-from graspd.service.model.states import Lane, Stage
+from graspd.service.model.states import Priority, Stage
 from graspd.service.model.workers import WorkerBeat, need_of
 from graspd.service.queue import entries
 from graspd.service.queue.allowed import TASK_FUNCTION, new_job
@@ -88,8 +88,10 @@ class RqQueue:
             self.connection.ping()
         return time.perf_counter() - start
 
-    def enqueue(self, messages: Sequence[Message], lane: Lane, *, again: bool = False, apart: bool = False) -> int:
-        """Append tasks to a lane. A task (by id and attempt) that already waits or runs is not queued twice.
+    def enqueue(
+        self, messages: Sequence[Message], priority: Priority, *, again: bool = False, apart: bool = False
+    ) -> int:
+        """Append tasks to a priority. A task (by id and attempt) that already waits or runs is not queued twice.
 
         Args:
             again: the caller has seen that the queue lost these tasks; what it still remembers of them is replaced.
@@ -106,7 +108,7 @@ class RqQueue:
             if stale:
                 self.connection.delete(*stale)
             for message in messages:
-                name = queue_name(lane, message.stage, need_of(message) if apart else None)
+                name = queue_name(priority, message.stage, need_of(message) if apart else None)
                 if name not in self._queues:
                     self._queues[name] = Queue(name, self.connection, serializer=JSONSerializer)
                 with suppress(DuplicateJobError):
@@ -135,13 +137,13 @@ class RqQueue:
                 pipe.lrange(key, 0, -1)
             return {entries.task_of(entries.text(job))[0] for jobs in pipe.execute() for job in jobs}
 
-    def depths(self) -> dict[tuple[Lane, Stage], int]:
-        """Number of waiting tasks of each lane and stage."""
+    def depths(self) -> dict[tuple[Priority, Stage], int]:
+        """Number of waiting tasks of each priority and stage."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             lists = known_lists(self.connection)
             for name in lists:
                 pipe.llen(list_key(name))
-            depths: Counter[tuple[Lane, Stage]] = Counter()
+            depths: Counter[tuple[Priority, Stage]] = Counter()
             for name, length in zip(lists, pipe.execute(), strict=True):
                 depths[place_of(name)] += length
             return dict(depths)

@@ -49,7 +49,7 @@ class Grasps(Sequence[dict[str, Any]]):
         columns: Sequence[str] = DEFAULT_COLUMNS,
         *,
         valid: bool = True,
-        unjudged: bool = False,
+        unvalidated: bool = False,
         where: Where | None = None,
     ) -> None:
         """Looks into every base shard once, for the rows to keep.
@@ -57,8 +57,8 @@ class Grasps(Sequence[dict[str, Any]]):
         Args:
             shards: see `open_shards`; scene and views shards among them are passed over.
             columns: what a sample holds.
-            valid: only valid grasps: sound ones of which a referee said that they hold.
-            unjudged: instead of them only those that are sound and that nobody judged.
+            valid: only valid grasps: feasible ones of which a validator said that they hold.
+            unvalidated: instead of them only those that are feasible and that are not validated.
             where: keeps those of them for which it answers True.
 
         Raises:
@@ -67,7 +67,7 @@ class Grasps(Sequence[dict[str, Any]]):
         if unknown := set(columns) - set(SCHEMAS["base"]):
             raise InputError(f"base shards have no column {sorted(unknown)[0]!r}; docs/reference/dataset.md lists them")
         self.shards, self.columns = shards, tuple(columns)
-        self._valid, self._unjudged, self._where = valid, unjudged, where
+        self._valid, self._unvalidated, self._where = valid, unvalidated, where
         self._files = shards.of("base")
         self._memory: OrderedDict[str, dict[str, Array]] = OrderedDict()
         self._rows = [self._kept(file) for file in self._files]
@@ -128,8 +128,8 @@ class Grasps(Sequence[dict[str, Any]]):
 
     def _kept(self, file: ShardFile) -> NDArray[np.intp]:
         held = self._load(file, tuple(SCHEMAS["base"]) if self._where else validity.COLUMNS, keep=False)
-        if self._valid or self._unjudged:
-            mask = validity.chosen(held, unjudged=self._unjudged)
+        if self._valid or self._unvalidated:
+            mask = validity.chosen(held, unvalidated=self._unvalidated)
         else:
             mask = np.ones(len(held["quality/valid"]), bool)
         if self._where is not None:

@@ -82,7 +82,7 @@ class Pictures(Sequence[dict[str, Any]]):
         grasp_quality: Sequence[str] = ("quality/epsilon",),
         clear: bool = True,
         valid: bool = True,
-        unjudged: bool = False,
+        unvalidated: bool = False,
         with_grasps_only: bool = False,
     ) -> None:
         """
@@ -92,7 +92,7 @@ class Pictures(Sequence[dict[str, Any]]):
             grasp_quality: base columns of its grasps.
             clear: only grasps that are clear of the table, and of neighbours, in this scene.
             valid: only valid grasps; False: all that the base shards hold.
-            unjudged: instead of valid ones only those that are sound and that nobody judged.
+            unvalidated: instead of valid ones only those that are feasible and that are not validated.
             with_grasps_only: leave out pictures of scenes without a grasp.
 
         Raises:
@@ -106,7 +106,7 @@ class Pictures(Sequence[dict[str, Any]]):
         if unknown := set(grasp_quality) - set(SCHEMAS["base"]):
             raise InputError(f"base shards have no column {sorted(unknown)[0]!r}; docs/reference/dataset.md lists them")
         self.shards, self.columns, self._quality = shards, tuple(columns), tuple(grasp_quality)
-        self._which = {"clear": clear, "valid": valid, "unjudged": unjudged}
+        self._which = {"clear": clear, "valid": valid, "unvalidated": unvalidated}
         self._scenes: OrderedDict[str, Scenes] = OrderedDict()
         self._tables: OrderedDict[str, RowTable] = OrderedDict()
         self._places: list[Place] = []
@@ -198,7 +198,7 @@ class Scenes:
     """
 
     def __init__(
-        self, shards: Shards, shard: str, quality: Sequence[str], *, clear: bool, valid: bool, unjudged: bool
+        self, shards: Shards, shard: str, quality: Sequence[str], *, clear: bool, valid: bool, unvalidated: bool
     ) -> None:
         file = shards.by_id(shard)
         scenes = read_shard(shards.path(file), kind=file.kind)
@@ -211,8 +211,8 @@ class Scenes:
         row = np.arange(len(scene)) if planned else np.asarray(scenes["grasp/base_index"])
         free = np.asarray(base["quality/success"]) >= 0 if planned else np.asarray(scenes["grasp/valid"]) == 1
         mask = free if clear else np.ones(len(scene), bool)
-        if valid or unjudged:
-            mask = mask & validity.chosen(base.arrays, unjudged=unjudged)[row]
+        if valid or unvalidated:
+            mask = mask & validity.chosen(base.arrays, unvalidated=unvalidated)[row]
         kept = np.flatnonzero(mask)
         self._scene, self._row = scene[kept], row[kept]
         pose = np.asarray(scenes["grasp/hand_pose"], float)[kept]

@@ -69,7 +69,7 @@ class ShuffledShards(IterableDataset[Sample]):
         columns: Sequence[str] = DEFAULT_COLUMNS,
         *,
         valid: bool = True,
-        unjudged: bool = False,
+        unvalidated: bool = False,
         where: Where | None = None,
         buffer: int = 4096,
         seed: int = 0,
@@ -82,7 +82,7 @@ class ShuffledShards(IterableDataset[Sample]):
             shards: see `open_shards`.
             columns: what a sample holds.
             valid: only valid grasps.
-            unjudged: instead of them only those that are sound and that nobody judged.
+            unvalidated: instead of them only those that are feasible and that are not validated.
             where: keeps those of them for which it answers True.
             buffer: grasps among which the next one is drawn.
             seed: of the order; `epoch` changes it.
@@ -92,7 +92,7 @@ class ShuffledShards(IterableDataset[Sample]):
         """
         self.epoch = 0
         self._shards, self._columns, self._where = shards, tuple(columns), where
-        self._valid, self._unjudged = valid, unjudged
+        self._valid, self._unvalidated = valid, unvalidated
         self._buffer, self._seed, self._rank, self._ranks = max(1, buffer), seed, rank, ranks
         self._transform = transform
 
@@ -106,7 +106,9 @@ class ShuffledShards(IterableDataset[Sample]):
         held: list[Sample] = []
         for at in order:
             one = Shards((files[at],), self._shards.store, self._shards.cache)
-            for sample in Grasps(one, self._columns, valid=self._valid, unjudged=self._unjudged, where=self._where):
+            for sample in Grasps(
+                one, self._columns, valid=self._valid, unvalidated=self._unvalidated, where=self._where
+            ):
                 held.append(sample)
                 if len(held) > self._buffer:
                     yield self._transform(_draw(held, draw))

@@ -70,9 +70,9 @@ def _mask(node: Node, columns: Mapping[str, Array], said: Mapping[str, Any]) -> 
 def _flag(name: str, columns: Mapping[str, Array]) -> Mask:
     if name == "valid":
         return validity.valid(columns)
-    if name == "sound":
-        return validity.sound(columns)
-    if name == "judged":
+    if name == "feasible":
+        return validity.feasible(columns)
+    if name == "validated":
         return np.asarray(columns.get("quality/success", np.full(len(columns["quality/valid"]), -1))) >= 0
     path = _FLAGS[name]
     return np.asarray(columns[path]) == 1 if path in columns else np.zeros(len(columns["quality/valid"]), bool)

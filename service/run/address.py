@@ -81,7 +81,7 @@ def _lives(pid: int, started: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Joining:
+class ListenAddress:
     """Where the embedded Redis listens besides its socket."""
 
     file: Path
@@ -128,7 +128,7 @@ class Joining:
             return
 
 
-def joining(settings: Settings, file: Path, *, host: str | None = None, port: int = 0) -> Joining:
+def joining(settings: Settings, file: Path, *, host: str | None = None, port: int = 0) -> ListenAddress:
     """An address, a free port (or `port`) and a fresh password.
 
     Args:
@@ -150,4 +150,4 @@ def joining(settings: Settings, file: Path, *, host: str | None = None, port: in
             free = int(probe.getsockname()[1])
     except OSError as error:
         raise InputError(f"Redis cannot listen on {name}:{port or 'any'}: {error.strerror}; see --share-host") from None
-    return Joining(file.resolve(), f"[{name}]" if ":" in name else name, address, free, secrets.token_hex(24))
+    return ListenAddress(file.resolve(), f"[{name}]" if ":" in name else name, address, free, secrets.token_hex(24))

@@ -38,7 +38,7 @@ class Child:
     environment: Mapping[str, str]
     folder: Path | None
     """Data folder: pid files go to `run/`, output to `logs/`. None: no such files, and the output is the parent's."""
-    mend: Callable[[Path], None] | None = None
+    fix: Callable[[Path], None] | None = None
     """Called with its log after it failed, before it is started again."""
     process: subprocess.Popen[bytes] | None = None
     starts: int = 0
@@ -84,8 +84,8 @@ class Child:
             # A worker that has done enough ends by itself, with code 0.
             level = logging.WARNING if code else logging.INFO
             log.log(level, "%s ended (%s); it is started again in %.2g s", self.name, _ended(code), self._pause)
-            if code > 0 and self.mend is not None and self._log_file is not None:
-                self.mend(self._log_file)
+            if code > 0 and self.fix is not None and self._log_file is not None:
+                self.fix(self._log_file)
             self.process = None
             self._not_before = now + self._pause
             self._pause = min(_LONGEST_PAUSE_S, 2 * self._pause)

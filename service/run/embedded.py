@@ -17,7 +17,7 @@ from typing import IO, Final
 
 from graspd.service.model.errors import BusyError, QueueUnavailable
 from graspd.service.queue.connection import password_file, socket_path
-from graspd.service.run.address import Joining
+from graspd.service.run.address import ListenAddress
 from graspd.service.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -45,7 +45,7 @@ def find_server() -> tuple[Path, str]:
     )
 
 
-def server_command(settings: Settings, joining: Joining | None = None) -> list[str]:
+def server_command(settings: Settings, joining: ListenAddress | None = None) -> list[str]:
     """The command that runs the embedded Redis in the foreground. Makes its folders; call `own_redis` first.
 
     Args:

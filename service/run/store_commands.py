@@ -12,13 +12,13 @@ from graspd.service.model import names
 from graspd.service.model.errors import ConflictError
 
 app = typer.Typer(no_args_is_help=True)
-store_app = typer.Typer(no_args_is_help=True, help="Check the store, and mend it.")
+store_app = typer.Typer(no_args_is_help=True, help="Check the store, and fix it.")
 app.add_typer(store_app, name="store")
 
 
 @store_app.callback()
 def store() -> None:
-    """Check the store, and mend it."""
+    """Check the store, and fix it."""
 
 
 @store_app.command(epilog="graspd admin store verify --repair")
@@ -38,7 +38,7 @@ def verify(
     from graspd.service.pipeline.identity import identify_if_redis_answers
     from graspd.service.pipeline.integrity import MISSING, scan
     from graspd.service.pipeline.integrity_scan import Turn
-    from graspd.service.pipeline.repair import repair as mend
+    from graspd.service.pipeline.repair import repair as fix
 
     services = Services.open(load_settings(data_dir=data_dir), make=False)
     if repair:
@@ -53,7 +53,7 @@ def verify(
             shards += key.startswith(f"{names.SHARDS}/") and key.endswith(".json")
             found += [wrong] if wrong is not None else []
         services.index.damage.replace(found)
-        repaired, left = mend(services, found) if repair else ([], found)
+        repaired, left = fix(services, found) if repair else ([], found)
     finally:
         turn.end()
         services.close()

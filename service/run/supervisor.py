@@ -24,7 +24,7 @@ from graspd.service.pipeline.identity import identify_if_redis_answers, recorded
 from graspd.service.pipeline.leading import PART
 from graspd.service.queue.connection import redis_url
 from graspd.service.queue.rq_queue import RqQueue, open_queue
-from graspd.service.run.address import Joining, forget_address, record_address
+from graspd.service.run.address import ListenAddress, forget_address, record_address
 from graspd.service.run.children import Child, end_leftovers, keep_alive, stop_children
 from graspd.service.run.embedded import find_server, give_up_log, lock_file, own_redis, server_command, set_log_aside
 from graspd.service.settings import Settings
@@ -52,7 +52,7 @@ class Supervisor:
         workers: int = 1,
         api: bool = True,
         worker_command: Sequence[str] = (*_PROGRAM, "worker"),
-        joining: Joining | None = None,
+        joining: ListenAddress | None = None,
     ) -> None:
         """`settings.port` 0 picks a free port; `joining` lets workers of other machines in."""
         if workers < 0:
@@ -238,7 +238,7 @@ class Supervisor:
             self._locks.append(own_redis(self.settings))
             log.info("Redis: %s, from %s", *find_server())
             redis = child("redis", *server_command(self.settings, self._joining))
-            redis.mend = lambda output: give_up_log(self.settings, output)
+            redis.fix = lambda output: give_up_log(self.settings, output)
             children.append(redis)
         # One that is started again need not wait until its predecessor's lease has run out.
         name = self._wanted.controller_name or f"{socket.gethostname()}-up-{secrets.token_hex(8)}"

@@ -77,9 +77,9 @@ def _hand(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     if "dofs" in facts:
         lines.append(("dofs", f"{len(facts['dofs'])}, driving {len(facts.get('joints', []))} joints"))
         lines += [("", _dof(name, facts)) for name in facts["dofs"]]
-    mend = [_OVERRIDES[key] for key in guessed if key in _OVERRIDES]
+    fix = [_OVERRIDES[key] for key in guessed if key in _OVERRIDES]
     if guessed:
-        lines.append(("guessed", f"{', '.join(guessed)}{'; override: ' + ' '.join(mend) if mend else ''}"))
+        lines.append(("guessed", f"{', '.join(guessed)}{'; override: ' + ' '.join(fix) if fix else ''}"))
     return lines
 
 

@@ -71,15 +71,15 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         "quality/thresholds_m": Column("T", "f8", "m", "none", "contact thresholds of the sweep"),
         **_measured(optional=False),
         "quality/valid": Column(
-            "N", "u1", "bool", "none", "1: sound, and the referee judged that it holds; 0 where nobody judged"
+            "N", "u1", "bool", "none", "1: feasible, and the validator validated that it holds; 0 where not validated"
         ),
-        "quality/sound": Column("N", "u1", "bool", "none", "1: passed the geometric gate", optional=True),
+        "quality/feasible": Column("N", "u1", "bool", "none", "1: passed the geometric gate", optional=True),
         "quality/success": Column(
             "N",
             "i1",
             "bool",
             "none",
-            "verdict of the referee at the level of attribute verdict_level: 1 held, 0 dropped, -1 not tested",
+            "verdict of the validator at the level of attribute verdict_level: 1 held, 0 dropped, -1 not tested",
             optional=True,
         ),
         "quality/verdict_outcome": Column(
@@ -99,20 +99,20 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "worst displacement or rotation of the pushes over its limit; below 1: held",
             optional=True,
         ),
-        "quality/judged_by": Column(
+        "quality/validated_by": Column(
             "N",
             "u1",
             "enum",
             "none",
-            "whose verdict success is: 0 MuJoCo on the CPU, which alone certifies, 1 MuJoCo Warp, the first judge",
+            "whose verdict success is: 0 MuJoCo on the CPU, which alone certifies, 1 MuJoCo Warp, the prefilter",
             optional=True,
         ),
-        "quality/audit": Column(
+        "quality/recheck": Column(
             "N",
             "i1",
             "bool",
             "none",
-            "verdict by the letter of the protocol: 1 held, 0 dropped, -1 not audited",
+            "verdict under the unmodified DexGraspBench protocol: 1 held, 0 dropped, -1 not rechecked",
             optional=True,
         ),
         "quality/published": Column(
@@ -327,18 +327,18 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "root_link": RootAttribute("text", "link of the hand whose pose is given"),
     "mu": RootAttribute("number", "Coulomb coefficient of `quality/epsilon` and `quality/wrench_volume`", _BASE),
     "want": RootAttribute(
-        "text", "valid: valid grasps were asked for (sound ones where nobody judges); raw: of any kind", _BASE
+        "text", "valid: valid grasps were asked for (feasible ones where nothing is validated); raw: of any kind", _BASE
     ),
-    "tried": RootAttribute("integer", "grasps tried until the last one kept", _BASE),
+    "candidates": RootAttribute("integer", "candidates until the last one kept", _BASE),
     "outcomes": RootAttribute("text", "JSON: tries that were not kept, by what became of them", _BASE),
     "reason": RootAttribute("text", "why a command found fewer grasps than asked for; absent: it did not", _BASE),
     "grasps_wanted": RootAttribute("integer", "grasps asked for, where a command was interrupted before", _BASE),
     "robust": RootAttribute(
         "text",
-        "JSON: models around the nominal one in which each valid grasp was judged, and the wanted share; absent: none",
+        "JSON: models around the nominal one in which each valid grasp was validated, and the wanted share; absent: none",
         _BASE,
     ),
-    "verdict_level": RootAttribute("text", "level of the referee, or `none` where nobody judged", _BASE),
+    "verdict_level": RootAttribute("text", "level of the validator, or `none` where not validated", _BASE),
     "verdict_key": RootAttribute(
         "text",
         "digest of all that its verdicts follow from; verdicts of different keys must not be mixed in one number",

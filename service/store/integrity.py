@@ -29,7 +29,7 @@ from graspd.service.store.store import STREAM_BYTES, Stamp, Store
 CHECKSUM_LISTS: Final = ("SHA256SUMS", "checksums.sha256")
 _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 _LEVELS: Final = 3
-MEND: Final = "`graspd admin store verify --repair` makes it again where that is possible"
+FIX: Final = "`graspd admin store verify --repair` makes it again where that is possible"
 #: Bits may rot without a new time of change, so that what was found intact is not believed for ever [s].
 _BELIEVED_S: Final = 3600.0
 _REMEMBERED: Final = 100_000
@@ -53,12 +53,12 @@ def read_checked(store: Store, key: str, sha256: str) -> bytes:
 def check_digest(name: str, found: str, expected: str) -> None:
     """DamagedShard, with the shard's name, where the checksums differ."""
     if found != expected:
-        raise DamagedShard(f"{name} is damaged: its SHA-256 is {found[:12]}..., expected {expected[:12]}...; {MEND}")
+        raise DamagedShard(f"{name} is damaged: its SHA-256 is {found[:12]}..., expected {expected[:12]}...; {FIX}")
 
 
 def gone(key: str) -> DamagedShard:
     """The error of a shard with a manifest and no file."""
-    return DamagedShard(f"{key} is gone from the store, and its manifest is there; {MEND}")
+    return DamagedShard(f"{key} is gone from the store, and its manifest is there; {FIX}")
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class _Intact:
     """A digest of each `STREAM_BYTES` of it."""
 
 
-class Checked:
+class CheckedObjects:
     """Remembers which objects were found intact while their size, tag and time of change stay. Safe between threads."""
 
     def __init__(self, store: Store) -> None:
@@ -110,7 +110,7 @@ class Checked:
             if _of_block(block) != known.blocks[number]:
                 with self._lock:
                     self._known.pop((key, sha256), None)
-                raise DamagedShard(f"{key} is damaged: some of its bytes turned since it was read; {MEND}")
+                raise DamagedShard(f"{key} is damaged: some of its bytes turned since it was read; {FIX}")
             yield block[max(0, start - at) : end - at]
 
     def _intact(self, key: str, sha256: str) -> _Intact:

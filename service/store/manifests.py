@@ -38,10 +38,10 @@ class GraspSummary(BaseModel):
 
     valid: bool
     success: bool | None = None
-    verdict_level: str | None = Field(None, description="level of the referee that gave `success`")
+    verdict_level: str | None = Field(None, description="level of the validator that gave `success`")
     lift_hard: bool | None = Field(None, description="in a scene: lifted at half the friction")
     robust_weakest: str | None = Field(
-        None, description="axis of the first model in which it does not hold; None: held in all, or not judged there"
+        None, description="axis of the first model in which it does not hold; None: held in all, or not validated there"
     )
 
 
@@ -75,9 +75,11 @@ class ShardManifest(BaseModel):
     seconds: float
     worker: str
     valid: int = Field(0, description="base: valid grasps; scene: pairs of grasp and scene in which the hand is clear")
-    tried: int = Field(0, ge=0, description="grasps planned for this base shard, kept or not")
-    audited: int = Field(0, ge=0, description="certified grasps that were tested again by the letter")
-    audit_held: int = Field(0, ge=0, description="of these, grasps that held")
+    candidates: int = Field(0, ge=0, description="grasps planned for this base shard, kept or not")
+    rechecked: int = Field(
+        0, ge=0, description="certified grasps that were tested again under the DexGraspBench protocol"
+    )
+    recheck_held: int = Field(0, ge=0, description="of these, grasps that held")
     index_threshold_m: float | None = None
     grasps: tuple[GraspSummary, ...] = ()
     info: dict[str, Any] = Field(default_factory=dict)
@@ -86,8 +88,8 @@ class ShardManifest(BaseModel):
     @classmethod
     def _tried_what_it_holds(cls, data: Any) -> Any:
         # Before a shard could hold valid grasps alone, it held every grasp that was tried.
-        if isinstance(data, dict) and "tried" not in data and data.get("kind") == "base":
-            return {**data, "tried": data.get("counts", {}).get("N", 0)}
+        if isinstance(data, dict) and "candidates" not in data and data.get("kind") == "base":
+            return {**data, "candidates": data.get("counts", {}).get("N", 0)}
         return data
 
     @model_validator(mode="after")
@@ -97,11 +99,11 @@ class ShardManifest(BaseModel):
         return self
 
     @property
-    def judged(self) -> int:
-        """Tries that were judged, by the geometric gate and the referee: those of a base shard with a referee, or
-        none. What is valid is a share of these; of what nobody judged it is not known."""
+    def validated(self) -> int:
+        """Tries that were validated, by the geometric gate and the validator: those of a base shard with a validator,
+        or none. What is valid is a share of these; of what is not validated it is not known."""
         has_verdicts = any(grasp.success is not None for grasp in self.grasps)
-        return self.tried if has_verdicts or (not self.grasps and self.request.referee != "none") else 0
+        return self.candidates if has_verdicts or (not self.grasps and self.request.validation != "none") else 0
 
     @property
     def count(self) -> int:
@@ -159,10 +161,13 @@ def _contents(kind: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping
     valid = validity.valid(arrays) if kind == "base" else arrays.get("grasp/valid")
     fields: dict[str, Any] = {"valid": 0 if valid is None else int(np.count_nonzero(valid))}
     if kind == "base":
-        audit = arrays.get("quality/audit", np.empty(0, np.int8))
+        recheck = arrays.get("quality/recheck", np.empty(0, np.int8))
         fields["index_threshold_m"], fields["grasps"] = summarise(arrays, attributes)
-        fields["tried"] = int(attributes.get("tried", len(arrays["quality/valid"])))
-        fields["audited"], fields["audit_held"] = int(np.count_nonzero(audit >= 0)), int(np.count_nonzero(audit == 1))
+        fields["candidates"] = int(attributes.get("candidates", len(arrays["quality/valid"])))
+        fields["rechecked"], fields["recheck_held"] = (
+            int(np.count_nonzero(recheck >= 0)),
+            int(np.count_nonzero(recheck == 1)),
+        )
     return fields
 
 

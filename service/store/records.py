@@ -252,7 +252,7 @@ class Deletion(Record):
     attempts: tuple[tuple[str, int], ...] = ()
 
 
-class Released(Record):
+class DeletedJob(Record):
     """A job that was deleted: its shards go when nobody has needed them for the grace time."""
 
     version: Literal[1] = 1

@@ -173,7 +173,7 @@ def open_store(url: str, *, public_endpoint: str | None = None, make: bool = Tru
         public_endpoint: S3 endpoint as clients reach it. Without it, one given by AWS_ENDPOINT_URL is taken for an
             address of the service's own network: then no download is signed, and files go through the API.
         make: whether a folder that is absent is made. What only reads finds nothing in an empty one, and a mistyped
-            path would pass for a sound store.
+            path would pass for a feasible store.
 
     Raises:
         NotFoundError: the folder is absent, and not to be made.

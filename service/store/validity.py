@@ -1,7 +1,7 @@
-"""How the grasps of a base shard stand: valid, sound but judged by nobody, or neither.
+"""How the grasps of a base shard stand: valid, feasible but validated by nobody, or neither.
 
-*Sound*: passed the geometric gate. *Valid*: sound, and a referee judged that it holds. In a shard that nobody judged no
-grasp is valid, whatever its column `quality/valid` says: graspd 0.1 wrote there which were sound.
+*Feasible*: passed the geometric gate. *Valid*: feasible, and a validator validated that it holds. In a shard that are
+not validated no grasp is valid, whatever its column `quality/valid` says: graspd 0.1 wrote there which were feasible.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 #: The columns of a base shard that tell; the first one always exists.
-COLUMNS: Final = ("quality/valid", "quality/sound", "quality/success")
+COLUMNS: Final = ("quality/valid", "quality/feasible", "quality/success")
 
 
-def judged(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
-    """(N,) whether a referee judged the grasp."""
+def validated(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
+    """(N,) whether a validator validated the grasp."""
     if "quality/success" not in columns:
         return np.zeros(len(columns["quality/valid"]), bool)
     return np.asarray(columns["quality/success"]) >= 0
@@ -25,14 +25,14 @@ def judged(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
 
 def valid(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
     """(N,) whether the grasp is valid."""
-    return (np.asarray(columns["quality/valid"]) == 1) & judged(columns)
+    return (np.asarray(columns["quality/valid"]) == 1) & validated(columns)
 
 
-def sound(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
+def feasible(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
     """(N,) whether the grasp passed the geometric gate, as far as the shard tells; a valid one did."""
-    return np.asarray(columns.get("quality/sound", columns["quality/valid"])) == 1
+    return np.asarray(columns.get("quality/feasible", columns["quality/valid"])) == 1
 
 
-def chosen(columns: Mapping[str, NDArray[Any]], *, unjudged: bool = False) -> NDArray[np.bool_]:
-    """(N,) the valid grasps; with `unjudged` instead those that are sound and judged by nobody."""
-    return sound(columns) & ~judged(columns) if unjudged else valid(columns)
+def chosen(columns: Mapping[str, NDArray[Any]], *, unvalidated: bool = False) -> NDArray[np.bool_]:
+    """(N,) the valid grasps; with `unvalidated` instead those that are feasible and validated by nobody."""
+    return feasible(columns) & ~validated(columns) if unvalidated else valid(columns)

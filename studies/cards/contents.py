@@ -222,7 +222,7 @@ COLUMNS: Final[dict[str, tuple[str, ...]]] = {
         "quality/thresholds_m",
         *(metric.path for metric in GRASP_METRICS),
         *validity.COLUMNS,
-        "quality/audit",
+        "quality/recheck",
         "quality/lift_hard",
     ),
     "scene": ("grasp/base_index", "grasp/hand_pose", "grasp/valid", "grasp/rejection", "scene/object_pose"),
@@ -303,7 +303,7 @@ def _unopened(file: ShardFile, manifest: ShardManifest) -> Piece:
         "want": manifest.request.want,
     }
     if file.kind == "base":
-        said["tried"] = manifest.tried
+        said["candidates"] = manifest.candidates
     return Piece(file, {}, said, manifest.size_bytes, manifest.count, manifest.info, manifest.stage_revision)
 
 

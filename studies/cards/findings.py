@@ -26,7 +26,7 @@ _SHOWN: Final = 8
 
 def findings(card: Row) -> list[str]:
     """Sentences in Markdown, each with the figures it rests on."""
-    told = [_snapshot(card), *_gaps(card), _yields(card), _balance(card), _audits(card), *_table(card)]
+    told = [_snapshot(card), *_gaps(card), _yields(card), _balance(card), _rechecks(card), *_table(card)]
     told += [_directions(card), *_joints(card), _qualities(card), _repeated(card), *_mixed(card), *_unknown(card)]
     return [line for line in told if line]
 
@@ -52,7 +52,7 @@ def _gaps(card: Row) -> list[str]:
     short = [c for c in card["cells"] if wanted and not c["missing_tasks"] and c["valid"] < c["asked"]]
     if short:
         short.sort(key=lambda cell: cell["valid"] / cell["asked"])
-        each = _listed([f"{_pair(c)} ({c['valid']} of {c['asked']} after {c['tried']} tries)" for c in short])
+        each = _listed([f"{_pair(c)} ({c['valid']} of {c['asked']} after {c['candidates']} tries)" for c in short])
         told.append(
             f"**{len(short)} of {len(card['cells'])} cells ran out of budget** before all valid grasps were found: "
             f"{each}."
@@ -61,18 +61,18 @@ def _gaps(card: Row) -> list[str]:
 
 
 def _yields(card: Row) -> str:
-    rows = [cell for cell in card["cells"] if cell["of_judged"] is not None]
+    rows = [cell for cell in card["cells"] if cell["of_validated"] is not None]
     low: list[Row] = []
     for hand in dict.fromkeys(cell["hand"] for cell in rows):
         own = [cell for cell in rows if cell["hand"] == hand]
-        middle = sorted(cell["of_judged"] for cell in own)[len(own) // 2]
-        low += [cell for cell in own if cell["of_judged"] < _LITTLE * middle]
+        middle = sorted(cell["of_validated"] for cell in own)[len(own) // 2]
+        low += [cell for cell in own if cell["of_validated"] < _LITTLE * middle]
     if not low:
         return ""
-    low.sort(key=lambda cell: cell["of_judged"])
-    each = _listed([f"{_pair(cell)} ({_percent(cell['of_judged'])})" for cell in low])
+    low.sort(key=lambda cell: cell["of_validated"])
+    each = _listed([f"{_pair(cell)} ({_percent(cell['of_validated'])})" for cell in low])
     return (
-        f"**Hard pairs**, where under half as many tries are valid as usual for the hand: {each}. What they hold is a "
+        f"**Hard pairs**, where under half as many candidates are valid as usual for the hand: {each}. What they hold is a "
         "selection of what was easy."
     )
 
@@ -89,23 +89,23 @@ def _balance(card: Row) -> str:
     return f"**Uneven**: {'; '.join(said)}." if said else ""
 
 
-def _audits(card: Row) -> str:
+def _rechecks(card: Row) -> str:
     found = card["validity"]
-    if not found["audited"]:
+    if not found["rechecked"]:
         return (
-            "**No audits**: no verdict was checked by the letter of the protocol, so the share of false ones is not "
+            "**No rechecks**: no verdict was checked under the unmodified DexGraspBench protocol, so the share of false ones is not "
             "known."
         )
     wrong = [
-        f"{_pair(cell)} ({cell['audit_dropped']} of {cell['audited']})"
+        f"{_pair(cell)} ({cell['recheck_dropped']} of {cell['rechecked']})"
         for cell in card["cells"]
-        if cell["audit_dropped"]
+        if cell["recheck_dropped"]
     ]
     if not wrong:
         return ""
     rate = found["false_valid"]
     return (
-        f"**Audits overturned {found['audit_dropped']} of {found['audited']:,} verdicts** "
+        f"**Rechecks overturned {found['recheck_dropped']} of {found['rechecked']:,} verdicts** "
         f"({_percent(rate['share'])}, 95 % {_percent(rate['low'])} to {_percent(rate['high'])}): {_listed(wrong)}."
     )
 
@@ -219,7 +219,7 @@ def _mixed(card: Row) -> list[str]:
     told = []
     for key, what in (
         ("methods", "methods"),
-        ("levels", "levels of the referee"),
+        ("levels", "levels of the validator"),
         ("friction", "friction coefficients"),
         ("code_versions", "versions of graspd"),
         ("wants", "wishes (raw and valid)"),

@@ -147,21 +147,21 @@ def _knobs(text: str) -> Any:
 
 def _validity(cells: Iterable[CellTally]) -> Row:
     cells = list(cells)
-    tried, valid = sum(cell.tried for cell in cells), sum(cell.valid for cell in cells)
-    judged = sum(cell.judged for cell in cells)
-    audited, held = sum(cell.audited for cell in cells), sum(cell.audit_held for cell in cells)
+    candidates, valid = sum(cell.candidates for cell in cells), sum(cell.valid for cell in cells)
+    validated = sum(cell.validated for cell in cells)
+    rechecked, held = sum(cell.rechecked for cell in cells), sum(cell.recheck_held for cell in cells)
     rejected: Counter[str] = Counter()
     for cell in cells:
         rejected.update(cell.rejected)
     return {
-        "tried": tried,
+        "candidates": candidates,
         "valid": valid,
-        "judged": judged,
-        "of_judged": share(min(valid, judged), judged),
+        "validated": validated,
+        "of_validated": share(min(valid, validated), validated),
         "rejected": dict(rejected) or None,
-        "audited": audited,
-        "audit_dropped": audited - held,
-        "false_valid": share(audited - held, audited),
+        "rechecked": rechecked,
+        "recheck_dropped": rechecked - held,
+        "false_valid": share(rechecked - held, rechecked),
         "lift_hard": share(sum(cell.lift_hard for cell in cells), sum(cell.lift_tested for cell in cells)),
         "seconds": round(sum(cell.seconds for cell in cells), 3),
     }
@@ -235,9 +235,10 @@ def _cells(contents: Contents, tally: Tally) -> list[Row]:
         valid = _validity([cell])
         row: Row = {"hand": pair[0], "object": pair[1], "asked": asked, "grasps": cell.grasps}
         row |= {
-            key: valid[key] for key in ("tried", "judged", "valid", "rejected", "audited", "audit_dropped", "seconds")
+            key: valid[key]
+            for key in ("candidates", "validated", "valid", "rejected", "rechecked", "recheck_dropped", "seconds")
         }
-        row["of_judged"] = valid["of_judged"] and valid["of_judged"]["share"]
+        row["of_validated"] = valid["of_validated"] and valid["of_validated"]["share"]
         row |= {"missing_tasks": gap.tasks if gap else 0, "missing_because": gap.reason if gap else None}
         row["median"] = {name: found["median"] for name, found in _quality([cell]).items()}
         row["clear_of_table"] = (_table([cell])["of_grasps"] or {}).get("share")

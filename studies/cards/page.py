@@ -30,9 +30,9 @@ _SIZES: Final = (
 #: A longer table of objects is folded.
 _UNFOLDED: Final = 20
 _LEVELS: Final = {
-    "letter": "MuJoCo, DexGraspBench's protocol by the letter",
-    "certificate": "MuJoCo, DexGraspBench's protocol; a push ends as soon as it certainly holds",
-    "screen": "MuJoCo, coarse physics, and the certificate where these are close to a limit",
+    "dexgraspbench": "MuJoCo, DexGraspBench's protocol under the DexGraspBench protocol",
+    "standard": "MuJoCo, DexGraspBench's protocol; a push ends as soon as it certainly holds",
+    "fast": "MuJoCo, coarse physics, and the standard level where these are close to a limit",
 }
 _NOT_MODELLED: Final = """\
 - Verdicts are of a simulation: an object of its stated mass and friction (0.1 kg and 0.6 where none is stated), pushed
@@ -124,11 +124,11 @@ def _summary(card: Row, plots: Mapping[str, str]) -> str:
     made, making = card["composition"], card["making"]
     with_pictures = f", {made['pictures']:,} pictures of {made['scenes']:,} scenes" if made["pictures"] else ""
     by = " and ".join(making["methods"]) or "an unknown method"
-    judged = " and ".join(making["levels"])
+    validated = " and ".join(making["levels"])
     lines = [
         f"{made['valid']:,} valid grasps{_places(making)} of {_count(len(made['hands']), 'robot hand')} on "
         f"{_count(len(made['objects']), 'object')}{with_pictures}. Planned by `{by}`, "
-        + (f"judged by MuJoCo (`{judged}`), measured" if judged else "measured, not judged by a referee")
+        + (f"validated by MuJoCo (`{validated}`), measured" if validated else "measured, not validated by a validator")
         + f"; made by graspd {' and '.join(making['code_versions'])}."
     ]
     if taken := card["snapshot"]:
@@ -169,7 +169,7 @@ def _making(card: Row) -> str:
     knobs = ", ".join(str(found.get("name", "custom")) for found in making["fidelities"])
     rows = {
         "method, fidelity": f"{', '.join(making['methods'])}; {knobs}",
-        "referee": "; ".join(_LEVELS.get(level, level) for level in making["levels"]) or "none",
+        "validation": "; ".join(_LEVELS.get(level, level) for level in making["levels"]) or "none",
         "imported from": ", ".join(making["imported_from"]),
         "friction of ε and Vol": ", ".join(f"{value:g}" for value in making["friction"]),
         "contact threshold of the figures": _millimetres(card["contact_threshold_m"]),
@@ -216,13 +216,13 @@ def _validity(card: Row, plots: Mapping[str, str]) -> str:
         )
     elif card["making"]["levels"]:
         text = (
-            f"A grasp is valid if the referee says that it holds and it passes the geometric gate: {gate}. "
-            'Audited ones were judged again by the letter of the protocol; "false valid" is the share of them that the '
+            f"A grasp is valid if the validator says that it holds and it passes the geometric gate: {gate}. "
+            'Rechecked ones were validated again under the unmodified DexGraspBench protocol; "false valid" is the share of them that the '
             "letter drops."
         )
     else:
         text = (
-            f"No referee judged, so no grasp is valid. A grasp that passes the geometric gate, {gate}, is sound: "
+            f"No validator validated, so no grasp is valid. A grasp that passes the geometric gate, {gate}, is feasible: "
             "whether it holds is not known."
         )
     return f"## Validity\n\n{text}\n\n{validity_table(card)}{_plot('yield.png', plots)}"
@@ -339,7 +339,7 @@ def _millimetres(value: float | None) -> str:
 def citations(methods: Iterable[str], name: str, version: str, year: str, snapshot: str) -> str:
     """BibTeX of the methods' papers and of the dataset itself; `snapshot` may be empty."""
     note = f",\n  note   = {{snapshot {snapshot}}}" if snapshot else ""
-    key = "".join(letter for letter in name if letter.isalnum()) or "dataset"
+    key = "".join(dexgraspbench for dexgraspbench in name if dexgraspbench.isalnum()) or "dataset"
     own = f"""@misc{{{key}{year},
   title  = {{{name}: grasps made by graspd {version}}},
   year   = {{{year}}}{note}

@@ -32,12 +32,12 @@ def draw(card: Row, tally: Tally, folder: Path) -> dict[str, str]:
         file name -> what it shows, in the order of the card.
     """
     plots: tuple[tuple[str, str, Callable[[Row, Tally], Any]], ...] = (
-        ("yield.png", "Valid share of the judged grasps, by hand and object", _yields),
+        ("yield.png", "Valid share of the validated grasps, by hand and object", _yields),
         ("quality.png", "Distribution of each quality over the valid grasps, by hand", _qualities),
         ("directions.png", "From where the palm comes, by hand", _directions),
         ("table.png", "Share of the valid grasps that are clear of the table in one scene at least", _table),
         ("joints.png", "Range that each joint uses between its limits", _joints),
-        ("sizes.png", "Valid share of the tries against the size of the object", _sizes),
+        ("sizes.png", "Valid share of the candidates against the size of the object", _sizes),
     )
     written = {}
     for name, shows, make in plots:
@@ -72,9 +72,9 @@ def _plain(axes: Any, *, grid: str = "both") -> None:
 def _yields(card: Row, tally: Tally) -> Any:
     hands, objects = _hands(card), _objects(card)
     shares = np.full((len(objects), len(hands)), np.nan)
-    rows = {(cell["hand"], cell["object"]): cell for cell in card["cells"] if cell["of_judged"] is not None}
+    rows = {(cell["hand"], cell["object"]): cell for cell in card["cells"] if cell["of_validated"] is not None}
     for (hand, obj), cell in rows.items():
-        shares[objects.index(obj), hands.index(hand)] = cell["of_judged"]
+        shares[objects.index(obj), hands.index(hand)] = cell["of_validated"]
     if not rows:
         return None
     named = len(objects) <= _NAMED
@@ -83,14 +83,16 @@ def _yields(card: Row, tally: Tally) -> Any:
     image = axes.imshow(shares, cmap="YlGnBu", vmin=0, vmax=1, aspect="auto", interpolation="nearest")
     axes.set_xticks(range(len(hands)), hands)
     axes.set_yticks(range(len(objects)) if named else [], objects if named else [])
-    axes.set_title(f"{card['name']}: valid of judged (grasps)", loc="left", fontsize=10)
+    axes.set_title(f"{card['name']}: valid of validated (grasps)", loc="left", fontsize=10)
     for (hand, obj), cell in rows.items() if named else ():
         x, y = hands.index(hand), objects.index(obj)
-        text = f"{100 * cell['of_judged']:.0f} %  ({cell['valid']})"
-        axes.text(x, y, text, ha="center", va="center", fontsize=8, color="white" if cell["of_judged"] > 0.6 else INK)
+        text = f"{100 * cell['of_validated']:.0f} %  ({cell['valid']})"
+        axes.text(
+            x, y, text, ha="center", va="center", fontsize=8, color="white" if cell["of_validated"] > 0.6 else INK
+        )
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
-    figure.colorbar(image, ax=axes, label="valid of judged", shrink=0.8)
+    figure.colorbar(image, ax=axes, label="valid of validated", shrink=0.8)
     return figure
 
 
@@ -221,7 +223,7 @@ def _joints(card: Row, tally: Tally) -> Any:
 
 def _sizes(card: Row, tally: Tally) -> Any:
     sizes = {obj["name"]: sorted(obj["extents_m"]) for obj in card["composition"]["objects"] if obj["extents_m"]}
-    rows = [cell for cell in card["cells"] if cell["object"] in sizes and cell["of_judged"] is not None]
+    rows = [cell for cell in card["cells"] if cell["object"] in sizes and cell["of_validated"] is not None]
     if not rows:
         return None
     figure = _figure(9, 3.2)
@@ -231,7 +233,7 @@ def _sizes(card: Row, tally: Tally) -> Any:
             own = [cell for cell in rows if cell["hand"] == hand]
             axes.scatter(
                 [1e3 * sizes[cell["object"]][place] for cell in own],
-                [100 * cell["of_judged"] for cell in own],
+                [100 * cell["of_validated"] for cell in own],
                 s=22,
                 color=COLOURS[number % len(COLOURS)],
                 label=hand,
@@ -242,6 +244,6 @@ def _sizes(card: Row, tally: Tally) -> Any:
         axes.set_xlim(0, None)
         axes.set_ylim(0, 103)
         _plain(axes)
-    panels[0].set_ylabel("valid share of the judged, %", fontsize=9)
+    panels[0].set_ylabel("valid share of the validated, %", fontsize=9)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=8, frameon=False)
     return figure

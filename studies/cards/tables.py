@@ -58,32 +58,32 @@ def objects_table(card: Row) -> str:
 
 
 def validity_table(card: Row) -> str:
-    """By hand and in all: tries, valid ones, why the others are not, audits, cost."""
+    """By hand and in all: tries, valid ones, why the others are not, rechecks, cost."""
     found = {**card["validity"]["by_hand"], "**all**": card["validity"]}
     rows = []
     for name, row in found.items():
-        of_judged = interval(row["of_judged"]) if row["judged"] or not row["tried"] else "not judged"
+        of_validated = interval(row["of_validated"]) if row["validated"] or not row["candidates"] else "not validated"
         each = 1000 * row["seconds"] / row["valid"] if row["valid"] and row["seconds"] else None
         rows.append(
             [
                 name,
-                f"{row['tried']:,}",
+                f"{row['candidates']:,}",
                 f"{row['valid']:,}",
-                of_judged,
+                of_validated,
                 _rejected(row["rejected"]),
-                f"{row['audited']:,}",
-                str(row["audit_dropped"]) if row["audited"] else "-",
+                f"{row['rechecked']:,}",
+                str(row["recheck_dropped"]) if row["rechecked"] else "-",
                 interval(row["false_valid"]),
                 "not recorded" if each is None else f"{each:,.0f}",
             ]
         )
     head = (
         "hand",
-        "tried",
+        "candidates",
         "valid",
-        "valid of judged (95 %)",
+        "valid of validated (95 %)",
         "why not",
-        "audited",
+        "rechecked",
         "overturned",
         "false valid (95 %)",
         "worker s per 1,000",
@@ -116,9 +116,9 @@ def cells_table(card: Row) -> str:
                 cell["hand"],
                 cell["object"],
                 "-" if cell["asked"] is None else f"{cell['asked']:,}",
-                f"{cell['tried']:,}",
+                f"{cell['candidates']:,}",
                 f"{cell['valid']:,}",
-                percent(cell["of_judged"]),
+                percent(cell["of_validated"]),
                 *(_fixed(median.get(name), QUALITY_NAMES[name][1]) for name in _SHOWN),
                 percent(cell["clear_of_table"]),
                 _fixed(cell["diversity"], 2),
@@ -132,9 +132,9 @@ def cells_table(card: Row) -> str:
         "hand",
         "object",
         "asked",
-        "tried",
+        "candidates",
         "valid",
-        "of judged",
+        "of validated",
         *(QUALITY_NAMES[name][0] for name in _SHOWN),
         "clear of table",
         "D",
@@ -186,12 +186,12 @@ def _spread(cell: Row | None, digits: int) -> str:
 
 
 def _rejected(rejected: Mapping[str, int] | None) -> str:
-    """In words: what the tries came to that are not kept."""
+    """In words: what the candidates came to that are not kept."""
     words = {
-        "dropped": "dropped by the referee",
+        "dropped": "dropped by the validator",
         "gate": "failed the gate",
         "diverged": "diverged",
-        "fragile": "held in too few models",
+        "not_robust": "held in too few models",
         "alike": "too like another",
     }
     parts = [f"{count:,} {words.get(why, why)}" for why, count in (rejected or {}).items() if count]

@@ -96,11 +96,11 @@ class CellTally:
 
     grasps: int = 0
     valid: int = 0
-    tried: int = 0
-    judged: int = 0
-    """Tries of shards that a referee judged."""
-    audited: int = 0
-    audit_held: int = 0
+    candidates: int = 0
+    validated: int = 0
+    """Tries of shards that a validator validated."""
+    rechecked: int = 0
+    recheck_held: int = 0
     scenes: int = 0
     pairs: int = 0
     clear_pairs: int = 0
@@ -231,14 +231,14 @@ def _add_base(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts) -> 
     valid = validity.valid(columns)
     cell.grasps += piece.rows
     cell.valid += int(valid.sum())
-    tried = int(piece.said.get("tried", piece.rows))
-    cell.tried += tried
-    if validity.judged(columns).any() or (not piece.rows and piece.said.get("verdict_level", "none") != "none"):
-        cell.judged += tried
+    candidates = int(piece.said.get("candidates", piece.rows))
+    cell.candidates += candidates
+    if validity.validated(columns).any() or (not piece.rows and piece.said.get("verdict_level", "none") != "none"):
+        cell.validated += candidates
     cell.rejected.update({str(why): int(count) for why, count in dict(piece.info.get("rejected", {})).items()})
-    if (audit := columns.get("quality/audit")) is not None:
-        cell.audited += int(np.count_nonzero(audit[valid] >= 0))
-        cell.audit_held += int(np.count_nonzero(audit[valid] == 1))
+    if (recheck := columns.get("quality/recheck")) is not None:
+        cell.rechecked += int(np.count_nonzero(recheck[valid] >= 0))
+        cell.recheck_held += int(np.count_nonzero(recheck[valid] == 1))
     if (hard := columns.get("quality/lift_hard")) is not None:
         cell.lift_tested += int(np.count_nonzero(hard[valid] >= 0))
         cell.lift_hard += int(np.count_nonzero(hard[valid] == 1))

@@ -15,21 +15,21 @@ from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.studies.bench import device_name
 from graspd.studies.chart.statistics import figures, plain, summed
-from graspd.studies.chart.trials import FRICTION, THRESHOLD_M, Setting, Trial
+from graspd.studies.chart.trials import FRICTION, THRESHOLD_M, Rollout, Setting
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners import method, planner
-from graspd.worker.run import Run
 from graspd.worker.validation.decomposition import decompose
 
 Say = Callable[[str], None]
 
-#: Error bound of the object that all settings are measured and judged on [m]: what a coarser mesh costs is seen.
+#: Error bound of the object that all settings are measured and validated on [m]: what a coarser mesh costs is seen.
 TRUE_ERROR_M: Final = FIDELITIES["standard"].face_error_m
 
 
 @dataclass(frozen=True)
-class Thing:
+class ChartObject:
     """An object to be loaded at the error bound [m] that a fidelity asks for."""
 
     name: str
@@ -38,7 +38,7 @@ class Thing:
 
 def chart(
     hands: Sequence[HandModel],
-    things: Sequence[Thing],
+    things: Sequence[ChartObject],
     settings: Sequence[Setting],
     *,
     repeats: int,
@@ -53,7 +53,7 @@ def chart(
         things: the objects.
         settings: what to compare.
         repeats: timed calls of each setting on each pair.
-        models: around the nominal one, in which each grasp that holds is judged.
+        models: around the nominal one, in which each grasp that holds is validated.
         say: told of each cell as it ends.
         keep: given the result so far after each pair.
 
@@ -66,7 +66,7 @@ def chart(
         for hand in hands:
             true = thing.load(TRUE_ERROR_M)
             pieces = decompose(true)
-            cells = [Trial(s, hand, thing.load(s.knobs.face_error_m), true, pieces) for s in settings]
+            cells = [Rollout(s, hand, thing.load(s.knobs.face_error_m), true, pieces) for s in settings]
             for cell in cells:
                 cell.warm_up()
             for _ in range(repeats):
@@ -87,7 +87,7 @@ def _result(runs: Sequence[dict[str, Any]], settings: Sequence[Setting], models:
         "device": device_name(settings[0].run.device),
         "versions": {"graspd": PACKAGE_VERSION, "warp": wp.config.version},
         "threads": settings[0].run.cores,
-        "referee": {"protocol": "dexgraspbench", "level": "certificate"},
+        "validation": {"protocol": "dexgraspbench", "level": "standard"},
         "models": models,
         "friction": FRICTION,
         "threshold_m": THRESHOLD_M,
@@ -101,7 +101,7 @@ def _of_hands(runs: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]
     return {hand: [run for run in runs if run["hand"] == hand] for hand in dict.fromkeys(run["hand"] for run in runs)}
 
 
-def _row(cell: Trial, hand: HandModel, thing: Thing) -> dict[str, Any]:
+def _row(cell: Rollout, hand: HandModel, thing: ChartObject) -> dict[str, Any]:
     setting = cell.setting
     return {
         "method": setting.method,
@@ -117,7 +117,7 @@ def _row(cell: Trial, hand: HandModel, thing: Thing) -> dict[str, Any]:
 def _line(run: dict[str, Any]) -> str:
     return (
         f"{run['method']:11s} {run['fidelity']:13s} {run['hand']:18s} {run['object']:20s} "
-        f"{run['end_to_end_per_second']:8.3f} valid/s  letter {run['letter']:.2f}  hard {run['hard']:.2f}  "
+        f"{run['end_to_end_per_second']:8.3f} valid/s  letter {run['dexgraspbench']:.2f}  hard {run['hard']:.2f}  "
         f"eps {run['epsilon']:.3f}  PD {run['pd_mm']:.2f} mm"
     )
 
@@ -136,7 +136,7 @@ def settings_of(
     peer_batch: int,
     options: Sequence[str],
     quick: bool,
-    run: Run,
+    run: ExecutionContext,
 ) -> list[Setting]:
     """A setting for every method, fidelity and batch; methods without fidelities have one each.
 

@@ -18,21 +18,21 @@ Row = Mapping[str, Any]
 
 #: Title and key of the accuracies over speed.
 PANELS: Final = (
-    ("Success by the letter", "letter"),
+    ("Success under the DexGraspBench protocol", "dexgraspbench"),
     ("Success at half the friction", "hard"),
     ("Robust share of those that hold", "robust"),
     ("ε (median)", "epsilon"),
     ("Penetration, mm (median; less is better)", "pd_mm"),
 )
 IN_SCENES: Final = (
-    ("Lifted, share of all tries", "lift"),
-    ("Lifted by the letter", "lift_letter"),
+    ("Lifted, share of all candidates", "lift"),
+    ("Lifted under the DexGraspBench protocol", "lift_dexgraspbench"),
     ("Lifted at half the friction", "lift_hard"),
     ("Robust share of those lifted", "robust"),
 )
 SPEED: Final = "end_to_end_per_second"
 #: Shares.
-OF_ONE: Final = frozenset({"letter", "hard", "robust", "lift", "lift_letter", "lift_hard"})
+OF_ONE: Final = frozenset({"dexgraspbench", "hard", "robust", "lift", "lift_dexgraspbench", "lift_hard"})
 COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
 MARKERS: Final = ("o", "s", "D", "^", "v", "P", "X", "<")
 INK: Final = "#1f2937"
@@ -49,9 +49,9 @@ def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
     for axes, (title, key) in zip(panels.flat[:5], PANELS, strict=True):
         labels += _over_speed(axes, rows, styles, key, title, words, SPEED)
     last, timed = panels.flat[5], [row for row in rows if row["seconds_to_first_valid"]]
-    labels += _panel(last, timed, styles, x="seconds_to_first_valid", y="letter")
+    labels += _panel(last, timed, styles, x="seconds_to_first_valid", y="dexgraspbench")
     last.set_xlabel("seconds to the first valid grasp, end to end (less is better)")
-    last.set_title("Success by the letter", loc="left", fontsize=11)
+    last.set_title("Success under the DexGraspBench protocol", loc="left", fontsize=11)
     last.set_ylim(-0.07, 1.04)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
     _save(figure, labels, files)
@@ -112,7 +112,7 @@ def _over_speed(
 
 
 def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> None:
-    """Shares of tries over lifted grasps per second, and what is lifted over the seconds to the first.
+    """Shares of candidates over lifted grasps per second, and what is lifted over the seconds to the first.
 
     Args:
         second: what a second is called.

@@ -32,9 +32,9 @@ COLUMNS: Final = (
     "valid_per_second",
     "valid_per_second_low",
     "valid_per_second_high",
-    "letter",
-    "letter_low",
-    "letter_high",
+    "dexgraspbench",
+    "dexgraspbench_low",
+    "dexgraspbench_high",
     "hard",
     "hard_low",
     "hard_high",
@@ -57,7 +57,7 @@ COLUMNS: Final = (
 )
 
 #: Accuracies of the summary, and how they are printed.
-ACCURACIES: Final = (("letter", ".2f"), ("hard", ".2f"), ("robust", ".2f"), ("epsilon", ".3f"), ("pd_mm", ".2f"))
+ACCURACIES: Final = (("dexgraspbench", ".2f"), ("hard", ".2f"), ("robust", ".2f"), ("epsilon", ".3f"), ("pd_mm", ".2f"))
 
 
 def write(chart: Row, folder: Path) -> list[Path]:
@@ -75,9 +75,9 @@ def write(chart: Row, folder: Path) -> list[Path]:
     draw_hands(
         chart["by_hand"],
         files[-1:],
-        key="letter",
+        key="dexgraspbench",
         speed=SPEED,
-        words=("success by the letter", "valid grasps per second, end to end"),
+        words=("success under the DexGraspBench protocol", "valid grasps per second, end to end"),
     )
     if chart.get("sweeps"):
         files.append(folder / "sweeps.png")
@@ -90,7 +90,7 @@ def markdown(chart: Row) -> str:
     """The chart as a page: what was run, one table per question."""
     parts = [_head(chart), summary_table(chart["summary"]), _ratios(chart["summary"])]
     if len(chart["by_hand"]) > 1:
-        parts += ["## Each hand", "![Success by the letter over speed](chart.hands.png)"]
+        parts += ["## Each hand", "![Success under the DexGraspBench protocol over speed](chart.hands.png)"]
         parts += [f"### {hand}\n\n{summary_table(rows)}" for hand, rows in chart["by_hand"].items()]
     parts += ["## Each hand and object", runs_table(chart["runs"])]
     parts += [
@@ -111,10 +111,10 @@ def _head(chart: Row) -> str:
         f"# Speed against accuracy\n\n{command}{chart['device']}, {chart['threads']} threads, graspd "
         f"{chart['versions']['graspd']}, Warp {chart['versions']['warp']}, {chart['created']}. Hands: {hands}. "
         f"Objects: {objects}. Warm, repeats in turn.{' ' + chart['remark'] if chart.get('remark') else ''}\n\n"
-        f"- *valid*: holds in MuJoCo (DexGraspBench protocol, level *{chart['referee']['level']}*) and is sound\n"
-        "- speeds are end to end, as a job works: planned, judged, and measured where it holds; *planner's*: grasps "
+        f"- *valid*: holds in MuJoCo (DexGraspBench protocol, level *{chart['validation']['level']}*) and is feasible\n"
+        "- speeds are end to end, as a job works: planned, validated, and measured where it holds; *planner's*: grasps "
         "that hold over the seconds of planner and postures alone; on a CPU a second is one of one core\n"
-        "- *letter*: holds by the letter of the protocol; *hard*: at half the friction; *robust*: share of "
+        "- *letter*: holds under the unmodified DexGraspBench protocol; *hard*: at half the friction; *robust*: share of "
         f"{chart['models']} models around the nominal one in which a grasp that holds does, on average\n"
         f"- ε, contact: μ = {chart['friction']:g}, within {1e3 * chart['threshold_m']:g} mm; ε and penetration are "
         "medians of a pair's grasps, then means over the pairs\n"
@@ -176,7 +176,7 @@ def _ratios(rows: Sequence[Row]) -> str:
         if not times:
             times = f"> × {best[SPEED] / most_valid(row):.3g} (0 of {row['grasps']} valid)"
         lines.append(
-            f"| {row['method']} {row['fidelity']} | {times} | {best['letter'] - row['letter']:+.2f} "
+            f"| {row['method']} {row['fidelity']} | {times} | {best['dexgraspbench'] - row['dexgraspbench']:+.2f} "
             f"| {best['epsilon'] - row['epsilon']:+.3f} | {best['pd_mm'] - row['pd_mm']:+.2f} |"
         )
     return "\n".join(lines)
@@ -191,7 +191,7 @@ def runs_table(runs: Sequence[Row]) -> str:
     ]
     lines += [
         f"| {run['hand']} | {run['object']} | {run['method']} | {run['fidelity']} | {run[SPEED]:.3g} "
-        f"| {run['letter']:.2f} | {run['hard']:.2f} | {share(run['robust'])} | {run['epsilon']:.3f} | "
+        f"| {run['dexgraspbench']:.2f} | {run['hard']:.2f} | {share(run['robust'])} | {run['epsilon']:.3f} | "
         f"{run['pd_mm']:.2f} | {run['spd_mm']:.2f} | {run['ca_cm2']:.1f} |"
         for run in sorted(runs, key=lambda r: (r["hand"], r["object"]))
     ]

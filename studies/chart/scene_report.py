@@ -27,15 +27,15 @@ COLUMNS: Final = (
     "end_seconds",
     "clear_count",
     "lift_count",
-    "lift_letter_count",
+    "lift_dexgraspbench_count",
     "lift_hard_count",
     "clear",
     "lift",
     "lift_low",
     "lift_high",
-    "lift_letter",
-    "lift_letter_low",
-    "lift_letter_high",
+    "lift_dexgraspbench",
+    "lift_dexgraspbench_low",
+    "lift_dexgraspbench_high",
     "lift_hard",
     "lift_hard_low",
     "lift_hard_high",
@@ -66,7 +66,7 @@ def write(chart: Row, folder: Path) -> list[Path]:
     draw_scenes([named(row) for row in chart["summary"]], files[3:], second=second_of(chart))
     files.append(folder / "chart.hands.png")
     by_hand = {hand: [named(row) for row in rows] for hand, rows in chart["by_hand"].items()}
-    words = ("share of all tries that is lifted", f"lifted grasps per {second_of(chart)}, end to end")
+    words = ("share of all candidates that is lifted", f"lifted grasps per {second_of(chart)}, end to end")
     draw_hands(by_hand, files[-1:], key="lift", speed=SPEED, words=words, label=one_of_several)
     files[2].write_text(markdown(chart) + "\n")
     return files
@@ -111,7 +111,7 @@ def _head(chart: Row) -> str:
         "that peers can do\n"
         "- *clear*: free of what stands there, coming, closing and lifting\n"
         "- *lifted*: clear, and lifted by MuJoCo (level *lift*); *letter*: clear, and lifted by DexGraspBench's test; "
-        "*half friction*: lifted at that too; shares of all tries\n"
+        "*half friction*: lifted at that too; shares of all candidates\n"
         f"- *robust*: share of {chart['models']} models around the nominal one in which a lifted grasp is lifted, on "
         "average\n"
         f"- speed: lifted grasps over {seconds}, end to end: planner, postures, way, lift, and "
@@ -154,7 +154,7 @@ def _runs(runs: Sequence[Row], second: str) -> str:
     ]
     lines += [
         f"| {run['hand']} | {run['object']} | {run['way']} | {run['method']} | {run['fidelity']} | {run['grasps']} | "
-        f"{run['clear']:.2f} | {run['lift']:.2f} | {run['lift_letter']:.2f} | {run['lift_hard']:.2f} | "
+        f"{run['clear']:.2f} | {run['lift']:.2f} | {run['lift_dexgraspbench']:.2f} | {run['lift_hard']:.2f} | "
         f"{share(run['robust'])} | {run[SPEED]:.3g} |"
         for run in runs
     ]

@@ -1,10 +1,10 @@
 """Grasps planned in a scene against grasps planned around a free object, put into the same scene and filtered.
 
 A setting of a method that plans in scenes is run both ways, others only the second. Grasp i is tried in scene i of the
-object's stable faces in turn, whichever way it was planned, and judged alike: clear on its way, lifted, lifted by the
-letter, at half the friction, and in models around the nominal one. Speed is lifted grasps over seconds, on a CPU those
-of all cores together, which do not follow what else the machine does: of planner and postures alone, and end to end,
-with way, referee and the metrics of what is lifted.
+object's stable faces in turn, whichever way it was planned, and validated alike: clear on its way, lifted, lifted by
+the letter, at half the friction, and in models around the nominal one. Speed is lifted grasps over seconds, on a CPU
+those of all cores together, which do not follow what else the machine does: of planner and postures alone, and end to
+end, with way, validator and the metrics of what is lifted.
 """
 
 from __future__ import annotations
@@ -26,36 +26,36 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.studies import FILTERED, IN_SCENE
 from graspd.service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from graspd.studies.bench import device_name
-from graspd.studies.chart.chart import TRUE_ERROR_M, Thing
+from graspd.studies.chart.chart import TRUE_ERROR_M, ChartObject
 from graspd.studies.chart.statistics import first_valid, pareto, plain
 from graspd.studies.chart.trials import FRICTION, MODELS_SEED, SEED, WARM_SEED, Setting
 from graspd.studies.clock import clock_of
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners import Trial, Wanted, method, synthesize
+from graspd.worker.planners import PlanRequest, Rollout, method, synthesize
 from graspd.worker.quality.intervals import wilson, wilson_of_mean
 from graspd.worker.quality.table import measure
 from graspd.worker.scenes.kinds import rest_poses, supports_of
-from graspd.worker.scenes.trial import lift_trial
-from graspd.worker.scenes.way import plan_way
-from graspd.worker.simulation.surroundings import Placed, Scenes
+from graspd.worker.scenes.rollout import lift_rollout
+from graspd.worker.scenes.trajectory import plan_way
+from graspd.worker.simulation.environment import Placed, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
-from graspd.worker.validation.lifting import judge_lifts
+from graspd.worker.validation.lifting import validate_lifts
 from graspd.worker.validation.robust import robust
 
 Row = dict[str, Any]
 Say = Callable[[str], None]
 
-#: Shares of all tries, by their column.
-SHARES: Final = ("clear", "lift", "lift_letter", "lift_hard")
+#: Shares of all candidates, by their column.
+SHARES: Final = ("clear", "lift", "lift_dexgraspbench", "lift_hard")
 #: Accuracies that have a front.
-ACCURACIES: Final = ("lift", "lift_letter", "lift_hard", "robust")
+ACCURACIES: Final = ("lift", "lift_dexgraspbench", "lift_hard", "robust")
 SPEEDS: Final = (("valid_per_second", "seconds"), ("end_to_end_per_second", "end_seconds"))
 #: Raise when a row has other columns: what is kept then begins anew.
 FORM: Final = 2
-#: Raw grasps per second, by the speed that counts those lifted.
-RAW: Final = {"valid_per_second": "grasps_per_second", "end_to_end_per_second": "raw_end_to_end_per_second"}
+#: Candidates per second, by the speed that counts those lifted.
+RAW: Final = {"valid_per_second": "grasps_per_second", "end_to_end_per_second": "candidates_end_to_end_per_second"}
 #: A grasp that takes longer is not made once more to time the first one [s].
 _SHORT_S: Final = 1.0
 _NOTHING: Final = {**{f"{name}_count": 0 for name in SHARES}, "robust_sum": 0.0, "first_seconds": 0.0}
@@ -65,12 +65,12 @@ _NOTHING: Final = {**{f"{name}_count": 0 for name in SHARES}, "robust_sum": 0.0,
 class Place:
     """An object in its scenes, which are made when the first setting that is not kept is tried."""
 
-    thing: Thing
+    thing: ChartObject
     spec: SceneSpec
 
     @cached_property
     def true(self) -> ObjectModel:
-        """As the judge sees it: the same for all settings."""
+        """As the validator sees it: the same for all settings."""
         return self.thing.load(TRUE_ERROR_M)
 
     @cached_property
@@ -85,7 +85,7 @@ class Place:
 
 def scene_chart(
     hands: Sequence[HandModel],
-    things: Sequence[Thing],
+    things: Sequence[ChartObject],
     settings: Sequence[Setting],
     spec: SceneSpec,
     *,
@@ -166,21 +166,21 @@ def _tried(setting: Setting, way: str, hand: HandModel, place: Place, models: in
     note, few = "", min(setting.run.cores, setting.batch)
     clock = clock_of(setting.run.device)
     try:
-        trial = lift_trial(hand, obj, lambda: place.pieces) if way == IN_SCENE else None
-        _planned(setting, hand, obj, _first(placed), trial, warm=True)
+        rollout = lift_rollout(hand, obj, lambda: place.pieces) if way == IN_SCENE else None
+        _planned(setting, hand, obj, _first(placed), rollout, warm=True)
         began = clock()
-        grasps = _planned(setting, hand, obj, placed, trial)
+        grasps = _planned(setting, hand, obj, placed, rollout)
         row["seconds"] = clock() - began
-        judged = Judged(hand, place, grasps, placed)
+        validated = Validated(hand, place, grasps, placed)
         row["end_seconds"] = clock() - began
         each = row["end_seconds"] / setting.batch
         row["first_seconds"] = each * few
         if each < _SHORT_S:
             began = clock()
             start = placed.take(slice(0, few))
-            Judged(hand, place, _planned(setting, hand, obj, start, trial), start)
+            Validated(hand, place, _planned(setting, hand, obj, start, rollout), start)
             row["first_seconds"] = clock() - began
-        row |= judged.counts(models)
+        row |= validated.counts(models)
     except InputError as error:
         # A scene that leaves no way in, or a pair that the method refuses.
         note = str(error)
@@ -195,17 +195,21 @@ def _first(placed: Placed) -> Placed:
 
 
 def _planned(
-    setting: Setting, hand: HandModel, obj: ObjectModel, placed: Placed, trial: Trial | None, *, warm: bool = False
+    setting: Setting, hand: HandModel, obj: ObjectModel, placed: Placed, rollout: Rollout | None, *, warm: bool = False
 ) -> GraspSet:
     """Grasps that are planned in the scenes with a trial, or around a free object without."""
     options = {**setting.options, **(setting.warm if warm else {})}
-    wanted = Wanted(
-        len(placed.index), setting.knobs, WARM_SEED if warm else SEED, placed=placed if trial else None, trial=trial
+    wanted = PlanRequest(
+        len(placed.index),
+        setting.knobs,
+        WARM_SEED if warm else SEED,
+        placed=placed if rollout else None,
+        rollout=rollout,
     )
     return synthesize(hand, obj, wanted, setting.run, method=setting.method, options=options)
 
 
-class Judged:
+class Validated:
     """Grasps with their way and the verdict of the lift, and measured where that is one."""
 
     def __init__(self, hand: HandModel, place: Place, grasps: GraspSet, placed: Placed) -> None:
@@ -219,7 +223,7 @@ class Judged:
     def _lifting(self, rows: NDArray[np.intp], **options: Any) -> NDArray[np.intp]:
         if not len(rows):
             return rows
-        success = judge_lifts(
+        success = validate_lifts(
             self.hand,
             self.place.true,
             self.grasps.take(rows),
@@ -230,8 +234,8 @@ class Judged:
         return rows[success == 1]
 
     def counts(self, models: int) -> Row:
-        """How many are clear on their way, lifted besides, by the letter, at half the friction besides; and of those
-        lifted the sum of the shares of models in which they are."""
+        """How many are clear on their way, lifted besides, under the DexGraspBench protocol, at half the friction
+        besides; and of those lifted the sum of the shares of models in which they are."""
         lifted = self.lifted
         shares = robust(
             self.hand,
@@ -245,14 +249,14 @@ class Judged:
         return {
             "clear_count": len(self.clear),
             "lift_count": len(lifted),
-            "lift_letter_count": len(self._lifting(self.clear, level="letter")),
+            "lift_dexgraspbench_count": len(self._lifting(self.clear, level="dexgraspbench")),
             "lift_hard_count": len(self._lifting(lifted, hard=True)),
             "robust_sum": float(shares.sum()),
         }
 
 
 def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
-    """Shares of all tries with their 95 % (Wilson), and lifted grasps per second, over some cells.
+    """Shares of all candidates with their 95 % (Wilson), and lifted grasps per second, over some cells.
 
     `robust` is the mean share of models over the grasps that are lifted. Where several cells are summed, each grasp
     counts alike. A cell that was refused took no time that is known.
@@ -314,7 +318,7 @@ def _result(runs: Sequence[Row], settings: Sequence[Setting], spec: SceneSpec, m
         "device": device_name(settings[0].run.device),
         "versions": {"graspd": PACKAGE_VERSION},
         "scene": spec.model_dump(mode="json"),
-        "referee": {"protocol": "lift", "level": "lift"},
+        "validation": {"protocol": "lift", "level": "lift"},
         "runs": list(runs),
         "models": models,
         "summary": summed(runs),

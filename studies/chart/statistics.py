@@ -8,21 +8,21 @@ from typing import Any, Final
 import numpy as np
 
 from graspd.service.model.transforms import Floats
-from graspd.studies.chart.trials import Trial
+from graspd.studies.chart.trials import Rollout
 from graspd.worker.quality.intervals import wilson, wilson_of_mean
 
 #: Bootstrap draws; error bars are their 2.5 and 97.5 percentiles.
 DRAWS: Final = 400
 BAR: Final = (2.5, 97.5)
 #: Accuracies: whether more is better. The first three are not of sweeps.
-METRICS: Final = {"letter": True, "hard": True, "robust": True, "gsr": True, "epsilon": True, "pd_mm": False}
+METRICS: Final = {"dexgraspbench": True, "hard": True, "robust": True, "gsr": True, "epsilon": True, "pd_mm": False}
 #: What is drawn against accuracies.
 SPEEDS: Final = ("valid_per_second", "end_to_end_per_second")
 #: Of these the median of a cell's grasps counts; of `gsr` the mean.
 MEDIANS: Final = ("epsilon", "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "wrench_volume")
 
 
-def figures(cell: Trial) -> dict[str, Any]:
+def figures(cell: Rollout) -> dict[str, Any]:
     """The keys of a run: speed, accuracy, and `KEY_low`, `KEY_high` of each."""
     held, kept = (np.concatenate(rows).astype(float) for rows in (cell.success, cell.kept))
     seconds, batch = np.array(cell.seconds), cell.setting.batch
@@ -46,7 +46,7 @@ def figures(cell: Trial) -> dict[str, Any]:
         row[f"{key}_low"], row[f"{key}_high"] = np.percentile(values, BAR)
     widen(row, int(held.sum()), len(held), len(held) / float(seconds.sum()))
     widen_speed(row, "end_to_end_per_second", int(kept.sum()), len(kept), len(kept) / sum(cell.end_seconds))
-    row |= _scrutinised(cell) if cell.letter else {}
+    row |= _scrutinised(cell) if cell.dexgraspbench else {}
     return {key: plain(value) for key, value in row.items()}
 
 
@@ -63,10 +63,11 @@ def widen_speed(row: dict[str, Any], key: str, valid: int, grasps: int, per_seco
     row[f"{key}_high"] = max(row[f"{key}_high"], high * per_second)
 
 
-def _scrutinised(cell: Trial) -> dict[str, Any]:
-    """Success by the letter and at half the friction, and the mean share of other models that held ones hold in."""
+def _scrutinised(cell: Rollout) -> dict[str, Any]:
+    """Success under the DexGraspBench protocol and at half the friction, and the mean share of other models that held
+    ones hold in."""
     row: dict[str, Any] = {}
-    for key, verdicts in (("letter", cell.letter), ("hard", cell.hard)):
+    for key, verdicts in (("dexgraspbench", cell.dexgraspbench), ("hard", cell.hard)):
         held = np.concatenate(verdicts) == 1
         row[key] = float(held.mean())
         row[f"{key}_low"], row[f"{key}_high"] = wilson(int(held.sum()), len(held))
@@ -88,7 +89,7 @@ def first_valid(share: float, seconds: Sequence[float], grasps: int) -> float | 
     return float(np.median(seconds)) / (1.0 - (1.0 - share) ** grasps)
 
 
-def _draws(cell: Trial) -> dict[str, Floats]:
+def _draws(cell: Rollout) -> dict[str, Floats]:
     """Bootstrap: repeats with replacement, then grasps within each."""
     rng = np.random.default_rng(0)
     repeats = len(cell.seconds)
@@ -137,7 +138,7 @@ def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             row[f"{key}_low"], row[f"{key}_high"] = (_ratio_bar(own, key, times, side) for side in ("low", "high"))
         widen(row, valid, row["grasps"], row["grasps_per_second"])
         widen_speed(row, "end_to_end_per_second", kept, row["grasps"], row["grasps"] / end)
-        row["raw_end_to_end_per_second"] = row["grasps"] / end
+        row["candidates_end_to_end_per_second"] = row["grasps"] / end
         rows.append({key: plain(value) for key, value in row.items()})
     for key, more in METRICS.items():
         # Who makes no valid grasp is on no front: a hand that touches nothing does not penetrate either.
@@ -170,7 +171,7 @@ def _ratio_bar(runs: Sequence[dict[str, Any]], key: str, seconds: str, side: str
 def most_valid(row: Mapping[str, Any]) -> float:
     """Valid grasps per second, end to end, that a method has at most, with 95 %, of which none of n is: a share of
     3 / n. In scenes, of those that are lifted."""
-    raw = row.get("raw_end_to_end_per_second", row["grasps_per_second"])
+    raw = row.get("candidates_end_to_end_per_second", row["grasps_per_second"])
     return float(raw) * min(1.0, 3.0 / row["grasps"])
 
 

@@ -17,16 +17,16 @@ import warp as wp
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import FIDELITIES, Fidelity
 from graspd.studies.chart import kernels
-from graspd.studies.chart.chart import TRUE_ERROR_M, Thing
+from graspd.studies.chart.chart import TRUE_ERROR_M, ChartObject
 from graspd.studies.chart.statistics import figures, plain
-from graspd.studies.chart.trials import Setting, Trial
+from graspd.studies.chart.trials import Rollout, Setting
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair, pair_of
 from graspd.worker.planners.fast_graspd.planner import grasps_of, optimise_pair
-from graspd.worker.planners.port import Wanted
-from graspd.worker.run import Run
+from graspd.worker.planners.port import PlanRequest
 from graspd.worker.simulation import record
 from graspd.worker.simulation.data import Data
 from graspd.worker.simulation.launches import Launches
@@ -107,12 +107,12 @@ def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[Turn]:
 
 def sweep(
     hand: HandModel,
-    thing: Thing,
+    thing: ChartObject,
     *,
     batch: int,
     repeats: int,
     quick: bool,
-    run: Run,
+    run: ExecutionContext,
     knobs: Sequence[str] = (),
     say: Say = lambda line: None,
 ) -> list[dict[str, Any]]:
@@ -125,10 +125,10 @@ def sweep(
     default = Turn("", "default")
     true = thing.load(TRUE_ERROR_M)
     pieces = decompose(true)
-    cells: dict[tuple[str, str], Trial] = {}
+    cells: dict[tuple[str, str], Rollout] = {}
     for turn in [default, *turns(quick, knobs)]:
         if turn is default or not turn.default:
-            cells[turn.knob, turn.value] = Trial(
+            cells[turn.knob, turn.value] = Rollout(
                 _setting(turn, batch, run), hand, thing.load(turn.fidelity.face_error_m), true, pieces
             )
     for _ in range(repeats):
@@ -149,19 +149,19 @@ def sweep(
     return rows
 
 
-def _setting(turn: Turn, batch: int, run: Run) -> Setting:
+def _setting(turn: Turn, batch: int, run: ExecutionContext) -> Setting:
     make = partial(_make, turn=turn, run=run)
     return Setting("fast_graspd", turn.value, turn.fidelity, batch=batch, run=run, make=make)
 
 
-def _make(hand: HandModel, obj: ObjectModel, count: int, seed: int, *, turn: Turn, run: Run) -> GraspSet:
+def _make(hand: HandModel, obj: ObjectModel, count: int, seed: int, *, turn: Turn, run: ExecutionContext) -> GraspSet:
     began = time.perf_counter()
     pair = (turn.change or _same)(pair_of(hand, obj, turn.fidelity, run.device))
-    parts = optimise_pair(pair, Wanted(count, turn.fidelity, seed), run)
+    parts = optimise_pair(pair, PlanRequest(count, turn.fidelity, seed), run)
     return grasps_of(hand, obj, parts, time.perf_counter() - began)
 
 
-class AskingEach(Pair):
+class QueryPerVelocity(Pair):
     """Every simulated velocity asks for the distances anew; the answers are the same."""
 
     def iteration(self, model: Model, data: Data, optimizer: str, patience: int) -> Launches:
@@ -181,4 +181,4 @@ class AskingEach(Pair):
 
 def asking_each(pair: Pair) -> Pair:
     """The pair with a query for each velocity."""
-    return AskingEach(pair.coarse, pair.fine, pair.options, pair.hand)
+    return QueryPerVelocity(pair.coarse, pair.fine, pair.options, pair.hand)

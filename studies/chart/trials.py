@@ -1,4 +1,4 @@
-"""One cell of the chart: a method at a fidelity on a hand and an object, run several times and judged."""
+"""One cell of the chart: a method at a fidelity on a hand and an object, run several times and validated."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from numpy.typing import NDArray
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.transforms import Floats
 from graspd.studies.clock import clock_of
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners import Trial as Tried
-from graspd.worker.planners import Wanted, synthesize
+from graspd.worker.planners import PlanRequest, synthesize
+from graspd.worker.planners import Rollout as Tried
 from graspd.worker.quality.gate import passes
 from graspd.worker.quality.table import measure
-from graspd.worker.run import ALONE, Run
-from graspd.worker.scenes.trial import trial_on
+from graspd.worker.scenes.rollout import rollout_on
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.robust import robust
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.validator import validate
 
 #: Contact threshold and Coulomb coefficient of area, epsilon and wrench volume: the paper's.
 THRESHOLD_M: Final = 0.005
@@ -65,7 +65,7 @@ class Setting:
     """Grasps per call, and per repeat."""
     warm: Mapping[str, Any] = field(default_factory=dict)
     """Options of the call before the first timed one."""
-    run: Run = ALONE
+    run: ExecutionContext = DEFAULT_CONTEXT
     make: Make | None = None
     """Another way to make them than by method and fidelity: for sweeps of what no fidelity names."""
 
@@ -76,19 +76,19 @@ class Setting:
         count: int,
         seed: int,
         *,
-        trial: Tried | None = None,
+        rollout: Tried | None = None,
         warm: bool = False,
     ) -> GraspSet:
         """Make grasps; methods that try candidates do so by `trial`."""
         if self.make is not None:
             return self.make(hand, obj, count, seed)
         options = {**self.options, **(self.warm if warm else {})}
-        wanted = Wanted(count, self.knobs, seed, trial=trial)
+        wanted = PlanRequest(count, self.knobs, seed, rollout=rollout)
         return synthesize(hand, obj, wanted, self.run, method=self.method, options=options)
 
 
 @dataclass
-class Trial:
+class Rollout:
     """Repeats of a setting on a pair, as they come in."""
 
     setting: Setting
@@ -96,24 +96,24 @@ class Trial:
     obj: ObjectModel
     """As the planner sees it."""
     true: ObjectModel
-    """As metrics and referee see it: the same for all settings."""
+    """As metrics and validator see it: the same for all settings."""
     pieces: ConvexPieces
     """Of `true`."""
     seconds: list[float] = field(default_factory=list)
     """On a CPU those of all threads together, which do not ask what else the machine does; on a GPU those that pass."""
     end_seconds: list[float] = field(default_factory=list)
-    """End to end: planned, judged, and measured where they hold."""
+    """End to end: planned, validated, and measured where they hold."""
     made: list[GraspSet] = field(default_factory=list)
     success: list[NDArray[np.int8]] = field(default_factory=list)
-    """Verdicts of the certificate."""
+    """Verdicts of the standard level."""
     kept: list[NDArray[np.int8]] = field(default_factory=list)
-    """1 valid: a grasp holds and is sound."""
+    """1 valid: a grasp holds and is feasible."""
     columns: list[dict[str, Floats]] = field(default_factory=list)
     first_calls: list[float] = field(default_factory=list)
     """Seconds of calls of `first_grasps` grasps, end to end."""
     first_grasps: int = 1
-    letter: list[NDArray[np.int8]] = field(default_factory=list)
-    """Verdicts of the letter of the protocol; with `hard` and `shares` there only after `scrutinise`."""
+    dexgraspbench: list[NDArray[np.int8]] = field(default_factory=list)
+    """Verdicts of the unmodified DexGraspBench protocol; with `hard` and `shares` there only after `scrutinise`."""
     hard: list[NDArray[np.int8]] = field(default_factory=list)
     shares: list[Floats] = field(default_factory=list)
     """Of other models in which a grasp holds; nan where it does not in the nominal one."""
@@ -121,7 +121,7 @@ class Trial:
     @cached_property
     def tried(self) -> Tried | None:
         """What candidates go through, as where grasps are made for users."""
-        return trial_on(self.setting.run, self.hand, self.obj, self._pieces, in_scenes=False)
+        return rollout_on(self.setting.run, self.hand, self.obj, self._pieces, in_scenes=False)
 
     def _pieces(self) -> ConvexPieces:
         return self.pieces
@@ -132,20 +132,20 @@ class Trial:
 
     def warm_up(self) -> None:
         """One call that is not counted: kernels, grids and samples are there afterwards."""
-        self.setting.grasps(self.hand, self.obj, 1, WARM_SEED, trial=self.tried, warm=True)
+        self.setting.grasps(self.hand, self.obj, 1, WARM_SEED, rollout=self.tried, warm=True)
 
     def repeat(self) -> None:
         """One timed call, then quality and verdict of its grasps."""
         batch = self.setting.batch
         began = self._clock()
-        found = self.setting.grasps(self.hand, self.obj, batch, SEED + len(self.seconds), trial=self.tried)
+        found = self.setting.grasps(self.hand, self.obj, batch, SEED + len(self.seconds), rollout=self.tried)
         self.seconds.append(self._clock() - began)
-        success, sound, table = self._finished(found)
+        success, feasible, table = self._finished(found)
         self.end_seconds.append(self._clock() - began)
         lost = self._measured(found.take(np.flatnonzero(success != 1)))
         self.made.append(found)
         self.success.append(success)
-        self.kept.append(sound)
+        self.kept.append(feasible)
         columns = {}
         for key in COLUMNS:
             columns[key] = np.empty(len(found))
@@ -154,11 +154,11 @@ class Trial:
 
     def _finished(self, found: GraspSet) -> tuple[NDArray[np.int8], NDArray[np.int8], dict[str, Floats]]:
         """What a job does with planned grasps: verdicts, which are valid, and the columns of those that hold."""
-        success = judge(self.hand, self.true, found, pieces=self.pieces, run=self.setting.run).success
+        success = validate(self.hand, self.true, found, pieces=self.pieces, run=self.setting.run).success
         held = np.flatnonzero(success == 1)
         table = self._measured(found.take(held))
         kept = np.zeros(len(found), np.int8)
-        kept[held] = table.pop("sound")
+        kept[held] = table.pop("feasible")
         return success, kept, table
 
     def _measured(self, found: GraspSet) -> dict[str, Floats]:
@@ -166,14 +166,15 @@ class Trial:
             self.hand, self.true, found, friction=FRICTION, thresholds_m=[THRESHOLD_M], run=self.setting.run
         )
         columns = {key: _flat(table[f"quality/{name}"]) for key, name in COLUMNS.items()}
-        return columns | {"sound": np.asarray(passes(table), float)}
+        return columns | {"feasible": np.asarray(passes(table), float)}
 
     def scrutinise(self, models: int) -> None:
-        """Judge what was made by the letter, at half the friction, and in so many models around the nominal one."""
+        """Validate what was made under the DexGraspBench protocol, at half the friction, and in so many models around
+        the nominal one."""
         common: dict[str, Any] = {"pieces": self.pieces, "run": self.setting.run}
         for found, success in zip(self.made, self.success, strict=True):
-            self.letter.append(judge(self.hand, self.true, found, level="letter", **common).success)
-            self.hard.append(judge(self.hand, self.true, found, hard=True, **common).success)
+            self.dexgraspbench.append(validate(self.hand, self.true, found, level="dexgraspbench", **common).success)
+            self.hard.append(validate(self.hand, self.true, found, hard=True, **common).success)
             shares = robust(self.hand, self.true, found, held=success, models=models, seed=MODELS_SEED, **common).share
             self.shares.append(shares)
 
@@ -188,7 +189,7 @@ class Trial:
             self.first_calls.append(each * grasps)
             return
         began = self._clock()
-        self._finished(self.setting.grasps(self.hand, self.obj, grasps, SEED - len(self.seconds), trial=self.tried))
+        self._finished(self.setting.grasps(self.hand, self.obj, grasps, SEED - len(self.seconds), rollout=self.tried))
         self.first_calls.append(self._clock() - began)
 
     def values(self, key: str) -> Floats:

@@ -19,16 +19,16 @@ from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import GraspdError
 from graspd.service.model.states import AssetKind
 from graspd.service.model.studies import MapCell, Outcome, StabilityMap, reachable
-from graspd.worker.certified import certified_grasps
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.generation import validated_grasps
 from graspd.worker.hands.load import load_hand
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import load_object
-from graspd.worker.run import ALONE, Run
 
 MILLIMETRES: Final = 1e-3
-#: What maps of raw grasps tell of a cell, from where on it is bad, and how a user sees it.
-MEASURE: Final = "share of tries that are valid: certified by the referee, and past the geometric gate"
+#: What maps of candidates tell of a cell, from where on it is bad, and how a user sees it.
+MEASURE: Final = "share of candidates that are valid: held by the validator, and past the geometric gate"
 BOUNDS: Final = "weak: under a half; broken: none, or a number that is none"
 SHOWS: Final = "few or no valid grasps: a job ends with a note that its budget found fewer than asked for"
 
@@ -104,7 +104,7 @@ def shape_map(
     *,
     fidelities: Sequence[str] = ("draft", "standard", "fine"),
     count: int = 8,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
     families: Sequence[str] = tuple(FAMILIES),
     defects: Sequence[str] = tuple(DEFECTS),
     say: Callable[[str], None] = lambda line: None,
@@ -131,7 +131,7 @@ def shape_map(
         BOUNDS,
         reachable(cells, lambda cell: True),
         SHOWS,
-        "ingest refuses what has no inside and says `thin` where walls are; the gate and the referee flag grasps that "
+        "ingest refuses what has no inside and says `thin` where walls are; the gate and the validator flag grasps that "
         "sink in; a job that finds too few says so",
         "tests/studies/test_stability.py::test_a_shape_is_refused_or_its_grasps_are_sound",
         reach="all: users bring such shapes",
@@ -152,9 +152,9 @@ def shape_cell(
     options: dict[str, Any],
     asked: dict[str, Any],
     count: int,
-    run: Run,
+    run: ExecutionContext,
 ) -> MapCell:
-    """Raw grasps of a hand on a mesh, planned and judged as a job does.
+    """Candidates of a hand on a mesh, planned and validated as a job does.
 
     Args:
         hand: the hand.
@@ -165,10 +165,10 @@ def shape_cell(
         count: grasps.
         run: its threads.
     """
-    request = JobRequest(hand="hand", object="shape", grasps=count, want="raw", audits=0, **asked)
+    request = JobRequest(hand="hand", object="shape", grasps=count, want="candidates", rechecks=0, **asked)
     try:
         obj = prepared(mesh, options, request.knobs.face_error_m)
-        found = certified_grasps(hand, obj, request, count=count, run=run)
+        found = validated_grasps(hand, obj, request, count=count, run=run)
     except GraspdError as error:
         return refused(*place, error)
     valid = float(found.columns["quality/valid"].mean())
@@ -272,7 +272,7 @@ def hand_map(
     couplings: Sequence[Coupling] = COUPLINGS,
     fidelity: str = "standard",
     count: int = 8,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
     say: Callable[[str], None] = lambda line: None,
 ) -> StabilityMap:
     """Valid grasps of a cube in each hand, or why the hand is refused."""
@@ -307,7 +307,7 @@ def _cell(
     make: Callable[[], HandModel],
     fidelity: str,
     count: int,
-    run: Run,
+    run: ExecutionContext,
     say: Callable[[str], None],
 ) -> MapCell:
     try:

@@ -144,7 +144,7 @@ def rate_map(
         _BOUNDS,
         reachable(cells, lambda cell: (cell.panel, cell.x, cell.y) == (_OPTIMIZERS["adam"], 1.0, 1.0)),
         "hands jump past the object or sink into it",
-        "rates and weights are fixed by the schedule; hands that are no numbers are dropped, others judged",
+        "rates and weights are fixed by the schedule; hands that are no numbers are dropped, others validated",
         "tests/worker/test_certified.py::test_hands_that_are_no_numbers_are_dropped_and_counted",
         reach="Adam at 1 and 1: rates and weights are no options of a job; `optimizer: gd` brings the paper's own",
     )

@@ -1,6 +1,6 @@
 """Integrators on their own: a ball thrown into a cage of contact points, one step after another, in float64.
 
-The cage stands still, the ball flies inside it. A sound integrator gives it no more energy than it had, keeps it in
+The cage stands still, the ball flies inside it. A feasible integrator gives it no more energy than it had, keeps it in
 the cage and lets nothing sink in. The position-based ones are those of `worker.simulation.reference`, which the
 kernels are tested against; the force-based one is the penalty force of Grasp'D (2022) under semi-implicit Euler.
 """
@@ -194,7 +194,7 @@ def time_step_map(time_steps: Sequence[float] = TIME_STEPS, speeds: Sequence[flo
         f"{SINK_M[1] * 1e3:g} mm deep",
         cells,
         "an object that is thrown out of the hand, or hands that sink into it",
-        "the planner takes one step of 1 mm (time step x speed), where its integrators are good; the referee steps "
+        "the planner takes one step of 1 mm (time step x speed), where its integrators are good; the validator steps "
         "MuJoCo's implicit solver",
         "tests/studies/test_stability.py::test_the_planners_own_step_lies_where_its_integrators_are_good",
         reach=f"the offered solvers at a step of {1e3 * step:g} mm; the step is no option of a job",

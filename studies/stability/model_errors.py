@@ -1,4 +1,4 @@
-"""Models that are wrong: grasps that hold in the referee's model, judged in one of which a single thing is off.
+"""Models that are wrong: grasps that hold in the validator's model, validated in one of which a single thing is off.
 
 Amounts go from what `--robust` draws (`worker.validation.variant`) to where little holds. Places and turns are off
 in a direction of each grasp's own.
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.studies import MapCell, Outcome, StabilityMap
-from graspd.worker.certified import certified_grasps
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.generation import validated_grasps
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.run import ALONE, Run
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions
 from graspd.worker.validation.variant import (
@@ -110,14 +110,14 @@ def model_error_map(
     every: int = 1,
     fidelity: str = "standard",
     count: int = 16,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
     say: Callable[[str], None] = lambda line: None,
 ) -> StabilityMap:
     """Share of valid grasps that still hold where one thing is off; of each amount's every so many-th."""
     cells = [cell for hand in hands for cell in _cells(hand, obj, errors, every, fidelity, count, run, say)]
     return StabilityMap(
         "model_errors",
-        f"{count} valid grasps of {obj.name}, judged in models that are wrong",
+        f"{count} valid grasps of {obj.name}, validated in models that are wrong",
         "by how much",
         "hand",
         "share of the grasps that hold there, too",
@@ -125,9 +125,9 @@ def model_error_map(
         cells,
         "a grasp that is valid here fails on a robot that is another one",
         "`--robust` keeps what holds in the wanted share of models that are off by so much; `robust_share` and "
-        "`robust_weakest` are stored. What is farther off is another hand: `graspd evaluate --judge-hand` judges in it",
+        "`robust_weakest` are stored. What is farther off is another hand: `graspd evaluate --validation-hand` validates in it",
         "tests/studies/test_stability_model_errors.py::test_amounts_within_reach_are_those_that_robust_draws",
-        reach="amounts that `--robust` draws: a job that asks for it is judged there",
+        reach="amounts that `--robust` draws: a job that asks for it is validated there",
     )
 
 
@@ -138,22 +138,22 @@ def _cells(
     every: int,
     fidelity: str,
     count: int,
-    run: Run,
+    run: ExecutionContext,
     say: Callable[[str], None],
 ) -> list[MapCell]:
-    request = JobRequest(hand="hand", object="object", grasps=count, fidelity=fidelity, audits=0)
-    grasps = certified_grasps(hand, obj, request, count=count, run=run).grasps
+    request = JobRequest(hand="hand", object="object", grasps=count, fidelity=fidelity, rechecks=0)
+    grasps = validated_grasps(hand, obj, request, count=count, run=run).grasps
     models = Models(hand, obj, decompose(obj), MujocoOptions())
     ways = np.random.default_rng(11).normal(size=(count, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
 
     def share(error: _Error, amount: float) -> float:
         with ThreadPoolExecutor(run.cores, thread_name_prefix="model-errors") as pool:
-            judged = pool.map(
-                lambda row: models.certificate(grasps, row, error.variant(hand, amount, ways[row])).success,
+            validated = pool.map(
+                lambda row: models.standard(grasps, row, error.variant(hand, amount, ways[row])).success,
                 range(len(grasps)),
             )
-            return float(np.mean(list(judged))) if len(grasps) else float("nan")
+            return float(np.mean(list(validated))) if len(grasps) else float("nan")
 
     cells = []
     for name in errors:

@@ -15,12 +15,12 @@ from graspd.service.model.scene_spec import Box, HalfSpace, SceneSpec
 from graspd.service.model.studies import MapCell, Outcome, StabilityMap, reachable
 from graspd.service.model.transforms import quat_rotate
 from graspd.studies.stability.assets import prepared, refused
-from graspd.worker.certified import Certified, certified_grasps
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
-from graspd.worker.run import ALONE, Run
 from graspd.worker.scenes.kinds import rest_poses, supports_of
-from graspd.worker.simulation.surroundings import Scenes
+from graspd.worker.simulation.environment import Scenes
 
 Say = Callable[[str], None]
 Support = HalfSpace | Box
@@ -52,7 +52,7 @@ RATIOS: Final = (0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8)
 KINDS: Final = ("free", "table", "bin", "shelf")
 
 _TABLE: Final = HalfSpace()
-_MEASURE: Final = "share of tries that are lifted out of the scene; – where no hand came in clear"
+_MEASURE: Final = "share of candidates that are lifted out of the scene; – where no hand came in clear"
 _BOUNDS: Final = "weak: under a half; broken: none"
 _SHOWS: Final = (
     "few or no valid grasps: `clear_share` and `lift_share` of `graspd synth --json` say which of both is missing"
@@ -71,7 +71,7 @@ def height_map(
     sides: Sequence[float] = SIDES_MM,
     fidelity: str = "draft",
     count: int = 8,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
     say: Say = lambda line: None,
 ) -> StabilityMap:
     """Boxes from a plate to a tower on a table."""
@@ -103,7 +103,7 @@ def wall_map(
     walls: Sequence[str] = tuple(WALLS),
     fidelity: str = "draft",
     count: int = 8,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
     say: Say = lambda line: None,
 ) -> StabilityMap:
     """A box with walls at a distance from its sides."""
@@ -135,7 +135,7 @@ def neighbour_map(
     around: Sequence[str] = tuple(NEIGHBOURS),
     fidelity: str = "draft",
     count: int = 8,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
     say: Say = lambda line: None,
 ) -> StabilityMap:
     """A box among boxes as large as itself."""
@@ -177,7 +177,7 @@ def size_map(
     kinds: Sequence[str] = KINDS,
     fidelity: str = "draft",
     count: int = 8,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
     say: Say = lambda line: None,
 ) -> StabilityMap:
     """Cubes from a crumb to as large as the hand, afloat and in scenes."""
@@ -256,7 +256,7 @@ def _cell(
     placement: Placement,
     fidelity: str,
     count: int,
-    run: Run,
+    run: ExecutionContext,
     say: Say,
 ) -> MapCell:
     sides, spec = placement
@@ -271,23 +271,28 @@ def _cell(
 
 
 def planned(
-    hand: HandModel, sides_mm: Sequence[float], spec: SceneSpec, fidelity: str, count: int, run: Run = ALONE
-) -> Certified:
-    """Raw grasps of a box of these sides [mm] in a scene, through the doors that a user's object and scene go through.
+    hand: HandModel,
+    sides_mm: Sequence[float],
+    spec: SceneSpec,
+    fidelity: str,
+    count: int,
+    run: ExecutionContext = DEFAULT_CONTEXT,
+) -> ValidatedBatch:
+    """Candidates of a box of these sides [mm] in a scene, through the doors that a user's object and scene go through.
 
     Raises:
         GraspdError: the box or the scene is refused.
     """
     mesh: Any = trimesh.creation.box(np.asarray(sides_mm) * MILLIMETRES)
     obj = prepared(mesh, {"units": "m"}, FIDELITIES[fidelity].face_error_m)
-    request = JobRequest(hand="hand", object="box", grasps=count, want="raw", fidelity=fidelity, audits=0)
+    request = JobRequest(hand="hand", object="box", grasps=count, want="candidates", fidelity=fidelity, rechecks=0)
     scenes = None
     if spec.kind != "free":
         scenes = Scenes(supports_of(spec), rest_poses(spec, obj, count=2, seed=0)["scene/object_pose"])
-    return certified_grasps(hand, obj, request, count=count, scenes=scenes, run=run)
+    return validated_grasps(hand, obj, request, count=count, scenes=scenes, run=run)
 
 
-def _told(found: Certified) -> tuple[float, Outcome, str, str]:
+def _told(found: ValidatedBatch) -> tuple[float, Outcome, str, str]:
     """Value, outcome, note and label of a cell."""
     valid = float(found.columns["quality/valid"].mean())
     clear = found.shares.get("clear_share", 1.0)

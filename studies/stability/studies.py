@@ -8,10 +8,10 @@ from typing import Any, Final
 from graspd.service.model.studies import StabilityMap, reachable
 from graspd.studies.stability import assets, descents, gradients, integrators, model_errors, scenes
 from graspd.studies.stability.assets import BOUNDS, FAMILIES, MEASURE, SHOWS, shape_cell
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.run import ALONE, Run
 
 Say = Callable[[str], None]
 
@@ -22,7 +22,7 @@ ALL_HANDS: Final = ("allegro", "barrett", "shadow")
 
 
 def run(
-    names: Sequence[str], hand: str, obj: str, *, quick: bool, long: bool, work: Run, say: Say
+    names: Sequence[str], hand: str, obj: str, *, quick: bool, long: bool, work: ExecutionContext, say: Say
 ) -> list[StabilityMap]:
     """The maps of the named studies, in the order of the names."""
     model, thing = hand_from_path(hand), object_from_path(obj)
@@ -126,7 +126,7 @@ def peer_map(
     methods: Sequence[str] = METHODS,
     shapes: dict[str, tuple[float, ...]] = SHAPES,
     count: int = 8,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
     say: Callable[[str], None] = lambda line: None,
 ) -> StabilityMap:
     """Valid grasps of each method on each shape, at the settings that it was published with."""
@@ -148,7 +148,7 @@ def peer_map(
         BOUNDS,
         reachable(cells, lambda cell: True),
         SHOWS,
-        "what a method leaves in the object or the referee drops is never valid; a job that finds too few says so",
+        "what a method leaves in the object or the validator drops is never valid; a job that finds too few says so",
         "tests/studies/test_stability.py::test_a_job_whose_every_grasp_is_bad_ends_with_none",
         reach="all: any job may name another method",
     )

@@ -14,7 +14,7 @@ from graspd.service.model.domain import JobRequest
 from graspd.service.model.metrics import Axis
 from graspd.service.model.planning import PlannedTask, message_of, plan
 from graspd.service.model.records import AttemptRecord, JobRecord
-from graspd.service.model.states import AssetKind, Lane, Stage
+from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.model.transforms import pose_to_matrix
 from graspd.service.model.workers import WorkerBeat
 from graspd.service.pipeline.backends import Services
@@ -44,7 +44,7 @@ def add_job(services: Services, **fields: object) -> JobRecord:
         request=request,
         hand_digest=hand,
         object_digest=object_,
-        lane=Lane.INTERACTIVE,
+        priority=Priority.INTERACTIVE,
         created=timestamp(),
     )
     put_record(services.store, names.job_record(record.id), record)
@@ -164,8 +164,8 @@ def _base(random: np.random.Generator, count: int, request: JobRequest) -> Array
     arrays["quality/grasp_type"] = kinds.integers(1, 4, count).astype(np.int32)
     arrays["quality/approach_cell"] = kinds.integers(0, 48, count).astype(np.int32)
     arrays["quality/valid"] = (random.random(count) < 0.8).astype(np.uint8)
-    if request.referee == "none":
-        return arrays | {"quality/sound": np.ones(count, np.uint8), "quality/valid": np.zeros(count, np.uint8)}
+    if request.validation == "none":
+        return arrays | {"quality/feasible": np.ones(count, np.uint8), "quality/valid": np.zeros(count, np.uint8)}
     arrays["quality/success"] = arrays["quality/valid"].astype(np.int8)
     if request.models:
         held = arrays["quality/success"] == 1

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from graspd.baselines.autograsp import kernels
-from graspd.baselines.autograsp.method import TOUCH_M, Closed, Closer
+from graspd.baselines.autograsp.method import TOUCH_M, ClosedHands, HandCloser
 from graspd.baselines.common import ground_of
 from graspd.worker.simulation.data import HandState
 from tests.worker.models import object_from_mesh, two_finger_hand
@@ -16,10 +16,10 @@ from tests.worker.models import object_from_mesh, two_finger_hand
 SAMPLED = 1.5e-3
 
 
-def closed(box: tuple[float, float, float], shift: float = 0.0) -> tuple[Closed, np.ndarray]:
+def closed(box: tuple[float, float, float], shift: float = 0.0) -> tuple[ClosedHands, np.ndarray]:
     """Two fingers, 80 mm apart, closed on a box in front of the palm; and each body's distance from it."""
     hand, obj = two_finger_hand(), object_from_mesh(trimesh.creation.box(box))
-    closer = Closer(ground_of(hand, obj, "cpu", kernels), 1)
+    closer = HandCloser(ground_of(hand, obj, "cpu", kernels), 1)
     pivot = np.array([[shift, 0.0, -0.06]])
     found = closer.close(HandState(pivot, np.array([[1.0, 0, 0, 0]]), np.zeros((1, 2))))
     return found, closer.distances(found.state)
@@ -51,7 +51,7 @@ def test_nothing_is_passed_through_however_thin(thickness: float) -> None:
 
 def test_the_approach_ends_at_the_standoff() -> None:
     hand, obj = two_finger_hand(), object_from_mesh(trimesh.creation.box((0.03, 0.03, 0.03)))
-    closer = Closer(ground_of(hand, obj, "cpu", kernels), 1)
+    closer = HandCloser(ground_of(hand, obj, "cpu", kernels), 1)
     start = HandState(np.array([[0.0, 0.0, -0.15]]), np.array([[1.0, 0, 0, 0]]), np.zeros((1, 2)))
     there = closer.approach(start, 0.004)
     assert closer.distances(there).min() == pytest.approx(0.004, abs=3e-4)

@@ -21,9 +21,22 @@ STOPS = ["standoff", "pregrasp", "grasp", "squeeze", "lift"]
 
 @pytest.fixture(scope="module")
 def bin_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two sound grasps in a bin; the page shows them whether they lift or not."""
+    """Two feasible grasps in a bin; the page shows them whether they lift or not."""
     path = tmp_path_factory.mktemp("scene") / "bin.h5"
-    arguments = ["--hand", "allegro", "--object", "mug", "--scene", "bin", "--scenes", "1", "-n", "2", "--want", "raw"]
+    arguments = [
+        "--hand",
+        "allegro",
+        "--object",
+        "mug",
+        "--scene",
+        "bin",
+        "--scenes",
+        "1",
+        "-n",
+        "2",
+        "--want",
+        "candidates",
+    ]
     result = CliRunner().invoke(
         synth, [*arguments, "--fidelity", "draft", "--device", "cpu", "-o", str(path), "--json"]
     )

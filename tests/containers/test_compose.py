@@ -142,8 +142,8 @@ def test_a_job_over_http_outlives_two_killed_workers(project: Project) -> None:
             "object": "mug",
             "grasps": 32 * BATCHES,
             "fidelity": "draft",
-            "want": "raw",
-            "referee": "none",
+            "want": "candidates",
+            "validation": "none",
         }
         job = client.post("/v1/jobs", json=wanted)
         assert job.status_code == 202, job.text

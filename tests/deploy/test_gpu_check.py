@@ -20,7 +20,7 @@ ptxas info    : Function properties for small_00000000_cuda_kernel_forward
     0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads
 ptxas info    : Used 12 registers, used 0 barriers
 """
-SOUND = Kernel("simulation.kernels.surface", "gather", 90, 71, 0, 0)
+FEASIBLE = Kernel("simulation.kernels.surface", "gather", 90, 71, 0, 0)
 
 
 def test_registers_stack_and_spills_of_each_kernel_are_read() -> None:
@@ -36,12 +36,12 @@ def test_registers_stack_and_spills_of_each_kernel_are_read() -> None:
     [({}, None), ({"spilled_bytes": 4}, "spills"), ({"stack_bytes": 513}, "stack"), ({"registers": 129}, "registers")],
 )
 def test_a_kernel_that_does_not_fit_is_named(change: dict[str, int], fault: str | None) -> None:
-    faults = replace(SOUND, **change).faults
+    faults = replace(FEASIBLE, **change).faults
     assert (faults == []) if fault is None else (fault in faults[0])
 
 
 def test_a_kernel_that_runs_once_may_take_more_registers() -> None:
-    assert replace(SOUND, name="anneal", registers=200).faults == []
+    assert replace(FEASIBLE, name="anneal", registers=200).faults == []
 
 
 def test_every_kernel_of_the_planner_s_iteration_is_looked_for() -> None:

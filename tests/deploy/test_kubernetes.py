@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 import graspd.cli
-from graspd.service.model.states import Lane, Stage
+from graspd.service.model.states import Priority, Stage
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.queue.lists import queue_name
 from graspd.service.settings import Settings
@@ -122,10 +122,10 @@ def test_every_list_of_the_queue_starts_a_worker_that_serves_it(variant: str) ->
         arguments = job_template(found)["template"]["spec"]["containers"][0]["args"]
         at = arguments.index("--stages") + 1 if "--stages" in arguments else None
         stages = arguments[at].split(",") if at else list(Stage)
-        own = {f"rq:queue:{queue_name(lane, Stage(stage))}" for lane in Lane for stage in stages}
+        own = {f"rq:queue:{queue_name(priority, Stage(stage))}" for priority in Priority for stage in stages}
         assert {trigger.metadata.list_name for trigger in spec.triggers} == own
         served |= own
-    assert served == {f"rq:queue:{queue_name(lane, stage)}" for lane in Lane for stage in Stage}
+    assert served == {f"rq:queue:{queue_name(priority, stage)}" for priority in Priority for stage in Stage}
 
 
 def test_nothing_ends_a_worker_that_is_busy() -> None:

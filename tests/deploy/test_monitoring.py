@@ -78,13 +78,13 @@ def test_only_what_grows_is_taken_for_a_rate(who: str, expression: str) -> None:
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule["alert"])
 def test_an_alert_says_what_it_means_and_the_mend(rule: dict[str, Any]) -> None:
     assert rule["labels"]["severity"] in ("page", "ticket")
-    assert {"summary", "description", "mend"} <= rule["annotations"].keys()
+    assert {"summary", "description", "fix"} <= rule["annotations"].keys()
     assert f"| `{rule['alert']}` | {rule['labels']['severity']} |" in PAGE
-    mend = rule["annotations"]["mend"]
-    named = re.findall(r"\bgraspd [a-z][^;,]*", mend)
+    fix = rule["annotations"]["fix"]
+    named = re.findall(r"\bgraspd [a-z][^;,]*", fix)
     assert not any(faults := [Line("alerts.yaml", one).fault() for one in named]), faults
     checks = {check.name for check in all_checks(Settings())}
-    for only in re.findall(r"--only (\S+)", mend):
+    for only in re.findall(r"--only (\S+)", fix):
         assert set(only.rstrip(";").split(",")) <= checks
     labels = set(re.findall(r"\$labels\.(\w+)", str(rule["annotations"])))
     by = {word.strip() for found in re.findall(r"by \(([^)]*)\)", rule["expr"]) for word in found.split(",")}

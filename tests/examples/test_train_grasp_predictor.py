@@ -11,7 +11,16 @@ import pytest
 
 from examples.train_grasp_predictor import execution, sources
 from examples.train_grasp_predictor.evaluation import FACE, OBJECT, Exam, examined
-from examples.train_grasp_predictor.samples import Scene, Sight, Taught, apart, each_scene, rows_of, sights, taught
+from examples.train_grasp_predictor.samples import (
+    Scene,
+    Sight,
+    TrainedModel,
+    apart,
+    each_scene,
+    rows_of,
+    sights,
+    taught,
+)
 from examples.train_grasp_predictor.table import markdown
 from examples.train_grasp_predictor.without_network import SQUEEZE, Nearest, across
 from graspd.baselines.learned.network import Proposals, decode
@@ -100,11 +109,11 @@ def test_most_alike_grasps_lie_nearer_together_than_most_unlike_ones() -> None:
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(40, 12 + 3 * JOINTS))
     scene = Scene("block", "a" * 64, 0)
-    given = Taught([scene] * 40, rows, np.ones(40), np.ones(40, bool), np.ones(40))
+    given = TrainedModel([scene] * 40, rows, np.ones(40), np.ones(40, bool), np.ones(40))
     held = sources.Held(open_shards([]), [])
     held.poses[scene] = np.array([0, 0, 0, 1.0, 0, 0, 0])
 
-    def width(part: Taught) -> float:
+    def width(part: TrainedModel) -> float:
         return float(np.linalg.norm(part.rows[:, None, :3] - part.rows[None, :, :3], axis=2).mean())
 
     alike, unlike = (sources.spread(given, held, 10, alike=alike) for alike in (True, False))
@@ -130,7 +139,7 @@ def test_the_nearest_picture_gives_its_grasps_turned_with_it() -> None:
     other = Sight(Scene("cube", "b" * 64, 0), other.points, other.normals, other.object_pose)
     rows = rows_of(grasps_of(), np.repeat(shown.object_pose[None], 5, axis=0))
     parts = [
-        Taught([sight.scene] * 5, given, np.ones(5), np.ones(5, bool), np.ones(5))
+        TrainedModel([sight.scene] * 5, given, np.ones(5), np.ones(5, bool), np.ones(5))
         for sight, given in ((shown, rows), (other, rows + 5.0))
     ]
     found = Nearest([shown, other], parts).propose(asked, 5, np.random.default_rng(0))

@@ -11,12 +11,12 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="torch is not installed; `pip install torch` runs these tests")
 
-from examples.train_grasp_predictor.evaluator import Ensemble, Evaluator, Hands, Tries, learned, scores  # noqa: E402
+from examples.train_grasp_predictor.evaluator import Attempts, Ensemble, Evaluator, Hands, learned, scores  # noqa: E402
 from examples.train_grasp_predictor.network import Proposer  # noqa: E402
-from examples.train_grasp_predictor.practice import Practice  # noqa: E402
-from examples.train_grasp_predictor.refinement import BEGUN, Refined, moved  # noqa: E402
-from examples.train_grasp_predictor.samples import Scene, Sight, Taught, sights, taught  # noqa: E402
-from examples.train_grasp_predictor.training import Lessons, train, turned  # noqa: E402
+from examples.train_grasp_predictor.practice import TrainingRun  # noqa: E402
+from examples.train_grasp_predictor.refinement import BEGUN, RefinedHands, moved  # noqa: E402
+from examples.train_grasp_predictor.samples import Scene, Sight, TrainedModel, sights, taught  # noqa: E402
+from examples.train_grasp_predictor.training import TrainingData, train, turned  # noqa: E402
 from examples.train_grasp_predictor.without_network import SQUEEZE, across  # noqa: E402
 from graspd.baselines.learned import network as net  # noqa: E402
 from graspd.service.model import transforms  # noqa: E402
@@ -72,7 +72,7 @@ def one_thread() -> Iterator[None]:
 def test_training_comes_nearer_to_the_grasps_that_it_is_shown(tmp_path: Path) -> None:
     box_scenes.write(tmp_path)
     shards = open_shards(tmp_path)
-    lessons = Lessons.of(sights(shards, noise="stereo"), [taught(shards, "box")])
+    lessons = TrainingData.of(sights(shards, noise="stereo"), [taught(shards, "box")])
     assert len(lessons) == box_scenes.VIEWS
     early, late = (train(lessons, steps=steps, seed=0) for steps in (10, 40))
     assert late.loss < 0.9 * early.loss
@@ -112,7 +112,7 @@ def test_an_evaluator_tells_hands_at_the_object_from_hands_beside_it(hand: HandM
         return hands_at(hand, places), near
 
     hands, near = around(64)
-    evaluator = learned(hand, Tries.of(hand, [sight], [hands], near), steps=30, seed=0)
+    evaluator = learned(hand, Attempts.of(hand, [sight], [hands], near), steps=30, seed=0)
     others, near = around(32)
     found = scores(evaluator, hand, sight, others)
     assert found[near].min() > found[~near].max()
@@ -180,7 +180,7 @@ def test_hands_move_to_where_the_evaluator_believes_in_them(hand: HandModel) -> 
         return hands_at(hand, rng.normal(0, 0.01, (count, 3)) + np.array([0.0, 0.03, 0.6]))
 
     def best(rounds: tuple[float, ...]) -> np.ndarray:
-        refined = Refined(hand, Wish(), source, rounds)(ball(), 2, np.random.default_rng(0))
+        refined = RefinedHands(hand, Wish(), source, rounds)(ball(), 2, np.random.default_rng(0))
         return np.linalg.norm(refined.hand_pose[:, :3] - [0.0, 0.0, 0.6], axis=1)
 
     chosen, moved_on = best(()), best((1.0, 0.7, 0.5, 0.4))
@@ -192,8 +192,8 @@ def test_hands_move_to_where_the_evaluator_believes_in_them(hand: HandModel) -> 
 def test_tries_of_two_rounds_keep_each_its_picture_and_its_verdict(hand: HandModel) -> None:
     high = ball()
     low = dataclasses.replace(high, points=high.points - [0.0, 0.0, 0.1])
-    one = Tries.of(hand, [high, low], [hands_at(hand, np.full((1, 3), 0.1 * k)) for k in (1, 2)], np.array([1, 0]))
-    other = Tries.of(hand, [low], [hands_at(hand, np.full((3, 3), 0.3))], np.array([0, 1, 1]))
+    one = Attempts.of(hand, [high, low], [hands_at(hand, np.full((1, 3), 0.1 * k)) for k in (1, 2)], np.array([1, 0]))
+    other = Attempts.of(hand, [low], [hands_at(hand, np.full((3, 3), 0.3))], np.array([0, 1, 1]))
     both = one.and_those(other)
     heights = both.points[both.picture].mean(dim=1)[:, 2].numpy() - 0.2
     np.testing.assert_allclose(heights, [0.0, -0.1, -0.1, -0.1, -0.1], atol=0.01)
@@ -209,9 +209,9 @@ def test_practice_lifts_what_is_known_to_lift_and_not_what_is_far_away(hand: Han
     sight = Sight(Scene("block", "a" * 64, 0), points, np.tile([0, 0, 1.0], (512, 1)), pose)
     held = across(hand, sight, 4, squeeze=SQUEEZE, rng=np.random.default_rng(0))
     rows = net.encode(held, np.zeros(3))
-    given = Taught([sight.scene] * 4, rows, np.ones(4), np.ones(4, bool), np.ones(4))
+    given = TrainedModel([sight.scene] * 4, rows, np.ones(4), np.ones(4, bool), np.ones(4))
     far = dataclasses.replace(held, hand_pose=held.hand_pose + np.array([0.5, 0, 0, 0, 0, 0, 0]))
-    practice = Practice(hand, {"block": block}, [given], [sight], lambda *_: far)
+    practice = TrainingRun(hand, {"block": block}, [given], [sight], lambda *_: far)
     tries = practice.tried(practice.beginning, 1, np.random.default_rng(0))
     assert not tries.lifted[:4].any()  # what the source proposed
     assert tries.lifted[4:].mean() >= 0.25  # grasps of the data, moved or not

@@ -19,7 +19,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
-from graspd.worker.planners.port import Wanted
+from graspd.worker.planners.port import PlanRequest
 
 
 @pytest.fixture(scope="session")
@@ -35,7 +35,7 @@ def block() -> ObjectModel:
 
 @pytest.fixture(scope="session")
 def grasps(hand: HandModel, block: ObjectModel) -> GraspSet:
-    return synthesize(hand, block, Wanted(count=4, fidelity=FIDELITIES["draft"], seed=5))
+    return synthesize(hand, block, PlanRequest(count=4, fidelity=FIDELITIES["draft"], seed=5))
 
 
 @pytest.fixture(scope="session")
@@ -44,7 +44,20 @@ def on_tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
     and pictures is not true of it: their numbers are the block's, which is all that writers and readers see of them."""
     folder = tmp_path_factory.mktemp("on-tables")
     block, views = folder / "block.h5", folder / "block-views.h5"
-    words = ["--hand", "barrett", "--object", "block", "--scene", "table", "--scenes", "2", "-n", "8", "--want", "raw"]
+    words = [
+        "--hand",
+        "barrett",
+        "--object",
+        "block",
+        "--scene",
+        "table",
+        "--scenes",
+        "2",
+        "-n",
+        "8",
+        "--want",
+        "candidates",
+    ]
     words += ["--seed", "1"]  # all eight of these are valid
     run("synth", *words, "--fidelity", "draft", "-o", block)
     run("render", block, "--views", "2", "--width", "96", "--height", "72", "-o", views)

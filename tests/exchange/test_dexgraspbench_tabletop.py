@@ -22,7 +22,7 @@ from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.simulation.surroundings import Obstacle, Placed
+from graspd.worker.simulation.environment import Obstacle, Placed
 from tests.exchange.bench_loader import PREFIX, files_of, load, tabletop_test
 
 CONFIG, EXPERIMENT = "graspd_barrett", "graspd_tabletop"
@@ -41,7 +41,7 @@ def graspd(*words: object) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Raw grasps in two scenes: most lift, the first `LIMP` do not, for they squeeze no more than the open hand."""
+    """Candidates in two scenes: most lift, the first `LIMP` do not, for they squeeze no more than the open hand."""
     out = tmp_path_factory.mktemp("scenes") / "g.h5"
     graspd(
         "synth",
@@ -56,7 +56,7 @@ def shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "-n",
         COUNT,
         "--want",
-        "raw",
+        "candidates",
         "--fidelity",
         "draft",
         "-o",
@@ -150,7 +150,7 @@ def geom_bottom(found: Any, geom: int) -> float:
 
 
 def test_its_tabletop_test_says_what_our_letter_says(bench: Path, shard: Path) -> None:
-    said = graspd("evaluate", shard, "--protocol", "lift", "--level", "letter")
+    said = graspd("evaluate", shard, "--protocol", "lift", "--level", "dexgraspbench")
     ours = {one["row"]: one for one in said["verdicts"]}
     decided, apart = 0, []
     for file in files_of(bench, CONFIG, EXPERIMENT):
@@ -181,14 +181,14 @@ def test_grasps_on_a_table_come_back_with_their_scenes_ways_and_verdicts(
     np.testing.assert_allclose(
         back.placed.object_pose[back.placed.index], stored["scene/object_pose"][given.scene], atol=ROUNDING_M
     )
-    lift = ("--protocol", "lift", "--level", "letter")
+    lift = ("--protocol", "lift", "--level", "dexgraspbench")
     again = graspd("evaluate", folder, "--hand", "barrett", "--object", "block", *lift)
     first = graspd("evaluate", shard, *lift)
     there = {one["row"]: one["held"] for one in first["verdicts"]}
     assert [one["held"] for one in again["verdicts"]] == [there[row] for row in rows]
 
 
-def test_an_import_is_judged_by_its_lift(bench: Path, stored: Shard, tmp_path: Path) -> None:
+def test_an_import_is_validated_by_its_lift(bench: Path, stored: Shard, tmp_path: Path) -> None:
     folder = bench / "output" / f"{EXPERIMENT}_{CONFIG}"
     out = tmp_path / "imported"
     graspd(

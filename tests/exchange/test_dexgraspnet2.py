@@ -15,7 +15,7 @@ import trimesh
 from graspd.exchange import dexgraspnet2
 from graspd.exchange.dexgraspnet2 import load_npz
 from graspd.exchange.dexgraspnet2_graspness import surface_samples
-from graspd.exchange.lots import Look
+from graspd.exchange.plan import Look
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, apply, compose, pose_from_matrix
 from graspd.service.readers import Pictures, open_shards

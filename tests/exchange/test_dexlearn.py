@@ -12,7 +12,7 @@ import trimesh
 
 from graspd.exchange import dexgraspbench, dexlearn
 from graspd.exchange.bench_hand import body_names
-from graspd.exchange.lots import held_out, looks
+from graspd.exchange.plan import held_out, looks
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import apply, compose, invert, pose_to_matrix
 from graspd.service.readers import Pictures, open_shards

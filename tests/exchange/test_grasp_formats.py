@@ -20,7 +20,7 @@ from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.validator import validate
 
 TINY = 1e-9  # positions and quaternions are only re-ordered, not computed with
 
@@ -70,7 +70,7 @@ def test_dexgraspbench_there_and_back_is_the_same_grasp_with_the_same_verdict(
     (back,) = dexgraspbench.read(tmp_path, hand="barrett", obj="block")
     np.testing.assert_allclose(back.grasps.squeeze.hand_pose, grasps.squeeze.hand_pose, atol=TINY)
     np.testing.assert_array_equal(back.grasps.pregrasp.joint_positions, grasps.pregrasp.joint_positions)
-    ours, theirs = (judge(hand, block, some).success for some in (grasps, back.grasps))
+    ours, theirs = (validate(hand, block, some).success for some in (grasps, back.grasps))
     np.testing.assert_array_equal(theirs, ours)
 
 
@@ -183,7 +183,7 @@ def test_imported_grasps_are_scored_and_say_where_they_come_from(
     dexgraspbench.write(hand, block, grasps, range(len(grasps)), tmp_path / "bench")
     (found,) = dexgraspbench.read(tmp_path / "bench", hand="barrett", obj="block")
     path = write_scored(
-        found, Origin("dexgraspbench", "a test", "CC0-1.0"), tmp_path / "out", referee="screen", friction=1
+        found, Origin("dexgraspbench", "a test", "CC0-1.0"), tmp_path / "out", validation="fast", friction=1
     )
     shard = read_shard(path, kind="base")
     assert (shard.attributes["source"], shard.attributes["licence"]) == ("a test", "CC0-1.0")

@@ -133,9 +133,9 @@ def test_an_object_among_several_is_named(data: Path) -> None:
             graspgen.read(data / "grasps" / "barrett", hand="barrett", obj="block", object_name=name)
 
 
-def test_what_nobody_judged_has_no_label(on_tables: Path, tmp_path: Path) -> None:
+def test_what_nobody_validated_has_no_label(on_tables: Path, tmp_path: Path) -> None:
     with pytest.raises(AssertionError, match="whether it holds"):
-        run("export", on_tables, "--format", "graspgen", "--unjudged", "-o", tmp_path / "out")
+        run("export", on_tables, "--format", "graspgen", "--unvalidated", "-o", tmp_path / "out")
 
 
 @pytest.mark.parametrize(

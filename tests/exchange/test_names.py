@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd.exchange.lots import prim_name, prim_names
+from graspd.exchange.plan import prim_name, prim_names
 
 Sdf = pytest.importorskip("pxr.Sdf")
 

@@ -36,7 +36,7 @@ def test_a_fresh_machine_is_well_and_nothing_is_made_on_it(tmp_path: Path) -> No
     told = json.loads(done.stdout.splitlines()[-1])
     assert told["ok"] is True
     assert [one["name"] for one in told["checks"]] == QUICK.split(",")
-    assert all({"name", "ok", "message", "mend"} <= one.keys() for one in told["checks"])
+    assert all({"name", "ok", "message", "fix"} <= one.keys() for one in told["checks"])
     assert list(tmp_path.iterdir()) == []
 
 
@@ -46,7 +46,7 @@ def test_what_is_wrong_ends_it_with_1_and_says_the_mend(tmp_path: Path) -> None:
     assert done.returncode == 1
     lines = [line.split(maxsplit=2) for line in done.stdout.splitlines()]
     assert [line[:2] for line in lines if line[0] == "bad"] == [["bad", "redis"], ["bad", "keys"]]
-    assert sum(line[0] == "mend:" for line in lines) == 2
+    assert sum(line[0] == "fix:" for line in lines) == 2
     assert "hidden" not in done.stdout + done.stderr
 
 

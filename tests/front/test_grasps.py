@@ -29,7 +29,7 @@ def columns(count: int, *, scenes: int = 0, seed: int = 0) -> dict[str, Any]:
             values = np.arange(count, dtype=float)
             made[metric.path] = np.stack([values - 100, values, values + 100], axis=1) if metric.swept else values
     made["quality/valid"] = np.arange(count) % 2
-    made["quality/sound"] = np.ones(count)
+    made["quality/feasible"] = np.ones(count)
     made["quality/success"] = np.arange(count) % 2
     if scenes:
         made["scene/object_pose"] = np.tile([0.0, 0, 0.1, 1, 0, 0, 0], (scenes, 1)) + seed * np.eye(7)[0]

@@ -28,18 +28,18 @@ def test_a_file_of_robust_grasps_says_so_to_every_reader(tmp_path: Path) -> None
 
 def test_grasps_in_scenes_are_robust_if_they_lift_in_other_models(tmp_path: Path) -> None:
     (tmp_path / "made").mkdir()
-    file, copies = tmp_path / "made" / "table.h5", tmp_path / "judged"
+    file, copies = tmp_path / "made" / "table.h5", tmp_path / "validated"
     asked = ["--hand", "barrett", "--object", "block", "--scene", "table", "--scenes", "2", "--fidelity", "draft"]
-    wanted = ["-n", "2", "--want", "raw", "--robust-models", "2", "--json"]
+    wanted = ["-n", "2", "--want", "candidates", "--robust-models", "2", "--json"]
     made = CliRunner().invoke(synth, [*asked, *wanted, "-o", str(file)])
     assert made.exit_code == 0, made.output
     grasps = graspd.open(file)
     lifted, share = grasps.column("quality/success") == 1, grasps.column("quality/robust_share")
     assert lifted.any() and (np.isfinite(share) == lifted).all()
     lift = ["--protocol", "lift", "--robust", "3", "--json"]
-    judged = CliRunner().invoke(evaluate, [str(tmp_path / "made"), *lift, "-o", str(copies)])
-    assert judged.exit_code == 0, judged.output
-    said, copy = json.loads(judged.stdout.splitlines()[-1]), graspd.open(copies / "table.h5")
+    validated = CliRunner().invoke(evaluate, [str(tmp_path / "made"), *lift, "-o", str(copies)])
+    assert validated.exit_code == 0, validated.output
+    said, copy = json.loads(validated.stdout.splitlines()[-1]), graspd.open(copies / "table.h5")
     again = copy.metric("robust_share")
     assert said["robust_share"] == round(float(again[lifted].mean()), 6) and said["robust_n"] == lifted.sum()
     assert [one["robust_share"] is None for one in said["verdicts"]] == (~lifted).tolist() == np.isnan(again).tolist()

@@ -16,11 +16,11 @@ from graspd.worker.hands.jaws import MAX_DOFS
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners.fast_graspd import scene_starts
-from graspd.worker.planners.fast_graspd.across import crossings_of
+from graspd.worker.planners.fast_graspd.antipodal_starts import crossings_of
 from graspd.worker.planners.fast_graspd.pairs import pair_of
 from graspd.worker.planners.fast_graspd.reaching import size_to_pads
+from graspd.worker.simulation.environment import Environment, Obstacle
 from graspd.worker.simulation.obstacles import DeviceObstacles
-from graspd.worker.simulation.surroundings import Obstacle, Surroundings
 
 HANDS = ("allegro/allegro_hand_right.urdf", "barrett_bh280/bh280.urdf", "shadow/shadow_hand_right.urdf")
 
@@ -51,7 +51,7 @@ def test_pads_of_the_hands_hold_the_built_in_objects(name: str) -> None:
 def test_in_scenes_points_are_not_pulled_and_palms_set_out_from_where_they_did() -> None:
     hand, obj = hand_from_path("barrett"), object_from_path("block")
     pair = pair_of(hand, obj, FIDELITIES["standard"], "cpu")
-    table = Surroundings((Obstacle.half_space([0, 0, 1], -0.05),), np.array([0.0, 0.0, 1.0]))
+    table = Environment((Obstacle.half_space([0, 0, 1], -0.05),), np.array([0.0, 0.0, 1.0]))
     obstacles = DeviceObstacles.create(hand, [table], obj.centre_of_mass, "cpu")
     for side in (pair.coarse, pair.fine):
         assert pair.model(side).options.pull > 0

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 import graspd
-from graspd import showing
+from graspd import display as showing
 from graspd.service.store.shards import write_shard
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path

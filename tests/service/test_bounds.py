@@ -6,14 +6,14 @@ from pathlib import Path
 
 from benchmarks.large_index import fill
 from graspd.service.model.clock import timestamp
-from graspd.service.model.states import Lane
+from graspd.service.model.states import Priority
 from graspd.service.queue.port import Event, EventKind, Report
 from graspd.service.queue.rq_queue import EVENTS, EVENTS_KEPT, RqQueue, cancel_key
 from graspd.service.store.store import open_store
 from tests.fakes import message_for
 from tests.indexes import empty_index
 
-#: Redis memory of a waiting task [bytes]; at most GRASPD_QUEUE_WINDOW of them wait in each lane.
+#: Redis memory of a waiting task [bytes]; at most GRASPD_QUEUE_WINDOW of them wait in each priority.
 TASK_BYTES = 3000
 #: Redis memory of an event [bytes]; at most EVENTS_KEPT are kept.
 EVENT_BYTES = 500
@@ -31,7 +31,7 @@ def test_a_waiting_task_takes_a_few_kilobytes_of_redis_and_gives_them_back(rq_qu
 
     def come_and_go() -> int:
         """Redis memory while the tasks wait [bytes]."""
-        rq_queue.enqueue(tasks, Lane.BULK)
+        rq_queue.enqueue(tasks, Priority.BULK)
         full = used(rq_queue)
         rq_queue.discard([task.task_id for task in tasks])
         for task in tasks:  # as their time to live does
@@ -72,7 +72,7 @@ def test_an_index_grows_by_about_a_kilobyte_a_grasp(tmp_path: Path) -> None:
 
 
 def test_everything_in_redis_that_is_not_of_a_fixed_number_has_an_end(rq_queue: RqQueue) -> None:
-    rq_queue.enqueue([message_for()], Lane.BULK)
+    rq_queue.enqueue([message_for()], Priority.BULK)
     rq_queue.discard(["0" * 32])
     rq_queue.announce("controller", 5)
     rq_queue.lead("a", 5)

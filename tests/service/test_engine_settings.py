@@ -20,7 +20,7 @@ def nothing_set(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_where_nothing_is_set_they_are_the_defaults_of_all_settings() -> None:
     whole = load_settings()
-    assert engine_settings() == EngineSettings() == EngineSettings(whole.first_judge, whole.processes)
+    assert engine_settings() == EngineSettings() == EngineSettings(whole.prefilter, whole.processes)
 
 
 @pytest.mark.parametrize("name", ["GRASPD_PROCESSES", "graspd_processes"])
@@ -30,8 +30,8 @@ def test_what_is_set_counts(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_bad_value_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("GRASPD_FIRST_JUDGE", "perhaps")
-    with pytest.raises(InputError, match="GRASPD_FIRST_JUDGE"):
+    monkeypatch.setenv("GRASPD_PREFILTER", "perhaps")
+    with pytest.raises(InputError, match="GRASPD_PREFILTER"):
         engine_settings()
 
 

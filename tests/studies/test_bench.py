@@ -12,12 +12,12 @@ from typer.testing import CliRunner
 from graspd.commands.studies import app
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.studies.timing import host_ms, kernel_shares
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners.fast_graspd.pairs import pair_of
 from graspd.worker.planners.fast_graspd.planner import plan
-from graspd.worker.planners.port import Wanted
-from graspd.worker.run import Run
+from graspd.worker.planners.port import PlanRequest
 
 RUN_KEYS = {
     "fidelity",
@@ -70,7 +70,7 @@ def test_kernels_on_the_processor_are_no_time_of_the_host() -> None:
     hand, obj, fidelity, count = hand_from_path("barrett"), object_from_path("block"), FIDELITIES["draft"], 16
     host = host_ms(hand, obj, fidelity, count)
     began = time.thread_time()
-    plan(hand, obj, Wanted(count, fidelity, seed=0), Run("cpu", threads=1))
+    plan(hand, obj, PlanRequest(count, fidelity, seed=0), ExecutionContext("cpu", threads=1))
     assert host < 0.5 * 1e3 * (time.thread_time() - began) / count
 
 

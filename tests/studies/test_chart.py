@@ -19,9 +19,9 @@ from graspd.studies.chart.chart import settings_of
 from graspd.studies.chart.report import markdown
 from graspd.studies.chart.statistics import first_valid, pareto, summed
 from graspd.studies.chart.sweeps import Turn, _make, asking_each, turns
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.run import Run
 
 RUN_KEYS = {
     "method",
@@ -34,7 +34,7 @@ RUN_KEYS = {
     "epsilon",
     "pd_mm",
     "end_to_end_per_second",
-    "letter",
+    "dexgraspbench",
     "hard",
     "robust",
 }
@@ -74,7 +74,7 @@ def test_end_to_end_counts_what_is_valid_over_all_that_a_job_does(made: tuple[di
         assert run["kept"] <= run["valid"]
         assert all(whole > planned for whole, planned in zip(run["end_seconds"], run["seconds"], strict=True))
         assert run["end_to_end_per_second"] == pytest.approx(run["kept"] / sum(run["end_seconds"]), rel=1e-4)
-        for key in ("letter", "hard", "end_to_end_per_second", *(["robust"] if run["valid"] else [])):
+        for key in ("dexgraspbench", "hard", "end_to_end_per_second", *(["robust"] if run["valid"] else [])):
             assert run[f"{key}_low"] <= run[key] <= run[f"{key}_high"], key
         assert (run["robust"] is None) == (run["valid"] == 0)
     assert set(made[0]["by_hand"]) == {"barrett"} and made[0]["models"] == 2
@@ -125,7 +125,7 @@ def test_a_method_can_be_charted_with_options_and_a_batch_of_its_own() -> None:
         peer_batch=4,
         options=["graspit:steps=40000"],
         quick=False,
-        run=Run(threads=1),
+        run=ExecutionContext(threads=1),
     )
     assert (plain.fidelity, plain.batch, plain.options) == ("as published", 4, {"steps": "40000"})
     assert (kept.fidelity, kept.batch, kept.options) == ("keep=5", 10, {"steps": "40000", "keep": "5"})
@@ -153,10 +153,19 @@ def test_the_first_valid_grasp_takes_as_many_calls_as_a_coin_of_that_bias() -> N
 def run_of(method: str, valid: int, seconds: float, pd: float) -> dict[str, Any]:
     row: dict[str, Any] = {"method": method, "fidelity": "standard", "batch": 10, "grasps": 10, "valid": valid}
     row |= {"seconds": [seconds], "seconds_to_first_valid": seconds if valid else None, "gsr": valid / 10}
-    row |= {"letter": valid / 10, "hard": valid / 20, "robust": 0.5 if valid else None}
+    row |= {"dexgraspbench": valid / 10, "hard": valid / 20, "robust": 0.5 if valid else None}
     row |= {"epsilon": 0.1, "pd_mm": pd, "valid_per_second": valid / seconds}
     row |= {"kept": valid, "end_seconds": [2 * seconds], "end_to_end_per_second": valid / seconds / 2}
-    for key in ("gsr", "letter", "hard", "robust", "epsilon", "pd_mm", "valid_per_second", "end_to_end_per_second"):
+    for key in (
+        "gsr",
+        "dexgraspbench",
+        "hard",
+        "robust",
+        "epsilon",
+        "pd_mm",
+        "valid_per_second",
+        "end_to_end_per_second",
+    ):
         row |= {f"{key}_low": row[key], f"{key}_high": row[key]}
     return row
 
@@ -165,13 +174,13 @@ def test_sums_divide_all_valid_grasps_by_all_seconds() -> None:
     (row,) = summed([run_of("a", 8, 1.0, 0.1), run_of("a", 2, 4.0, 0.3)])
     assert row["valid_per_second"] == pytest.approx(10 / 5.0)
     assert row["end_to_end_per_second"] == pytest.approx(10 / 10.0)
-    assert row["gsr"] == row["letter"] == pytest.approx(0.5)
+    assert row["gsr"] == row["dexgraspbench"] == pytest.approx(0.5)
     assert row["pd_mm"] == pytest.approx(0.2)
 
 
 def test_a_method_that_makes_nothing_valid_is_on_no_front() -> None:
     able, unable = summed([run_of("a", 5, 1.0, 0.5), run_of("b", 0, 0.1, 0.0)])
-    assert able["front"] == ["letter", "hard", "robust", "gsr", "epsilon", "pd_mm"]
+    assert able["front"] == ["dexgraspbench", "hard", "robust", "gsr", "epsilon", "pd_mm"]
     assert unable["front"] == [] and unable["robust"] is None
     assert unable["seconds_to_first_valid"] is None
 
@@ -189,7 +198,7 @@ def test_a_ratio_to_a_method_without_a_valid_grasp_is_a_bound() -> None:
             "device": "",
             "threads": 2,
             "versions": {"graspd": "", "warp": ""},
-            "referee": {"level": ""},
+            "validation": {"level": ""},
             "friction": 1.0,
             "threshold_m": 0.005,
         }
@@ -213,7 +222,7 @@ def test_asking_for_distances_anew_changes_no_grasp() -> None:
     hand, obj = hand_from_path("barrett"), object_from_path("block")
     little = FIDELITIES["draft"].model_copy(update={"coarse_iterations": 12, "fine_iterations": 5})
     shared, anew = (
-        _make(hand, obj, 2, 0, turn=Turn("queries", "", little, change), run=Run(threads=1))
+        _make(hand, obj, 2, 0, turn=Turn("queries", "", little, change), run=ExecutionContext(threads=1))
         for change in (None, asking_each)
     )
     np.testing.assert_array_equal(shared.grasp.hand_pose, anew.grasp.hand_pose)

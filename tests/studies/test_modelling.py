@@ -13,14 +13,14 @@ import trimesh
 
 from benchmarks.modelling.common import auc, ranking, share
 from benchmarks.modelling.drops import drops, forearm
-from benchmarks.modelling.steps import rollout, step
+from benchmarks.modelling.steps import forward_simulation, step
 from graspd.service.store.shards import write_shard
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.quality.probe import probe_of
 from graspd.worker.rendering import render
-from graspd.worker.run import Run
 from graspd.worker.scenes import drop
 from graspd.worker.simulation.reference import Contacts, World, direct
 from tests.conftest import REPOSITORY
@@ -51,7 +51,7 @@ def test_an_object_that_nothing_touches_moves_on_freely() -> None:
     far = Posture(np.array([[5.0, 0, 0, 1, 0, 0, 0]]), hand.expand(np.zeros((1, hand.dofs))))
     world = World(inertia=obj.inertia, gyration=obj.gyration_radius)
     # Six of seven velocities move by one step each; norms are smoothed by 1 % of a step, twice.
-    np.testing.assert_allclose(rollout(probe, far, world, (1, 4)), [[6 / 7, 24 / 7]], atol=0.03)
+    np.testing.assert_allclose(forward_simulation(probe, far, world, (1, 4)), [[6 / 7, 24 / 7]], atol=0.03)
 
 
 @pytest.mark.parametrize(("score", "expected"), [([1, 2, 3, 4], 1.0), ([4, 3, 2, 1], 0.0), ([1, 1, 1, 1], 0.5)])
@@ -105,7 +105,9 @@ def test_the_page_cites_the_measured_tables() -> None:
 def test_the_pages_recipe_finds_the_point_of_the_mesh_behind_each_pixel(tmp_path: Path) -> None:
     obj = object_from_path("block")
     poses = drop(obj, count=1, seed=2)["scene/object_pose"]
-    arrays = render(obj, poses, views=1, stereo=False, width=40, height=30, seed=3, samples=2, run=Run(threads=1))
+    arrays = render(
+        obj, poses, views=1, stereo=False, width=40, height=30, seed=3, samples=2, run=ExecutionContext(threads=1)
+    )
     (tmp_path / "views.h5").write_bytes(write_shard("views", arrays, {}))
     with h5py.File(tmp_path / "scenes.h5", "w") as file:
         file["scene/object_pose"] = poses

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from graspd.commands.admin import app
 from graspd.studies.rendering_bench import COMPRESSIONS, bench_render, tables
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.rendering.scene_setup import CameraPlan, Setting
-from graspd.worker.run import Run
 from tests.worker.models import object_from_mesh
 
 BLOCK = object_from_mesh(trimesh.creation.box((0.05, 0.06, 0.07)), "block")
@@ -21,7 +21,7 @@ BLOCK = object_from_mesh(trimesh.creation.box((0.05, 0.06, 0.07)), "block")
 def test_the_bare_tracer_traces_the_same_scene():
     poses = np.array([[[0, 0, 0.035, 1.0, 0, 0, 0]]])
     setting = Setting([BLOCK], poses, CameraPlan(2, 48, 36, None), seed=0, samples=4)
-    whole = setting.shoot(Run())
+    whole = setting.shoot(ExecutionContext())
     bare = setting.stage("cpu").shoot(replace(setting.shot, shaded=False))
     np.testing.assert_array_equal(bare.shape, whole.shape)
     np.testing.assert_array_equal(bare.depth, whole.depth)

@@ -19,13 +19,13 @@ from graspd.service.pipeline.fidelity_choice import cheapest
 from graspd.service.store.records import latest
 from graspd.service.store.store import open_store
 from graspd.studies.chart import scenes
-from graspd.studies.chart.chart import Thing, settings_of
+from graspd.studies.chart.chart import ChartObject, settings_of
 from graspd.studies.chart.scene_report import markdown
 from graspd.studies.chart.scenes import figures, summed
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.quality.intervals import wilson
-from graspd.worker.run import Run
 
 TABLE = SceneSpec(kind="table", faces="all")
 ARGUMENTS = ("--scene", "table", "--quick", "--methods", "fast_graspd,autograsp", "--hands", "barrett")
@@ -53,7 +53,7 @@ def test_lifted_per_second_are_those_lifted_over_the_seconds(made: tuple[dict[st
         assert 0 <= run["lift_hard_count"] <= run["lift_count"] <= run["clear_count"] <= run["grasps"]
         assert run["valid_per_second"] == pytest.approx(run["lift_count"] / run["seconds"], rel=1e-4)
         assert run["lift_low"] <= run["lift"] <= run["lift_high"]
-        assert run["end_seconds"] > run["seconds"] and run["lift_letter_count"] <= run["clear_count"]
+        assert run["end_seconds"] > run["seconds"] and run["lift_dexgraspbench_count"] <= run["clear_count"]
         assert run["end_to_end_per_second"] == pytest.approx(run["lift_count"] / run["end_seconds"], rel=1e-4)
         assert (run["robust"] is None) == (run["seconds_to_first"] is None) == (run["lift_count"] == 0)
         assert run["robust"] is None or 0 <= run["robust_low"] <= run["robust"] <= run["robust_high"] <= 1
@@ -137,15 +137,21 @@ def test_seconds_are_those_of_the_clock_of_the_settings_device(monkeypatch: pyte
         def __init__(self, *_: object) -> None: ...
 
         def counts(self, models: int) -> dict[str, Any]:
-            return {"clear_count": 2, "lift_count": 2, "lift_letter_count": 2, "lift_hard_count": 1, "robust_sum": 2.0}
+            return {
+                "clear_count": 2,
+                "lift_count": 2,
+                "lift_dexgraspbench_count": 2,
+                "lift_hard_count": 1,
+                "robust_sum": 2.0,
+            }
 
     monkeypatch.setattr(scenes, "clock_of", clock)
     monkeypatch.setattr(scenes, "_planned", lambda *_, **__: None)
-    monkeypatch.setattr(scenes, "Judged", Verdict)
+    monkeypatch.setattr(scenes, "Validated", Verdict)
     (setting,) = settings_of(
-        ["fast_graspd"], ["draft"], batches=[2], peer_batch=2, options=[], quick=True, run=Run("cuda:0", 1)
+        ["fast_graspd"], ["draft"], batches=[2], peer_batch=2, options=[], quick=True, run=ExecutionContext("cuda:0", 1)
     )
-    place = scenes.Place(Thing("block", lambda error: object_from_path("block", face_error_m=error)), TABLE)
+    place = scenes.Place(ChartObject("block", lambda error: object_from_path("block", face_error_m=error)), TABLE)
     row = scenes._tried(setting, FILTERED, hand_from_path("barrett"), place, 1)
     assert asked == ["cuda:0"]
     assert (row["seconds"], row["end_seconds"], row["valid_per_second"]) == (7.0, 14.0, pytest.approx(2 / 7, rel=1e-4))
@@ -158,7 +164,7 @@ def run_of(way: str, pair: str, lifted: int, seconds: float, grasps: int = 10) -
         "end_seconds": 2 * seconds,
         "clear_count": lifted,
         "lift_count": lifted,
-        "lift_letter_count": lifted,
+        "lift_dexgraspbench_count": lifted,
         "lift_hard_count": 0,
         "robust_sum": 0.5 * lifted,
     }

@@ -22,13 +22,13 @@ from graspd.service.store.records import latest
 from graspd.service.store.store import open_store
 from graspd.studies.stability import assets, descents, gradients, integrators, report, studies
 from graspd.studies.stability.report import markdown, write
-from graspd.worker.certified import certified_grasps
 from graspd.worker.engines import backend
+from graspd.worker.execution_context import DEFAULT_CONTEXT
+from graspd.worker.generation import validated_grasps
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners.fast_graspd.pairs import Pair, pair_of
-from graspd.worker.run import ALONE
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.model import LossOptions
 
@@ -97,8 +97,8 @@ def test_a_start_that_is_too_far_is_flagged(pair: Pair) -> None:
 
 def test_a_job_whose_every_grasp_is_bad_ends_with_none(hand: HandModel) -> None:
     crumb = assets.prepared(assets.cube(1), {"units": "m"}, 1e-5)
-    request = JobRequest(hand="hand", object="crumb", grasps=2, fidelity="draft", budget=2, audits=0)
-    found = certified_grasps(hand, crumb, request, count=2)
+    request = JobRequest(hand="hand", object="crumb", grasps=2, fidelity="draft", budget=2, rechecks=0)
+    found = validated_grasps(hand, crumb, request, count=2)
     assert found.tried == len(found.grasps) + sum(found.rejected.values())
     assert (found.columns["quality/valid"] == 1).all()
 
@@ -113,7 +113,9 @@ def test_a_long_run_does_not_drift(pair: Pair) -> None:
 @pytest.mark.slow
 def test_a_quick_run_takes_less_than_the_minute_that_it_promises() -> None:
     started = time.process_time()
-    found = studies.run(STUDIES, "allegro", "block", quick=True, long=False, work=ALONE, say=lambda line: None)
+    found = studies.run(
+        STUDIES, "allegro", "block", quick=True, long=False, work=DEFAULT_CONTEXT, say=lambda line: None
+    )
     assert time.process_time() - started < 60  # CPU seconds: others may keep the machine busy
     assert [one.name for one in found] == list(STUDIES) and all(one.cells for one in found)
 

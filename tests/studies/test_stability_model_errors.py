@@ -19,7 +19,7 @@ from graspd.worker.validation.variant import Variant, draw
 FRICTION, MASS = "friction over the model's", "mass over the model's"
 
 
-def judged(monkeypatch: pytest.MonkeyPatch, name: str, amounts: tuple[float, ...]) -> list[MapCell]:
+def validated(monkeypatch: pytest.MonkeyPatch, name: str, amounts: tuple[float, ...]) -> list[MapCell]:
     monkeypatch.setitem(ERRORS, name, replace(ERRORS[name], amounts=amounts))
     backend.start()
     hand, obj = hand_from_path("barrett"), object_from_path("block")
@@ -27,7 +27,7 @@ def judged(monkeypatch: pytest.MonkeyPatch, name: str, amounts: tuple[float, ...
 
 
 def test_the_models_own_friction_keeps_what_holds_and_ice_keeps_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    ice, own = judged(monkeypatch, FRICTION, (0.01, 1.0))
+    ice, own = validated(monkeypatch, FRICTION, (0.01, 1.0))
     assert (own.value, own.outcome, own.reached) == (1.0, "good", True)
     assert (ice.value, ice.outcome, ice.reached) == (0.0, "broken", False)
 
@@ -69,12 +69,12 @@ def test_an_amount_departs_along_one_axis_only(name: str) -> None:
 
 
 def test_a_hand_without_valid_grasps_is_no_number_and_broken(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = model_errors.certified_grasps
+    found = model_errors.validated_grasps
 
     def none(*arguments: object, **options: object) -> object:
         made = found(*arguments, **options)  # type: ignore[arg-type]
         return replace(made, grasps=made.grasps.take(np.zeros(0, int)))
 
-    monkeypatch.setattr(model_errors, "certified_grasps", none)
-    (cell,) = judged(monkeypatch, MASS, (1.0,))
+    monkeypatch.setattr(model_errors, "validated_grasps", none)
+    (cell,) = validated(monkeypatch, MASS, (1.0,))
     assert cell.outcome == "broken" and not np.isfinite(cell.value)

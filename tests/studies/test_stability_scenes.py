@@ -16,12 +16,12 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.studies import MapCell, Stability, StabilityMap, from_json
 from graspd.studies.stability import scenes
-from graspd.worker.certified import Certified
 from graspd.worker.engines import backend
+from graspd.worker.generation import ValidatedBatch
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.scenes.kinds import supports_of
-from graspd.worker.scenes.way import MARGIN_M
+from graspd.worker.scenes.trajectory import MARGIN_M
 from tests.worker.simulation.test_surroundings import mujoco_room
 
 
@@ -31,7 +31,7 @@ def hand() -> HandModel:
     return hand_from_path("barrett")
 
 
-def assert_valid_ones_are_clear(hand: HandModel, found: Certified, spec: SceneSpec) -> None:
+def assert_valid_ones_are_clear(hand: HandModel, found: ValidatedBatch, spec: SceneSpec) -> None:
     """By MuJoCo's distances at the grasp, whatever the planner thinks of its clearance."""
     rows = np.flatnonzero(found.columns["quality/valid"] == 1)
     assert (found.columns["quality/clearance_m"][rows] >= MARGIN_M).all()
@@ -69,8 +69,8 @@ def test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so(tmp_path: Path) -> 
     ]
     result = CliRunner().invoke(build(), words)
     assert result.exit_code == 3, result.output
-    assert "the budget of 2 tries for each ended first" in result.output
-    assert "of the tries are clear of what stands there" in result.output
+    assert "the budget of 2 candidates for each ended first" in result.output
+    assert "of the candidates are clear of what stands there" in result.output
 
 
 @pytest.mark.parametrize("gap", [5, 30])

@@ -128,7 +128,7 @@ def test_a_folder_of_objects_becomes_a_dataset_and_its_files(
 ) -> None:
     graspd("hands", "add", "pincer.urdf", "--no-self-test")
     wanted = ("datasets", "create", "play", "--hands", "pincer", "--objects", "toys", "--grasps", "4")
-    cheap = ("--fidelity", "draft", "--want", "raw", "--referee", "none")
+    cheap = ("--fidelity", "draft", "--want", "candidates", "--validation", "none")
     code, seen, _ = graspd(*wanted, *cheap, "--dry-run")
     assert code == 0 and seen["estimate"]["cells"] == 3 and "dataset" not in seen
     code, made, said = graspd(*wanted, *cheap, "--yes", "--wait")

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import pytest
 
 from graspd.service.model.clock import timestamp
-from graspd.service.model.states import Lane, State
+from graspd.service.model.states import Priority, State
 from graspd.service.pipeline import job_actions
 from tests.fakes import request
 from tests.system.conftest import System
@@ -73,7 +73,7 @@ def test_a_worker_that_was_killed_is_shown_as_lost(start: Start) -> None:
 
 def test_somebody_at_a_screen_does_not_wait_for_a_dataset(start: Start) -> None:
     system = start(workers=2, environment={"FAKE_SECONDS": "0.3"})
-    bulk = job_actions.submit(system.services, request(grasps=100_000), lane=Lane.BULK)[0].id
+    bulk = job_actions.submit(system.services, request(grasps=100_000), priority=Priority.BULK)[0].id
     system.until(lambda: system.services.index.jobs.get(bulk).grasps, "the dataset runs")
     system.hold.touch()
     system.until(lambda: len(system.services.queue.waiting()) >= _WAITING, "the dataset fills the queue")
@@ -91,14 +91,19 @@ def test_somebody_at_a_screen_does_not_wait_for_a_dataset(start: Start) -> None:
 
 def test_steady_small_jobs_do_not_stop_a_dataset(start: Start) -> None:
     system = start(environment={"FAKE_SECONDS": "0.05"})
-    bulk = job_actions.submit(system.services, request(grasps=3200), lane=Lane.BULK)[0].id
+    bulk = job_actions.submit(system.services, request(grasps=3200), priority=Priority.BULK)[0].id
     ended = threading.Event()
 
     def keep_busy() -> None:
         seed = 0
         while not ended.is_set():
             # There are always more small tasks than the one worker gets done.
-            if sum(n for (lane, _), n in system.services.queue.depths().items() if lane is Lane.INTERACTIVE) < 8:
+            if (
+                sum(
+                    n for (priority, _), n in system.services.queue.depths().items() if priority is Priority.INTERACTIVE
+                )
+                < 8
+            ):
                 seed += 1
                 system.submit(request(grasps=128, seed=seed))
             time.sleep(0.02)

@@ -94,7 +94,7 @@ def test_a_full_disk_is_waited_for_until_there_is_room(start: Start, small_disk:
     job = system.submit(request(grasps=32 * 100))
     says = "No space left on device"
     system.until(lambda: any(says in message for message in messages(system, job)), "a task says so")
-    time.sleep(1.0)  # some more tries
+    time.sleep(1.0)  # some more candidates
     assert not system.services.index.jobs.get(job).state.is_final
     subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
     finish_and_compare(system, job, 32 * 100)

@@ -11,7 +11,7 @@ import pytest
 from graspd.service.model import names
 from graspd.service.model.planning import plan
 from graspd.service.model.records import JobRecord
-from graspd.service.model.states import Lane, Stage, State
+from graspd.service.model.states import Priority, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.store.manifests import load_shard
 from graspd.service.store.records import read_record
@@ -24,7 +24,7 @@ Start = Callable[..., System]
 
 def submitted(system: System, grasps: int, *, span: int) -> str:
     """A job in bulk whose tasks have so many batches."""
-    record = job_actions.prepare(system.services, wanted(grasps=grasps), lane=Lane.BULK)
+    record = job_actions.prepare(system.services, wanted(grasps=grasps), priority=Priority.BULK)
     return job_actions.enter(system.services, record.model_copy(update={"span": span}))[0].id
 
 

@@ -11,10 +11,10 @@ from graspd.service.index.rebuild import differences
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.states import AssetKind, Stage, State
 from graspd.service.store.shards import read_shard
-from graspd.worker.certified import certified_grasps
+from graspd.worker.generation import validated_grasps
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.scenes.beside import scenes_of
+from graspd.worker.scenes.placement import scenes_of
 from tests.system.conftest import System
 
 pytestmark = pytest.mark.chaos
@@ -52,7 +52,7 @@ def test_a_worker_killed_in_mid_synthesis_leaves_the_same_grasps(start: Callable
     if request.in_scene:
         scenes, poses = scenes_of(request.place, block, [], count=request.scenes, seed=request.seed)
         np.testing.assert_array_equal(kept["scene/object_pose"], poses["scene/object_pose"])
-    undisturbed = certified_grasps(hand_from_path("barrett"), block, request, count=24, scenes=scenes).grasps
+    undisturbed = validated_grasps(hand_from_path("barrett"), block, request, count=24, scenes=scenes).grasps
     np.testing.assert_array_equal(kept["grasp/hand_pose"], undisturbed.grasp.hand_pose)
     np.testing.assert_array_equal(kept["grasp/joint_positions"], undisturbed.grasp.joint_positions)
     assert differences(index, system.services.store) == []

@@ -1,4 +1,4 @@
-"""Batches of valid grasps: rounds, budgets, audits."""
+"""Batches of valid grasps: rounds, budgets, rechecks."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from hypothesis import strategies as st
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import InputError, TaskCancelled
 from graspd.service.model.metrics import MIN_DISTANCE_M, Axis
-from graspd.worker import certified
-from graspd.worker.certified import Certified, certified_grasps
+from graspd.worker import generation
+from graspd.worker.execution_context import ExecutionContext
+from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.planners import Wanted
+from graspd.worker.planners import PlanRequest
 from graspd.worker.quality.diversity import distances, hand_points
 from graspd.worker.rounds import next_round, taken
-from graspd.worker.run import Run
 from graspd.worker.validation.protocol import Outcome
 from graspd.worker.validation.robust import Robustness
 
@@ -45,21 +45,21 @@ def wish(**changes: Any) -> JobRequest:
 
 
 @pytest.fixture(scope="module")
-def valid(hand: HandModel, block: ObjectModel) -> Certified:
-    return certified_grasps(hand, block, wish(audits=2), count=COUNT)
+def valid(hand: HandModel, block: ObjectModel) -> ValidatedBatch:
+    return validated_grasps(hand, block, wish(rechecks=2), count=COUNT)
 
 
-def test_a_batch_of_valid_grasps_holds_nothing_else(valid: Certified) -> None:
+def test_a_batch_of_valid_grasps_holds_nothing_else(valid: ValidatedBatch) -> None:
     assert len(valid.grasps) == COUNT
     assert (valid.columns["quality/valid"] == 1).all()
-    assert (valid.columns["quality/sound"] == 1).all()
+    assert (valid.columns["quality/feasible"] == 1).all()
     assert (valid.columns["quality/success"] == 1).all()
     assert all(len(array) == COUNT for path, array in valid.columns.items() if path != "quality/thresholds_m")
 
 
-def test_every_grasp_that_was_tried_is_accounted_for(valid: Certified) -> None:
-    assert valid.tried == COUNT + sum(valid.rejected.values())
-    assert valid.planned >= valid.tried
+def test_every_grasp_that_was_tried_is_accounted_for(valid: ValidatedBatch) -> None:
+    assert valid.candidates == COUNT + sum(valid.rejected.values())
+    assert valid.planned >= valid.candidates
 
 
 def test_tries_count_up_to_the_last_grasp_that_is_kept(
@@ -70,14 +70,14 @@ def test_tries_count_up_to_the_last_grasp_that_is_kept(
         outcome = np.ones((len(grasps), 6), np.uint8)
         return SimpleNamespace(success=held, outcome=outcome, margin=np.zeros(len(grasps)), seconds=0.0)
 
-    monkeypatch.setattr(certified, "judge", every_other)
-    monkeypatch.setattr(certified, "passes", lambda columns: np.ones(len(columns["quality/success"]), np.uint8))
-    found = certified_grasps(hand, block, wish(audits=0), count=COUNT)
+    monkeypatch.setattr(generation, "validate", every_other)
+    monkeypatch.setattr(generation, "passes", lambda columns: np.ones(len(columns["quality/success"]), np.uint8))
+    found = validated_grasps(hand, block, wish(rechecks=0), count=COUNT)
     # Six tries hold at 0, 2, 4; of the seven that promise to be enough the ones at 0, 2, 4 are.
-    assert (found.tried, found.planned, found.rejected["dropped"]) == (6 + 5, 6 + 7, 3 + 2)
+    assert (found.candidates, found.planned, found.rejected["dropped"]) == (6 + 5, 6 + 7, 3 + 2)
 
 
-def test_what_the_referee_saw_of_each_try_is_counted(
+def test_what_the_validator_saw_of_each_try_is_counted(
     hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen = [Outcome.HELD, Outcome.DISPLACED, Outcome.ROTATED, Outcome.LOST_WHILE_CLOSING, Outcome.PENETRATION]
@@ -88,22 +88,24 @@ def test_what_the_referee_saw_of_each_try_is_counted(
         held = (outcome[:, 2] == Outcome.HELD).astype(np.int8)
         return SimpleNamespace(success=held, outcome=outcome, margin=np.zeros(len(grasps)), seconds=0.0)
 
-    monkeypatch.setattr(certified, "judge", each_otherwise)
-    monkeypatch.setattr(certified, "passes", lambda columns: np.zeros(len(columns["quality/success"]), np.uint8))
-    found = certified_grasps(hand, block, wish(audits=0, grasps=5, budget=1), count=5, run=Run(threads=1))
+    monkeypatch.setattr(generation, "validate", each_otherwise)
+    monkeypatch.setattr(generation, "passes", lambda columns: np.zeros(len(columns["quality/success"]), np.uint8))
+    found = validated_grasps(
+        hand, block, wish(rechecks=0, grasps=5, budget=1), count=5, run=ExecutionContext(threads=1)
+    )
     gates = {
         name: found.outcomes.pop(name, 0) for name in ("gate_penetration", "gate_self_penetration", "gate_contacts")
     }
     assert sum(gates.values()) == 1
     assert found.outcomes == {"slipped": 1, "turned": 1, "lost_while_closing": 1, "penetration": 1}
-    assert (found.rejected["dropped"], found.rejected["gate"], found.tried) == (4, 1, 5)
+    assert (found.rejected["dropped"], found.rejected["gate"], found.candidates) == (4, 1, 5)
 
 
 @pytest.mark.parametrize("after", [0, 1])
-def test_a_batch_that_is_stopped_is_what_was_judged_before(
+def test_a_batch_that_is_stopped_is_what_was_validated_before(
     hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch, after: int
 ) -> None:
-    rounds, real = [], certified._Work._round
+    rounds, real = [], generation._Work._round
 
     def counted(*given: Any) -> Any:
         if len(rounds) == after:
@@ -112,47 +114,47 @@ def test_a_batch_that_is_stopped_is_what_was_judged_before(
         rounds[-1].grasps, rounds[-1].columns = taken(rounds[-1].grasps, rounds[-1].columns, np.arange(1))
         return rounds[-1]
 
-    monkeypatch.setattr(certified._Work, "_round", counted)
+    monkeypatch.setattr(generation._Work, "_round", counted)
     if not after:
         with pytest.raises(TaskCancelled):
-            certified_grasps(hand, block, wish(audits=0), count=COUNT, partial=True)
+            validated_grasps(hand, block, wish(rechecks=0), count=COUNT, partial=True)
         return
-    found = certified_grasps(hand, block, wish(audits=0), count=COUNT, partial=True)
+    found = validated_grasps(hand, block, wish(rechecks=0), count=COUNT, partial=True)
     assert len(found.grasps) == 1 and found.verdict_key is not None
 
 
 def test_a_grasp_like_one_that_is_kept_makes_room_for_another(
     hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = certified.synthesize
+    real = generation.synthesize
 
     def twins(*given: Any, **named: Any) -> GraspSet:
         found = real(*given, **named)
         return found.take(np.arange(len(found)) // 2 * 2)  # each grasp twice
 
-    monkeypatch.setattr(certified, "synthesize", twins)
-    plain = {"referee": "none", "fidelity": "draft", "budget": 8}
-    found = certified_grasps(hand, block, wish(**plain), count=COUNT)
+    monkeypatch.setattr(generation, "synthesize", twins)
+    plain = {"validation": "none", "fidelity": "draft", "budget": 8}
+    found = validated_grasps(hand, block, wish(**plain), count=COUNT)
     points = hand_points(hand, found.grasps.grasp)
     rows, others = np.triu_indices(len(points), 1)
     assert len(found.grasps) == COUNT and distances(points, rows, others).min() >= MIN_DISTANCE_M
     assert found.rejected["alike"] >= COUNT - 1
-    assert certified_grasps(hand, block, wish(**plain, min_distance=0), count=COUNT).rejected["alike"] == 0
+    assert validated_grasps(hand, block, wish(**plain, min_distance=0), count=COUNT).rejected["alike"] == 0
 
 
-def test_only_as_many_grasps_are_audited_as_were_asked_for(valid: Certified) -> None:
-    assert (valid.columns["quality/audit"] >= 0).tolist() == [True] * 2 + [False] * (COUNT - 2)
+def test_only_as_many_grasps_are_audited_as_were_asked_for(valid: ValidatedBatch) -> None:
+    assert (valid.columns["quality/recheck"] >= 0).tolist() == [True] * 2 + [False] * (COUNT - 2)
 
 
-def test_the_same_batch_is_the_same_grasps(hand: HandModel, block: ObjectModel, valid: Certified) -> None:
-    again = certified_grasps(hand, block, wish(audits=2), count=COUNT)
+def test_the_same_batch_is_the_same_grasps(hand: HandModel, block: ObjectModel, valid: ValidatedBatch) -> None:
+    again = validated_grasps(hand, block, wish(rechecks=2), count=COUNT)
     np.testing.assert_array_equal(again.grasps.squeeze.joint_positions, valid.grasps.squeeze.joint_positions)
-    assert again.tried == valid.tried
+    assert again.candidates == valid.candidates
 
 
-def test_raw_grasps_are_all_kept_with_their_verdicts(hand: HandModel, block: ObjectModel) -> None:
-    found = certified_grasps(hand, block, wish(want="raw", audits=0), count=COUNT)
-    assert (len(found.grasps), found.tried, found.rejected) == (
+def test_candidate_grasps_are_all_kept_with_their_verdicts(hand: HandModel, block: ObjectModel) -> None:
+    found = validated_grasps(hand, block, wish(want="candidates", rechecks=0), count=COUNT)
+    assert (len(found.grasps), found.candidates, found.rejected) == (
         COUNT,
         COUNT,
         {"diverged": 0, "dropped": 0, "gate": 0, "alike": 0},
@@ -161,23 +163,23 @@ def test_raw_grasps_are_all_kept_with_their_verdicts(hand: HandModel, block: Obj
     assert ((found.columns["quality/valid"] == 1) <= (found.columns["quality/success"] == 1)).all()
 
 
-def test_without_a_referee_nobody_judges(hand: HandModel, block: ObjectModel) -> None:
-    found = certified_grasps(hand, block, wish(referee="none"), count=COUNT)
+def test_without_a_validator_nobody_judges(hand: HandModel, block: ObjectModel) -> None:
+    found = validated_grasps(hand, block, wish(validation="none"), count=COUNT)
     assert found.verdict_key is None
     assert "quality/success" not in found.columns
     assert len(found.grasps) == COUNT
-    assert (found.columns["quality/sound"] == 1).all(), "the budget is for sound grasps then"
+    assert (found.columns["quality/feasible"] == 1).all(), "the budget is for feasible grasps then"
     assert not found.columns["quality/valid"].any()
 
 
 def test_the_methods_own_options_reach_it(hand: HandModel, block: ObjectModel) -> None:
-    wanted = {"method": "autograsp", "want": "raw", "referee": "none"}
+    wanted = {"method": "autograsp", "want": "candidates", "validation": "none"}
     near, far = (
-        certified_grasps(hand, block, wish(**wanted, options={"standoff_m": gap}), count=2) for gap in (0.0, 0.05)
+        validated_grasps(hand, block, wish(**wanted, options={"standoff_m": gap}), count=2) for gap in (0.0, 0.05)
     )
     assert not np.allclose(near.grasps.grasp.hand_pose, far.grasps.grasp.hand_pose)
     with pytest.raises(InputError, match="its options: standoff_m"):
-        certified_grasps(hand, block, wish(**wanted, options={"speed": 3}), count=2)
+        validated_grasps(hand, block, wish(**wanted, options={"speed": 3}), count=2)
 
 
 def test_a_budget_that_finds_nothing_ends_with_nothing(
@@ -185,7 +187,7 @@ def test_a_budget_that_finds_nothing_ends_with_nothing(
 ) -> None:
     planned: list[int] = []
 
-    def plan(_hand: Any, _obj: Any, wanted: Wanted, *_: Any, **__: Any) -> GraspSet:
+    def plan(_hand: Any, _obj: Any, wanted: PlanRequest, *_: Any, **__: Any) -> GraspSet:
         count = wanted.count
         planned.append(wanted.batch)
         posture = Posture(np.tile([0.0, 0, 1, 1, 0, 0, 0], (count, 1)), np.zeros((count, len(hand.joint_names))))
@@ -196,10 +198,10 @@ def test_a_budget_that_finds_nothing_ends_with_nothing(
         outcome, nothing = np.full((n, 6), 4, np.uint8), np.zeros(n, np.int8)
         return SimpleNamespace(success=nothing, outcome=outcome, margin=np.full(n, 9.0), seconds=0.0)
 
-    monkeypatch.setattr(certified, "synthesize", plan)
-    monkeypatch.setattr(certified, "judge", drop)
-    found = certified_grasps(hand, block, wish(budget=3.0), count=COUNT)
-    assert (len(found.grasps), found.tried) == (0, 3 * COUNT)
+    monkeypatch.setattr(generation, "synthesize", plan)
+    monkeypatch.setattr(generation, "validate", drop)
+    found = validated_grasps(hand, block, wish(budget=3.0), count=COUNT)
+    assert (len(found.grasps), found.candidates) == (0, 3 * COUNT)
     assert len(set(planned)) == len(planned), "each round draws other grasps"
     assert found.columns["quality/valid"].shape == (0,)
 
@@ -207,16 +209,16 @@ def test_a_budget_that_finds_nothing_ends_with_nothing(
 def test_hands_that_are_no_numbers_are_dropped_and_counted(
     hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = certified.synthesize
+    whole = generation.synthesize
 
     def plan(*arguments: Any, **options: Any) -> GraspSet:
         made = whole(*arguments, **options)
         made.grasp.hand_pose[::2] = np.nan
         return made
 
-    monkeypatch.setattr(certified, "synthesize", plan)
-    found = certified_grasps(hand, block, wish(want="raw", referee="none"), count=COUNT)
-    assert (len(found.grasps), found.tried, found.rejected["diverged"]) == (COUNT // 2, COUNT, COUNT // 2)
+    monkeypatch.setattr(generation, "synthesize", plan)
+    found = validated_grasps(hand, block, wish(want="candidates", validation="none"), count=COUNT)
+    assert (len(found.grasps), found.candidates, found.rejected["diverged"]) == (COUNT // 2, COUNT, COUNT // 2)
     assert np.isfinite(found.grasps.grasp.hand_pose).all()
 
 
@@ -229,25 +231,25 @@ def test_rounds_end_with_enough_grasps_or_with_the_budget_used_up(
     wanted: int, factor: float, rates: list[float]
 ) -> None:
     budget = int(np.ceil(wanted * factor))
-    valid = tried = number = 0
-    while size := next_round(wanted, valid, tried, budget):
-        tried += size
+    valid = candidates = number = 0
+    while size := next_round(wanted, valid, candidates, budget):
+        candidates += size
         valid += int(size * rates[number % len(rates)])
         number += 1
         assert size > 0
-    assert tried <= budget
-    assert valid >= wanted or tried == budget
+    assert candidates <= budget
+    assert valid >= wanted or candidates == budget
 
 
 def test_only_grasps_that_hold_in_enough_models_count(hand: HandModel, block: ObjectModel) -> None:
-    found = certified_grasps(hand, block, wish(robust=0.75, robust_models=4, audits=0), count=3)
+    found = validated_grasps(hand, block, wish(robust=0.75, robust_models=4, rechecks=0), count=3)
     share, weakest = found.columns["quality/robust_share"], found.columns["quality/robust_weakest"]
     assert len(found.grasps) == 3
     assert (share >= 0.75).all()
     assert weakest.dtype == np.uint8 and ((weakest == 0) | (share < 1)).all()
     assert (found.columns["quality/valid"] == 1).all()
-    assert found.tried == 3 + sum(found.rejected.values())
-    assert "fragile" in found.rejected
+    assert found.candidates == 3 + sum(found.rejected.values())
+    assert "not_robust" in found.rejected
 
 
 def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(
@@ -257,17 +259,17 @@ def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(
         verdicts = np.where(held[:, None], 0, -1).astype(np.int8) * np.ones((1, models), np.int8)
         return Robustness(verdicts, np.full(verdicts.shape, Axis.POSE, np.uint8), wanted, 0.0)
 
-    monkeypatch.setattr(certified, "robust", nowhere)
-    none = certified_grasps(hand, block, wish(robust=0.5, budget=1, audits=0), count=4)
+    monkeypatch.setattr(generation, "robust", nowhere)
+    none = validated_grasps(hand, block, wish(robust=0.5, budget=1, rechecks=0), count=4)
     assert len(none.grasps) == 0
-    assert none.rejected["fragile"] > 0
-    raw = certified_grasps(hand, block, wish(robust=0.5, want="raw", audits=0), count=4)
+    assert none.rejected["not_robust"] > 0
+    raw = validated_grasps(hand, block, wish(robust=0.5, want="candidates", rechecks=0), count=4)
     held = raw.columns["quality/success"] == 1
     assert (raw.columns["quality/robust_share"][held] == 0).all() and len(raw.grasps) == 4
     assert (raw.columns["quality/robust_weakest"][held] == Axis.POSE).all()
     assert raw.columns["quality/valid"].any(), "a grasp that is not robust is valid all the same"
 
 
-def test_without_models_nothing_is_said_of_them(valid: Certified) -> None:
+def test_without_models_nothing_is_said_of_them(valid: ValidatedBatch) -> None:
     assert "quality/robust_share" not in valid.columns
-    assert "fragile" not in valid.rejected
+    assert "not_robust" not in valid.rejected

@@ -43,21 +43,21 @@ def test_grasps_come_back_from_the_columns_they_went_into(in_scenes: bool) -> No
         np.testing.assert_array_equal(back.lift.joint_positions, grasps.lift.joint_positions)
 
 
-@pytest.mark.parametrize(("key", "level"), [("k", "letter"), (None, "none")])
-def test_a_base_shard_says_who_judged_its_grasps(key: str | None, level: str) -> None:
+@pytest.mark.parametrize(("key", "level"), [("k", "dexgraspbench"), (None, "none")])
+def test_a_base_shard_says_who_validated_its_grasps(key: str | None, level: str) -> None:
     said = base_attributes(
         two_finger_hand(),
         object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05))),
-        JobOptions(referee="letter"),
-        tried=7,
+        JobOptions(validation="dexgraspbench"),
+        candidates=7,
         verdict_key=key,
     )
     check_attributes("base", said)
-    assert said["verdict_level"] == level and said.get("verdict_key") == key and said["tried"] == 7
+    assert said["verdict_level"] == level and said.get("verdict_key") == key and said["candidates"] == 7
 
 
 @pytest.mark.parametrize(
-    ("kind", "said"), [("base", {"colour": "red"}), ("views", {"mu": 1.0}), ("base", {"tried": "many"})]
+    ("kind", "said"), [("base", {"colour": "red"}), ("views", {"mu": 1.0}), ("base", {"candidates": "many"})]
 )
 def test_attributes_that_the_schema_does_not_have_are_refused(kind: str, said: dict[str, str]) -> None:
     with pytest.raises(InputError, match=next(iter(said))):

@@ -13,19 +13,19 @@ from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import TaskCancelled
 from graspd.service.model.fidelity import resolve_fidelity
 from graspd.service.model.scene_spec import SceneSpec
-from graspd.worker import certified
-from graspd.worker.certified import Certified, certified_grasps
+from graspd.worker import generation
+from graspd.worker.execution_context import ExecutionContext, Lanes
+from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.planners import NoPlace, Wanted, synthesize
+from graspd.worker.planners import NoPlace, PlanRequest, synthesize
 from graspd.worker.rounds import LANE, lanes_of
-from graspd.worker.run import Lanes, Run
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.side_by_side import side_by_side
-from graspd.worker.simulation.surroundings import Scenes
+from graspd.worker.simulation.environment import Scenes
 
-REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), audits=2, seed=3)
+REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), rechecks=2, seed=3)
 COUNT = 2 * LANE
 
 
@@ -41,12 +41,16 @@ def scenes(pair) -> Scenes:
 
 
 @pytest.fixture(scope="module")
-def one_lane(pair) -> Certified:
-    return certified_grasps(*pair, REQUEST, count=COUNT, run=Run(threads=1))
+def one_lane(pair) -> ValidatedBatch:
+    return validated_grasps(*pair, REQUEST, count=COUNT, run=ExecutionContext(threads=1))
 
 
-def assert_same(found: Certified, other: Certified) -> None:
-    assert (found.tried, found.rejected, found.verdict_key) == (other.tried, other.rejected, other.verdict_key)
+def assert_same(found: ValidatedBatch, other: ValidatedBatch) -> None:
+    assert (found.candidates, found.rejected, found.verdict_key) == (
+        other.candidates,
+        other.rejected,
+        other.verdict_key,
+    )
     columns, others = (one.grasps.to_columns() | one.columns for one in (found, other))
     assert columns.keys() == others.keys()
     for name, values in others.items():
@@ -56,27 +60,29 @@ def assert_same(found: Certified, other: Certified) -> None:
 def noted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
     """Round, first grasp and number of grasps of each call of the planner from now on."""
     calls: list[tuple[int, int, int]] = []
-    whole = certified.synthesize
+    whole = generation.synthesize
 
-    def plan(hand: Any, obj: Any, wanted: Wanted, *rest: Any, **named: Any) -> GraspSet:
-        calls.append((wanted.batch // certified.ROUND_STRIDE, wanted.first, wanted.count))
+    def plan(hand: Any, obj: Any, wanted: PlanRequest, *rest: Any, **named: Any) -> GraspSet:
+        calls.append((wanted.batch // generation.ROUND_STRIDE, wanted.first, wanted.count))
         return whole(hand, obj, wanted, *rest, **named)
 
-    monkeypatch.setattr(certified, "synthesize", plan)
+    monkeypatch.setattr(generation, "synthesize", plan)
     return calls
 
 
 def test_grasps_of_several_lanes_are_those_of_one(pair, one_lane, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = noted(monkeypatch)
-    found = certified_grasps(*pair, REQUEST, count=COUNT, run=Run(threads=2))
+    found = validated_grasps(*pair, REQUEST, count=COUNT, run=ExecutionContext(threads=2))
     assert sorted(calls)[:2] == [(0, 0, LANE), (0, LANE, LANE)]
     assert_same(found, one_lane)
 
 
 def test_grasps_of_several_lanes_in_scenes_are_those_of_one(pair, scenes, monkeypatch: pytest.MonkeyPatch) -> None:
-    wish = REQUEST.model_copy(update={"budget": 1.5, "audits": 0})
+    wish = REQUEST.model_copy(update={"budget": 1.5, "rechecks": 0})
     calls = noted(monkeypatch)
-    one, two = (certified_grasps(*pair, wish, count=COUNT, scenes=scenes, run=Run(threads=n)) for n in (1, 2))
+    one, two = (
+        validated_grasps(*pair, wish, count=COUNT, scenes=scenes, run=ExecutionContext(threads=n)) for n in (1, 2)
+    )
     assert (0, LANE, LANE) in calls
     assert_same(two, one)
     np.testing.assert_array_equal(two.grasps.scene, one.grasps.scene)
@@ -84,21 +90,21 @@ def test_grasps_of_several_lanes_in_scenes_are_those_of_one(pair, scenes, monkey
 
 def test_a_round_ends_as_soon_as_enough_are_found(pair, monkeypatch: pytest.MonkeyPatch) -> None:
     """A round has eight grasps at least; the first few of it are often enough, and the others are never planned."""
-    whole = certified.judge
+    whole = generation.validate
 
     def strict(hand: Any, obj: Any, grasps: GraspSet, **named: Any) -> Any:
         verdicts = whole(hand, obj, grasps, **named)
         return replace(verdicts, success=verdicts.success * (verdicts.margin < np.median(margins)).astype(np.int8))
 
     # A seed with which a second round is begun and not ended: five of six tried.
-    wish = REQUEST.model_copy(update={"audits": 0, "seed": 4})
-    margins = certified_grasps(*pair, wish, count=6, run=Run(threads=1)).columns["quality/verdict_margin"]
-    monkeypatch.setattr(certified, "judge", strict)
+    wish = REQUEST.model_copy(update={"rechecks": 0, "seed": 4})
+    margins = validated_grasps(*pair, wish, count=6, run=ExecutionContext(threads=1)).columns["quality/verdict_margin"]
+    monkeypatch.setattr(generation, "validate", strict)
     calls = noted(monkeypatch)
-    parts = certified_grasps(*pair, wish, count=6, run=Run(threads=1))
+    parts = validated_grasps(*pair, wish, count=6, run=ExecutionContext(threads=1))
     assert any(first > 0 or count < 8 for number, first, count in calls if number > 0)
-    monkeypatch.setattr(certified._Work, "_in_parts", False)
-    rounds = certified_grasps(*pair, wish, count=6, run=Run(threads=1))
+    monkeypatch.setattr(generation._Work, "_in_parts", False)
+    rounds = validated_grasps(*pair, wish, count=6, run=ExecutionContext(threads=1))
     assert parts.planned <= rounds.planned
     assert_same(parts, rounds)
 
@@ -106,54 +112,56 @@ def test_a_round_ends_as_soon_as_enough_are_found(pair, monkeypatch: pytest.Monk
 def test_a_lane_without_a_place_ends_blocked_where_another_has_one(
     pair, scenes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = certified.synthesize
+    whole = generation.synthesize
     refused: list[int] = []
 
-    def narrow(hand: Any, obj: Any, wanted: Wanted, *rest: Any, **named: Any) -> GraspSet:
+    def narrow(hand: Any, obj: Any, wanted: PlanRequest, *rest: Any, **named: Any) -> GraspSet:
         if wanted.first in without and not wanted.others_have_place:
             refused.append(wanted.first)
             raise NoPlace("no place")
         return whole(hand, obj, wanted, *rest, **named)
 
-    wish = REQUEST.model_copy(update={"want": "raw", "referee": "none"})
+    wish = REQUEST.model_copy(update={"want": "candidates", "validation": "none"})
     without: tuple[int, ...] = ()
-    free = certified_grasps(*pair, wish, count=COUNT, scenes=scenes, run=Run(threads=2))
-    monkeypatch.setattr(certified, "synthesize", narrow)
+    free = validated_grasps(*pair, wish, count=COUNT, scenes=scenes, run=ExecutionContext(threads=2))
+    monkeypatch.setattr(generation, "synthesize", narrow)
     without = (LANE,)
-    found = certified_grasps(*pair, wish, count=COUNT, scenes=scenes, run=Run(threads=2))
+    found = validated_grasps(*pair, wish, count=COUNT, scenes=scenes, run=ExecutionContext(threads=2))
     assert refused == [LANE]
     assert_same(found, free)
     without = (0, LANE)
     with pytest.raises(NoPlace):
-        certified_grasps(*pair, wish, count=COUNT, scenes=scenes, run=Run(threads=2))
+        validated_grasps(*pair, wish, count=COUNT, scenes=scenes, run=ExecutionContext(threads=2))
 
 
 @pytest.mark.parametrize("first", [0, 3])
 def test_grasps_from_one_of_a_batch_on_are_those_of_the_whole(pair, first: int) -> None:
-    whole = synthesize(*pair, Wanted(5, REQUEST.knobs, seed=2), Run(threads=1))
-    rest = synthesize(*pair, Wanted(5 - first, REQUEST.knobs, seed=2, first=first), Run(threads=2))
+    whole = synthesize(*pair, PlanRequest(5, REQUEST.knobs, seed=2), ExecutionContext(threads=1))
+    rest = synthesize(*pair, PlanRequest(5 - first, REQUEST.knobs, seed=2, first=first), ExecutionContext(threads=2))
     np.testing.assert_array_equal(rest.grasp.hand_pose, whole.grasp.hand_pose[first:])
     np.testing.assert_array_equal(rest.squeeze.joint_positions, whole.squeeze.joint_positions[first:])
 
 
 def test_the_first_valid_grasps_are_audited_whoever_finds_them(pair, one_lane, monkeypatch: pytest.MonkeyPatch) -> None:
     begun: list[int] = []
-    whole = certified._Work._begin_audits
+    whole = generation._Work._begin_rechecks
     monkeypatch.setattr(
-        certified._Work, "_begin_audits", lambda work, first: (begun.append(len(first.grasps)), whole(work, first))
+        generation._Work, "_begin_rechecks", lambda work, first: (begun.append(len(first.grasps)), whole(work, first))
     )
-    audited: list[GraspSet] = []
-    audit = certified._Work._audited
-    monkeypatch.setattr(certified._Work, "_audited", lambda work, some: (audited.append(some), audit(work, some))[1])
-    found = certified_grasps(*pair, REQUEST, count=COUNT, run=Run(threads=2))
-    assert len(begun) == len(audited) == 1
-    first = audited[0].moved(pair[1].centre)  # the engine works about the middle of the object
+    rechecked: list[GraspSet] = []
+    recheck = generation._Work._rechecked
+    monkeypatch.setattr(
+        generation._Work, "_rechecked", lambda work, some: (rechecked.append(some), recheck(work, some))[1]
+    )
+    found = validated_grasps(*pair, REQUEST, count=COUNT, run=ExecutionContext(threads=2))
+    assert len(begun) == len(rechecked) == 1
+    first = rechecked[0].moved(pair[1].centre)  # the engine works about the middle of the object
     np.testing.assert_array_equal(first.grasp.hand_pose, found.grasps.grasp.hand_pose[:2])
-    np.testing.assert_array_equal(found.columns["quality/audit"] >= 0, np.arange(COUNT) < 2)
-    np.testing.assert_array_equal(found.columns["quality/audit"], one_lane.columns["quality/audit"])
-    monkeypatch.setattr(certified._Work, "_begin_audits", lambda work, first: None)
-    late = certified_grasps(*pair, REQUEST, count=COUNT, run=Run(threads=2))
-    np.testing.assert_array_equal(found.columns["quality/audit"], late.columns["quality/audit"])
+    np.testing.assert_array_equal(found.columns["quality/recheck"] >= 0, np.arange(COUNT) < 2)
+    np.testing.assert_array_equal(found.columns["quality/recheck"], one_lane.columns["quality/recheck"])
+    monkeypatch.setattr(generation._Work, "_begin_rechecks", lambda work, first: None)
+    late = validated_grasps(*pair, REQUEST, count=COUNT, run=ExecutionContext(threads=2))
+    np.testing.assert_array_equal(found.columns["quality/recheck"], late.columns["quality/recheck"])
 
 
 @pytest.mark.parametrize(
@@ -174,7 +182,7 @@ def test_a_lane_that_ends_leaves_its_cores_to_the_others() -> None:
             super().leave()
             ended.set()
 
-    def work(part: int, run: Run) -> list[int]:
+    def work(part: int, run: ExecutionContext) -> list[int]:
         shared = run.cores
         both.wait()
         if part == 1:
@@ -183,38 +191,40 @@ def test_a_lane_that_ends_leaves_its_cores_to_the_others() -> None:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("graspd.worker.side_by_side.Lanes", Watched)
-        assert side_by_side([0, 1], work, Run(threads=4), size=lambda _: 1)[1] == [2, 4]
+        assert side_by_side([0, 1], work, ExecutionContext(threads=4), size=lambda _: 1)[1] == [2, 4]
 
 
 def test_a_lane_that_fails_stops_the_others() -> None:
     began = threading.Event()
 
-    def work(part: int, run: Run) -> None:
+    def work(part: int, run: ExecutionContext) -> None:
         if part == 0:
             assert began.wait(10)
             raise ValueError("the first")
         began.set()
         while True:
-            run.check("a lane")
+            run.check("a priority")
             threading.Event().wait(0.01)
 
     with pytest.raises(ValueError, match="the first"):
-        side_by_side([0, 1], work, Run(), size=lambda _: 1)
+        side_by_side([0, 1], work, ExecutionContext(), size=lambda _: 1)
 
 
 def test_lanes_tell_how_far_all_of_them_are() -> None:
     told: list[float] = []
 
-    def work(part: int, run: Run) -> None:
+    def work(part: int, run: ExecutionContext) -> None:
         run.progress(1.0, 1.0, "done")
 
-    side_by_side([0, 1, 2], work, Run(progress=lambda done, total, _: told.append(done / total)), size=lambda _: 2)
+    side_by_side(
+        [0, 1, 2], work, ExecutionContext(progress=lambda done, total, _: told.append(done / total)), size=lambda _: 2
+    )
     assert told[-1] == max(told) == pytest.approx(1.0) and len(told) == 3
 
 
 def test_lanes_are_cancelled_as_one() -> None:
-    def work(part: int, run: Run) -> None:
-        run.check("a lane")
+    def work(part: int, run: ExecutionContext) -> None:
+        run.check("a priority")
 
     with pytest.raises(TaskCancelled):
-        side_by_side([0, 1], work, Run(cancelled=lambda: True), size=lambda _: 1)
+        side_by_side([0, 1], work, ExecutionContext(cancelled=lambda: True), size=lambda _: 1)

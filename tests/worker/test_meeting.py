@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from graspd.service.model.errors import TaskCancelled
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.meeting import Meeting
-from graspd.worker.run import Run
 from tests.waiting import PATIENCE_S
 
 #: Long enough that no test sees its end.
@@ -56,13 +56,13 @@ def test_what_becomes_of_one_is_its_own() -> None:
 
 
 def test_work_that_fails_for_all_is_tried_for_each() -> None:
-    def fragile(items: Sequence[Any]) -> list[Any]:
+    def not_robust(items: Sequence[Any]) -> list[Any]:
         if 3 in items:
             raise ArithmeticError("three")
         return [2 * item for item in items]
 
     with Meeting(3, 100) as meeting:
-        first, second, third = asked(meeting, [2, 3, 4], fragile)
+        first, second, third = asked(meeting, [2, 3, 4], not_robust)
     assert (first, third) == (4, 8)
     assert isinstance(second, ArithmeticError)
 
@@ -145,7 +145,7 @@ def test_who_is_cancelled_waits_no_longer_and_is_not_served() -> None:
 
 def test_members_share_the_cores() -> None:
     meeting = Meeting(3, 100)
-    assert Run(threads=8, meeting=meeting).cores == 2
-    assert Run(threads=8, meeting=meeting).apart().cores == 8
+    assert ExecutionContext(threads=8, meeting=meeting).cores == 2
+    assert ExecutionContext(threads=8, meeting=meeting).apart().cores == 8
     meeting.leave()
-    assert Run(threads=8, meeting=meeting).cores == 4
+    assert ExecutionContext(threads=8, meeting=meeting).cores == 4

@@ -11,17 +11,17 @@ from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError, MeshError, TaskCancelled
 from graspd.service.model.fidelity import resolve_fidelity
 from graspd.worker import together
-from graspd.worker.certified import Certified, certified_grasps
 from graspd.worker.engines.joins import batches_at_once, fitting, parse_join
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.synthesis import synthesized
+from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.meeting import Meeting
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.pool.pool import MODULES, Pool
-from graspd.worker.run import Run
-from graspd.worker.together import certified_batches, distinct_batches
+from graspd.worker.together import distinct_batches, validated_batches
 
-REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), audits=0, grasps=6)
+REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), rechecks=0, grasps=6)
 
 
 @pytest.fixture(scope="module")
@@ -32,13 +32,13 @@ def pair():
 @pytest.fixture(scope="module")
 def alone(pair):
     """Batches done one after the other by this process."""
-    return certified_batches(*pair, REQUEST, sizes=[2, 2, 2], run=Run(threads=2))
+    return validated_batches(*pair, REQUEST, sizes=[2, 2, 2], run=ExecutionContext(threads=2))
 
 
 def assert_same(batches, others) -> None:
     for one, other in zip(batches, others, strict=True):
-        assert (one.tried, one.rejected, one.planned, one.verdict_key) == (
-            other.tried,
+        assert (one.candidates, one.rejected, one.planned, one.verdict_key) == (
+            other.candidates,
             other.rejected,
             other.planned,
             other.verdict_key,
@@ -60,8 +60,8 @@ def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(
 
     monkeypatch.setattr(together, "Meeting", Noted)
     told: list[tuple[float, float]] = []
-    run = Run(threads=2, progress=lambda done, total, message: told.append((done, total)))
-    joined = certified_batches(*pair, REQUEST, sizes=[2, 2, 2], join=3, run=run)
+    run = ExecutionContext(threads=2, progress=lambda done, total, message: told.append((done, total)))
+    joined = validated_batches(*pair, REQUEST, sizes=[2, 2, 2], join=3, run=run)
     assert launches[0].served[0] == 3, "the first launch has all three"
     assert_same(joined, alone)
     assert told[-1] == (6, 6)
@@ -71,26 +71,28 @@ def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(
 def test_batches_that_other_processes_judge_and_measure_are_the_same(pair, alone) -> None:
     told: list[tuple[float, float]] = []
     with Pool(2, MODULES) as pool:
-        run = Run(threads=2, pool=pool, progress=lambda done, total, message: told.append((done, total)))
-        assert_same(certified_batches(*pair, REQUEST, sizes=[2, 2, 2], join=2, run=run), alone)
+        run = ExecutionContext(threads=2, pool=pool, progress=lambda done, total, message: told.append((done, total)))
+        assert_same(validated_batches(*pair, REQUEST, sizes=[2, 2, 2], join=2, run=run), alone)
         assert len(pool.pids) == 2
     assert told[-1] == (6, 6)
 
 
 def test_grasps_alike_in_two_batches_are_replaced_by_those_of_another(pair) -> None:
-    request = REQUEST.model_copy(update={"referee": "none"})
-    first, third = (certified_batches(*pair, request, sizes=[size], run=Run(threads=2))[0] for size in (2, 3))
+    request = REQUEST.model_copy(update={"validation": "none"})
+    first, third = (
+        validated_batches(*pair, request, sizes=[size], run=ExecutionContext(threads=2))[0] for size in (2, 3)
+    )
     asked: list[tuple[int, int]] = []
 
-    def more(count: int, number: int) -> Certified:
+    def more(count: int, number: int) -> ValidatedBatch:
         asked.append((count, number))
-        return certified_grasps(*pair, request, count=count, batch=number, run=Run(threads=2))
+        return validated_grasps(*pair, request, count=count, batch=number, run=ExecutionContext(threads=2))
 
     found = distinct_batches(pair[0], request, [first, third], more)
     # The second batch begins as the first one does: two of its three are there already.
     assert asked == [(2, 2)] and [len(one.grasps) for one in found] == [2, 1, 2]
     assert found[1].rejected["alike"] == 2 and len(found[1].columns["quality/epsilon"]) == 1
-    raw = request.model_copy(update={"want": "raw"})
+    raw = request.model_copy(update={"want": "candidates"})
     assert distinct_batches(pair[0], raw, [first, third], more) == [first, third]
 
 
@@ -99,14 +101,16 @@ def test_what_becomes_of_one_batch_ends_the_job(pair) -> None:
         raise MeshError("no pieces")
 
     with pytest.raises(MeshError, match="no pieces"):
-        certified_batches(*pair, REQUEST, sizes=[2, 2], join=2, pieces=torn, run=Run(threads=1))  # type: ignore[arg-type]
+        validated_batches(*pair, REQUEST, sizes=[2, 2], join=2, pieces=torn, run=ExecutionContext(threads=1))  # type: ignore[arg-type]
 
 
 def test_a_job_that_is_cancelled_stops_all_its_batches(pair) -> None:
     told: list[str] = []
-    run = Run(threads=1, progress=lambda done, total, message: told.append(message), cancelled=lambda: bool(told))
+    run = ExecutionContext(
+        threads=1, progress=lambda done, total, message: told.append(message), cancelled=lambda: bool(told)
+    )
     with pytest.raises(TaskCancelled):
-        certified_batches(*pair, REQUEST, sizes=[2, 2], join=2, run=run)
+        validated_batches(*pair, REQUEST, sizes=[2, 2], join=2, run=run)
 
 
 def test_how_many_are_joined_where_nobody_says() -> None:

@@ -15,7 +15,7 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.jaws import jaws_of, slides
 from graspd.worker.hands.model import HandModel
 from graspd.worker.quality.contact import finger_of_body
-from graspd.worker.quality.posed import Posing
+from graspd.worker.quality.posed import PostureData
 from graspd.worker.simulation.kernels import distance, jamming, opening, optimizers
 from graspd.worker.simulation.launches import Launches, launch
 
@@ -70,7 +70,7 @@ def count_fingers(hand: HandModel) -> int:
 class Openings:
     """N hands in their grasps, opened together: dofs `q` (N, D), and where fingers go, `wide`; None: to be found."""
 
-    def __init__(self, posing: Posing, hand_pose: Floats, q: Floats, wide: Floats | None = None) -> None:
+    def __init__(self, posing: PostureData, hand_pose: Floats, q: Floats, wide: Floats | None = None) -> None:
         self.posing, self.hand_pose, self.q = posing, hand_pose, q
         self.count, self.fingers_count = len(q), count_fingers(posing.hand)
         with wp.ScopedDevice(posing.device):
@@ -156,7 +156,7 @@ class Openings:
                     ],
                     outputs=[back],
                 )
-                launch(jamming.judge_retreat, self.count, inputs=[PALM_CLEARANCE_M, step], outputs=[back])
+                launch(jamming.measure_retreat, self.count, inputs=[PALM_CLEARANCE_M, step], outputs=[back])
         poses = self.hand_pose.copy()
         away = np.array(RETREATS_M)[back.chosen.numpy()]
         poses[:, :3] -= away[:, None] * quat_rotate(poses[:, 3:], posing.hand.palm.approach)
@@ -206,7 +206,7 @@ class Openings:
             inputs=[posing.probe.skin, posing.points, self.fingers, posing.lane, CLEARANCE_M, self.bodies],
             outputs=[sweep],
         )
-        out.add(opening.judge_opening, self.count, inputs=[CLEARANCE_M, self.step], outputs=[sweep])
+        out.add(opening.measure_opening, self.count, inputs=[CLEARANCE_M, self.step], outputs=[sweep])
         out.add(optimizers.advance, 1, inputs=[], outputs=[self.step])
         out.run(OPENING_STEPS + 1)
 

@@ -17,14 +17,14 @@ from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import Floats
 from graspd.worker.control.jaw_squeeze import jaw_squeeze
 from graspd.worker.control.opening import Blocked, Openings, count_fingers, fingers_of_bodies, fingers_of_dofs
-from graspd.worker.control.squeeze import Holds, balanced
+from graspd.worker.control.squeeze import HoldForces, balanced
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.posed import posing_of
+from graspd.worker.simulation.environment import CLEAR_M, Placed
 from graspd.worker.simulation.obstacles import body_room, obstacle_room
-from graspd.worker.simulation.surroundings import CLEAR_M, Placed
 
 #: Distance that opening fingers keep from obstacles [m].
 ROOM_M: Final = 0.0025
@@ -32,7 +32,7 @@ ROOM_M: Final = 0.0025
 #: would sweep it away.
 WIDE: Final = 0.4
 
-#: Hand points that postures are judged by; those within so much of the object press on it [m], as many at most.
+#: Hand points that postures are validated by; those within so much of the object press on it [m], as many at most.
 _POINTS: Final = 600
 PRESSING_M: Final = 0.003
 MAX_PRESSING: Final = 16
@@ -117,7 +117,7 @@ def hold_forces(
     friction: float = FRICTION,
     closing: float = 0.0,
     device: str = "cpu",
-) -> Holds:
+) -> HoldForces:
     """Balanced contact forces of N grasps; `Holds.residual` predicts whether a grasp will hold. Fingers that touch
     nothing press with their points that are nearer than `closing` [m]."""
     posing = posing_of(hand, obj, points=_POINTS, device=device)

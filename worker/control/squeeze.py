@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
 from graspd.worker.grasps import Posture
-from graspd.worker.quality.posed import Posing
+from graspd.worker.quality.posed import PostureData
 from graspd.worker.quality.probe import FACING_COS
 from graspd.worker.simulation.kernels import balance as kernels
 from graspd.worker.simulation.kernels import touching
@@ -30,7 +30,7 @@ SUM: Final = 10.0
 
 
 @dataclass(frozen=True)
-class Holds:
+class HoldForces:
     """Balanced forces of N grasps."""
 
     residual: Floats
@@ -41,7 +41,7 @@ class Holds:
 
 
 def balanced(
-    posing: Posing,
+    posing: PostureData,
     grasp: Posture,
     *,
     total_normal_force: float,
@@ -49,7 +49,7 @@ def balanced(
     within: float,
     most: int,
     closing: float = 0.0,
-) -> Holds:
+) -> HoldForces:
     """Balanced contact forces of N grasps within the hand's torque limits.
 
     Where the torques exceed a limit all forces shrink together, so the balance stays.
@@ -64,7 +64,7 @@ def balanced(
         closing: points of a finger that has none so near press where they are nearer than this [m].
     """
     hand = posing.hand
-    found = Holds(np.ones(len(grasp)), np.zeros((len(grasp), hand.dofs)))
+    found = HoldForces(np.ones(len(grasp)), np.zeros((len(grasp), hand.dofs)))
     for rows in posing.parts(len(grasp)):
         residual, torque = _balanced(posing, grasp.take(rows), total_normal_force, friction, (within, closing), most)
         found.residual[rows], found.torque[rows] = residual.numpy(), torque.numpy()
@@ -72,7 +72,7 @@ def balanced(
 
 
 def _balanced(
-    posing: Posing, grasp: Posture, total: float, friction: float, reach: tuple[float, float], most: int
+    posing: PostureData, grasp: Posture, total: float, friction: float, reach: tuple[float, float], most: int
 ) -> tuple[Any, Any]:
     bodies, near = posing.touch(grasp, max(reach))
     count, points, radius = len(grasp), len(posing.probe.points), posing.probe.obj.radius
@@ -137,14 +137,14 @@ def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
         work.residual, work.wanted = (wp.empty((batch, rows), dtype=wp.float64) for _ in range(2))
         work.used = wp.empty((batch, columns), dtype=wp.int32)
         x = wp.empty((batch, columns), dtype=wp.float64)
-        sound = wp.empty(batch, dtype=wp.int32)
+        feasible = wp.empty(batch, dtype=wp.int32)
         launch(
             kernels.nonnegative,
             batch,
             inputs=[matrix, wp.array(target, dtype=wp.float64), wp.float64(ridge), count],
-            outputs=[work, x, sound],
+            outputs=[work, x, feasible],
         )
-    unsolved = np.flatnonzero(sound.numpy() == 0)
+    unsolved = np.flatnonzero(feasible.numpy() == 0)
     if len(unsolved):
         found, columns, used = x.numpy(), matrix.numpy(), count.numpy()
         for b in unsolved:

@@ -16,7 +16,7 @@ BYTES_PER_GRASP: Final = 2.5 * 2**20
 MEMORY_SHARE: Final = 0.5
 #: More batches of one pair than this seldom wait.
 MOST: Final = 64
-#: Batches at work for each one in a launch: while one half is on the device, the other is judged and measured.
+#: Batches at work for each one in a launch: while one half is on the device, the other is validated and measured.
 PER_LAUNCH: Final = 2
 
 

@@ -21,7 +21,7 @@ from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import ConflictError, GraspdError, InputError, NotFoundError
 from graspd.service.model.matter import FRICTION, MASS_KG
 from graspd.service.model.states import AssetKind
-from graspd.service.readers.ways import scene_spec_of
+from graspd.service.readers.trajectories import scene_spec_of
 from graspd.service.store.assets import builtin_files, builtin_names
 from graspd.service.store.columns import Attribute
 from graspd.service.store.library import load_asset_files
@@ -35,10 +35,10 @@ from graspd.worker.objects.formats import READERS
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import files_from_path as object_files
 from graspd.worker.objects.prepare import load_object, object_from_path
-from graspd.worker.scenes.beside import neighbour_of
 from graspd.worker.scenes.kinds import supports_of
 from graspd.worker.scenes.neighbours import Neighbours
-from graspd.worker.simulation.surroundings import Placed, Scenes
+from graspd.worker.scenes.placement import neighbour_of
+from graspd.worker.simulation.environment import Placed, Scenes
 
 #: What a file may be called that describes a hand or an object.
 SUFFIXES: Final = {AssetKind.HAND: (".urdf", ".xml", ".zip"), AssetKind.OBJECT: (*READERS, ".zip")}
@@ -51,7 +51,7 @@ _FILES: Final[dict[AssetKind, Callable[[Path], tuple[str, dict[str, bytes], dict
 
 
 @dataclass(frozen=True)
-class Sought:
+class AssetReference:
     """A hand or an object as a shard knows it."""
 
     kind: AssetKind
@@ -82,7 +82,7 @@ def remembered(hand: str, obj: str, options: Mapping[str, Any]) -> dict[str, Att
     return found | ({"object_options": json_attribute(dict(options))} if options else {})
 
 
-def find(sought: Sought) -> Found:
+def find(sought: AssetReference) -> Found:
     """The files of a hand or object: built in, at the path the shard notes, in the store, or in the shard's folder.
 
     Raises:
@@ -107,13 +107,13 @@ def find(sought: Sought) -> Found:
     )
 
 
-def _paths(sought: Sought, looked: list[str]) -> Iterator[Path]:
+def _paths(sought: AssetReference, looked: list[str]) -> Iterator[Path]:
     if sought.source:
         looked.append(f"at {sought.source}, where the shard was made")
         yield Path(sought.source)
 
 
-def _stored(sought: Sought, looked: list[str]) -> Found | None:
+def _stored(sought: AssetReference, looked: list[str]) -> Found | None:
     from graspd.service.settings import Settings
 
     url = Settings().resolved_store_url
@@ -124,7 +124,7 @@ def _stored(sought: Sought, looked: list[str]) -> Found | None:
         return None
 
 
-def _beside(sought: Sought, looked: list[str]) -> Iterator[Path]:
+def _beside(sought: AssetReference, looked: list[str]) -> Iterator[Path]:
     if sought.folder is None:
         return
     looked.append(f"in {sought.folder}")
@@ -133,7 +133,7 @@ def _beside(sought: Sought, looked: list[str]) -> Iterator[Path]:
     yield from (path for _, path in zip(range(LOOKED_AT), fitting, strict=False))
 
 
-def at(sought: Sought, path: Path) -> Found | None:
+def at(sought: AssetReference, path: Path) -> Found | None:
     """The files at a path, if they are what is sought."""
     try:
         if not path.is_file():
@@ -208,15 +208,15 @@ def _object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
     return obj
 
 
-def _loaded(wanted: Sought, found: Found, face_error_m: float) -> ObjectModel:
+def _loaded(wanted: AssetReference, found: Found, face_error_m: float) -> ObjectModel:
     return load_object(
         found.files, name=wanted.name, digest=wanted.digest, face_error_m=face_error_m, options=found.options
     )
 
 
-def _wanted(shard: Shard, kind: AssetKind) -> Sought:
+def _wanted(shard: Shard, kind: AssetKind) -> AssetReference:
     said = shard.attributes
-    return Sought(
+    return AssetReference(
         kind,
         str(said.get(kind.value, "")),
         str(said.get(f"{kind.value}_digest", "")),
@@ -267,7 +267,7 @@ def beside_attributes(others: Sequence[ObjectModel], given: Sequence[str]) -> di
 
 def _neighbour(shard: Shard, name: str, digest: str, source: str) -> ObjectModel:
     folder = None if shard.path is None else shard.path.resolve().parent
-    wanted = Sought(AssetKind.OBJECT, name, digest, source, folder=folder)
+    wanted = AssetReference(AssetKind.OBJECT, name, digest, source, folder=folder)
     return _loaded(wanted, find(wanted), NEIGHBOUR_FACE_ERROR_M)
 
 
@@ -334,18 +334,18 @@ def base_attributes(
     obj: ObjectModel,
     request: JobOptions,
     *,
-    tried: int,
+    candidates: int,
     verdict_key: str | None,
     outcomes: Mapping[str, int] = MappingProxyType({}),
 ) -> dict[str, Attribute]:
-    """The hand's joints, what was asked for, in which scene, how many grasps were tried, and who judged them.
+    """The hand's joints, what was asked for, in which scene, how many grasps were tried, and who validated them.
 
     Args:
         hand: the hand.
-        obj: the object as it was judged.
-        request: friction, want, referee and scene.
-        tried: grasps tried until the last one kept.
-        verdict_key: digest of the terms of the verdicts; None: nobody judged.
+        obj: the object as it was validated.
+        request: friction, want, validator and scene.
+        tried: candidates until the last one kept.
+        verdict_key: digest of the terms of the verdicts; None: not validated.
         outcomes: tries that were not kept, by what became of them.
     """
     said: dict[str, Attribute] = {
@@ -355,7 +355,7 @@ def base_attributes(
         "object_mass_kg": obj.mass,
         "object_friction": obj.friction,
         "want": request.want,
-        "tried": tried,
+        "candidates": candidates,
     }
     if outcomes:
         said["outcomes"] = json_attribute(dict(outcomes))
@@ -365,7 +365,7 @@ def base_attributes(
         said["robust"] = json_attribute({"models": request.models, "wanted": request.robust})
     if verdict_key is None:
         return said | {"verdict_level": "none"}
-    return said | {"verdict_level": request.referee, "verdict_key": verdict_key}
+    return said | {"verdict_level": request.validation, "verdict_key": verdict_key}
 
 
 def wrist_attributes(hand: HandModel) -> dict[str, Attribute]:

@@ -90,36 +90,37 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
     return Subset(looked_at, kept, files, len(shards) - len(shards.of("base")))
 
 
-UnjudgedOption = Annotated[
-    bool, typer.Option("--unjudged", help="Instead of valid grasps those that are sound and that nobody judged.")
+UnvalidatedOption = Annotated[
+    bool,
+    typer.Option("--unvalidated", help="Instead of valid grasps those that are feasible and that are not validated."),
 ]
 EveryOption = Annotated[bool, typer.Option("--all", help="All grasps, also those that failed.")]
 
 
-def choose(base: Shard, *, unjudged: bool = False, every: bool = False) -> tuple[NDArray[np.bool_], str]:
+def choose(base: Shard, *, unvalidated: bool = False, every: bool = False) -> tuple[NDArray[np.bool_], str]:
     """(N,) the grasps that are taken, and what they are called.
 
     Raises:
         InputError: both wishes at once, or there is no such grasp; tells what there is.
     """
-    if unjudged and every:
-        raise InputError("--unjudged and --all exclude each other")
+    if unvalidated and every:
+        raise InputError("--unvalidated and --all exclude each other")
     count = len(base["quality/valid"])
     if every:
         mask, word = np.ones(count, bool), "grasps of any kind"
     else:
-        mask = validity.chosen(base.arrays, unjudged=unjudged)
-        word = "sound grasps that nobody judged" if unjudged else "valid grasps"
+        mask = validity.chosen(base.arrays, unvalidated=unvalidated)
+        word = "feasible grasps that are not validated" if unvalidated else "valid grasps"
     if not mask.any():
         raise InputError(f"{base.path or 'the shard'} holds no {word}; {_there_are(base, count)}")
     return mask, word
 
 
 def _there_are(base: Shard, count: int) -> str:
-    waiting = int(validity.chosen(base.arrays, unjudged=True).sum())
+    waiting = int(validity.chosen(base.arrays, unvalidated=True).sum())
     valid = int(validity.valid(base.arrays).sum())
     if waiting:
-        return f"{waiting} of its {count} are sound and were judged by nobody: take them with --unjudged"
+        return f"{waiting} of its {count} are feasible and were validated by nobody: take them with --unvalidated"
     if valid:
-        return f"{valid} of its {count} are valid: leave out --unjudged"
+        return f"{valid} of its {count} are valid: leave out --unvalidated"
     return f"all {count} failed: take them with --all" if count else "it has no grasp at all"

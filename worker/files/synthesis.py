@@ -19,9 +19,9 @@ from graspd.service.model.planning import shortfall, totals
 from graspd.service.model.scene_spec import MOST_SCENES, SceneSpec
 from graspd.service.store.columns import Attribute
 from graspd.service.store.shards import json_attribute
-from graspd.worker.certified import Certified, certified_grasps
 from graspd.worker.engines.devices import Device
 from graspd.worker.engines.joins import batches_at_once, parse_join
+from graspd.worker.execution_context import ExecutionContext, PrefilterMode, Progress
 from graspd.worker.files.provenance import (
     NEIGHBOUR_FACE_ERROR_M,
     base_attributes,
@@ -29,6 +29,7 @@ from graspd.worker.files.provenance import (
     remembered,
     wrist_attributes,
 )
+from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.grasps import joined_columns
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
@@ -37,10 +38,9 @@ from graspd.worker.objects.options import as_asked
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import planner
 from graspd.worker.pool.pool import MODULES, Pool, processes_at_once
-from graspd.worker.run import FirstJudge, Progress, Run
-from graspd.worker.scenes.beside import scenes_of
+from graspd.worker.scenes.placement import scenes_of
 from graspd.worker.scenes.rest import rolling_poses
-from graspd.worker.together import certified_batches, distinct_batches
+from graspd.worker.together import distinct_batches, validated_batches
 from graspd.worker.validation.payload import Limit
 
 Arrays = dict[str, NDArray[Any]]
@@ -52,12 +52,12 @@ _KEPT: Final = ("scene/object_pose", "scene/rest_probability", "scene/neighbour_
 
 
 @dataclass(frozen=True)
-class Synthesized:
-    """A base shard in memory, and what became of all tries."""
+class SynthesisResult:
+    """A base shard in memory, and what became of all candidates."""
 
     arrays: Arrays
     attributes: dict[str, Attribute]
-    batches: list[Certified]
+    batches: list[ValidatedBatch]
     request: JobOptions
     place: SceneSpec
     interrupted: bool
@@ -78,7 +78,7 @@ class Synthesized:
             len(self.arrays["quality/valid"]),
             request.grasps,
             request.counted,
-            sum(batch.tried for batch in self.batches),
+            sum(batch.candidates for batch in self.batches),
             request.budget,
             totals(batch.outcomes for batch in self.batches),
             limit.line if limit is not None and limit.hopeless else "",
@@ -89,7 +89,7 @@ class Synthesized:
 
     @property
     def narrow(self) -> str | None:
-        """The geometric reason where nothing is valid, raw grasps or none; None: there is none."""
+        """The geometric reason where nothing is valid, candidates or none; None: there is none."""
         return None if self.arrays["quality/valid"].any() else self.batches[0].narrow
 
     @property
@@ -102,10 +102,10 @@ class Synthesized:
         count, request = len(self.arrays["quality/valid"]), self.request
         told: dict[str, Any] = {
             "grasps": count,
-            "tried": sum(batch.tried for batch in self.batches),
+            "candidates": sum(batch.candidates for batch in self.batches),
             "valid": int(self.arrays["quality/valid"].sum()),
-            "sound": int(self.arrays["quality/sound"].sum()),
-            "referee": request.referee,
+            "feasible": int(self.arrays["quality/feasible"].sum()),
+            "validation": request.validation,
             "mass_kg": self.attributes["object_mass_kg"],
             "object_friction": self.attributes["object_friction"],
             "want": request.want,
@@ -133,7 +133,7 @@ class Synthesized:
                 "robust_models": request.models,
                 "robust_wanted": request.robust,
                 "robust_share": self._mean("robust_share", 4),
-                "fragile": sum(batch.rejected.get("fragile", 0) for batch in self.batches),
+                "not_robust": sum(batch.rejected.get("not_robust", 0) for batch in self.batches),
             }
         if self.place.kind != "free":
             told |= {"scene": self.place.kind, "scenes": len(self.arrays["scene/object_pose"])} | self._shares()
@@ -188,19 +188,19 @@ def synthesized(
     mesh: Mapping[str, Any] | None = None,
     device: str = "auto",
     threads: int = 0,
-    first_judge: FirstJudge = "auto",
+    prefilter: PrefilterMode = "auto",
     join: int | str = "auto",
     processes: int = 0,
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
     partial: bool = False,
-) -> Synthesized:
+) -> SynthesisResult:
     """The grasps of a job in one process, without a queue or a server.
 
     Args:
         hand: a URDF, a ZIP with one, or the name of a built-in hand.
         obj: a mesh or the name of a built-in object.
-        request: how many grasps, how made and judged.
+        request: how many grasps, how made and validated.
         place: where they are used.
         scenes: scenes that the grasps are shared out to.
         mesh: how the object's file is read: units, scale_to, keep_largest, allow_open.
@@ -208,14 +208,14 @@ def synthesized(
         threads: CPU threads; 0: one per core.
         first_judge: whether MuJoCo Warp gives the clear verdicts; auto: on a GPU, where it is installed.
         join: batches of 32 whose grasps are planned in one launch, or auto; the grasps are the same.
-        processes: that judge and measure; 1: this one; 0: on a GPU one for each core less one, else 1.
+        processes: that validate and measure; 1: this one; 0: on a GPU one for each core less one, else 1.
         progress: told of the grasps that are done, and of how many.
         cancelled: asked often; True: the work stops.
-        partial: if it is stopped, what was judged before is the result.
+        partial: if it is stopped, what was validated before is the result.
 
     Raises:
         InputError: unknown method, option, hand, object or device, or a scene without room.
-        TaskCancelled: `cancelled` answered True; with `partial`, before anything was judged.
+        TaskCancelled: `cancelled` answered True; with `partial`, before anything was validated.
     """
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
     if place.kind != "free" and not 1 <= scenes <= MOST_SCENES:
@@ -235,19 +235,19 @@ def synthesized(
     if place.kind != "free":
         where, poses = scenes_of(place, thing, others, count=scenes, seed=request.seed)
     sizes = [min(BATCH_SIZE, request.grasps - first) for first in range(0, request.grasps, BATCH_SIZE)]
-    run = Run(chosen, threads, first_judge=first_judge)
+    run = ExecutionContext(chosen, threads, prefilter=prefilter)
     run = run if progress is None else replace(run, progress=progress)
     run = run if cancelled is None else replace(run, cancelled=cancelled)
     joined = batches_at_once(chosen, wanted)
     with _pool(processes_at_once(chosen, processes, threads=threads)) as pool:
         run = replace(run, pool=pool)
-        batches = certified_batches(
+        batches = validated_batches(
             model, thing, request, sizes=sizes, join=joined, scenes=where, run=run, partial=partial
         )
 
-        def more(count: int, number: int) -> Certified | None:
+        def more(count: int, number: int) -> ValidatedBatch | None:
             try:
-                return certified_grasps(
+                return validated_grasps(
                     model, thing, request, count=count, batch=number, scenes=where, run=run.quiet(), partial=partial
                 )
             except TaskCancelled:
@@ -267,7 +267,7 @@ def synthesized(
         attributes |= {"scene": json_attribute(_as_stored(place, others))} | wrist_attributes(model)
         attributes |= beside_attributes(others, [one.object for one in place.neighbours])
     rolling = rolling_poses(thing, poses["scene/object_pose"]) if poses and place.target is None else 0
-    made = Synthesized(arrays, attributes, batches, request, place, interrupted, seconds, rolling)
+    made = SynthesisResult(arrays, attributes, batches, request, place, interrupted, seconds, rolling)
     if made.reason is not None:
         attributes["reason"] = made.reason
     return made
@@ -313,7 +313,7 @@ def chosen_fidelity(name: str, contact_solver: str = "") -> Fidelity:
 
 
 def _attributes(
-    hand: HandModel, obj: ObjectModel, request: JobOptions, batches: list[Certified], device: str, seconds: float
+    hand: HandModel, obj: ObjectModel, request: JobOptions, batches: list[ValidatedBatch], device: str, seconds: float
 ) -> dict[str, Attribute]:
     attributes: dict[str, Attribute] = {
         "hand": hand.name,
@@ -327,8 +327,8 @@ def _attributes(
         "device": device,
         "seconds": round(seconds, 4),
     }
-    tried = sum(batch.tried for batch in batches)
+    candidates = sum(batch.candidates for batch in batches)
     outcomes = totals(batch.outcomes for batch in batches)
     return attributes | base_attributes(
-        hand, obj, request, tried=tried, verdict_key=batches[0].verdict_key, outcomes=outcomes
+        hand, obj, request, candidates=candidates, verdict_key=batches[0].verdict_key, outcomes=outcomes
     )

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 
 from graspd.service.model.errors import AssetError, InputError
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.hands.closing import chains_of
 from graspd.worker.hands.guess import approach_is_tied
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.load import assemble, assumed_efforts, main_file, mounting_of
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.oppositions import require_opposing
 from graspd.worker.hands.options import HandOptions, parse_options
+from graspd.worker.hands.pinch_postures import require_opposing
 from graspd.worker.hands.robot import Robot, chain_to
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.hands.tree import build_tree, cut_drives, joints_above, passed_limits
 from graspd.worker.hands.xacro import read_robot
-from graspd.worker.run import ALONE, Run
 
 #: Points with which the outer surface is measured.
 _SURFACE_POINTS = 512
@@ -28,7 +28,10 @@ TIED = "approach (a tie)"
 
 
 def check_hand(
-    files: Mapping[str, bytes], name: str, options: Mapping[str, Any] | None = None, run: Run = ALONE
+    files: Mapping[str, bytes],
+    name: str,
+    options: Mapping[str, Any] | None = None,
+    run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> dict[str, Any]:
     """What `load_hand` makes of these files; `run` is told of which link the shapes are made.
 

@@ -16,6 +16,7 @@ from graspd.service.model.states import AssetKind
 from graspd.service.model.transforms import Floats, compose
 from graspd.service.store.assets import builtin_files, builtin_names, unpack_file, without_common_folder
 from graspd.service.store.hand_files import files_of_hand, hand_name, main_of
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.hands import collisions, guess, primitives, shapes
 from graspd.worker.hands.collisions import resting_neighbours
 from graspd.worker.hands.guess import complete
@@ -38,7 +39,6 @@ from graspd.worker.hands.tree import Tree, build_tree, joint_type
 from graspd.worker.hands.visuals import PlacedShape, Visuals
 from graspd.worker.hands.xacro import read_robot
 from graspd.worker.objects.disk_cache import recalling
-from graspd.worker.run import ALONE, Run
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ def load_hand(
         drag: whether its joints have the armature and the dry friction that the files state.
 
     Raises:
-        HandError: the files describe no usable hand; the message names what is wrong and the mend.
+        HandError: the files describe no usable hand; the message names what is wrong and the fix.
     """
     settings = parse_options(files, options)
     main = main_file(files, settings)
@@ -77,7 +77,7 @@ def assemble(
     *,
     name: str,
     digest: str,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> HandModel:
     """The model of a checked robot and options. Raises TaskCancelled where `run` is cancelled."""
     tree = build_tree(robot, options)
@@ -92,7 +92,12 @@ def assemble(
 
 
 def mounting_of(
-    robot: Robot, options: HandOptions, files: Mapping[str, bytes], main: str, hand: HandModel, run: Run = ALONE
+    robot: Robot,
+    options: HandOptions,
+    files: Mapping[str, bytes],
+    main: str,
+    hand: HandModel,
+    run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> tuple[HandModel | None, str]:
     """The links above the hand's root, None where there are none; and why their shapes cannot be read, in words:
     faults above a hand do not refuse it."""
@@ -122,7 +127,7 @@ def body_model(
     *,
     name: str,
     digest: str,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> HandModel:
     """Bodies, joints and pieces of a tree, without what makes them a hand: palm, fingers, closing, neighbours.
 
@@ -182,7 +187,7 @@ def main_file(files: Mapping[str, bytes], options: HandOptions) -> str:
 
 
 def _pieces(
-    robot: Robot, tree: Tree, files: Mapping[str, bytes], base: str, as_it_looks: bool, run: Run
+    robot: Robot, tree: Tree, files: Mapping[str, bytes], base: str, as_it_looks: bool, run: ExecutionContext
 ) -> tuple[ConvexPiece, ...]:
     """Of the collision elements; or, as it looks, of a link's visual ones, where it has both."""
     pieces, hulls = [], Hulls()

@@ -143,7 +143,7 @@ class HandModel:
     tendons: tuple[Tendon, ...] = field(default=(), metadata=TOLD_IF_SET)
     """Drives of several dofs, none on two; the other dofs have a drive each."""
     drag: Drag | None = field(default=None, metadata=TOLD_IF_SET)
-    """None: the referee's joints have none, as the protocol says."""
+    """None: the validator's joints have none, as the protocol says."""
     mounting: HandModel | None = field(default=None, metadata=TOLD_IF_SET)
     """Links above the root that stay clear in scenes, as a tree of bodies and wrist joints that starts at the root; see
     `worker.hands.mounting`."""

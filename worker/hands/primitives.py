@@ -169,8 +169,8 @@ def signed_distance(kind: str, size: tuple[float, ...], vertices: Floats, faces:
             normals = np.cross(b - a, c - a)
             lengths = np.linalg.norm(normals, axis=1)
             # A sliver of the triangulation has no direction of its own.
-            sound = lengths > 1e-9 * lengths.max()
-            normals, a = normals[sound] / lengths[sound, None], a[sound]
+            feasible = lengths > 1e-9 * lengths.max()
+            normals, a = normals[feasible] / lengths[feasible, None], a[feasible]
             return (points @ normals.T - np.einsum("ij,ij->i", normals, a)).max(axis=1)
 
 

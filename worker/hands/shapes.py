@@ -22,7 +22,7 @@ from graspd.worker.hands.model import ConvexPiece
 from graspd.worker.hands.primitives import hull, new_hull, signed_distance, tessellate, triangle_areas, volume
 from graspd.worker.hands.robot import Ints, Shape
 from graspd.worker.hands.visuals import find_mesh
-from graspd.worker.objects.convex import TooMuchWork, coacd_parts, default_cache, keep_parts, load_parts
+from graspd.worker.objects.convex import WorkLimitExceeded, coacd_parts, default_cache, keep_parts, load_parts
 from graspd.worker.objects.disk_cache import recalled
 from graspd.worker.objects.formats import read_mesh
 
@@ -199,7 +199,7 @@ def _decomposed(vertices: Floats, faces: Ints) -> tuple[tuple[Floats, ...], bool
             break
         try:
             made = coacd_parts(*light, {"threshold": threshold, **_COACD}, _CPU_S)
-        except TooMuchWork as limit:
+        except WorkLimitExceeded as limit:
             # Other shapes than those of a faster machine would be another hand.
             raise HandError(f"taking the mesh apart into convex pieces needs {limit}; simplify it") from None
         sure &= bool(made)

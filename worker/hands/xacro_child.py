@@ -1,7 +1,7 @@
 """Xacro in a process of its own: `python -m graspd.worker.hands.xacro_child` reads a JSON object and writes one.
 
 Three fences, because expressions in xacro are Python and what guards them in the library can be climbed: names that
-lead out of an expression are refused; an audit hook refuses whatever would touch files, processes or the network; and
+lead out of an expression are refused; a recheck hook refuses whatever would touch files, processes or the network; and
 the kernel gives this process no new file descriptor, without which neither a file nor a socket nor a program opens.
 """
 

@@ -10,7 +10,7 @@ import numpy as np
 from graspd.service.model.errors import AssetError, InputError
 from graspd.worker.objects.options import ObjectOptions, parse_options
 from graspd.worker.objects.prepare import build, main_file, repaired_mesh, weighed
-from graspd.worker.objects.repair import Repaired
+from graspd.worker.objects.repair import RepairedMesh
 
 #: Bound with which the prepared mesh of the report is simplified [m]: that of the standard fidelity.
 REPORT_ERROR_M = 3e-4
@@ -54,7 +54,7 @@ def check_object(
     return {"verdict": verdict, "message": "; ".join(parts), "repairs": list(mesh.repairs), "facts": facts}
 
 
-def _facts(mesh: Repaired, face_error_m: float, options: ObjectOptions) -> dict[str, Any]:
+def _facts(mesh: RepairedMesh, face_error_m: float, options: ObjectOptions) -> dict[str, Any]:
     model = weighed(build(mesh, face_error_m), options)
     away, extents = float(np.linalg.norm(mesh.centre)), np.ptp(mesh.vertices, axis=0)
     notes = list(mesh.notes)

@@ -24,7 +24,7 @@ from graspd.service.model.transforms import Floats
 log = logging.getLogger(__name__)
 
 
-class TooMuchWork(Exception):
+class WorkLimitExceeded(Exception):
     """A decomposition needs more computing than it is given."""
 
 
@@ -51,7 +51,7 @@ def coacd_parts(vertices: Floats, faces: NDArray[Any], options: Mapping[str, Any
         done = subprocess.run(command, input=given.getvalue(), capture_output=True, check=True)
     except subprocess.CalledProcessError as error:
         if error.returncode == -signal.SIGXCPU:
-            raise TooMuchWork(f"more than {cpu_s} s of computing") from None
+            raise WorkLimitExceeded(f"more than {cpu_s} s of computing") from None
         if error.returncode == -signal.SIGKILL:
             raise OSError("CoACD was killed; the machine may lack memory") from None
         log.warning("CoACD failed: %s", error.stderr.decode(errors="replace").strip()[-200:] or error.returncode)

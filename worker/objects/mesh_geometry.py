@@ -174,7 +174,7 @@ LEAST_DIGITS: Final = 5
 
 
 @dataclass(frozen=True)
-class Centred:
+class CentredMesh:
     """The points of a mesh about the middle of their bounding box, in the units of its file."""
 
     points: Floats
@@ -185,7 +185,7 @@ class Centred:
     """Distance of two neighbouring numbers of the file where the mesh lies."""
 
 
-def centred(points: Floats) -> Centred:
+def centred(points: Floats) -> CentredMesh:
     """Points (V, 3) about their middle, rounded so that they do not depend on where the origin lies.
 
     Where all coordinates are decimals as far as the file's numbers tell, they become these decimals: a mesh of decimals
@@ -206,7 +206,7 @@ def centred(points: Floats) -> Centred:
     steps = np.rint(steps)
     ends = steps.min(axis=0) + steps.max(axis=0)
     # Twice the distance from the middle in whole steps: one division rounds, so it gives the same for every scale.
-    return Centred((2 * steps - ends) / (2 * scale), low + ends / (2 * scale), resolution)
+    return CentredMesh((2 * steps - ends) / (2 * scale), low + ends / (2 * scale), resolution)
 
 
 def carried(pose: ArrayLike, by: ArrayLike) -> Floats:

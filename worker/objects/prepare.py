@@ -33,7 +33,7 @@ from graspd.worker.objects.formats import READERS, read_mesh
 from graspd.worker.objects.mesh_geometry import corner_normals, mass_properties, signed_volume
 from graspd.worker.objects.model import Ints, ObjectModel
 from graspd.worker.objects.options import OF_MATTER, ObjectOptions, parse_options
-from graspd.worker.objects.repair import Repaired, repair
+from graspd.worker.objects.repair import RepairedMesh, repair
 from graspd.worker.objects.topology import Indices
 
 #: Names of files that say nothing of what is in them: the objects of such a set differ by their folders.
@@ -55,7 +55,7 @@ def load_object(
         options: keys that go over those of `asset.json`.
 
     Raises:
-        MeshError: the mesh cannot be used; the message names what is wrong and the mend.
+        MeshError: the mesh cannot be used; the message names what is wrong and the fix.
     """
     settings = parse_options(files, options)
     main = main_file(files, settings)
@@ -94,13 +94,13 @@ def _prepared(main: str, data: bytes, options_json: str, face_error_m: float) ->
     )
 
 
-def repaired_mesh(main: str, data: bytes, options: ObjectOptions) -> Repaired:
+def repaired_mesh(main: str, data: bytes, options: ObjectOptions) -> RepairedMesh:
     """The mesh of a file as a solid in metres; errors name the file."""
     return _repaired(main, data, options.model_dump_json())
 
 
 @lru_cache(maxsize=2)
-def _repaired(main: str, data: bytes, options_json: str) -> Repaired:
+def _repaired(main: str, data: bytes, options_json: str) -> RepairedMesh:
     """Kept for a while: it is the same for every bound of the simplification."""
     soup = read_mesh(main, data)
     try:
@@ -109,7 +109,7 @@ def _repaired(main: str, data: bytes, options_json: str) -> Repaired:
         raise MeshError(f"{main}: {error}", facts=error.facts) from None
 
 
-def build(mesh: Repaired, face_error_m: float) -> ObjectModel:
+def build(mesh: RepairedMesh, face_error_m: float) -> ObjectModel:
     """The model of a repaired mesh."""
     vertices, faces, error = simplify(mesh.vertices, mesh.faces, face_error_m, closed=mesh.watertight)
     hull_vertices, hull_faces = convex_hull(vertices)
@@ -254,22 +254,22 @@ def simplify(vertices: Floats, faces: Indices, error_m: float, *, closed: bool =
     if error_m <= 0 or len(faces) <= FEW_FACES:
         return vertices, faces, 0.0
     limit = MARGIN * error_m
-    original = Original(vertices, faces, closed)
+    original = ReferenceMesh(vertices, faces, closed)
     if len(faces) > MANY_FACES:
         # A fifth of the error buys a mesh that is quick to compare with; by the triangle inequality the rest remains.
-        start = _trial(original, MANY_FACES, limit / 5)
+        start = _rollout(original, MANY_FACES, limit / 5)
         if start is not None:
-            original, limit = Original(*start, closed), limit * 4 / 5
+            original, limit = ReferenceMesh(*start, closed), limit * 4 / 5
     accepted: list[Mesh] = []
     low, high = float(FEW_FACES), float(len(original.faces))
     while high / low > STEP:
         target = round(math.sqrt(low * high))
-        trial = _trial(original, target, limit)
-        if trial is None:
+        rollout = _rollout(original, target, limit)
+        if rollout is None:
             low = target
         else:
             high = target
-            accepted.append(trial)
+            accepted.append(rollout)
     if not accepted and closed:
         accepted = _thinned(original, limit)
     for mesh in reversed(accepted):
@@ -279,7 +279,7 @@ def simplify(vertices: Floats, faces: Indices, error_m: float, *, closed: bool =
     return vertices, faces, 0.0
 
 
-class Original:
+class ReferenceMesh:
     """The mesh that trials are held against; what is asked of it many times is computed once."""
 
     def __init__(self, vertices: Floats, faces: Indices, closed: bool) -> None:
@@ -314,8 +314,8 @@ class Original:
         return surface_points(*mesh, SAMPLES)
 
 
-def _trial(original: Original, target: int, error_m: float) -> Mesh | None:
-    """A mesh of about `target` faces if it is sound and within the bound.
+def _rollout(original: ReferenceMesh, target: int, error_m: float) -> Mesh | None:
+    """A mesh of about `target` faces if it is feasible and within the bound.
 
     A collapse that broke the surface at one count often does not at the next, so a few are tried.
     """
@@ -349,7 +349,7 @@ def _collapse(vertices: Floats, faces: Indices, target: int) -> Mesh | None:
     return mesh
 
 
-def _thinned(original: Original, error_m: float) -> list[Mesh]:
+def _thinned(original: ReferenceMesh, error_m: float) -> list[Mesh]:
     whole = mesh_geometry.to_manifold(original.vertices, original.faces)
     if whole is None:
         return []

@@ -18,7 +18,7 @@ from graspd.worker.objects import mesh_geometry, topology
 from graspd.worker.objects.distance import MeshDistance, surface_points
 from graspd.worker.objects.formats import Soup
 from graspd.worker.objects.intersections import crossings, untangle
-from graspd.worker.objects.mesh_geometry import Centred, centred, signed_volume
+from graspd.worker.objects.mesh_geometry import CentredMesh, centred, signed_volume
 from graspd.worker.objects.options import UNITS, ObjectOptions
 from graspd.worker.objects.topology import Indices
 
@@ -46,7 +46,7 @@ _SAMPLES: Final = 4000
 
 
 @dataclass(frozen=True)
-class Repaired:
+class RepairedMesh:
     """A mesh in metres with the names of what was changed and of what is odd but right."""
 
     vertices: Floats
@@ -63,15 +63,15 @@ class Repaired:
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The middle in the file's frame [m]."""
 
-    def but(self, vertices: Floats, faces: Indices, repair: str) -> Repaired:
+    def but(self, vertices: Floats, faces: Indices, repair: str) -> RepairedMesh:
         return replace(self, vertices=vertices, faces=faces, repairs=(*self.repairs, repair))
 
 
-def repair(soup: Soup, options: ObjectOptions) -> Repaired:
+def repair(soup: Soup, options: ObjectOptions) -> RepairedMesh:
     """The soup as a solid in metres.
 
     Raises:
-        MeshError: wrong units, no volume, holes, several components; the message says the mend.
+        MeshError: wrong units, no volume, holes, several components; the message says the fix.
     """
     try:
         given = _to_metres(soup, options)
@@ -87,7 +87,7 @@ def repair(soup: Soup, options: ObjectOptions) -> Repaired:
     return replace(mesh, moved_m=moved)
 
 
-def _solid(mesh: Repaired, options: ObjectOptions) -> Repaired:
+def _solid(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
     mesh = _close(_clean(mesh))
     if not topology.is_closed(mesh.faces):
         return _open(mesh, options)
@@ -103,7 +103,7 @@ def _solid(mesh: Repaired, options: ObjectOptions) -> Repaired:
     return mesh
 
 
-def _to_metres(soup: Soup, options: ObjectOptions) -> Repaired:
+def _to_metres(soup: Soup, options: ObjectOptions) -> RepairedMesh:
     used, inverse = np.unique(soup.faces, return_inverse=True)
     given, faces, unit = centred(soup.vertices[used]), inverse.reshape(-1, 3), UNITS[options.units]
     extents = np.ptp(given.points, axis=0) * unit
@@ -125,10 +125,10 @@ def _to_metres(soup: Soup, options: ObjectOptions) -> Repaired:
         )
     notes = (_coarse(given, unit),) if given.resolution * unit > COARSE_M else ()
     x, y, z = (float(value) for value in on_grid(given.centre * unit))
-    return Repaired(given.points * unit, faces, notes=notes, centre=(x, y, z))
+    return RepairedMesh(given.points * unit, faces, notes=notes, centre=(x, y, z))
 
 
-def _coarse(given: Centred, unit: float) -> str:
+def _coarse(given: CentredMesh, unit: float) -> str:
     return (
         f"the mesh lies {float(np.linalg.norm(given.centre)) * unit:.4g} m from its origin, where the file's numbers "
         f"are {1e3 * given.resolution * unit:.2g} mm apart; move it nearer, or write 64-bit numbers (OBJ, PLY)"
@@ -148,7 +148,7 @@ def _length(metres: float) -> str:
     return f"{1e3 * metres:.3g} mm" if metres < 0.1 else f"{1e2 * metres:.3g} cm"
 
 
-def _clean(mesh: Repaired) -> Repaired:
+def _clean(mesh: RepairedMesh) -> RepairedMesh:
     """Vertices merged; faces without area and duplicates dropped."""
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     vertices, faces = topology.merge_vertices(mesh.vertices, mesh.faces, MERGE * extent)
@@ -170,7 +170,7 @@ def _clean(mesh: Repaired) -> Repaired:
     return mesh
 
 
-def _close(mesh: Repaired) -> Repaired:
+def _close(mesh: RepairedMesh) -> RepairedMesh:
     """Winding made consistent, crowded edges taken apart, seams welded, pinholes filled."""
     if topology.open_edges(mesh.faces):
         mesh = _weld(mesh)
@@ -189,7 +189,7 @@ def _close(mesh: Repaired) -> Repaired:
     return mesh
 
 
-def _weld(mesh: Repaired) -> Repaired:
+def _weld(mesh: RepairedMesh) -> RepairedMesh:
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -209,7 +209,7 @@ def _weld(mesh: Repaired) -> Repaired:
     return mesh.but(*topology.compact(mesh.vertices[first], faces), f"welded {len(pairs)} pairs of vertices at a seam")
 
 
-def _fill_pinholes(mesh: Repaired) -> Repaired:
+def _fill_pinholes(mesh: RepairedMesh) -> RepairedMesh:
     """A fan over each small hole; the whole mesh stays open if one is large."""
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     loops = [loop for loop in _rims(mesh.faces) or [] if len(loop) > 2]
@@ -242,7 +242,7 @@ def _rims(faces: Indices) -> list[list[int]] | None:
     return loops
 
 
-def _open(mesh: Repaired, options: ObjectOptions) -> Repaired:
+def _open(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
     holes = topology.open_edges(mesh.faces)
     if options.allow_open:
         note = f"not watertight: {holes} open edges; the mass is that of the convex hull"
@@ -260,7 +260,7 @@ def _areas(vertices: Floats, faces: Indices) -> Floats:
     return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
 
-def _resolve_components(mesh: Repaired, options: ObjectOptions) -> Repaired:
+def _resolve_components(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
     """Debris dropped, every component outward, overlapping ones united; more than one left is the user's choice."""
     shells = topology.components(mesh.faces)
     parts = [topology.compact(mesh.vertices, mesh.faces[shells == k]) for k in range(shells.max() + 1)]
@@ -285,8 +285,13 @@ def _resolve_components(mesh: Repaired, options: ObjectOptions) -> Repaired:
 
 
 def _unite(
-    mesh: Repaired, parts: list[tuple[Floats, Indices]], against: np.ndarray, *, turned: bool, options: ObjectOptions
-) -> Repaired:
+    mesh: RepairedMesh,
+    parts: list[tuple[Floats, Indices]],
+    against: np.ndarray,
+    *,
+    turned: bool,
+    options: ObjectOptions,
+) -> RepairedMesh:
     """One solid of several shells: those wound against the largest are cavities if they lie inside it."""
     if turned:
         mesh = mesh.but(mesh.vertices, mesh.faces[:, ::-1], "winding turned outward")
@@ -333,7 +338,7 @@ def _unite(
     return replace(mesh, vertices=_join_oriented(positives, holes)[0], faces=_join_oriented(positives, holes)[1])
 
 
-def _resolve_self_intersections(mesh: Repaired) -> Repaired:
+def _resolve_self_intersections(mesh: RepairedMesh) -> RepairedMesh:
     """What a shell encloses twice counts once, where that leaves the outer surface as it is; else a note."""
     found = crossings(mesh.vertices, mesh.faces)
     if found is None or not len(found):

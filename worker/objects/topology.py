@@ -194,7 +194,7 @@ def split_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
 def part_double_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
     """Two edges between the same two vertices made distinct: all but one get a vertex in the middle.
 
-    Such edges are sound on a surface with a tunnel, but in a list of faces they look like one edge with four faces.
+    Such edges are feasible on a surface with a tunnel, but in a list of faces they look like one edge with four faces.
     """
     index, counts = edge_faces(faces)
     crowded = np.flatnonzero(counts > 2)

@@ -6,26 +6,26 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from graspd.worker.engines.devices import check_device
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fitting import fitting_pairs
-from graspd.worker.planners.port import Asked, Joined, Method, NoPlace, Options, Planner, Trial, Wanted
+from graspd.worker.planners.port import BatchRequest, Joined, Method, NoPlace, Options, Planner, PlanRequest, Rollout
 from graspd.worker.planners.registry import GROUP, PLANNERS, joined, method, method_names, planner
-from graspd.worker.run import ALONE, Run
 
 __all__ = [
     "GROUP",
     "PLANNERS",
-    "Asked",
+    "BatchRequest",
     "Joined",
     "Method",
     "NoPlace",
     "Options",
     "Planner",
-    "Run",
-    "Trial",
-    "Wanted",
+    "ExecutionContext",
+    "Rollout",
+    "PlanRequest",
     "fitting_pairs",
     "method",
     "method_names",
@@ -37,8 +37,8 @@ __all__ = [
 def synthesize(
     hand: HandModel,
     obj: ObjectModel,
-    wanted: Wanted,
-    run: Run = ALONE,
+    wanted: PlanRequest,
+    run: ExecutionContext = DEFAULT_CONTEXT,
     *,
     method: str = "fast_graspd",
     options: Mapping[str, Any] | None = None,
@@ -54,14 +54,14 @@ def synthesize(
     together = joined(method, options) if run.meeting is not None else None
     if run.meeting is None or together is None:
         return alone(hand, obj, wanted, run)
-    around = (wanted.trial is not None, wanted.placed.fixed if wanted.placed is not None else None)
+    around = (wanted.rollout is not None, wanted.placed.fixed if wanted.placed is not None else None)
     key = (hand.content, obj.content, method, repr(options), wanted.fidelity.model_dump_json(), run.device, *around)
 
-    def work(asked: Sequence[Asked]) -> list[GraspSet | Exception]:
+    def work(asked: Sequence[BatchRequest]) -> list[GraspSet | Exception]:
         try:
             return together(hand, obj, asked)
         finally:
             check_device(run.device)  # here, where nobody else has work on it
 
-    found: GraspSet = run.meeting.ask(key, Asked(wanted, run), work, size=wanted.count, cancelled=run.cancelled)
+    found: GraspSet = run.meeting.ask(key, BatchRequest(wanted, run), work, size=wanted.count, cancelled=run.cancelled)
     return found

@@ -13,17 +13,17 @@ from pydantic import BaseModel, ConfigDict
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import Fidelity
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.run import Run
-from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.simulation.environment import Placed
 
 #: Scores (N,) of N grasps, in their scenes or around a free object (None): the smaller the better, below 1 good enough
 #: to look at no other candidate, from 2 on so bad that others are worth their time. The third argument has the score of
 #: what each would replace, inf where there is nothing: a trial may end as soon as it is not better by a class (0, 1).
 #: Called by several threads at once.
-Trial = Callable[[GraspSet, Placed | None, NDArray[np.float64]], NDArray[np.float64]]
+Rollout = Callable[[GraspSet, Placed | None, NDArray[np.float64]], NDArray[np.float64]]
 
 
 class NoPlace(InputError):
@@ -31,7 +31,7 @@ class NoPlace(InputError):
 
 
 @dataclass(frozen=True)
-class Wanted:
+class PlanRequest:
     """Which grasps of a hand on an object."""
 
     count: int
@@ -41,7 +41,7 @@ class Wanted:
     """Number of the batch among those of one seed."""
     placed: Placed | None = None
     """Their scenes: grasp i in scene `placed.index[i]`; None: around a free object."""
-    trial: Trial | None = None
+    rollout: Rollout | None = None
     """What several candidates of a grasp go through before one is chosen; None: the planner's own merit chooses."""
     first: int = 0
     """Number of the first grasp within its batch; above 0 for methods that make batches `in_parts` only."""
@@ -63,15 +63,15 @@ class Planner(Protocol):
         NoPlace: in scenes, when nowhere is a place to start, though `wanted.others_have_place` is not told.
     """
 
-    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet: ...
+    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet: ...
 
 
 @dataclass(frozen=True)
-class Asked:
+class BatchRequest:
     """One of several batches that are asked for at once."""
 
-    wanted: Wanted
-    run: Run
+    wanted: PlanRequest
+    run: ExecutionContext
 
 
 class Joined(Protocol):
@@ -82,7 +82,9 @@ class Joined(Protocol):
     place, a TaskCancelled where its own `run.cancelled()` answers True; the others go on.
     """
 
-    def __call__(self, hand: HandModel, obj: ObjectModel, asked: Sequence[Asked]) -> list[GraspSet | Exception]: ...
+    def __call__(
+        self, hand: HandModel, obj: ObjectModel, asked: Sequence[BatchRequest]
+    ) -> list[GraspSet | Exception]: ...
 
 
 class Options(BaseModel):

@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from graspd.worker.engines.devices import is_out_of_memory
-from graspd.worker.run import Run
+from graspd.worker.execution_context import ExecutionContext
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -27,7 +27,7 @@ T = TypeVar("T")
 class Steps:
     """Counts work done by all threads; looks at cancellation."""
 
-    def __init__(self, total: float, run: Run) -> None:
+    def __init__(self, total: float, run: ExecutionContext) -> None:
         self._total, self._run = total, run
         self._done = 0.0
         self._lock = threading.Lock()
@@ -41,7 +41,7 @@ class Steps:
             self._run.progress(min(self._done, self._total), self._total, message)
 
 
-def cut(count: int, run: Run, *, least: int = 1) -> list[range]:
+def cut(count: int, run: ExecutionContext, *, least: int = 1) -> list[range]:
     """Contiguous, nearly equal parts of a batch: one on a GPU, at most one per thread on a CPU.
 
     Args:

@@ -34,7 +34,7 @@ from graspd.worker.pool.child import Order
 log = logging.getLogger(__name__)
 #: Modules whose work the processes do for a worker; named and not imported: a worker is there before its engine is.
 MODULES: Final = ("graspd.worker.validation.validator", "graspd.worker.quality.table")
-#: What each process keeps of things that pieces of work share: two for a pair that is judged and measured.
+#: What each process keeps of things that pieces of work share: two for a pair that is validated and measured.
 KEPT: Final = 8
 #: Memory that a process takes at the most, with the models of the pairs that it keeps [bytes]; see
 #: docs/explanation/performance.md.
@@ -262,7 +262,7 @@ def end_child(process: subprocess.Popen[bytes], patience_s: float) -> str:
 
 
 def processes_at_once(device: str, wanted: int, *, threads: int = 0, workers: int = 1, root: Path = ROOT) -> int:
-    """Processes that judge and measure; 1: the worker's own, with threads.
+    """Processes that validate and measure; 1: the worker's own, with threads.
 
     Where nobody says, a worker on a GPU has one for each core but its own, as far as a quarter of the memory goes. On a
     CPU the planner takes the same cores at other times, and threads do.

@@ -60,12 +60,12 @@ def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[]
         )
     gpus: list[dict[str, Any]] = found["gpus"]
     needed = f"the driver says CUDA {_dotted(found['driver'])}, Warp is made for {_dotted(found['toolkit'])}"
-    mend = "a driver of R580 or newer; in containers the NVIDIA container toolkit and --gpus all; CUDA_VISIBLE_DEVICES"
+    fix = "a driver of R580 or newer; in containers the NVIDIA container toolkit and --gpus all; CUDA_VISIBLE_DEVICES"
     if not gpus:
         if settings.device.startswith("cuda"):
-            return bad(name, f"GRASPD_DEVICE is {settings.device}, and no GPU is found; {needed}", mend)
+            return bad(name, f"GRASPD_DEVICE is {settings.device}, and no GPU is found; {needed}", fix)
         if (has_driver or _has_driver)():
-            return bad(name, f"this machine has an NVIDIA driver, and no GPU can be used; {needed}", mend)
+            return bad(name, f"this machine has an NVIDIA driver, and no GPU can be used; {needed}", fix)
         return good(name, "none; work runs on the CPU")
     if settings.device.startswith("cuda") and settings.device not in [one["name"] for one in gpus]:
         return bad(
@@ -92,8 +92,8 @@ def kernels(settings: Settings, *, child: Child = run_child) -> Finding:
             "pip install 'graspd[worker]'; see disk and memory; dmesg tells what was killed",
         )
     if found["error"]:
-        mend = f"see the message; for a damaged cache remove {found['cache']}"
-        return bad(name, f"on {found['device']}: {found['error']}", mend)
+        fix = f"see the message; for a damaged cache remove {found['cache']}"
+        return bad(name, f"on {found['device']}: {found['error']}", fix)
     return good(
         name,
         f"grasps, scenes and pictures of a ball make sense on {found['device']}; kept in {found['cache']}",

@@ -33,12 +33,12 @@ from graspd.service.queue.port import Report
 from graspd.service.store.store import Store, open_store
 from graspd.worker.engines.devices import Device
 from graspd.worker.engines.joins import batches_at_once, parse_join
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.pool.pool import MODULES, Pool, processes_at_once
 from graspd.worker.process.fitness import Check, Fitness
 from graspd.worker.process.link import Condition, Setup
 from graspd.worker.process.runner import Runner
 from graspd.worker.process.selfcheck import check_engine
-from graspd.worker.run import Run
 from graspd.worker.stages import stage_table
 from graspd.worker.stages.context import StageFunction, StopReason, TaskContext
 
@@ -204,8 +204,8 @@ class Surroundings:
         return batches_at_once(self._device.resolve(), parse_join(self.settings.join))
 
     def pool(self, stage: str) -> Pool | None:
-        """The processes that judge and measure, if a task of this stage has work for them; waits until it is known how
-        many they are."""
+        """The processes that validate and measure, if a task of this stage has work for them; waits until it is known
+        how many they are."""
         if stage != Stage.SYNTHESIZE:
             return None
         if not self._processes:
@@ -231,7 +231,7 @@ class Surroundings:
 
         stage, chosen = raw.get("stage", ""), self.settings
         device = "cpu" if stage == Stage.INGEST else self._device.resolve()
-        run = Run(device, chosen.threads, first_judge=chosen.first_judge, pool=self.pool(stage))
+        run = ExecutionContext(device, chosen.threads, prefilter=chosen.prefilter, pool=self.pool(stage))
         return TaskContext(self.store, run, join=self._join if stage == Stage.SYNTHESIZE else 1, tell=tell)
 
 

@@ -1,6 +1,6 @@
 """A worker's check of itself: can it load its engine, and does that give a result that makes sense?
 
-What a stage runs on is made to work on a ball: a grasp that is judged and measured, a drop, a picture. This loads or
+What a stage runs on is made to work on a ball: a grasp that is validated and measured, a drop, a picture. This loads or
 compiles the kernels too, so the first task does not wait for them.
 """
 
@@ -22,7 +22,7 @@ from graspd.service.model.states import Stage
 if TYPE_CHECKING:
     from graspd.worker.objects.model import ObjectModel
 
-from graspd.worker.run import Run
+from graspd.worker.execution_context import ExecutionContext
 
 log = logging.getLogger(__name__)
 _RADIUS_M: Final = 0.03
@@ -53,24 +53,24 @@ def check_engine(device: Callable[[], str], stages: Collection[Stage], *, thread
             with imports():
                 importlib.import_module(f"graspd.worker.stages.{name}")
             if stage in _CHECKS:
-                _CHECKS[stage](Run(of_device, threads))
+                _CHECKS[stage](ExecutionContext(of_device, threads))
     except Exception as error:
         raise EngineError(f"{name}: {type(error).__name__}: {' '.join(str(error).split())[:200]}") from error
     log.info("the engine works; the check took %.1f s", time.monotonic() - started)
 
 
-def _check_synthesis(run: Run) -> None:
-    from graspd.worker.certified import certified_grasps
+def _check_synthesis(run: ExecutionContext) -> None:
+    from graspd.worker.generation import validated_grasps
     from graspd.worker.hands.load import hand_from_path
 
-    request = JobRequest(hand=_HAND, object="ball", grasps=1, fidelity="draft", want="raw")
-    found = certified_grasps(hand_from_path(_HAND), _ball(), request, count=1, run=run)
+    request = JobRequest(hand=_HAND, object="ball", grasps=1, fidelity="draft", want="candidates")
+    found = validated_grasps(hand_from_path(_HAND), _ball(), request, count=1, run=run)
     _expect(
         len(found.grasps) == 1 and np.isfinite(found.grasps.grasp.hand_pose).all(), "a grasp of a ball is no number"
     )
 
 
-def _check_scene(run: Run) -> None:
+def _check_scene(run: ExecutionContext) -> None:
     from graspd.worker.scenes import drop
 
     height = drop(_ball(), count=1, seed=0)["scene/object_pose"][0, 2]
@@ -78,7 +78,7 @@ def _check_scene(run: Run) -> None:
     _expect(abs(height - _RADIUS_M) < 0.1 * _RADIUS_M, f"a ball comes to rest at a height of {height:.3g} m")
 
 
-def _check_pictures(run: Run) -> None:
+def _check_pictures(run: ExecutionContext) -> None:
     from graspd.worker.rendering import render
 
     pose = np.array([[0.0, 0.0, _RADIUS_M, 1.0, 0.0, 0.0, 0.0]])
@@ -86,7 +86,7 @@ def _check_pictures(run: Run) -> None:
     _expect(int(np.ptp(made["image/rgb"])) > 0, "a picture of a ball shows nothing")
 
 
-_CHECKS: Final[Mapping[Stage, Callable[[Run], None]]] = {
+_CHECKS: Final[Mapping[Stage, Callable[[ExecutionContext], None]]] = {
     Stage.SYNTHESIZE: _check_synthesis,
     Stage.SCENE: _check_scene,
     Stage.RENDER: _check_pictures,

@@ -20,7 +20,8 @@ _DIGITS: Final = 7
 
 
 class Overlap:
-    """The pieces of a hand against a closed object, by a sound test: a piece that is left out shares nothing with it.
+    """The pieces of a hand against a closed object, by a feasible test: a piece that is left out shares nothing with
+    it.
 
     No face of the object reaches into such a piece, no corner of it is in the object, and nothing of the object in it.
     Faces that only a plane through two edges would part from a piece count as reaching into it.

@@ -30,7 +30,7 @@ GPU_HANDS: Final = 4096
 
 
 @dataclass(frozen=True)
-class Posing:
+class PostureData:
     """A hand and an object as the kernels of postures see them."""
 
     probe: Probe
@@ -43,7 +43,7 @@ class Posing:
     fingers: int
 
     @classmethod
-    def of(cls, probe: Probe) -> Posing:
+    def of(cls, probe: Probe) -> PostureData:
         with wp.ScopedDevice(probe.device):
             for module in (touching, balance, opening, jamming, optimizers):
                 wp.load_module(module=module, device=probe.device)
@@ -105,7 +105,7 @@ class Posing:
         root = np.array(posture.hand_pose, float)
         root[:, :3] -= self.probe.obj.centre_of_mass
         bodies = PosedBodies.of(self.hand, root, posture.joint_positions, self.device).bodies
-        near, shape = touching.Touching(), (count, len(self.probe.points))
+        near, shape = touching.NearbySurface(), (count, len(self.probe.points))
         with wp.ScopedDevice(self.device):
             near.distance, near.cosine = wp.empty(shape, dtype=wp.float32), wp.empty(shape, dtype=wp.float64)
             near.closest, near.normal = (wp.empty(shape, dtype=wp.vec3) for _ in range(2))
@@ -147,14 +147,14 @@ def _points(probe: Probe) -> Any:
     return out
 
 
-_posings: LRUCache[tuple[str, str, int, str], Posing] = LRUCache(8)
+_posings: LRUCache[tuple[str, str, int, str], PostureData] = LRUCache(8)
 _lock = threading.Lock()
 
 
-def posing_of(hand: HandModel, obj: ObjectModel, *, points: int, device: str = "cpu") -> Posing:
+def posing_of(hand: HandModel, obj: ObjectModel, *, points: int, device: str = "cpu") -> PostureData:
     """The pair on a device, with so many hand points; from memory where it was used lately."""
     key = (hand.content, obj.content, points, device)
     with _lock:
         if key not in _posings:
-            _posings[key] = Posing.of(probe_of(hand, obj, hand_points=points, object_points=64, device=device))
+            _posings[key] = PostureData.of(probe_of(hand, obj, hand_points=points, object_points=64, device=device))
         return _posings[key]

@@ -33,6 +33,7 @@ from graspd.service.model.integers import distinct_values
 from graspd.service.model.metrics import GRASP_METRICS, GraspType
 from graspd.service.model.transforms import Floats
 from graspd.service.store.manifests import INDEX_THRESHOLD_M
+from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel, JointType
 from graspd.worker.objects.disk_cache import content_of
@@ -50,7 +51,6 @@ from graspd.worker.quality.overlap import Overlap, penetration_depth
 from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, Probe, probe_of
 from graspd.worker.quality.volume import SharedVolume
 from graspd.worker.quality.wrench_space import Norm, measure_spaces, wrenches
-from graspd.worker.run import ALONE, Count, Run
 
 Columns = dict[str, NDArray[np.generic]]
 
@@ -114,7 +114,7 @@ def measure(
     thresholds_m: Sequence[float] = DEFAULT_THRESHOLDS_M,
     norm: Norm = "l1",
     every_volume: bool = False,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> dict[str, NDArray[np.generic]]:
     """Quality columns of a base shard for N grasps, at the posture of contact.
 
@@ -177,7 +177,7 @@ class _Terms:
         return {f"quality/{name}": np.zeros((0, len(self.thresholds)) if name in swept else 0) for name in MEASURES}
 
 
-def _measured(terms: _Terms, postures: Sequence[Posture], done: Count, run: Run) -> list[Columns]:
+def _measured(terms: _Terms, postures: Sequence[Posture], done: Count, run: ExecutionContext) -> list[Columns]:
     """The columns of each chunk, by threads or by the processes of a pool."""
     if run.pool is not None:
         return run.pool.map(

@@ -121,8 +121,8 @@ def _solid(vertices: Floats, faces: NDArray[np.int32]) -> m3d.Manifold | None:
         tri_verts=np.ascontiguousarray(faces, dtype=np.uint32),
     )
     solid = m3d.Manifold(mesh)
-    sound = solid.status() == m3d.Error.NoError and not solid.is_empty() and solid.volume() > 0
-    return solid if sound else None
+    feasible = solid.status() == m3d.Error.NoError and not solid.is_empty() and solid.volume() > 0
+    return solid if feasible else None
 
 
 def _hull(piece: ConvexPiece) -> m3d.Manifold:

@@ -278,7 +278,7 @@ def radius(points: Floats) -> float | None:
 def _grown(
     points: Floats, count: NDArray[Any], whole: NDArray[np.bool_], corners: NDArray[np.intp], scale: Floats
 ) -> tuple[Floats, Floats]:
-    """(H,) radius and volume of hulls that begin with simplices (H, 7); nan where one is not sound."""
+    """(H,) radius and volume of hulls that begin with simplices (H, 7); nan where one is not feasible."""
     corner = np.take_along_axis(points, corners[..., None], axis=1)
     middle = corner.mean(axis=1)
     normal, offset = _planes(corner - middle[:, None])

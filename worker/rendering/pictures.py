@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from graspd.service.model.colours import hexadecimal
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
+
+#: Sides 120 degrees apart, measured from the side view of the hand [rad].
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import moved
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
@@ -19,9 +22,6 @@ from graspd.worker.rendering.hands import drawn_bodies, hand_looks, hand_solids
 from graspd.worker.rendering.kernels.shading import CATCHER
 from graspd.worker.rendering.scenery import Box, Lamp, Look, Shot, Solid
 from graspd.worker.rendering.tracer import Tracer
-
-#: Sides 120 degrees apart, measured from the side view of the hand [rad].
-from graspd.worker.run import ALONE, Run
 
 THREE_SIDES: Final = tuple(np.radians([-35.0, 85.0, 205.0]).tolist())
 ELEVATION: Final = np.radians(20.0)
@@ -56,7 +56,7 @@ def grasp_pictures(
     size: tuple[int, int] = (320, 320),
     azimuths: Sequence[float] = THREE_SIDES[:1],
     *,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
     samples: int = SAMPLES,
 ) -> NDArray[np.uint8]:
     """Pictures of N grasps from A sides.
@@ -103,7 +103,7 @@ def _shoot(
     size: tuple[int, int],
     azimuths: Sequence[float],
     samples: int,
-    run: Run,
+    run: ExecutionContext,
 ) -> NDArray[np.uint8]:
     worlds, (width, height) = len(bodies), size
     points = np.concatenate(

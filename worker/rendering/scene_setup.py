@@ -17,6 +17,7 @@ from graspd.service.model.colours import Colour, hexadecimal, linear
 from graspd.service.model.scene_spec import Box as BoxSupport
 from graspd.service.model.scene_spec import HalfSpace
 from graspd.service.model.transforms import Floats, apply
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.cameras import (
     SAMPLED,
@@ -42,7 +43,6 @@ from graspd.worker.rendering.scenery import (
     slabs,
 )
 from graspd.worker.rendering.tracer import Tracer
-from graspd.worker.run import Run
 
 #: Draws of cameras, of which the first is taken that sees this share of the object past the supports; else the best.
 _DRAWS: Final = 32
@@ -136,17 +136,17 @@ class Setting:
             lamps=[scene.lamp for scene in scenes],
         )
 
-    def shoot(self, run: Run, *, normals: bool = False) -> Pictures:
+    def shoot(self, run: ExecutionContext, *, normals: bool = False) -> Pictures:
         """The pictures; `Pictures.shape` is 0 for supports, 1 for the object, 2 + m for neighbour m."""
         return self._named(self.stage(run.device).shoot(replace(self.shot, normals=normals), run))
 
-    def shoot_alone(self, run: Run) -> Pictures:
+    def shoot_alone(self, run: ExecutionContext) -> Pictures:
         """One ray per pixel of the object with nothing around it; `Pictures.shape` is 1 where it is seen."""
         poses = self._poses.copy()
         poses[:, [k for k in range(poses.shape[1]) if k != len(self._slabs)], 2] = _AWAY_M
         return self._named(self.stage(run.device, poses).shoot(replace(self.shot, samples=1, shaded=False), run))
 
-    def shoot_with(self, drawn: DrawnHand, run: Run) -> Pictures:
+    def shoot_with(self, drawn: DrawnHand, run: ExecutionContext) -> Pictures:
         """The same pictures with a hand in them."""
         key = (*self._key(), drawn.hand.content, drawn.wrist is not None, run.device)
         stage = _kept(key, lambda: [*self._solids(), *(part.solid for part in drawn.parts)], run.device)

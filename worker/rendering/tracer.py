@@ -25,11 +25,11 @@ from graspd.service.model.transforms import (
     quat_to_matrix,
 )
 from graspd.worker.engines import backend
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.rendering.annotate import box_corners
 from graspd.worker.rendering.kernels import exposure, rays
 from graspd.worker.rendering.kernels.shading import Light, Material
 from graspd.worker.rendering.scenery import Box, Look, Pictures, Shot, Solid
-from graspd.worker.run import ALONE, Run
 
 #: Pixels between two looks at whether to stop: what a core traces in a fifth of a second, and what a GPU holds at once.
 PIXELS_OF_A_CORE: Final = 100_000
@@ -101,7 +101,7 @@ class Tracer:
     def shoot(
         self,
         shot: Shot,
-        run: Run = ALONE,
+        run: ExecutionContext = DEFAULT_CONTEXT,
     ) -> Pictures:
         """Traces all cameras.
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, apply
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.objects.mesh_geometry import to_centre
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.annotate import (
@@ -25,7 +26,6 @@ from graspd.worker.rendering.cameras import BASELINE_M, SAMPLED, Cameras, GivenC
 from graspd.worker.rendering.hands import DrawnHand
 from graspd.worker.rendering.scene_setup import CameraPlan, Setting
 from graspd.worker.rendering.scenery import TABLE, TABLE_SIZE, Pictures, Supports
-from graspd.worker.run import ALONE, Run
 from graspd.worker.scenes.neighbours import Neighbours
 
 __all__ = ["SAMPLES", "TABLE_SIZE", "Extras", "render"]
@@ -63,7 +63,7 @@ def render(
     width: int,
     height: int,
     seed: int,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
     baseline_m: float = BASELINE_M,
     samples: int = SAMPLES,
     extras: Extras = NO_EXTRAS,

@@ -14,9 +14,9 @@ from graspd.service.model.transforms import Floats, compose
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.scenes.neighbours import Neighbours, neighbour_clearance
+from graspd.worker.simulation.environment import CLEAR_M, UP, Environment, Obstacle
 from graspd.worker.simulation.mounting import mounting_room, wrist_room
 from graspd.worker.simulation.obstacles import PosedFeatures
-from graspd.worker.simulation.surroundings import CLEAR_M, UP, Obstacle, Surroundings
 
 #: A grasp is kept if the hand stays at least this far above the table [m].
 MARGIN_M: Final = CLEAR_M
@@ -151,7 +151,7 @@ def _mounting_clearance(
     path = approach(grasp, pregrasp).hand_pose.reshape(len(grasp), PATH_POSTURES, 7)
     angles, heights = [], []
     for pose in object_pose:
-        table = [Surroundings((_TABLE.seen_from(pose),), UP)]
+        table = [Environment((_TABLE.seen_from(pose),), UP)]
         wrist, on_path = mounting_room(hand, path, table)
         only = np.zeros(len(grasp), np.intp)
         at_contact = on_path if hand.mounting is None else wrist_room(hand.mounting, path[:, -1:], wrist, table, only)

@@ -14,7 +14,7 @@ from graspd.worker.grasps import moved
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes.rest import lay_flat, resting_faces
 from graspd.worker.scenes.simulate import drop, reference_share, rest_probability
-from graspd.worker.simulation.surroundings import Obstacle
+from graspd.worker.simulation.environment import Obstacle
 
 #: Least gap between an object and a wall [m].
 GAP: Final = 0.01

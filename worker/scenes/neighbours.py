@@ -39,7 +39,7 @@ from graspd.worker.scenes.simulate import (
     rest_probability,
     steadied,
 )
-from graspd.worker.simulation.surroundings import Obstacle
+from graspd.worker.simulation.environment import Obstacle
 
 TIMEOUT_S: Final = 6.0
 #: Neighbours fall at this distance from the object, as a multiple of the sum of both bounding radii.

@@ -49,7 +49,7 @@ class Contacts:
         self.mark = wp.zeros((0, 0), dtype=wp.int32)
 
 
-class Marked(Contacts):
+class MarkedContacts(Contacts):
     """Contacts (B, N) at the places of their points, marked, and how many there are in each chunk (B, N / chunk)."""
 
     def __init__(self, capacity: int, points: int) -> None:
@@ -85,7 +85,7 @@ class Data:
         self.unit = joint_units(model.hand.model)
         with wp.ScopedDevice(self.device):
             self.contacts = Contacts(capacity, model.count)
-            self.marked = None if self.serial else Marked(capacity, model.count)
+            self.marked = None if self.serial else MarkedContacts(capacity, model.count)
             self.depths = Depths(capacity)
             self.schedule = Tables(still_schedule(), self.unit)
             self._allocate(capacity, model.bodies, model.dofs, model.options.velocities)

@@ -17,8 +17,8 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.mounting import wrist_positions
 from graspd.worker.hands.surface import farthest_points
+from graspd.worker.simulation.environment import CLEAR_M, Environment
 from graspd.worker.simulation.obstacles import MARGIN_M, obstacle_room
-from graspd.worker.simulation.surroundings import CLEAR_M, Surroundings
 
 #: Points of a mounting: the outermost in so many directions, then so many corners spread over it.
 OUTERMOST: Final = 20
@@ -30,7 +30,7 @@ TRIES: Final = 4
 def mounting_room(
     hand: HandModel,
     poses: Floats,
-    scenes: Sequence[Surroundings],
+    scenes: Sequence[Environment],
     which: NDArray[np.integer[Any]] | None = None,
     *,
     enough: float = CLEAR_M,
@@ -59,7 +59,7 @@ def mounting_room(
 def mounting_lack(
     hand: HandModel,
     poses: Floats,
-    scenes: Sequence[Surroundings],
+    scenes: Sequence[Environment],
     which: NDArray[np.integer[Any]],
     *,
     room: float = 0.0,
@@ -82,7 +82,7 @@ def mounting_lack(
 def _solved(
     mounting: HandModel,
     poses: Floats,
-    scenes: Sequence[Surroundings],
+    scenes: Sequence[Environment],
     which: NDArray[np.intp],
     points: Floats,
     enough: float,
@@ -103,7 +103,7 @@ def _solved(
     return wrists[number], room
 
 
-def point_room(mounting: HandModel, poses: Floats, scenes: Sequence[Surroundings], which: NDArray[np.intp]) -> Floats:
+def point_room(mounting: HandModel, poses: Floats, scenes: Sequence[Environment], which: NDArray[np.intp]) -> Floats:
     """(N, W) least distance of a mounting's points from obstacles of scenes `which` (N,) over root poses (N, P, 7), at
     each wrist position [m]: no less than the mounting's own, but near edges and corners of solids."""
     points = points_of(mounting)
@@ -140,7 +140,7 @@ def points_of(mounting: HandModel) -> Floats:
 
 
 def wrist_room(
-    mounting: HandModel, poses: Floats, wrist: Floats, scenes: Sequence[Surroundings], which: NDArray[np.integer[Any]]
+    mounting: HandModel, poses: Floats, wrist: Floats, scenes: Sequence[Environment], which: NDArray[np.integer[Any]]
 ) -> Floats:
     """(N,) least distance of mountings from the obstacles of scenes `which` (N,) at root poses (N, P, 7) and wrist
     angles (N, K) [m]."""

@@ -18,11 +18,11 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.primitives import HandFeatures
 from graspd.worker.simulation.device import DeviceHand, PosedBodies, to_xyzw
+from graspd.worker.simulation.environment import CLEAR_M, Environment, Obstacle
 from graspd.worker.simulation.kernels import chain as chain_kernels
 from graspd.worker.simulation.kernels import obstacles as kernels
 from graspd.worker.simulation.kernels import solids as solid_kernels
 from graspd.worker.simulation.launches import launch
-from graspd.worker.simulation.surroundings import CLEAR_M, Obstacle, Surroundings
 
 #: Distance that a hand keeps from obstacles [m]: twice what a scene's certificate asks, for the way is swept in steps.
 MARGIN_M: Final = 0.004
@@ -60,17 +60,17 @@ class PosedFeatures:
         return np.asarray((self.centre @ normal.T - offset - reach).max(axis=-1))
 
 
-def body_distances(hand: HandModel, postures: Posture, scene: Surroundings) -> Floats:
+def body_distances(hand: HandModel, postures: Posture, scene: Environment) -> Floats:
     """(P, L) signed distance of each of the hand's bodies from the nearest obstacle [m]; inf where there is none.
 
     Against half-spaces it is exact, and against solids that the hand is apart from, but for links that are hulls near
     an edge or a corner: there it is a lower bound. Farther than `FAR_M` from a solid counts as that.
     """
-    alike = Surroundings(tuple(replace(o, tips_m=None) for o in scene.obstacles), scene.up)
+    alike = Environment(tuple(replace(o, tips_m=None) for o in scene.obstacles), scene.up)
     return body_room(hand, postures, [alike])
 
 
-def _solid_distances(hand: HandModel, postures: Posture, scene: Surroundings) -> Floats:
+def _solid_distances(hand: HandModel, postures: Posture, scene: Environment) -> Floats:
     """(P, L) as `body_distances`, in float32: coordinates of 0.3 m are known to 3e-8."""
     bodies = body_poses(hand, postures.hand_pose, postures.joint_positions)
     device = _device_hand(hand)
@@ -102,13 +102,13 @@ def _device_hand(hand: HandModel) -> DeviceHand:
         return found
 
 
-def obstacle_distances(hand: HandModel, postures: Posture, scene: Surroundings) -> Floats:
+def obstacle_distances(hand: HandModel, postures: Posture, scene: Environment) -> Floats:
     """(P,) least of the `body_distances` of each posture [m]."""
     return np.asarray(body_distances(hand, postures, scene).min(axis=1))
 
 
 def body_room(
-    hand: HandModel, postures: Posture, scenes: Sequence[Surroundings], which: NDArray[np.integer[Any]] | None = None
+    hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]] | None = None
 ) -> Floats:
     """(P, L) as `body_distances`, in the scene `which` (P,) of each posture or else in the first, but fingertips count
     as farther from supports that they may come near: by what makes `CLEAR_M` of the distance that they are to keep [m].
@@ -120,7 +120,7 @@ def body_room(
         solids = [o for o in scene.obstacles if len(o.corners)]
         rows = np.flatnonzero(which == number) if solids else np.zeros(0, np.intp)
         for more in sorted({_more(o) for o in solids} if len(rows) else ()):
-            alike = Surroundings(tuple(o for o in solids if _more(o) == more), scene.up)
+            alike = Environment(tuple(o for o in solids if _more(o) == more), scene.up)
             out[rows] = np.minimum(out[rows], _solid_distances(hand, postures.take(rows), alike) + more * tips)
     return out
 
@@ -131,7 +131,7 @@ def _more(obstacle: Obstacle) -> float:
 
 
 def _half_space_room(
-    hand: HandModel, postures: Posture, scenes: Sequence[Surroundings], which: NDArray[np.integer[Any]]
+    hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]]
 ) -> Floats:
     """(P, L) as `body_room`, of the half-spaces alone."""
     every = [[o for o in scene.obstacles if not len(o.corners)] for scene in scenes]
@@ -148,7 +148,7 @@ def _half_space_room(
 
 
 def obstacle_room(
-    hand: HandModel, postures: Posture, scenes: Sequence[Surroundings], which: NDArray[np.integer[Any]] | None = None
+    hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]] | None = None
 ) -> Floats:
     """(P,) least of the `body_room` of each posture [m]."""
     return np.asarray(body_room(hand, postures, scenes, which).min(axis=1))
@@ -167,7 +167,7 @@ class DeviceObstacles:
     def create(
         cls,
         hand: HandModel,
-        scenes: Sequence[Surroundings],
+        scenes: Sequence[Environment],
         centre: Floats,
         device: str,
         *,

@@ -96,14 +96,14 @@ class Projection:
         data.set_state(state)
         now, best = self._states(state), self._states(state)
         self._depth.fill_(np.inf)
-        step = self._judged(now, best)
+        step = self._validated(now, best)
         self._add_equations(step)
         self._add_step(step, now)
         step.run(iterations)
-        self._judged(now, best).run()
+        self._validated(now, best).run()
         return self._found(best, n), self._depth.numpy()[:n].copy()
 
-    def _judged(self, now: Any, best: Any) -> Launches:
+    def _validated(self, now: Any, best: Any) -> Launches:
         """Places the hands and keeps what is better than ever."""
         d, o = self.data, self.options
         out = record_placement(self.model, d, within=max(o.near, o.hold))

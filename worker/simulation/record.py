@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 from graspd.service.model.errors import InputError
-from graspd.worker.simulation.data import Data, Marked
+from graspd.worker.simulation.data import Data, MarkedContacts
 from graspd.worker.simulation.kernels import (
     contact,
     kinematics,
@@ -123,7 +123,7 @@ def add_distances(out: Launches, m: Model, d: Data, *, within: float | None = No
         _add_packing(out, d, d.marked)
 
 
-def _add_packing(out: Launches, d: Data, marked: Marked) -> None:
+def _add_packing(out: Launches, d: Data, marked: MarkedContacts) -> None:
     """Marked contacts to their slots."""
     c = d.contacts
     counts = [marked.kept_in, marked.near_in]

@@ -65,7 +65,15 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
     """The object of a task, simplified as far as its fidelity allows."""
     request, digest = message.request, message.object_digest
     name, error = request.object, request.knobs.face_error_m
-    key = (store.url, AssetKind.OBJECT, name, digest, error, request.referee == "letter", *request.matter.items())
+    key = (
+        store.url,
+        AssetKind.OBJECT,
+        name,
+        digest,
+        error,
+        request.validation == "dexgraspbench",
+        *request.matter.items(),
+    )
 
     def load() -> ObjectModel:
         obj = prepared_object(store, digest, name=name, face_error_m=error)

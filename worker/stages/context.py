@@ -21,7 +21,7 @@ from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.store.columns import Attribute
 from graspd.service.store.manifests import ShardManifest, manifest_of
 from graspd.service.store.shards import check_columns, json_attribute, write_shard
-from graspd.worker.run import ALONE, Run
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 
 if TYPE_CHECKING:
     from graspd.service.store.store import Store
@@ -45,7 +45,7 @@ class TaskContext:
     def __init__(
         self,
         store: Store,
-        run: Run = ALONE,
+        run: ExecutionContext = DEFAULT_CONTEXT,
         *,
         join: int = 1,
         tell: Callable[[float, float, str], None] | None = None,

@@ -1,5 +1,5 @@
-"""Does a hand hold anything: grasps of three plain objects of a size that suits it, judged free by the certificate, and
-lifted off a table."""
+"""Does a hand hold anything: grasps of three plain objects of a size that suits it, validated free at level standard,
+and lifted off a table."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from graspd.service.model.domain import BATCH_SIZE, JobOptions
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import Floats, apply
-from graspd.worker.certified import Certified, certified_grasps
 from graspd.worker.control.postures import squeeze
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.grasps import Posture, joined
 from graspd.worker.hands.jaws import fingertip_pad, jaws_of
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.oppositions import oppositions_of
+from graspd.worker.hands.pinch_postures import oppositions_of
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import load_object
-from graspd.worker.run import ALONE, Run
-from graspd.worker.scenes.beside import scenes_of
+from graspd.worker.scenes.placement import scenes_of
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.payload import Limit, limit_of
 from graspd.worker.validation.protocol import Outcome
@@ -55,7 +55,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Best:
+class BestGrasp:
     """Of the grasps that hold the one with the largest epsilon; of equal ones the one that moves least."""
 
     obj: ObjectModel
@@ -65,7 +65,7 @@ class Best:
 
 @dataclass(frozen=True)
 class SelfTest:
-    """What came of it; `gsr` is the share of raw grasps that hold by the certificate, `table` that of `table_n`
+    """What came of it; `gsr` is the share of candidates that hold at level standard, `table` that of `table_n`
     grasps that lift the objects off a table."""
 
     gsr: float
@@ -74,7 +74,7 @@ class SelfTest:
     by_object: dict[str, float]
     table: float
     table_n: int
-    best: Best | None = None
+    best: BestGrasp | None = None
     """None: nothing was held."""
     lost: float = 0.0
     """Share of the grasps that do not hold whose object was lost while the hand closed; others slip when pushed."""
@@ -131,7 +131,7 @@ def failed(reason: str, says: str = "suspicious") -> dict[str, Any]:
     }
 
 
-def tried_softly(hand: Callable[[], HandModel], run: Run = ALONE) -> dict[str, Any]:
+def tried_softly(hand: Callable[[], HandModel], run: ExecutionContext = DEFAULT_CONTEXT) -> dict[str, Any]:
     """The facts of a self-test. A hand that finds no grasp, or a test that breaks, is told and stops nothing.
 
     Raises:
@@ -147,9 +147,14 @@ def tried_softly(hand: Callable[[], HandModel], run: Run = ALONE) -> dict[str, A
 
 
 def self_test(
-    hand: HandModel, run: Run = ALONE, *, grasps: int = GRASPS, on_table: int = TABLE_GRASPS, seed: int = 0
+    hand: HandModel,
+    run: ExecutionContext = DEFAULT_CONTEXT,
+    *,
+    grasps: int = GRASPS,
+    on_table: int = TABLE_GRASPS,
+    seed: int = 0,
 ) -> SelfTest:
-    """Raw grasps of a sphere, a box and a cylinder, as `JobOptions` has them by default, shared out evenly; and
+    """Candidates of a sphere, a box and a cylinder, as `JobOptions` has them by default, shared out evenly; and
     of these as they stand on a table.
 
     It has no limit of time: what a busy machine left out would be another verdict.
@@ -169,7 +174,7 @@ def self_test(
     held: dict[str, list[bool]] = {}
     lost: list[bool] = []
     lifted: list[tuple[int, float, Limit | None]] = []
-    best: Best | None = None
+    best: BestGrasp | None = None
     objects = plain_objects(width)
     for number, (name, obj) in enumerate(objects.items()):
         part = run.part(number / len(objects), (number + 1) / len(objects))
@@ -197,7 +202,7 @@ def _joined(limits: list[Limit]) -> Limit | None:
     return replace(limits[0], grasps=sum(one.grasps for one in limits), lifts_kg=lifts, bound_kg=bound)
 
 
-def _lost(batch: Certified) -> NDArray[np.bool_]:
+def _lost(batch: ValidatedBatch) -> NDArray[np.bool_]:
     """Of the grasps that do not hold, whether the object was lost while the hand closed."""
     failed = batch.columns["quality/success"] != 1
     outcome = batch.columns["quality/verdict_outcome"][failed]
@@ -217,21 +222,23 @@ def _give(hand: HandModel) -> float:
     return float(np.min((hand.effort / hand.stiffness * lever)[closes], initial=math.inf))
 
 
-def _batches(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: Run) -> list[Certified]:
+def _batches(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: ExecutionContext) -> list[ValidatedBatch]:
     found = []
     for batch, first in enumerate(range(0, count, BATCH_SIZE)):
         size = min(BATCH_SIZE, count - first)
-        request = JobOptions(want="raw", grasps=size, seed=seed, referee="certificate")
-        found.append(certified_grasps(hand, obj, request, count=size, batch=batch, run=run))
+        request = JobOptions(want="candidates", grasps=size, seed=seed, validation="standard")
+        found.append(validated_grasps(hand, obj, request, count=size, batch=batch, run=run))
     return found
 
 
-def _lifted(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: Run) -> tuple[int, float, Limit | None]:
+def _lifted(
+    hand: HandModel, obj: ObjectModel, count: int, seed: int, run: ExecutionContext
+) -> tuple[int, float, Limit | None]:
     """How many grasps of an object on a table were planned, the share of them that lift it, and what they lift with all
     their force."""
     scenes, _ = scenes_of(TABLE, obj, count=TABLE_SCENES, seed=seed)
-    request = JobOptions(want="raw", grasps=count, seed=seed, referee="certificate")
-    found = certified_grasps(hand, obj, request, count=count, scenes=scenes, run=run)
+    request = JobOptions(want="candidates", grasps=count, seed=seed, validation="standard")
+    found = validated_grasps(hand, obj, request, count=count, scenes=scenes, run=run)
     grasps, about = found.grasps.moved(np.negative(obj.centre)), obj.centred
     strong = replace(grasps, squeeze=squeeze(hand, about, grasps.grasp, total_normal_force=STRONG_N))
     both = joined([grasps, strong])
@@ -248,7 +255,7 @@ def _lifted(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: Run) 
     return found.planned, found.shares["lift_share"], limit and replace(limit, grasps=count)
 
 
-def _best(obj: ObjectModel, found: Certified) -> Best | None:
+def _best(obj: ObjectModel, found: ValidatedBatch) -> BestGrasp | None:
     columns = found.columns
     rows = np.flatnonzero(columns["quality/success"] == 1)
     if not len(rows):
@@ -256,7 +263,7 @@ def _best(obj: ObjectModel, found: Certified) -> Best | None:
     # Thin pads at two places give epsilon 0 at any threshold: then what moves least under the pushes is best.
     ranks = [(float(columns["quality/epsilon"][k].max()), -float(columns["quality/verdict_margin"][k])) for k in rows]
     row = max(range(len(rows)), key=ranks.__getitem__)
-    return Best(obj, found.grasps.grasp.take(rows[[row]]), ranks[row])
+    return BestGrasp(obj, found.grasps.grasp.take(rows[[row]]), ranks[row])
 
 
 def fitting_width(hand: HandModel) -> float:

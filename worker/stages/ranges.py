@@ -21,7 +21,7 @@ from graspd.worker.stages.context import Output
 #: Axes whose rows are those of one batch after the other; what has another axis is common to all.
 _ROWS: Final = ("N", "S", "K")
 #: Columns that only some batches of a job have, with what stands in the rows of the others.
-_OF_SOME: Final = {"quality/audit": np.int8(-1)}
+_OF_SOME: Final = {"quality/recheck": np.int8(-1)}
 
 
 def sizes_of(message: TaskMessage) -> list[int]:
@@ -42,7 +42,7 @@ def joined(message: TaskMessage, made: Sequence[Output], *, base_rows: Sequence[
 
     Args:
         message: the task.
-        made: of each of its batches, with the same columns but for audits.
+        made: of each of its batches, with the same columns but for rechecks.
         base_rows: rows of each batch in the base shard, where columns number these.
     """
     if len(made) == 1:

@@ -8,7 +8,7 @@ from graspd.service.model.messages import TaskMessage
 from graspd.service.model.scene_spec import supports_in
 from graspd.service.model.states import Stage
 from graspd.service.model.transforms import compose
-from graspd.service.readers.ways import wrists_of
+from graspd.service.readers.trajectories import wrists_of
 from graspd.service.store import validity
 from graspd.service.store.columns import Attribute
 from graspd.service.store.shards import Shard, json_attribute
@@ -61,7 +61,7 @@ def _beside(base: Shard, message: TaskMessage, context: TaskContext) -> Neighbou
 def _drawn(base: Shard, message: TaskMessage, context: TaskContext) -> DrawnHand | None:
     """The best valid grasp of each scene; None where there is no grasp at all."""
     hand = hand_of(context.store, message)
-    among = validity.chosen(base.arrays, unjudged=message.request.referee == "none")
+    among = validity.chosen(base.arrays, unvalidated=message.request.validation == "none")
     rows = best_in_scenes(base.arrays, among)
     if not len(among):
         return None

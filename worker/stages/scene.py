@@ -15,8 +15,8 @@ from graspd.service.store.shards import Shard, json_attribute
 from graspd.worker.files.provenance import wrist_attributes
 from graspd.worker.grasps import Posture
 from graspd.worker.scenes import drop, transfer
-from graspd.worker.scenes.beside import scenes_of
 from graspd.worker.scenes.clearance import count_rejections
+from graspd.worker.scenes.placement import scenes_of
 from graspd.worker.stages.assets import beside_attributes, hand_of, input_of, neighbours_of, object_of
 from graspd.worker.stages.context import Output, TaskContext, batch_seed
 from graspd.worker.stages.ranges import base_rows, batches_of, joined

@@ -16,12 +16,12 @@ from graspd.service.model.messages import TaskMessage
 from graspd.service.model.planning import told, totals
 from graspd.service.model.states import Stage
 from graspd.service.store.columns import Attribute
-from graspd.worker.certified import Certified
 from graspd.worker.files.provenance import base_attributes
+from graspd.worker.generation import ValidatedBatch
 from graspd.worker.planners import NoPlace, planner
-from graspd.worker.scenes.beside import neighbour_of
 from graspd.worker.scenes.kinds import supports_of
-from graspd.worker.simulation.surroundings import Scenes
+from graspd.worker.scenes.placement import neighbour_of
+from graspd.worker.simulation.environment import Scenes
 from graspd.worker.stages.assets import (
     beside_attributes,
     hand_of,
@@ -33,7 +33,7 @@ from graspd.worker.stages.assets import (
 )
 from graspd.worker.stages.context import Output, TaskContext
 from graspd.worker.stages.ranges import joined, sizes_of
-from graspd.worker.together import certified_batches
+from graspd.worker.together import validated_batches
 
 #: Columns of the scene shard that stand in the base shard as well: so it can be used by itself.
 _OF_SCENES: Final = ("scene/object_pose", "scene/rest_probability", "scene/neighbour_pose")
@@ -52,7 +52,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     scenes = [_scenes(message, part, context) for part in columns]
     context.check()
     try:
-        found = certified_batches(
+        found = validated_batches(
             hand,
             obj,
             message.request,
@@ -75,7 +75,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         hand,
         obj,
         message.request,
-        tried=sum(one.tried for one in found),
+        candidates=sum(one.candidates for one in found),
         verdict_key=found[0].verdict_key,
         outcomes=totals(one.outcomes for one in found),
     )
@@ -84,7 +84,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     return replace(whole, attributes={**whole.attributes, **said, **of_scenes, **beside_attributes(message)})
 
 
-def _output(found: Certified, columns: Mapping[str, NDArray[Any]]) -> Output:
+def _output(found: ValidatedBatch, columns: Mapping[str, NDArray[Any]]) -> Output:
     """The columns of one batch, and what is told of it."""
     seconds = {f"{name}_seconds": round(value, 4) for name, value in found.seconds.items()}
     shares = {name: round(value, 4) for name, value in found.shares.items()}
@@ -125,19 +125,19 @@ def _scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: Tas
     return replace(scenes, neighbours=beside, neighbour_pose=columns["scene/neighbour_pose"])
 
 
-def _check_hope(message: TaskMessage, batch: int, found: Certified, *, in_scenes: bool) -> None:
+def _check_hope(message: TaskMessage, batch: int, found: ValidatedBatch, *, in_scenes: bool) -> None:
     """What the first batch does not find at all, the others of its job are not made to look for."""
     request, limit = message.request, found.limit
-    if batch or request.want == "raw" or len(found.grasps):
+    if batch or request.want == "candidates" or len(found.grasps):
         return
-    none = f"none of {found.planned} grasps tried is {request.counted}"
+    none = f"none of {found.planned} candidates is {request.counted}"
     if limit is not None and limit.hopeless:
         raise LoadError(f"{none}: {limit.line}")
     if in_scenes:
         lost = "; ".join(filter(None, [told(found.outcomes), found.narrow, limit.line if limit is not None else ""]))
         raise SceneError(
             f"{none} in its scene ({request.place.kind}): {lost}; give "
-            f"a larger budget than {request.budget:g} tries for each grasp, or another pose, scene, hand or seed"
+            f"a larger budget than {request.budget:g} candidates for each grasp, or another pose, scene, hand or seed"
         )
 
 

@@ -14,11 +14,11 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.disk_cache import content_of
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.run import Run
-from graspd.worker.simulation.surroundings import Neighbour, Obstacle
+from graspd.worker.simulation.environment import Neighbour, Obstacle
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.model import MujocoOptions, Scene, build
 
@@ -111,7 +111,7 @@ def measured(
     make: Callable[[], Test],
     ask: Callable[[Test, int], float],
     *,
-    run: Run,
+    run: ExecutionContext,
     name: str,
 ) -> NDArray[np.float64]:
     """(count,) what tests measure of the grasps that are `held` (count,), None: of all; nan of the others.
@@ -129,7 +129,7 @@ def measured(
     """
 
     def asked(test: Test, row: int) -> float:
-        run.check("the referee")
+        run.check("the validator")
         return ask(test, row)
 
     out = np.full(count, np.nan)

@@ -1,8 +1,9 @@
 """Convex pieces of an object by CoACD (Wei et al. 2022), measured before use and kept on disk.
 
-The pieces are the object as the referee's engine knows it, so a bad decomposition is a bad referee: pieces that fill a
-hollow make every grasp of it wrong. Count, volume ratio and excess go with every verdict; a large excess is refused.
-Excess is what the pieces' union has more of volume, over the object's surface: the mean height of what was filled in.
+The pieces are the object as the validator's engine knows it, so a bad decomposition is a bad validator: pieces that
+fill a hollow make every grasp of it wrong. Count, volume ratio and excess go with every verdict; a large excess is
+refused. Excess is what the pieces' union has more of volume, over the object's surface: the mean height of what was
+filled in.
 """
 
 from __future__ import annotations
@@ -21,7 +22,14 @@ from graspd.service.model.errors import MeshError
 from graspd.service.model.libraries import version_of
 from graspd.service.model.transforms import Floats
 from graspd.worker.hands.primitives import triangle_areas
-from graspd.worker.objects.convex import TooMuchWork, coacd_parts, default_cache, keep_parts, load_parts, union_volume
+from graspd.worker.objects.convex import (
+    WorkLimitExceeded,
+    coacd_parts,
+    default_cache,
+    keep_parts,
+    load_parts,
+    union_volume,
+)
 from graspd.worker.objects.model import ObjectModel
 
 log = logging.getLogger(__name__)
@@ -89,7 +97,7 @@ def decompose(obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
     if pieces.excess_m > MAX_EXCESS_M:
         raise MeshError(
             f"{obj.name}: its {len(pieces)} convex pieces have {pieces.volume_ratio:.2f} times its volume and "
-            f"stand out {pieces.excess_m * 1e3:.1f} mm (limit {MAX_EXCESS_M * 1e3:g} mm); the referee cannot judge it"
+            f"stand out {pieces.excess_m * 1e3:.1f} mm (limit {MAX_EXCESS_M * 1e3:g} mm); the validator cannot validate it"
         )
     if any(obj.centre):
         pieces = replace(pieces, vertices=tuple(part + obj.centre for part in pieces.vertices))
@@ -144,7 +152,7 @@ def _make(obj: ObjectModel) -> tuple[Floats, ...]:
             break
         try:
             made = coacd_parts(obj.vertices, obj.faces, {"threshold": threshold, **_COACD}, CPU_S)
-        except TooMuchWork as error:
+        except WorkLimitExceeded as error:
             log.warning("%s: finer pieces than %d need %s; these stand", obj.name or "an object", len(best), error)
             break
         parts = tuple(part for part in made if _solid(part))

@@ -15,11 +15,11 @@ import numpy as np
 
 from graspd.service.model.transforms import Floats
 from graspd.worker.engines.mujoco_warnings import ARENA, void
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.run import ALONE, Run
 from graspd.worker.validation.compiled import slipping_model
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.model import add_object, add_shape
@@ -32,7 +32,12 @@ STEPS: Final = 35
 
 
 def simulated_displacement_cm(
-    hand: HandModel, obj: ObjectModel, grasp: Posture, *, pieces: ConvexPieces | None = None, run: Run = ALONE
+    hand: HandModel,
+    obj: ObjectModel,
+    grasp: Posture,
+    *,
+    pieces: ConvexPieces | None = None,
+    run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
     """(N,) way of the object's centre of mass in the displacement test, for N grasp postures [cm]; nan: it blew up.
 

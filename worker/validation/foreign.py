@@ -1,4 +1,4 @@
-"""Verdicts on grasps in another model of their hand: what was planned with one is judged with the other.
+"""Verdicts on grasps in another model of their hand: what was planned with one is validated with the other.
 
 The mechanism is the other model's: shapes, masses, where the joints are, their limits, couplings, armature and dry
 friction. The controller belongs to the grasp and stays: the commanded postures, gains, torque limits and, with the
@@ -14,15 +14,15 @@ from typing import Any, cast
 import numpy as np
 
 from graspd.service.model.transforms import Floats, apply, compose, invert
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.collisions import resting_neighbours
 from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.hands.same_hand import SameHand
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.run import ALONE, Run
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.key import Level
-from graspd.worker.validation.validator import Verdicts, judge
+from graspd.worker.validation.validator import Verdicts, validate
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class ForeignVerdicts:
         verdicts; and `share_counts`."""
         a, b = self.nominal.success == 1, self.foreign.success == 1
         return {
-            "judge_hand": self.same.theirs.name,
+            "validation_hand": self.same.theirs.name,
             "fingertips_mm": round(1e3 * self.same.fingertips_m, 6),
             "foreign_key": self.foreign.terms,
             **share_counts(
@@ -72,12 +72,18 @@ def share_counts(held: Mapping[str, int]) -> dict[str, Any]:
 
 
 def foreign_verdicts(
-    same: SameHand, obj: ObjectModel, grasps: GraspSet, nominal: Verdicts, *, pieces: ConvexPieces, run: Run = ALONE
+    same: SameHand,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    nominal: Verdicts,
+    *,
+    pieces: ConvexPieces,
+    run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> ForeignVerdicts:
-    """Judge grasps of `same.ours` in the other model, on the terms of their nominal verdicts."""
+    """Validate grasps of `same.ours` in the other model, on the terms of their nominal verdicts."""
     level = cast(Level, nominal.level)
     moved = in_other_model(same, grasps)
-    found = judge(driven_as(same), obj, moved, level=level, hard=nominal.hard, pieces=pieces, run=run)
+    found = validate(driven_as(same), obj, moved, level=level, hard=nominal.hard, pieces=pieces, run=run)
     return ForeignVerdicts(nominal, found, same)
 
 

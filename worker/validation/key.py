@@ -20,7 +20,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.validation import model, protocol
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 
-Level = Literal["letter", "certificate", "screen"]
+Level = Literal["dexgraspbench", "standard", "fast"]
 
 #: Raise when the code of the protocol or of the scene changes what it says, constants aside.
 REVISION: Final = 6
@@ -62,9 +62,9 @@ MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
     jaw_squeeze: ("GAP_M", "STALL", "LEAST_WAY"),
 }
 LEVEL_MOVES: Final[dict[Level, dict[ModuleType, tuple[str, ...]]]] = {
-    "letter": {protocol: ("LETTER_INTERVAL_S",)},
-    "certificate": {protocol: _EARLY},
-    "screen": {protocol: (*_EARLY, "SCREEN_BAND"), model: ("COARSE",)},
+    "dexgraspbench": {protocol: ("DEXGRASPBENCH_INTERVAL_S",)},
+    "standard": {protocol: _EARLY},
+    "fast": {protocol: (*_EARLY, "FAST_BAND"), model: ("COARSE",)},
 }
 
 
@@ -76,13 +76,13 @@ def verdict_key(
     *,
     pieces: ConvexPieces | None = None,
     cache: Path | None = None,
-    first_judge: Sequence[Any] = (),
+    prefilter: Sequence[Any] = (),
 ) -> str:
     """Digest of the terms of a verdict: all that it follows from but the grasp's own postures.
 
     In it: level, friction, masses, gains and torque limits, the rules of pregrasp and squeeze, shapes of the hand,
     convex pieces of the object, the constants of `MOVES` and of the level, version of the engine; and `first_judge`,
-    the first judge's terms where it takes part.
+    the prefilter's terms where it takes part.
 
     Raises:
         MeshError: `pieces` is not given and the object has none that are usable.
@@ -107,13 +107,13 @@ def verdict_key(
             # Of hands that have them alone, likewise.
             **({"tendons": [[*t.dofs, *t.coefficients] for t in hand.tendons]} if hand.tendons else {}),
             **({"drag": [hand.drag.armature.tolist(), hand.drag.dry_friction.tolist()]} if hand.drag else {}),
-            **({"first_judge": list(first_judge)} if first_judge else {}),
+            **({"prefilter": list(prefilter)} if prefilter else {}),
         }
     )
 
 
 def postures_key(terms: str, grasps: GraspSet) -> str:
-    """Digest of the terms (`verdict_key`) together with the postures that were judged."""
+    """Digest of the terms (`verdict_key`) together with the postures that were validated."""
     parts = (grasps.pregrasp, grasps.grasp, grasps.squeeze)
     arrays = (array for part in parts for array in (part.hand_pose, part.joint_positions))
     return digest_json([terms, digest_bytes(b"".join(np.ascontiguousarray(a, float).tobytes() for a in arrays))])

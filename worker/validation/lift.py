@@ -2,8 +2,8 @@
 
 letter: DexGraspBench's tabletop test as published: from the pregrasp, 1 N downwards, 10 cm up in 0.4 s, no hold.
 lift: the hand comes from its standoff and must touch nothing on the way, but that fingertips may touch supports, or
-press into them, as deep as the scene says; it rises smoothly in 0.8 s and holds for 2 s, cut short as the certificate's
-pushes are.
+press into them, as deep as the scene says; it rises smoothly in 0.8 s and holds for 2 s, cut short as the standard
+level's pushes are.
 Neighbours stand on the table as free bodies; at level lift they must not be moved 2 cm, nor toppled.
 The world of the simulation is the object frame: the scene lies under it as it stood when the object came to rest.
 """
@@ -22,7 +22,7 @@ from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import Floats, invert, quat_conjugate, quat_multiply, quat_rotate, slerp
 from graspd.worker.engines.mujoco_warnings import void
 from graspd.worker.grasps import GraspSet, Posture
-from graspd.worker.simulation.surroundings import RISE_M, Placed
+from graspd.worker.simulation.environment import RISE_M, Placed
 from graspd.worker.validation.model import Scene, blend
 from graspd.worker.validation.protocol import (
     MAX_PENETRATION_M,
@@ -30,8 +30,8 @@ from graspd.worker.validation.protocol import (
     STAGE_S,
     STAGES,
     Outcome,
+    Rollout,
     Test,
-    Trial,
 )
 
 #: A neighbour may be moved by this [m], and tilted by this [rad]: more is toppled. It may turn about the vertical.
@@ -67,7 +67,7 @@ class LiftOutcome(IntEnum):
 
 
 @dataclass
-class LiftTrial:
+class LiftTest:
     """Verdict on one grasp."""
 
     outcome: LiftOutcome = LiftOutcome.NOT_TRIED
@@ -90,38 +90,38 @@ class Lift(Test):
         self._in_hand = True
         self._beside = placed.neighbours_of(0)
 
-    def letter(self, grasps: GraspSet, row: int) -> LiftTrial:  # type: ignore[override]
+    def dexgraspbench(self, grasps: GraspSet, row: int) -> LiftTest:  # type: ignore[override]
         """As published: success is read once, when the root has risen, from where the object is in the world."""
         self._in_hand = False
-        if (trial := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
-            return trial
+        if (rollout := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
+            return rollout
         self._close(grasps, row)
         self._rise(grasps, row, np.arange(1, STAGES + 1) / STAGES, STAGE_S)
-        return self._ended(trial, self._judge(Trial()))
+        return self._ended(rollout, self._validate(Rollout()))
 
-    def lift(self, grasps: GraspSet, row: int) -> LiftTrial:
+    def lift(self, grasps: GraspSet, row: int) -> LiftTest:
         """From the standoff to the end of the hold; `grasps.approach` says how the hand comes."""
         self._in_hand = True
-        if (trial := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
-            return trial
+        if (rollout := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
+            return rollout
         if self._touches(grasps, row):
-            trial.outcome = LiftOutcome.TOUCHED_ON_THE_WAY
-            return trial
+            rollout.outcome = LiftOutcome.TOUCHED_ON_THE_WAY
+            return rollout
         if not self._close(grasps, row, give_up=True):
-            trial.outcome = LiftOutcome.DIVERGED if void(self.data) else LiftOutcome.LOST_WHILE_CLOSING
-            trial.steps = self._steps
-            return trial
+            rollout.outcome = LiftOutcome.DIVERGED if void(self.data) else LiftOutcome.LOST_WHILE_CLOSING
+            rollout.steps = self._steps
+            return rollout
         self._rise(grasps, row)
-        inner = Trial()
-        outcome = self._judge(inner)
+        inner = Rollout()
+        outcome = self._validate(inner)
         if outcome is Outcome.HELD:
             outcome = self._hold(inner)
-        trial = self._ended(trial, outcome)
-        if trial.success and self._neighbours_moved():
-            trial.outcome = LiftOutcome.NEIGHBOUR_MOVED
-        return trial
+        rollout = self._ended(rollout, outcome)
+        if rollout.success and self._neighbours_moved():
+            rollout.outcome = LiftOutcome.NEIGHBOUR_MOVED
+        return rollout
 
-    def _begin(self, grasps: GraspSet, row: int) -> LiftTrial:
+    def _begin(self, grasps: GraspSet, row: int) -> LiftTest:
         """The scene as this grasp has it; the object at rest; gravity on the object alone, as published."""
         self._steps, number = 0, int(self.placed.index[row])
         self._scene_pose = invert(np.asarray(self.placed.object_pose[number], float))
@@ -130,10 +130,10 @@ class Lift(Test):
         self._goal = np.zeros(3)
         self._put(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
         mujoco.mj_forward(self.scene.model, self.data)
-        trial = LiftTrial()
+        rollout = LiftTest()
         if max(self._depths_here()) > MAX_PENETRATION_M:
-            trial.outcome = LiftOutcome.PENETRATION
-        return trial
+            rollout.outcome = LiftOutcome.PENETRATION
+        return rollout
 
     def _put(self, hand_pose: Floats, joints: Floats) -> None:
         self.scene.place(self.data, hand_pose, joints)
@@ -199,7 +199,7 @@ class Lift(Test):
         return bool((distance < -allowed)[on_support].any() or (distance[of_hand & ~on_support] < -OVERHANG_M).any())
 
     def _rise(self, grasps: GraspSet, row: int, path: Floats = SMOOTHLY, step_s: float = RISING_S) -> None:
-        """The root to the top, or, but for the letter, to where the object is lost."""
+        """The root to the top, or, except at level dexgraspbench, to where the object is lost."""
         root = np.asarray(grasps.squeeze.hand_pose[row], float)
         self.scene.command(self.data, root, grasps.squeeze.joint_positions[row])
         for number, share in enumerate(path):
@@ -233,10 +233,10 @@ class Lift(Test):
         root = self.data.qpos[at : at + 7]
         return root[:3], quat_multiply(root[3:], quat_conjugate(self.data.mocap_quat[0]))
 
-    def _ended(self, trial: LiftTrial, outcome: Outcome) -> LiftTrial:
-        trial.steps, trial.margin = self._steps, self._excess()
-        trial.outcome = _OUTCOMES[outcome]
-        return trial
+    def _ended(self, rollout: LiftTest, outcome: Outcome) -> LiftTest:
+        rollout.steps, rollout.margin = self._steps, self._excess()
+        rollout.outcome = _OUTCOMES[outcome]
+        return rollout
 
 
 _OUTCOMES: Final[dict[Any, LiftOutcome]] = {

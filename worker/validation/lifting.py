@@ -14,22 +14,22 @@ from numpy.typing import NDArray
 from graspd.service.model.digests import digest_bytes, digest_json
 from graspd.service.model.errors import InputError
 from graspd.worker.control import postures
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.run import ALONE, Run
-from graspd.worker.simulation import surroundings
-from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.simulation import environment as surroundings
+from graspd.worker.simulation.environment import Placed
 from graspd.worker.validation import lift as protocol
 from graspd.worker.validation.compiled import answers, scene_of
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.key import postures_key, verdict_key
-from graspd.worker.validation.lift import Lift, LiftOutcome, LiftTrial
+from graspd.worker.validation.lift import Lift, LiftOutcome, LiftTest
 from graspd.worker.validation.model import TOUCH_ROUNDING_M, MujocoOptions
 
-LiftLevel = Literal["letter", "lift"]
+LiftLevel = Literal["dexgraspbench", "lift"]
 #: Lifts that were done, by `lift_of`.
-KnownLifts = dict[str, LiftTrial]
+KnownLifts = dict[str, LiftTest]
 LEVELS: Final[tuple[LiftLevel, ...]] = get_args(LiftLevel)
 #: Raise when the code of the lift test changes what it says, constants aside.
 REVISION: Final = 4
@@ -58,7 +58,7 @@ class LiftVerdicts:
         return [LiftOutcome(int(value)).name.lower().replace("_", " ") for value in self.outcome]
 
 
-def judge_lifts(
+def validate_lifts(
     hand: HandModel,
     obj: ObjectModel,
     grasps: GraspSet,
@@ -69,7 +69,7 @@ def judge_lifts(
     pieces: ConvexPieces | None = None,
     cache: Path | None = None,
     known: KnownLifts | None = None,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> LiftVerdicts:
     """Lift grasps out of their scenes; see `worker.validation.lift`.
 
@@ -78,7 +78,7 @@ def judge_lifts(
         obj: the object, with its mass and friction; `ObjectModel.published` has those of the protocol.
         grasps: N grasps with pregrasp, squeeze and, for level lift, approach.
         placed: their scenes; `index` has a scene for each.
-        level: letter or lift.
+        level: dexgraspbench or lift.
         hard: sliding friction halved, torsional friction a tenth, of supports too.
         pieces: convex pieces of the object; by default its CoACD pieces.
         cache: folder of the pieces.
@@ -97,25 +97,25 @@ def judge_lifts(
     scene = scene_of(hand, obj, pieces, physics, placed.supports, placed.neighbours)
     done, lock = 0, threading.Lock()
 
-    def ask(test: Lift, row: int) -> LiftTrial:
+    def ask(test: Lift, row: int) -> LiftTest:
         nonlocal done
-        run.check("the referee")
+        run.check("the validator")
         key = lift_of(grasps, row, placed, hard=hard) if known is not None else ""
-        trial = known.get(key) if known is not None else None
-        if trial is None:
-            trial = test.letter(grasps, row) if level == "letter" else test.lift(grasps, row)
+        rollout = known.get(key) if known is not None else None
+        if rollout is None:
+            rollout = test.dexgraspbench(grasps, row) if level == "dexgraspbench" else test.lift(grasps, row)
             if known is not None:
-                known[key] = trial
+                known[key] = rollout
         with lock:
             done += 1
             run.progress(done, len(grasps), "lifts")
-        return trial
+        return rollout
 
-    trials = answers(range(len(grasps)), lambda: Lift(scene, placed), ask, threads=run.cores, name="lift")
+    rollouts = answers(range(len(grasps)), lambda: Lift(scene, placed), ask, threads=run.cores, name="lift")
     return LiftVerdicts(
-        success=np.array([t.success for t in trials], np.int8),
-        outcome=np.array([t.outcome for t in trials], np.uint8),
-        margin=np.array([t.margin for t in trials], float),
+        success=np.array([t.success for t in rollouts], np.int8),
+        outcome=np.array([t.outcome for t in rollouts], np.uint8),
+        margin=np.array([t.margin for t in rollouts], float),
         level=level,
         hard=hard,
         terms=lift_key(hand, obj, placed, level, hard, pieces=pieces),
@@ -140,14 +140,14 @@ def require_ways(grasps: GraspSet, placed: Placed, level: LiftLevel) -> None:
     if level not in LEVELS:
         raise InputError(f"unknown level {level!r} of the lift test; choose one of {', '.join(LEVELS)}")
     if len(placed.index) != len(grasps) or (level == "lift" and grasps.approach is None):
-        raise InputError("the lift test needs a scene and, but for the letter, an approach of each grasp")
+        raise InputError("the lift test needs a scene and, except at level dexgraspbench, an approach of each grasp")
 
 
 def lift_key(
     hand: HandModel, obj: ObjectModel, placed: Placed, level: LiftLevel, hard: bool, *, pieces: ConvexPieces
 ) -> str:
     """Digest of the terms of a lift: those of the six pushes, the supports, and the constants of the lift."""
-    pushes = verdict_key(hand, obj, "letter" if level == "letter" else "certificate", hard, pieces=pieces)
+    pushes = verdict_key(hand, obj, "dexgraspbench" if level == "dexgraspbench" else "standard", hard, pieces=pieces)
     supports = b"".join(np.round(s.planes, 9).tobytes() for s in placed.supports)
     constants = {name: getattr(module, name) for module, names in _MOVES.items() for name in names}
     physics = asdict(MujocoOptions().hardened() if hard else MujocoOptions())

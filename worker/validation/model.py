@@ -20,7 +20,7 @@ from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.model import ConvexPiece, HandModel, JointType
 from graspd.worker.hands.tendons import Tendon, actuators
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.simulation.surroundings import CLEAR_M, Neighbour, Obstacle
+from graspd.worker.simulation.environment import CLEAR_M, Neighbour, Obstacle
 from graspd.worker.validation.decomposition import ConvexPieces
 
 #: Sliding and torsional friction; `hard` scales them by `HARD`.

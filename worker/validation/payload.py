@@ -33,6 +33,7 @@ from graspd.service.model.matter import ACCELERATION, MASS_KG, MOST_KG
 from graspd.service.model.planning import limit_told
 from graspd.service.model.transforms import Floats, cross, quat_rotate
 from graspd.worker.engines.mujoco_warnings import void
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.kinematics import generalized_forces
 from graspd.worker.hands.model import HandModel
@@ -40,12 +41,11 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.contact import choose_contacts
 from graspd.worker.quality.posed import posing_of
 from graspd.worker.quality.wrench_space import EDGES, cone_edges
-from graspd.worker.run import ALONE, Run
-from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.simulation.environment import Placed
 from graspd.worker.validation.compiled import measured, scene_of
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.model import Scene
-from graspd.worker.validation.prescreening import HANGING_CLOSING, LIFTING, Hanging
+from graspd.worker.validation.prescreening import HANGING_CLOSING, LIFTING, FixedRootScene
 from graspd.worker.validation.protocol import DIRECTIONS, LOST, Outcome, Test
 
 #: The payload is told downwards, to this ratio.
@@ -109,7 +109,7 @@ class _Weighed(Test):
                 step **= 2
 
 
-class LiftPayload(_Weighed, Hanging):
+class LiftPayload(_Weighed, FixedRootScene):
     """Of grasps in one scene."""
 
     def payload(self, grasps: GraspSet, row: int) -> float:
@@ -173,7 +173,7 @@ def payloads(
     pieces: ConvexPieces,
     placed: Placed | None = None,
     held: NDArray[np.bool_] | None = None,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
     """(N,) heaviest mass that each grasp lifts [kg]; nan: not tried, or it does not lift the object itself.
 
@@ -247,7 +247,7 @@ def limit_of(
     placed: Placed | None = None,
     wanted: float | None = None,
     least: int = LEAST,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Limit | None:
     """What the best of N grasps lifts; None: it lifts as much as is wanted, or fewer than `least` lift anything.
 
@@ -288,7 +288,7 @@ PERIODS: Final = 3
 STEP_S: Final = 0.008
 
 
-class Shake(Hanging):
+class Shake(FixedRootScene):
     """Shakes grasps in one scene. Not for several threads at once."""
 
     def margin(self, grasps: GraspSet, row: int) -> float:
@@ -319,7 +319,7 @@ def shake_margins(
     *,
     pieces: ConvexPieces,
     held: NDArray[np.bool_] | None = None,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
     """(N,) worst displacement or rotation over its limit of each grasp that is shaken: below 1 it survives; nan: not
     tried.

@@ -4,7 +4,7 @@ The hand closes and squeezes around the object in a fraction of the time of the 
 then gone, and for a moment most of the object's weight pulls; a free object is pushed towards the corners of a
 tetrahedron, nearly twice as hard as it weighs. All this at half the friction: what slips is pulled once more, from the
 same closed hand, at the whole friction, and by a third more than the weight in a scene. Not a verdict: it ranks
-candidates for a fifth of a verdict's cost, and what it chooses the whole test judges all the same.
+candidates for a fifth of a verdict's cost, and what it chooses the whole test validates all the same.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from graspd.worker.engines.mujoco_warnings import void
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.simulation.environment import Placed
 from graspd.worker.validation.compiled import scene_of
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import Lift, LiftOutcome
@@ -73,7 +73,7 @@ class Frictions:
     whole: Scene
 
 
-class ShortLift(Lift):
+class LiftRollout(Lift):
     """Runs short lifts of grasps in one scene. Not for several threads at once."""
 
     def __init__(self, scenes: Frictions, placed: Placed) -> None:
@@ -106,7 +106,7 @@ class ShortLift(Lift):
         return self._ahead(HANGING, enough)
 
 
-class ShortPush(Test):
+class PushRollout(Test):
     """Runs short pushes of grasps of a free object. Not for several threads at once."""
 
     def __init__(self, scenes: Frictions) -> None:
@@ -178,7 +178,7 @@ class _Shorts:
             return self._scenes
 
 
-class ShortLifts(_Shorts):
+class LiftRollouts(_Shorts):
     """Short lifts of grasps in their scenes."""
 
     def scores(self, grasps: GraspSet, placed: Placed, beat: Floats | None = None) -> Floats:
@@ -186,21 +186,21 @@ class ShortLifts(_Shorts):
         least = np.full(len(grasps), np.inf) if beat is None else beat
 
         def test(scenes: Frictions) -> Callable[[int], float]:
-            short = ShortLift(scenes, placed)
+            short = LiftRollout(scenes, placed)
             return lambda row: short.score(grasps, row, float(least[row]))
 
         return np.array(self._each(test, len(grasps), placed), float)
 
 
-class ShortPushes(_Shorts):
+class PushRollouts(_Shorts):
     """Short pushes of grasps of a free object."""
 
     def scores(self, grasps: GraspSet) -> Floats:
         """(N,) see `ShortPush.score`."""
-        return np.array(self._each(lambda s: partial(ShortPush(s).score, grasps), len(grasps), None), float)
+        return np.array(self._each(lambda s: partial(PushRollout(s).score, grasps), len(grasps), None), float)
 
 
-def push_trial(
+def push_rollout(
     hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1
 ) -> Callable[[GraspSet, Placed | None, Floats], Floats]:
     """A trial of free grasps as `worker.planners.Wanted` takes it: (N,) scores, below 1 for grasps that hold the object
@@ -212,12 +212,12 @@ def push_trial(
         pieces: gives the object's convex pieces when they are first needed.
         threads: of one call; planners on the CPU call from as many threads as they may use.
     """
-    pushes = ShortPushes(hand, obj, pieces, threads=threads)
+    pushes = PushRollouts(hand, obj, pieces, threads=threads)
 
-    def trial(grasps: GraspSet, placed: Placed | None, beat: Floats | None = None) -> Floats:
+    def rollout(grasps: GraspSet, placed: Placed | None, beat: Floats | None = None) -> Floats:
         return pushes.scores(grasps)
 
-    return trial
+    return rollout
 
 
 #: Stages of closing and of squeezing.
@@ -229,7 +229,7 @@ LOADING_S: Final = 0.04
 LOADS: Final = 5
 
 
-class Hanging(Lift):
+class FixedRootScene(Lift):
     """A scene whose root is fixed. Not for several threads at once."""
 
     def _closed(self, grasps: GraspSet, row: int) -> bool:

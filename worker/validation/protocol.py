@@ -2,7 +2,7 @@
 
 letter: as published; each of the 6 pushes starts from the closed hand as if it had closed anew and is held for 2 s.
 certificate: the same physics; a push ends as soon as linear extrapolation to 2 s stays inside half of the limits.
-screen: coarser physics (fixed root, 6 ms); where the margin is not clear, the certificate decides.
+screen: coarser physics (fixed root, 6 ms); where the margin is not clear, the standard level decides.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MAX_PENETRATION_M: Final = 0.010
 STAGES: Final = 10
 STAGE_S: Final = 0.04
 HOLD_S: Final = 2.0
-LETTER_INTERVAL_S: Final = 0.2
+DEXGRASPBENCH_INTERVAL_S: Final = 0.2
 #: Sequential test: first look and interval. Earlier looks miss slow creepers under a weak squeeze.
 FIRST_LOOK_S: Final = 0.08
 INTERVAL_S: Final = 0.04
@@ -44,7 +44,7 @@ LOST: Final = 10.0
 LOST_ROTATION: Final = math.radians(30.0)
 #: Coarse physics are trusted where their worst displacement or rotation over its limit is outside this band. What they
 #: wrongly accept moves little in them: a band that begins at 0.7 of the limit leaves nearly twice as many.
-SCREEN_BAND: Final = (0.3, 3.0)
+FAST_BAND: Final = (0.3, 3.0)
 
 
 class Outcome(IntEnum):
@@ -59,7 +59,7 @@ class Outcome(IntEnum):
     DIVERGED = 6
 
 
-class JudgedBy(IntEnum):
+class ValidatedBy(IntEnum):
     """Whose verdict it is. Only MuJoCo on the CPU gives certificates."""
 
     MUJOCO = 0
@@ -67,7 +67,7 @@ class JudgedBy(IntEnum):
 
 
 @dataclass
-class Trial:
+class Rollout:
     """Verdict on one grasp."""
 
     outcomes: list[Outcome] = field(default_factory=lambda: [Outcome.NOT_TRIED] * len(DIRECTIONS))
@@ -76,13 +76,13 @@ class Trial:
     penetration_m: float = 0.0
     self_penetration_m: float = 0.0
     steps: int = 0
-    judged_by: JudgedBy = JudgedBy.MUJOCO
+    validated_by: ValidatedBy = ValidatedBy.MUJOCO
 
     @property
     def success(self) -> bool:
         return all(outcome is Outcome.HELD for outcome in self.outcomes)
 
-    def fail(self, outcome: Outcome, direction: int = 0) -> Trial:
+    def fail(self, outcome: Outcome, direction: int = 0) -> Rollout:
         self.outcomes[direction] = outcome
         return self
 
@@ -99,11 +99,11 @@ class Test:
         size = mujoco.mj_stateSize(scene.model, mujoco.mjtState.mjSTATE_INTEGRATION)
         self._saved = np.empty(size)
 
-    def letter(self, grasps: GraspSet, row: int) -> Trial:
+    def dexgraspbench(self, grasps: GraspSet, row: int) -> Rollout:
         """The protocol as published, ending at the first push that fails."""
-        trial = self._start(grasps, row)
-        if trial.outcomes[0] is Outcome.PENETRATION:
-            return trial
+        rollout = self._start(grasps, row)
+        if rollout.outcomes[0] is Outcome.PENETRATION:
+            return rollout
         self._close(grasps, row)
         self._save()
         for direction in range(len(DIRECTIONS)):
@@ -111,45 +111,45 @@ class Test:
             self._restore()
             self._push(direction)
             outcome = Outcome.HELD
-            for _ in range(round(HOLD_S / LETTER_INTERVAL_S)):
-                self._run(LETTER_INTERVAL_S)
-                outcome = self._judge(trial)
+            for _ in range(round(HOLD_S / DEXGRASPBENCH_INTERVAL_S)):
+                self._run(DEXGRASPBENCH_INTERVAL_S)
+                outcome = self._validate(rollout)
                 if outcome is not Outcome.HELD:
                     break
-            trial.outcomes[direction] = outcome
+            rollout.outcomes[direction] = outcome
             if outcome is not Outcome.HELD:
                 break
-        trial.steps = self._steps
-        return trial
+        rollout.steps = self._steps
+        return rollout
 
-    def certificate(self, grasps: GraspSet, row: int) -> Trial:
+    def standard(self, grasps: GraspSet, row: int) -> Rollout:
         """Close once, branch the pushes, decide each as early as it is decided."""
-        trial = self._start(grasps, row)
-        if trial.outcomes[0] is Outcome.PENETRATION:
-            return trial
-        if not self._close(grasps, row, give_up=True) or self._judge(trial) is not Outcome.HELD:
+        rollout = self._start(grasps, row)
+        if rollout.outcomes[0] is Outcome.PENETRATION:
+            return rollout
+        if not self._close(grasps, row, give_up=True) or self._validate(rollout) is not Outcome.HELD:
             # A push must bring the object back inside the limits for this to be wrong: not seen in 690 grasps.
-            trial.margin = max(trial.margin, self._excess())
-            trial.steps = self._steps
-            return trial.fail(Outcome.DIVERGED if void(self.data) else Outcome.LOST_WHILE_CLOSING)
+            rollout.margin = max(rollout.margin, self._excess())
+            rollout.steps = self._steps
+            return rollout.fail(Outcome.DIVERGED if void(self.data) else Outcome.LOST_WHILE_CLOSING)
         self._save()
         for direction in range(len(DIRECTIONS)):
             self._restore()
             self._push(direction)
-            trial.outcomes[direction] = self._hold(trial)
-            if trial.outcomes[direction] is not Outcome.HELD:
+            rollout.outcomes[direction] = self._hold(rollout)
+            if rollout.outcomes[direction] is not Outcome.HELD:
                 break
-        trial.steps = self._steps
-        return trial
+        rollout.steps = self._steps
+        return rollout
 
-    def _start(self, grasps: GraspSet, row: int) -> Trial:
+    def _start(self, grasps: GraspSet, row: int) -> Rollout:
         self._steps = 0
-        trial = Trial()
-        trial.penetration_m, trial.self_penetration_m = self._depths(grasps.grasp, row)
+        rollout = Rollout()
+        rollout.penetration_m, rollout.self_penetration_m = self._depths(grasps.grasp, row)
         # As published: what counts is where the simulation starts. The depth at the grasp is only told.
         if max(self._depths(grasps.pregrasp, row)) > MAX_PENETRATION_M:
-            return trial.fail(Outcome.PENETRATION)
-        return trial
+            return rollout.fail(Outcome.PENETRATION)
+        return rollout
 
     def _put(self, hand_pose: Floats, joints: Floats) -> None:
         """The object at its start, the hand (7,), (J,) at rest."""
@@ -204,7 +204,7 @@ class Test:
         self.data.xfrc_applied[:] = 0.0
         self.data.xfrc_applied[self.scene.object_body, :3] = self.scene.push * np.array(DIRECTIONS[direction])
 
-    def _hold(self, trial: Trial) -> Outcome:
+    def _hold(self, rollout: Rollout) -> Outcome:
         """Sequential test: reject on a broken limit, accept when the present rates keep well inside it for 2 s."""
         elapsed = FIRST_LOOK_S - INTERVAL_S
         self._run(elapsed)
@@ -212,7 +212,7 @@ class Test:
         while elapsed < HOLD_S - 1e-9:
             self._run(INTERVAL_S)
             elapsed += INTERVAL_S
-            outcome = self._judge(trial)
+            outcome = self._validate(rollout)
             if outcome is not Outcome.HELD:
                 return outcome
             now, turned = self._offset(), self._motion()[1]
@@ -264,11 +264,11 @@ class Test:
         moved, turned = self._motion()
         return max(moved / MAX_DISPLACEMENT_M, turned / MAX_ROTATION)
 
-    def _judge(self, trial: Trial) -> Outcome:
+    def _validate(self, rollout: Rollout) -> Outcome:
         if void(self.data):
             return Outcome.DIVERGED
         moved, turned = self._motion()
-        trial.margin = max(trial.margin, moved / MAX_DISPLACEMENT_M, turned / MAX_ROTATION)
+        rollout.margin = max(rollout.margin, moved / MAX_DISPLACEMENT_M, turned / MAX_ROTATION)
         if not moved < MAX_DISPLACEMENT_M:
             return Outcome.DISPLACED
         return Outcome.HELD if turned < MAX_ROTATION else Outcome.ROTATED

@@ -1,6 +1,6 @@
 """Robustness of grasps: verdicts in other models of the same hand and object, and with the object displaced.
 
-A grasp is judged in k models, each of which departs from the nominal one along one axis (`variant`). Axes take turns
+A grasp is validated in k models, each of which departs from the nominal one along one axis (`variant`). Axes take turns
 in an order at random; all is drawn from the seed and the grasp's own numbers, so a grasp meets the same models wherever
 it stands, and the first 8 of 16 are those of 8.
 """
@@ -21,20 +21,20 @@ from numpy.typing import NDArray
 
 from graspd.service.model.metrics import ROBUST_MODELS, Axis
 from graspd.service.model.transforms import Floats, compose, invert, quat_from_axis_angle
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.run import ALONE, Run
-from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.simulation.environment import Placed
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.key import Level
 from graspd.worker.validation.lifting import LiftLevel, require_ways
 from graspd.worker.validation.model import MujocoOptions
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.validator import validate
 from graspd.worker.validation.variant import Variant, dealt, draw
 from graspd.worker.validation.varied import Models
 
-NOT_JUDGED: Final = -1
+NOT_VALIDATED: Final = -1
 #: Shares are wanted to this: 0.9 of 10 models is 9 of them.
 _EXACT: Final = 1e-9
 
@@ -44,7 +44,7 @@ class Robustness:
     """What became of N grasps in k models."""
 
     held: NDArray[np.int8]
-    """(N, k) 1 held, 0 not, -1 not judged: the grasp was not tried, or its share was decided."""
+    """(N, k) 1 held, 0 not, -1 not validated: the grasp was not tried, or its share was decided."""
     axis: NDArray[np.uint8]
     """(N, k) `Axis` of each model."""
     wanted: float
@@ -52,13 +52,13 @@ class Robustness:
 
     @property
     def share(self) -> Floats:
-        """(N,) share of the models in which a grasp holds; nan: not tried. Where judging ended early, what it is at
+        """(N,) share of the models in which a grasp holds; nan: not tried. Where validating ended early, what it is at
         least if the wanted share was reached, at most if it was missed."""
         models = self.held.shape[1]
         held, failed = (self.held == 1).sum(axis=1), (self.held == 0).sum(axis=1)
         reached = held >= needed(self.wanted, models)
         share = np.where(reached, held, models - failed) / models
-        return np.where((self.held == NOT_JUDGED).all(axis=1), np.nan, share)
+        return np.where((self.held == NOT_VALIDATED).all(axis=1), np.nan, share)
 
     @property
     def weakest(self) -> NDArray[np.uint8]:
@@ -73,17 +73,18 @@ class Robustness:
         return {"quality/robust_share": self.share, "quality/robust_weakest": self.weakest}
 
     def by_axis(self) -> dict[Axis, tuple[int, int]]:
-        """Of each axis that was judged: models in which a grasp held, and all of them."""
+        """Of each axis that was validated: models in which a grasp held, and all of them."""
         counts = {}
         for axis in Axis:
-            found = self.held[(self.axis == axis) & (self.held != NOT_JUDGED)]
+            found = self.held[(self.axis == axis) & (self.held != NOT_VALIDATED)]
             if len(found):
                 counts[axis] = (int(found.sum()), len(found))
         return counts
 
 
 def needed(wanted: float, models: int) -> int:
-    """Models of `models` in which a grasp has to hold for the wanted share; none is wanted at 0, so all are judged."""
+    """Models of `models` in which a grasp has to hold for the wanted share; none is wanted at 0, so all are
+    validated."""
     return math.ceil(wanted * models - _EXACT) if wanted > 0 else models
 
 
@@ -106,19 +107,19 @@ def robust(
     hard: bool = False,
     pieces: ConvexPieces | None = None,
     cache: Path | None = None,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Robustness:
-    """Judge grasps in models around the nominal one: six pushes at the level of the certificate, or lifts.
+    """Validate grasps in models around the nominal one: six pushes at the level of the standard level, or lifts.
 
     Args:
         hand: the hand.
         obj: the object.
         grasps: N grasps.
         held: (N,) verdicts of the nominal model; only grasps with 1 are tried. By default all.
-        placed: their scenes; the lift test out of these then judges. None: the six pushes do.
+        placed: their scenes; the lift test out of these then validates. None: the six pushes do.
         level: of the lift test.
         models: for each grasp.
-        wanted: share of them; judging a grasp ends when it is sure whether it is reached. 0: all are judged.
+        wanted: share of them; validating a grasp ends when it is sure whether it is reached. 0: all are validated.
         seed: of the models, with the grasp's own numbers.
         hard: at the hard protocol's friction.
         pieces: convex pieces of the object; by default its CoACD pieces.
@@ -133,7 +134,7 @@ def robust(
     if placed is not None:
         require_ways(grasps, placed, level)
     began = time.perf_counter()
-    verdicts = np.full((len(grasps), models), NOT_JUDGED, np.int8)
+    verdicts = np.full((len(grasps), models), NOT_VALIDATED, np.int8)
     axes = np.zeros((len(grasps), models), np.uint8)
     tried = np.arange(len(grasps)) if held is None else np.flatnonzero(np.asarray(held) == 1)
     if not len(tried):
@@ -145,8 +146,8 @@ def robust(
 
     def holds(row: int, variant: Variant) -> bool:
         if placed is None:
-            return around.certificate(grasps, row, variant).success
-        return around.lift(grasps, row, placed, variant, letter=level == "letter").success
+            return around.standard(grasps, row, variant).success
+        return around.lift(grasps, row, placed, variant, dexgraspbench=level == "dexgraspbench").success
 
     def work(row: int) -> None:
         nonlocal done
@@ -167,7 +168,7 @@ def robust(
 
 
 def models_of(hand: HandModel, grasps: GraspSet, row: int, models: int, seed: int) -> list[tuple[Axis, Variant]]:
-    """The models in which a grasp is judged, in their order."""
+    """The models in which a grasp is validated, in their order."""
     words = (seed, *_words(grasps, row))
     axes = dealt(hand, models, words)
     return [(axis, draw(axis, hand, np.random.default_rng((*words, k)))) for k, axis in enumerate(axes)]
@@ -196,11 +197,11 @@ def robustness(
     noise_m: float = NOISE_M,
     noise_rad: float = NOISE_RAD,
     seed: int = 0,
-    level: Level = "screen",
+    level: Level = "fast",
     hard: bool = False,
     pieces: ConvexPieces | None = None,
     cache: Path | None = None,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
     """(N,) share of `repeats` in which a grasp still holds with noise on the object's pose; nan: not tried.
 
@@ -232,7 +233,7 @@ def robustness(
         return out
     moves = np.array([_noise(obj, noise_m, noise_rad, (seed, k, int(i))) for k in range(repeats) for i in tried])
     noisy = _moved(grasps, np.tile(tried, repeats), invert(moves))
-    verdicts = judge(hand, obj, noisy, level=level, hard=hard, pieces=pieces, cache=cache, run=run)
+    verdicts = validate(hand, obj, noisy, level=level, hard=hard, pieces=pieces, cache=cache, run=run)
     out[tried] = verdicts.success.reshape(repeats, len(tried)).mean(axis=0)
     return out
 

@@ -1,4 +1,4 @@
-"""Verdicts of the referee on many grasps, all cores used; the model of a (hand, object) pair is built once."""
+"""Verdicts of the validator on many grasps, all cores used; the model of a (hand, object) pair is built once."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
+from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.disk_cache import content_of
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.run import ALONE, Count, Run
 from graspd.worker.validation.compiled import scene_of
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.key import Level, postures_key, verdict_key
 from graspd.worker.validation.model import COARSE, MujocoOptions, Scene
-from graspd.worker.validation.prefilter.prefilter import Screened, first_terms, screened
-from graspd.worker.validation.protocol import DIRECTIONS, SCREEN_BAND, Outcome, Test, Trial
+from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts, first_terms, screened
+from graspd.worker.validation.protocol import DIRECTIONS, FAST_BAND, Outcome, Rollout, Test
 
 log = logging.getLogger(__name__)
-#: Grasps that a process of a pool judges at a time: few, so that those of one batch are shared by many processes.
+#: Grasps that a process of a pool validates at a time: few, so that those of one batch are shared by many processes.
 _CHUNK: Final = 2
-LEVELS: Final = ("letter", "certificate", "screen")
+LEVELS: Final = ("dexgraspbench", "standard", "fast")
 #: Trials that were done, by `postures_key` of one grasp.
-KnownTrials = dict[str, Trial]
+KnownRollouts = dict[str, Rollout]
 
 
 @dataclass(frozen=True)
 class Verdicts:
-    """What the referee says of N grasps. Verdicts of different terms must not be mixed in one number."""
+    """What the validator says of N grasps. Verdicts of different terms must not be mixed in one number."""
 
     success: NDArray[np.int8]
     """(N,) 1 held in all six directions, 0 not."""
@@ -60,15 +60,15 @@ class Verdicts:
     terms: str
     """`verdict_key`: digest of all that moves a verdict but the grasp. Rates of different terms do not compare."""
     key: str
-    """Digest of the terms and of the postures that were judged."""
-    judged_by: NDArray[np.uint8]
+    """Digest of the terms and of the postures that were validated."""
+    validated_by: NDArray[np.uint8]
     """(N,) `JudgedBy`: whose verdict it is. Only those of MuJoCo on the CPU are certificates."""
     seconds: float
     """Wall time."""
     steps: int
     """Simulation steps of all trials."""
-    audited: int = 0
-    """Verdicts of the first judge that the CPU was asked for as well; where they differ the CPU's stands."""
+    rechecked: int = 0
+    """Verdicts of the prefilter that the CPU was asked for as well; where they differ the CPU's stands."""
     contradicted: int = 0
     """How many of them differed."""
 
@@ -85,28 +85,28 @@ class Verdicts:
         return found
 
 
-def judge(
+def validate(
     hand: HandModel,
     obj: ObjectModel,
     grasps: GraspSet,
     *,
-    level: Level = "certificate",
+    level: Level = "standard",
     hard: bool = False,
     pieces: ConvexPieces | None = None,
     cache: Path | None = None,
-    known: KnownTrials | None = None,
-    run: Run = ALONE,
+    known: KnownRollouts | None = None,
+    run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Verdicts:
     """Test grasps by the DexGraspBench force-closure protocol; see `worker.validation.protocol` for the levels.
 
     MuJoCo releases the interpreter lock while it steps, so threads use a few cores; for many `run` has a pool. Where
-    `run` has a first judge it gives the clear verdicts, see `worker.validation.prefilter.prefilter`.
+    `run` has a prefilter it gives the clear verdicts, see `worker.validation.prefilter.prefilter`.
 
     Args:
         hand: the hand; its stiffness and effort are the actuators' gains and limits.
         obj: the object, with its mass and friction; `ObjectModel.published` has those of the protocol.
         grasps: N grasps with pregrasp and squeeze postures.
-        level: letter, certificate or screen.
+        level: dexgraspbench, standard, or fast.
         hard: sliding friction halved, torsional friction a tenth.
         pieces: convex pieces of the object; by default its CoACD pieces.
         cache: folder of the pieces, see `decompose`.
@@ -122,32 +122,34 @@ def judge(
         raise InputError(f"unknown level {level!r}; choose one of {', '.join(LEVELS)}")
     began = time.perf_counter()
     pieces = pieces or decompose(obj, cache=cache)
-    first_judge = first_terms(hand, level, run)
-    # What the first judge leaves over is near a limit: coarse physics would ask the certificate as well.
-    of_the_cpu: Level = "certificate" if first_judge else level
+    prefilter = first_terms(hand, level, run)
+    # What the prefilter leaves over is near a limit: coarse physics would ask the standard level as well.
+    of_the_cpu: Level = "standard" if prefilter else level
     case = _Case(hand, obj, pieces, of_the_cpu, hard)
-    terms = verdict_key(hand, obj, level, hard, pieces=pieces, first_judge=first_judge)
-    first = screened(case.scene, terms, grasps, level=level, run=run) if first_judge else Screened({}, {})
-    trials = dict(first.stands)
-    left = [row for row in range(len(grasps)) if row not in trials]
+    terms = verdict_key(hand, obj, level, hard, pieces=pieces, prefilter=prefilter)
+    first = screened(case.scene, terms, grasps, level=level, run=run) if prefilter else PrefilterVerdicts({}, {})
+    rollouts = dict(first.stands)
+    left = [row for row in range(len(grasps)) if row not in rollouts]
     keys = {} if known is None else {row: postures_key(terms, grasps.take(slice(row, row + 1))) for row in left}
     if known is not None:
-        trials |= {row: known[key] for row, key in keys.items() if key in known}
-    _try(case, grasps, [row for row in left if row not in trials], trials, run)
+        rollouts |= {row: known[key] for row, key in keys.items() if key in known}
+    _try(case, grasps, [row for row in left if row not in rollouts], rollouts, run)
     if known is not None:
-        known |= {key: trials[row] for row, key in keys.items()}
-    contradicted = first.contradicted(trials)
+        known |= {key: rollouts[row] for row, key in keys.items()}
+    contradicted = first.contradicted(rollouts)
     if not first.believed(contradicted):
-        log.warning("%d of %d audited verdicts are contradicted: the CPU judges all", contradicted, len(first.audited))
-        _try(case, grasps, list(first.stands), trials, run)
-    ordered = [trials[row] for row in range(len(grasps))]
+        log.warning(
+            "%d of %d rechecked verdicts are contradicted: the CPU validates all", contradicted, len(first.rechecked)
+        )
+        _try(case, grasps, list(first.stands), rollouts, run)
+    ordered = [rollouts[row] for row in range(len(grasps))]
     found = _verdicts(ordered, case, terms, postures_key(terms, grasps), time.perf_counter() - began)
-    return replace(found, level=level, audited=len(first.audited), contradicted=contradicted)
+    return replace(found, level=level, rechecked=len(first.rechecked), contradicted=contradicted)
 
 
 @dataclass(frozen=True)
 class _Case:
-    """What is judged, and how."""
+    """What is validated, and how."""
 
     hand: HandModel
     obj: ObjectModel
@@ -157,12 +159,12 @@ class _Case:
 
     @cached_property
     def scene(self) -> Scene:
-        """Of the certificate."""
+        """Of the standard level."""
         return self._scene(MujocoOptions())
 
     @property
     def coarse(self) -> Scene | None:
-        return self._scene(COARSE) if self.level == "screen" else None
+        return self._scene(COARSE) if self.level == "fast" else None
 
     def _scene(self, physics: MujocoOptions) -> Scene:
         return scene_of(self.hand, self.obj, self.pieces, physics.hardened() if self.hard else physics)
@@ -173,23 +175,23 @@ class _Case:
         return _Bench(self, 1)
 
 
-def _try(case: _Case, grasps: GraspSet, rows: list[int], trials: dict[int, Trial], run: Run) -> None:
+def _try(case: _Case, grasps: GraspSet, rows: list[int], rollouts: dict[int, Rollout], run: ExecutionContext) -> None:
     """Put the trials of some grasps among those that are there."""
     if run.pool is None:
-        _Bench(case, run.cores).judge(grasps, rows, trials, run)
+        _Bench(case, run.cores).validate(grasps, rows, rollouts, run)
         return
     bare = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
     parts = [bare.take(np.array(rows[k : k + _CHUNK], np.intp)) for k in range(0, len(rows), _CHUNK)]
-    done = Count(len(grasps), run, "referee", len(grasps) - len(rows))
+    done = Count(len(grasps), run, "validation", len(grasps) - len(rows))
     made = run.pool.map(
-        _trials, content_of(case), case, parts, cancelled=run.cancelled, done=lambda k: done.add(len(parts[k]))
+        _rollouts, content_of(case), case, parts, cancelled=run.cancelled, done=lambda k: done.add(len(parts[k]))
     )
-    trials.update(zip(rows, (trial for part in made for trial in part), strict=True))
+    rollouts.update(zip(rows, (rollout for part in made for rollout in part), strict=True))
 
 
-def _trials(case: _Case, grasps: GraspSet) -> list[Trial]:
+def _rollouts(case: _Case, grasps: GraspSet) -> list[Rollout]:
     """Of some grasps, one after the other."""
-    return [case.bench.trial(grasps, row) for row in range(len(grasps))]
+    return [case.bench.rollout(grasps, row) for row in range(len(grasps))]
 
 
 class _Bench:
@@ -205,47 +207,47 @@ class _Bench:
             if coarse is not None:
                 self._coarse.put(Test(coarse))
 
-    def judge(self, grasps: GraspSet, rows: list[int], trials: dict[int, Trial], run: Run) -> None:
+    def validate(self, grasps: GraspSet, rows: list[int], rollouts: dict[int, Rollout], run: ExecutionContext) -> None:
         """Put the trials of some grasps among those that are there."""
-        done = Count(len(grasps), run, "referee", len(grasps) - len(rows))
+        done = Count(len(grasps), run, "validation", len(grasps) - len(rows))
 
         def work(row: int) -> None:
-            run.check("the referee")
-            trials[row] = self.trial(grasps, row)
+            run.check("the validator")
+            rollouts[row] = self.rollout(grasps, row)
             done.add(1)
 
-        with ThreadPoolExecutor(self.threads, thread_name_prefix="referee") as pool:
+        with ThreadPoolExecutor(self.threads, thread_name_prefix="validation") as pool:
             list(pool.map(work, rows))
 
-    def trial(self, grasps: GraspSet, row: int) -> Trial:
-        if self.level == "screen":
-            trial = self._with(self._coarse, grasps, row)
-            low, high = SCREEN_BAND
+    def rollout(self, grasps: GraspSet, row: int) -> Rollout:
+        if self.level == "fast":
+            rollout = self._with(self._coarse, grasps, row)
+            low, high = FAST_BAND
             # A penetration has no margin: it is a fact of geometry, the same in either physics.
-            clear = trial.outcomes[0] is Outcome.PENETRATION or not low < trial.margin < high
-            if clear and Outcome.DIVERGED not in trial.outcomes:
-                return trial
+            clear = rollout.outcomes[0] is Outcome.PENETRATION or not low < rollout.margin < high
+            if clear and Outcome.DIVERGED not in rollout.outcomes:
+                return rollout
             second = self._with(self._full, grasps, row)
-            second.steps += trial.steps
+            second.steps += rollout.steps
             return second
         return self._with(self._full, grasps, row)
 
-    def _with(self, tests: queue.SimpleQueue[Test], grasps: GraspSet, row: int) -> Trial:
+    def _with(self, tests: queue.SimpleQueue[Test], grasps: GraspSet, row: int) -> Rollout:
         test = tests.get()
         try:
-            return test.letter(grasps, row) if self.level == "letter" else test.certificate(grasps, row)
+            return test.dexgraspbench(grasps, row) if self.level == "dexgraspbench" else test.standard(grasps, row)
         finally:
             tests.put(test)
 
 
-def _verdicts(trials: list[Trial], case: _Case, terms: str, key: str, seconds: float) -> Verdicts:
+def _verdicts(rollouts: list[Rollout], case: _Case, terms: str, key: str, seconds: float) -> Verdicts:
     return Verdicts(
-        success=np.array([t.success for t in trials], np.int8),
-        outcome=np.array([t.outcomes for t in trials], np.uint8).reshape(-1, len(DIRECTIONS)),
-        margin=np.array([t.margin for t in trials], float),
-        penetration_depth_mm=np.array([t.penetration_m for t in trials], float) * 1e3,
-        self_penetration_depth_mm=np.array([t.self_penetration_m for t in trials], float) * 1e3,
-        judged_by=np.array([t.judged_by for t in trials], np.uint8),
+        success=np.array([t.success for t in rollouts], np.int8),
+        outcome=np.array([t.outcomes for t in rollouts], np.uint8).reshape(-1, len(DIRECTIONS)),
+        margin=np.array([t.margin for t in rollouts], float),
+        penetration_depth_mm=np.array([t.penetration_m for t in rollouts], float) * 1e3,
+        self_penetration_depth_mm=np.array([t.self_penetration_m for t in rollouts], float) * 1e3,
+        validated_by=np.array([t.validated_by for t in rollouts], np.uint8),
         level=case.level,
         hard=case.hard,
         pieces=len(case.pieces),
@@ -254,5 +256,5 @@ def _verdicts(trials: list[Trial], case: _Case, terms: str, key: str, seconds: f
         terms=terms,
         key=key,
         seconds=seconds,
-        steps=sum(t.steps for t in trials),
+        steps=sum(t.steps for t in rollouts),
     )

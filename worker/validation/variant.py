@@ -1,7 +1,8 @@
 """Variants of the validator's model: other shapes, drives, tendons, masses and places that a real hand might as well
 have.
 
-A `Variant` says how a model departs from the nominal one, `draw` draws one along an axis, `varied.Models` judges in it.
+A `Variant` says how a model departs from the nominal one, `draw` draws one along an axis, `varied.Models` validates in
+it.
 """
 
 from __future__ import annotations

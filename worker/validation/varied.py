@@ -1,4 +1,4 @@
-"""The referee's test of a grasp in a variant of the model: shapes are compiled anew, numbers changed in a copy."""
+"""The validator's test of a grasp in a variant of the model: shapes are compiled anew, numbers changed in a copy."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from graspd.service.model.transforms import Floats, compose, invert, quat_from_a
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.simulation.surroundings import Neighbour, Obstacle, Placed
+from graspd.worker.simulation.environment import Neighbour, Obstacle, Placed
 from graspd.worker.validation.compiled import scene_of
 from graspd.worker.validation.decomposition import ConvexPieces
-from graspd.worker.validation.lift import Lift, LiftTrial
+from graspd.worker.validation.lift import Lift, LiftTest
 from graspd.worker.validation.model import MujocoOptions, Scene, blend, build
-from graspd.worker.validation.protocol import STAGES, Test, Trial
+from graspd.worker.validation.protocol import STAGES, Rollout, Test
 from graspd.worker.validation.refit import Fit, refitted
 from graspd.worker.validation.variant import Coupling, Variant, nearest, recoupled
 
@@ -53,17 +53,19 @@ class Models:
         self._lock = threading.Lock()
         self._fingers = _fingers(hand)
 
-    def certificate(self, grasps: GraspSet, row: int, variant: Variant) -> Trial:
-        """The verdict on one grasp, at the level of the certificate, in a variant; the nominal one has the verdict of
-        `judge` bit for bit."""
+    def standard(self, grasps: GraspSet, row: int, variant: Variant) -> Rollout:
+        """The verdict on one grasp, at the level of the standard level, in a variant; the nominal one has the verdict
+        of `validate` bit for bit."""
         test = VariantTest(self.scene(variant), variant, self._lags(variant))
-        return test.certificate(self._taken(test.scene, seen(self.obj, grasps, row, variant)), 0)
+        return test.standard(self._taken(test.scene, seen(self.obj, grasps, row, variant)), 0)
 
-    def lift(self, grasps: GraspSet, row: int, placed: Placed, variant: Variant, *, letter: bool = False) -> LiftTrial:
+    def lift(
+        self, grasps: GraspSet, row: int, placed: Placed, variant: Variant, *, dexgraspbench: bool = False
+    ) -> LiftTest:
         """What the lift test says of a grasp in a variant; the nominal one has that of `judge_lifts` bit for bit.
 
         Args:
-            grasps: with, but for the letter, their way.
+            grasps: with, except at level dexgraspbench, their way.
             row: of the grasp.
             placed: the scenes of all grasps; their supports and neighbours are those of these models.
             variant: the model.
@@ -83,7 +85,7 @@ class Models:
             )
         test = VariantLift(self.scene(variant), where, variant, self._lags(variant))
         one = self._taken(test.scene, one)
-        return test.letter(one, 0) if letter else test.lift(one, 0)
+        return test.dexgraspbench(one, 0) if dexgraspbench else test.lift(one, 0)
 
     def _taken(self, scene: Scene, one: GraspSet) -> GraspSet:
         """The grasp as the hand of a scene can take it: one of fewer dofs cannot take all postures."""

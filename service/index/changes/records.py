@@ -137,7 +137,7 @@ class Changes:
         known = self._finished_shards(connection, [row["shard_id"] for row in rows])
         for row in rows:
             row.update(known.get(row["shard_id"], {}))
-        upsert(connection, tasks, rows, keep=[name for name in rows[0] if name != "lane"])
+        upsert(connection, tasks, rows, keep=[name for name in rows[0] if name != "priority"])
 
     def _enter(self, connection: Connection, record: JobRecord, first: int, *, goes_on: bool) -> None:
         """Some ranges from one on. A note tells where the next ones begin, and that the job cannot have ended."""

@@ -23,7 +23,7 @@ from graspd.service.index.tables import (
 )
 from graspd.service.index.views import AssetView
 from graspd.service.model.errors import NotFoundError
-from graspd.service.model.states import AssetKind, Lane, State
+from graspd.service.model.states import AssetKind, Priority, State
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,9 @@ class Removals:
 
     def planned_only(self, ids: Sequence[str]) -> list[str]:
         """Of these jobs, those that only a dataset's planner made, nobody by themselves, and that no dataset holds."""
-        query = select(jobs.c.id).where(jobs.c.id.in_(ids), jobs.c.lane == Lane.BULK.value, jobs.c.origin.is_(None))
+        query = select(jobs.c.id).where(
+            jobs.c.id.in_(ids), jobs.c.priority == Priority.BULK.value, jobs.c.origin.is_(None)
+        )
         query = query.where(~exists().where(dataset_cells.c.job_id == jobs.c.id))
         with self.database.reading() as connection:
             return list(connection.scalars(query))

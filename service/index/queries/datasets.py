@@ -262,7 +262,9 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
         reason = row["reason"]
         if row["state"] == State.SUCCEEDED.value and options.want == "valid" and found < options.grasps:
             lost = outcomes_of(connection, tasks.c.job_id == job)
-            reason = shortfall(found, options.grasps, options.counted, yields.get("tried", 0), options.budget, lost)
+            reason = shortfall(
+                found, options.grasps, options.counted, yields.get("candidates", 0), options.budget, lost
+            )
         views.append(
             CellView(
                 **{name: row[name] for name in ("position", "hand", "object", "job_id", "state", "planned", "choice")},
@@ -295,7 +297,7 @@ def _work_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[s
 
 
 def _made_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, Any]]:
-    wanted = [column for column in _MADE if column.name in ("grasps", "valid", "tried", "judged", "seconds")]
+    wanted = [column for column in _MADE if column.name in ("grasps", "valid", "candidates", "validated", "seconds")]
     query = (
         select(tasks.c.job_id, *wanted)
         .join(shards, shards.c.id == tasks.c.shard_id)
@@ -319,6 +321,6 @@ _MADE: Final = (
     func.coalesce(func.sum(shards.c.seconds), 0.0).label("seconds"),
     _base(shards.c.count).label("grasps"),
     _base(shards.c.valid).label("valid"),
-    _base(shards.c.tried).label("tried"),
-    _base(shards.c.judged).label("judged"),
+    _base(shards.c.candidates).label("candidates"),
+    _base(shards.c.validated).label("validated"),
 )

@@ -12,9 +12,9 @@ from sqlalchemy import Column, ColumnElement, exists, or_, select
 from graspd.service.index.database import Database, chunks
 from graspd.service.index.tables import assets, dataset_cells, datasets, jobs, tasks
 from graspd.service.model.domain import JobOptions
-from graspd.service.model.planning import MAX_BACKOFF_S, PlannedTask, Turns, WaitingJob, interleave, share_of
+from graspd.service.model.planning import MAX_BACKOFF_S, PlannedTask, RoundRobin, WaitingJob, interleave, share_of
 from graspd.service.model.records import Cell, Choice, JobRecord, Member
-from graspd.service.model.states import AssetKind, Lane, Stage, State
+from graspd.service.model.states import AssetKind, Priority, Stage, State
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class ReadyTask:
 
     job: JobRecord
     task: PlannedTask
-    lane: Lane
+    priority: Priority
     last_attempt: int
     retried_upto: int
 
@@ -44,23 +44,25 @@ class Feed:
 
     database: Database
 
-    def waiting_jobs(self, lane: Lane, *, now: float) -> list[WaitingJob]:
+    def waiting_jobs(self, priority: Priority, *, now: float) -> list[WaitingJob]:
         """Jobs with tasks that may be queued, oldest first."""
         due = _due(tasks.c.not_before, now)
         waiting = exists().where(tasks.c.job_id == jobs.c.id, *_WAITING, due)
         query = (
             select(jobs.c.id, jobs.c.origin, jobs.c.project)
-            .where(jobs.c.state.in_((State.QUEUED.value, State.RUNNING.value)), jobs.c.lane == lane.value, waiting)
+            .where(
+                jobs.c.state.in_((State.QUEUED.value, State.RUNNING.value)), jobs.c.priority == priority.value, waiting
+            )
             .order_by(jobs.c.created, jobs.c.id)
         )
         with self.database.reading() as connection:
             rows = connection.execute(query).all()
         return [WaitingJob(row.id, share_of(row.project, (row.origin or {}).get("key", ""))) for row in rows]
 
-    def ready_tasks(self, lane: Lane, turns: Turns, *, now: float, limit: int) -> list[ReadyTask]:
+    def ready_tasks(self, priority: Priority, turns: RoundRobin, *, now: float, limit: int) -> list[ReadyTask]:
         """At most `limit` tasks to be queued: in turn those of each project or key, and of each job of it."""
         of_key: dict[str, list[list[tuple[WaitingJob, ReadyTask]]]] = defaultdict(list)
-        for job, share in turns.order(self.waiting_jobs(lane, now=now), limit):
+        for job, share in turns.order(self.waiting_jobs(priority, now=now), limit):
             of_key[job.key].append([(job, task) for task in self.ready_of_job(job.id, limit=share, now=now)])
         chosen = interleave([interleave(of_jobs) for of_jobs in of_key.values()])[:limit]
         turns.served([job for job, _ in chosen])
@@ -152,7 +154,7 @@ def _record(row: Any) -> JobRecord:
     return JobRecord(
         id=row["job_id"],
         **{name: row[name] for name in _OF_THE_JOB},
-        lane=row["lane"],
+        priority=row["priority"],
         created=row["created"],
     )
 
@@ -161,7 +163,7 @@ def _ready(row: Any, record: JobRecord) -> ReadyTask:
     task = PlannedTask(
         row["id"], Stage(row["stage"]), row["batch"], row["count"], tuple(row["inputs"]), row["shard_id"]
     )
-    return ReadyTask(record, task, Lane(row["lane"]), row["last_attempt"], row["retried_upto"])
+    return ReadyTask(record, task, Priority(row["priority"]), row["last_attempt"], row["retried_upto"])
 
 
 @dataclass(frozen=True)

@@ -132,10 +132,10 @@ _OPERATORS: Final[dict[str, Callable[[Any, Any], ColumnElement[bool]]]] = {
     "!=": operator.ne,
 }
 _FLAGS: Final[dict[str, Callable[[Columns], ColumnElement[bool]]]] = {
-    "judged": lambda grasps: grasps.success.is_not(None),
+    "validated": lambda grasps: grasps.success.is_not(None),
     "valid": lambda grasps: grasps.valid.is_(True),
     "held": lambda grasps: grasps.success.is_(True),
-    # What judges a grasp that was planned in a scene is the lift.
+    # What validates a grasp that was planned in a scene is the lift.
     "lift": lambda grasps: and_(grasps.scene_kind != "free", grasps.success.is_(True)),
     "lift_hard": lambda grasps: grasps.lift_hard.is_(True),
 }
@@ -232,10 +232,10 @@ def conditions(where: GraspFilter | None) -> list[Test]:
             found.append(Condition("pair", grasps.c[name], operator.eq, wanted))
     flags = {name: getattr(where, name) for name in ("valid", "success", "lift_hard")}
     found += [Condition("flag", grasps.c[name], is_, flag) for name, flag in flags.items() if flag is not None]
-    # What nobody judged was not rejected.
-    judged = True if where.valid is False else where.judged
-    if judged is not None:
-        found.append(Condition("flag", grasps.c.success, operator.ne if judged else operator.eq, None))
+    # What is not validated was not rejected.
+    validated = True if where.valid is False else where.validated
+    if validated is not None:
+        found.append(Condition("flag", grasps.c.success, operator.ne if validated else operator.eq, None))
     if where.scene is not None:
         anyone = where.scene == "any"
         compared, kind = (operator.ne, "free") if anyone else (operator.eq, where.scene)
@@ -435,10 +435,10 @@ class GraspFilter(Model):
     """An expression of `service.model.where`."""
     project: str | None = None
     """Of whose jobs; None: of everybody's."""
-    judged: bool | None = None
-    """Whether the referee gave a verdict."""
+    validated: bool | None = None
+    """Whether the validator gave a verdict."""
     valid: bool | None = None
-    """False: judged, and not valid."""
+    """False: validated, and not valid."""
     success: bool | None = None
     scene: str | None = None
     """Kind of the scene that it was planned in; any: whichever, but not free."""

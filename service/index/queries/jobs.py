@@ -183,7 +183,7 @@ def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[Stag
 
 
 def _made(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, int]]:
-    same = ("valid", "tried", "judged", "audited", "audit_held")
+    same = ("valid", "candidates", "validated", "rechecked", "recheck_held")
     columns = {"grasps": "count", **{name: name for name in same}}
     query = (
         select(tasks.c.job_id, *(func.sum(shards.c[column]).label(name) for name, column in columns.items()))

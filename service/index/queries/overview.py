@@ -49,14 +49,14 @@ class Overview:
                 for kind, *row in connection.execute(select(shards.c.kind, *sums).where(*seen).group_by(shards.c.kind))
             }
             living = connection.scalar(alive)
-        _, made, valid, tried, judged, _ = of_shards.get("base", (0,) * 6)
+        _, made, valid, candidates, validated, _ = of_shards.get("base", (0,) * 6)
         return Stats(
             jobs=_by_state(of_jobs),
             tasks=_by_state(of_tasks),
             grasps=made,
             valid=valid,
-            tried=tried,
-            judged=judged,
+            candidates=candidates,
+            validated=validated,
             shards=sum(row[0] for row in of_shards.values()),
             bytes=sum(row[5] for row in of_shards.values()),
             workers=int(living or 0),
@@ -139,15 +139,20 @@ class Overview:
                     pairs[job][state] += int(number)
             for hand, obj, *sums in connection.execute(made):
                 if (hand, obj) in cells:
-                    cells[hand, obj] |= zip(("grasps", "valid", "tried", "judged"), map(int, sums), strict=True)
+                    cells[hand, obj] |= zip(("grasps", "valid", "candidates", "validated"), map(int, sums), strict=True)
         return [MatrixCell(hand=hand, object=obj, **cells[hand, obj]) for hand, obj in sorted(cells)]
 
 
-_CELL: Final = ("jobs", "queued", "running", "failed", "grasps", "valid", "tried", "judged")
+_CELL: Final = ("jobs", "queued", "running", "failed", "grasps", "valid", "candidates", "validated")
 #: Seconds of an interval, and how many characters of a time tell such intervals apart.
 _UNITS: Final = ((3600, 13), (60, 16), (1, 19))
 _REST_OF_TIME: Final = "0000-00-00T00:00:00Z"
-_MADE = (func.sum(shards.c.count), func.sum(shards.c.valid), func.sum(shards.c.tried), func.sum(shards.c.judged))
+_MADE = (
+    func.sum(shards.c.count),
+    func.sum(shards.c.valid),
+    func.sum(shards.c.candidates),
+    func.sum(shards.c.validated),
+)
 
 
 def _counted(column: ColumnElement[Any], *tests: ColumnElement[bool]) -> Select[Any]:
@@ -302,13 +307,13 @@ class BatchCost:
     seconds: float
     count: int
     valid: int
-    tried: int
+    candidates: int
     size_bytes: int
     batches: int = 1
 
     @property
     def kept(self) -> int:
-        """Grasps that count towards those asked for: valid ones, or where nobody judged all that stayed."""
+        """Grasps that count towards those asked for: valid ones, or where not validated all that stayed."""
         return self.valid if self.request.counted == "valid" else self.count
 
 

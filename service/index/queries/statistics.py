@@ -47,7 +47,7 @@ class Distributions:
 
 
 @dataclass(frozen=True)
-class Kinds:
+class GraspKinds:
     """Of what types grasps are, and from which cells of the sphere the palm comes; grasps that tell neither are left
     out."""
 
@@ -126,14 +126,14 @@ class Statistics:
             rows = [tuple(row) for row in connection.execute(query)]
         return share, np.array(rows, float).reshape(-1, len(metrics))
 
-    def kinds(self, where: GraspFilter, *, at_most: int = 20_000) -> Kinds:
+    def kinds(self, where: GraspFilter, *, at_most: int = 20_000) -> GraspKinds:
         """Types and directions, from about `at_most` grasps as `distributions` draws them."""
         columns = grasps.c.grasp_type, grasps.c.approach_cell
         with self.database.reading() as connection:
             _, tests = _sampled(connection, where, at_most)
             query = select(*columns, func.count()).where(*tests).group_by(*columns)
             rows = [tuple(row) for row in connection.execute(query)]
-        found = Kinds({}, {})
+        found = GraspKinds({}, {})
         for kind, cell, count in rows:
             for counts, value in ((found.types, kind), (found.cells, cell)):
                 if value is not None:

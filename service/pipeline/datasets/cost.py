@@ -1,8 +1,8 @@
 """What a dataset will cost, before it starts: time for 1, 8 and 64 workers, storage, network.
 
-    tries of a cell    = grasps / yield, at most grasps x budget   (raw grasps: grasps)
-    seconds of a cell  = tries x seconds per try + batches x scenes x seconds per scene + pictures x seconds per picture
-    time of W workers  = the larger of seconds / W and rounds of batches x seconds of a batch
+    tries of a cell    = grasps / yield, at most grasps x budget   (candidates: grasps)
+    seconds of a cell  = tries x seconds per candidate + batches x scenes x seconds per scene + pictures x seconds per
+    picture time of W workers  = the larger of seconds / W and rounds of batches x seconds of a batch
 
 The rates, each with an interval, come from `service.pipeline.rates`; intervals add, as if all were off
 together. A worker is one process of `graspd worker` on a device like those that were measured.
@@ -40,7 +40,7 @@ Batches = Callable[[Stage], list[BatchCost]]
 
 @dataclass
 class _Sums:
-    tried: float = 0.0
+    candidates: float = 0.0
     kept: float = 0.0
     valid: float = 0.0
     seconds: float = 0.0
@@ -104,13 +104,13 @@ def _once(objects: list[str], options: JobOptions) -> list[str]:
 
 
 def _add_cell(sums: _Sums, hand: str, rate: Rate, options: JobOptions) -> None:
-    tried = tries(rate, options)
-    valid = tried * rate.valid_yield
+    candidates = tries(rate, options)
+    valid = candidates * rate.valid_yield
     kept = min(valid, options.grasps) if options.want == "valid" else options.grasps
-    sums.tried += tried
+    sums.candidates += candidates
     sums.valid += min(valid, options.grasps)
     sums.kept += kept
-    seconds = tried * rate.seconds_per_try
+    seconds = candidates * rate.seconds_per_try
     sums.seconds += seconds
     sums.low += seconds * rate.spread[0]
     sums.high += seconds * rate.spread[1]
@@ -144,7 +144,7 @@ def _estimate(
     return Estimate(
         cells=cells,
         asked=cells * options.grasps,
-        tried=round(sums.tried),
+        candidates=round(sums.candidates),
         valid=round(sums.valid),
         counted=options.counted,
         tasks=batches * len(stages),

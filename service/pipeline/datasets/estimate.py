@@ -38,9 +38,11 @@ class Estimate(View):
 
     cells: int
     asked: int = Field(description="grasps asked for, over all cells")
-    tried: int = Field(description="grasps to be computed for these")
+    candidates: int = Field(description="grasps to be computed for these")
     valid: int = Field(description="grasps to be expected of the standing in `counted`")
-    counted: Literal["valid", "sound"] = Field("valid", description="what `valid` counts: sound ones if nobody judges")
+    counted: Literal["valid", "feasible"] = Field(
+        "valid", description="what `valid` counts: feasible ones if nothing is validated"
+    )
     tasks: int
     seconds: float
     seconds_low: float = Field(description="lower end of the interval of `seconds` [s]")

@@ -72,12 +72,12 @@ def redis(settings: Settings) -> Finding:
         return skipped(name, f"no service runs on this data folder; `graspd up` starts the Redis of {rung}")
     try:
         with redis_connection(settings) as client:
-            return _judge_redis(name, settings, client, _info(client))
+            return _check_redis(name, settings, client, _info(client))
     except (RedisError, OSError) as error:
-        return bad(name, f"{_shown(settings)} does not answer: {_line(error)}", _mend(error, settings))
+        return bad(name, f"{_shown(settings)} does not answer: {_line(error)}", _fix(error, settings))
 
 
-def _judge_redis(name: str, settings: Settings, client: Redis, info: Mapping[str, Any]) -> Finding:
+def _check_redis(name: str, settings: Settings, client: Redis, info: Mapping[str, Any]) -> Finding:
     version = str(info.get("redis_version", "0"))
     if int(info.get("cluster_enabled", 0)):
         return bad(name, "it is a Redis Cluster: tasks move between keys of several nodes", "name a plain Redis")
@@ -85,10 +85,8 @@ def _judge_redis(name: str, settings: Settings, client: Redis, info: Mapping[str
         return bad(name, f"it is a {info.get('role')}: it cannot be written", "name the primary in GRASPD_REDIS_URL")
     most, policy = int(info.get("maxmemory", 0)), str(info.get("maxmemory_policy", "noeviction"))
     if most and policy != "noeviction":
-        mend = "redis-cli config set maxmemory-policy noeviction, and the same line in its configuration"
-        return bad(
-            name, f"maxmemory-policy is {policy}: when memory is full, it throws tasks away without a word", mend
-        )
+        fix = "redis-cli config set maxmemory-policy noeviction, and the same line in its configuration"
+        return bad(name, f"maxmemory-policy is {policy}: when memory is full, it throws tasks away without a word", fix)
     used = int(info.get("used_memory", 0))
     if most and used > _FULL * most:
         return bad(
@@ -103,8 +101,8 @@ def _judge_redis(name: str, settings: Settings, client: Redis, info: Mapping[str
             name, f"{line}: older than 6.2, on which graspd was tried", "install Redis 6.2 or newer, or Valkey"
         )
     if _is_open(settings):
-        mend = "requirepass in its configuration, or an ACL, and the password in GRASPD_REDIS_URL"
-        return warning(name, f"{line}: it asks for no password, and who writes to it can start tasks", mend)
+        fix = "requirepass in its configuration, or an ACL, and the password in GRASPD_REDIS_URL"
+        return warning(name, f"{line}: it asks for no password, and who writes to it can start tasks", fix)
     if seconds > _SLOW_REDIS_S:
         return warning(
             name,
@@ -137,11 +135,11 @@ def persistence(settings: Settings) -> Finding:
             info = _info(client)
     except (RedisError, OSError):
         return skipped(name, "Redis does not answer")
-    mend = "make room on the disk of Redis and see its log; then redis-cli bgrewriteaof"
+    fix = "make room on the disk of Redis and see its log; then redis-cli bgrewriteaof"
     if int(info.get("aof_enabled", 0)):
         for what in ("aof_last_write_status", "aof_last_bgrewrite_status"):
             if info.get(what, "ok") != "ok":
-                return bad(name, f"the log of writes fails ({what}: {info[what]})", mend)
+                return bad(name, f"the log of writes fails ({what}: {info[what]})", fix)
         return good(name, "the log of writes is on: a killed Redis comes back with its tasks")
     if info.get("rdb_last_bgsave_status", "ok") != "ok":
         return bad(
@@ -171,7 +169,7 @@ def _is_open(settings: Settings) -> bool:
     return parts.scheme != "unix" and parts.hostname not in _LOCAL and not parts.password
 
 
-def _mend(error: Exception, settings: Settings) -> str:
+def _fix(error: Exception, settings: Settings) -> str:
     said = str(error).upper()
     if "NOAUTH" in said or "WRONGPASS" in said or "AUTHENTICATION" in said:
         return "put the password into GRASPD_REDIS_URL: redis://:PASSWORD@HOST:6379/0"
@@ -190,7 +188,7 @@ _NONE_HERE: Final = (
     "no index is here: GRASPD_INDEX_URL is unset and there is no index.sqlite; only api and controller need one"
 )
 _REBUILD: Final = (
-    "graspd admin index rebuild --check shows all of it; graspd admin index rebuild mends it while the service runs"
+    "graspd admin index rebuild --check shows all of it; graspd admin index rebuild fixes it while the service runs"
 )
 _CROWDED: Final = 0.8
 #: With more shards than this only a sample is compared.
@@ -209,11 +207,11 @@ def index(settings: Settings) -> Finding:
     except InputError as error:
         return bad(name, str(error), "see the message, and GRASPD_INDEX_URL")
     except UnavailableError as error:
-        mend = "start the database; see host, user, password and database in GRASPD_INDEX_URL"
-        return bad(name, str(error), mend if settings.index_url is not None else "see who may read the file")
+        fix = "start the database; see host, user, password and database in GRASPD_INDEX_URL"
+        return bad(name, str(error), fix if settings.index_url is not None else "see who may read the file")
     if found is None:
         return _absent(name, settings)
-    return _judge_index(name, settings, found)
+    return _check_index(name, settings, found)
 
 
 def _absent(name: str, settings: Settings) -> Finding:
@@ -223,7 +221,7 @@ def _absent(name: str, settings: Settings) -> Finding:
     return good(name, f"the index is made at the first start, in {where}")
 
 
-def _judge_index(name: str, settings: Settings, found: IndexCondition) -> Finding:
+def _check_index(name: str, settings: Settings, found: IndexCondition) -> Finding:
     parsed = make_url(settings.resolved_index_url)
     url = parsed.set(query={}).render_as_string(hide_password=True)
     line = f"{found.kind} at {url}, revision {found.revision or 'none'}"
@@ -342,8 +340,8 @@ def store_damage(settings: Settings) -> Finding:
             "graspd admin store verify --repair",
         )
     if made is not None and made.left_out:
-        mend = "put copies in their place, then graspd admin index rebuild"
-        return bad(name, f"{made.left_out} damaged records are left out of the index, {made.names[0]}", mend)
+        fix = "put copies in their place, then graspd admin index rebuild"
+        return bad(name, f"{made.left_out} damaged records are left out of the index, {made.names[0]}", fix)
     if not settings.integrity_scan_mb_per_s:
         return warning(
             name,
@@ -377,13 +375,13 @@ def store(settings: Settings) -> Finding:
         return good(name, f"{folder} is made at the first start, below {existing(folder)}")
     try:
         opened = open_store(settings.resolved_store_url, public_endpoint=settings.store_public_endpoint)
-        return judge_store(name, opened)
+        return check_store(name, opened)
     except GraspdError as error:
-        mend = f"make room below {folder}, and let user and group write there" if folder else _CREDENTIALS
-        return bad(name, str(error), mend)
+        fix = f"make room below {folder}, and let user and group write there" if folder else _CREDENTIALS
+        return bad(name, str(error), fix)
 
 
-def judge_store(name: str, opened: Store) -> Finding:
+def check_store(name: str, opened: Store) -> Finding:
     """The finding on an open store. Raises GraspdError where an operation fails."""
     key = f"{_FOLDER}/doctor-{secrets.token_hex(8)}"
     start = time.perf_counter()
@@ -395,8 +393,8 @@ def judge_store(name: str, opened: Store) -> Finding:
     if not wrong and opened.exists(key):
         wrong = "an object that was removed is still there"
     if wrong:
-        mend = "name a store that keeps this: a local disk, Amazon, Google, Azure, SeaweedFS, Ceph, or a recent MinIO"
-        return bad(name, f"{opened.url}: {wrong}", mend)
+        fix = "name a store that keeps this: a local disk, Amazon, Google, Azure, SeaweedFS, Ceph, or a recent MinIO"
+        return bad(name, f"{opened.url}: {wrong}", fix)
     line = (
         f"{opened.url} gives what it takes, lists, removes, and refuses a name that is taken ({1000 * seconds:.0f} ms)"
     )

@@ -35,12 +35,12 @@ class Finding:
     name: str
     condition: Condition
     message: str
-    mend: str = ""
+    fix: str = ""
     """What to do; "" where nothing is to be done."""
 
     @property
     def ok(self) -> bool:
-        """Whether nothing has to be mended."""
+        """Whether nothing has to be fixed."""
         return self.condition is not Condition.BAD
 
 
@@ -91,12 +91,12 @@ def good(name: str, message: str) -> Finding:
     return Finding(name, Condition.GOOD, message)
 
 
-def warning(name: str, message: str, mend: str) -> Finding:
-    return Finding(name, Condition.WARNING, message, mend)
+def warning(name: str, message: str, fix: str) -> Finding:
+    return Finding(name, Condition.WARNING, message, fix)
 
 
-def bad(name: str, message: str, mend: str) -> Finding:
-    return Finding(name, Condition.BAD, message, mend)
+def bad(name: str, message: str, fix: str) -> Finding:
+    return Finding(name, Condition.BAD, message, fix)
 
 
 def skipped(name: str, why: str) -> Finding:

@@ -66,7 +66,7 @@ def workers(settings: Settings) -> Finding:
         return skipped(name, _IDLE)
     try:
         with closing(open_queue(settings, patience=0)) as queue:
-            return _judge_workers(name, queue.workers(), _waiting(queue))
+            return _check_workers(name, queue.workers(), _waiting(queue))
     except QueueUnavailable:
         return skipped(name, _AWAY)
 
@@ -78,7 +78,7 @@ def _waiting(queue: RqQueue) -> Counter[Stage]:
     return +found
 
 
-def _judge_workers(name: str, beats: list[WorkerBeat], waiting: Counter[Stage]) -> Finding:
+def _check_workers(name: str, beats: list[WorkerBeat], waiting: Counter[Stage]) -> Finding:
     if other := [beat for beat in beats if beat.version != PACKAGE_VERSION]:
         some = ", ".join(sorted({f"{beat.version} on {beat.host}" for beat in other})[:3])
         return bad(
@@ -87,8 +87,8 @@ def _judge_workers(name: str, beats: list[WorkerBeat], waiting: Counter[Stage]) 
             f"install graspd {PACKAGE_VERSION} there as well",
         )
     if ill := [beat for beat in beats if beat.state == "quarantined"]:
-        mend = f"on {ill[0].host}: graspd doctor --only gpu,kernels,disk"
-        return bad(name, f"{len(ill)} workers are in quarantine, {ill[0].name}: {ill[0].reason}", mend)
+        fix = f"on {ill[0].host}: graspd doctor --only gpu,kernels,disk"
+        return bad(name, f"{len(ill)} workers are in quarantine, {ill[0].name}: {ill[0].reason}", fix)
     served = {stage for beat in beats for stage in beat.stages}
     if alone := sorted(stage.value for stage in waiting if stage not in served):
         tasks = sum(number for stage, number in waiting.items() if stage not in served)
@@ -111,18 +111,18 @@ def port(settings: Settings) -> Finding:
     if url is None and "api_url" in settings.model_fields_set:
         url = settings.api_url
     if url is not None:
-        return _judge_api(name, url)
+        return _check_api(name, url)
     where = f"{settings.host}:{settings.port}"
     if settings.port and (found := _readyz(f"http://{_reachable(settings.host)}:{settings.port}")) is not None:
         if found:
-            return _judge_api(name, f"http://{_reachable(settings.host)}:{settings.port}")
+            return _check_api(name, f"http://{_reachable(settings.host)}:{settings.port}")
         return bad(
             name, f"{where} is taken by something that is no graspd", "stop it, or set GRASPD_PORT (0: any free one)"
         )
     return _bind(name, settings, where)
 
 
-def _judge_api(name: str, url: str) -> Finding:
+def _check_api(name: str, url: str) -> Finding:
     found = _readyz(url)
     if found is None:
         return bad(
@@ -172,13 +172,13 @@ def _bind(name: str, settings: Settings, where: str) -> Finding:
         with closing(socket.create_server((settings.host, settings.port))):
             return good(name, f"{where} is free")
     except OSError as error:
-        mend = "set GRASPD_HOST to an address of this machine, and GRASPD_PORT to a port above 1023"
-        return bad(name, f"{where} cannot be bound: {error.strerror or error}", mend)
+        fix = "set GRASPD_HOST to an address of this machine, and GRASPD_PORT to a port above 1023"
+        return bad(name, f"{where} cannot be bound: {error.strerror or error}", fix)
 
 
 _OFF_S: Final = 2.0
 _WRONG_S: Final = 300.0
-_MEND: Final = "timedatectl set-ntp true, or chronyd, on the machine that is wrong: it differs from all others"
+_FIX: Final = "timedatectl set-ntp true, or chronyd, on the machine that is wrong: it differs from all others"
 
 
 def clocks(settings: Settings) -> Finding:
@@ -193,10 +193,10 @@ def clocks(settings: Settings) -> Finding:
     most = max(abs(offset) for offset in offsets.values())
     if most > _WRONG_S:
         return bad(
-            name, f"clocks differ from this one: {line}; S3 refuses such requests, and keys expire wrongly", _MEND
+            name, f"clocks differ from this one: {line}; S3 refuses such requests, and keys expire wrongly", _FIX
         )
     if most > _OFF_S:
-        return warning(name, f"clocks differ from this one: {line}", _MEND)
+        return warning(name, f"clocks differ from this one: {line}", _FIX)
     return good(name, f"within {_OFF_S:.0f} s: {line}")
 
 

@@ -164,8 +164,8 @@ def versions(requirements: Iterable[str] | None = None) -> Finding:
     except importlib.metadata.PackageNotFoundError:
         return bad(name, "graspd runs from a folder and is not installed", "pip install -e '.[all]' in that folder")
     if own.version != PACKAGE_VERSION:
-        mend = "install it again: pip install -e '.[all]', or the wheel"
-        return bad(name, f"the code is graspd {PACKAGE_VERSION}, its install says {own.version}", mend)
+        fix = "install it again: pip install -e '.[all]', or the wheel"
+        return bad(name, f"the code is graspd {PACKAGE_VERSION}, its install says {own.version}", fix)
     python = SpecifierSet(str(own.metadata["Requires-Python"]))
     if platform.python_version() not in python:
         return bad(

@@ -21,7 +21,7 @@ def settings(tmp_path: Path) -> Settings:
 def test_without_keys_only_this_machine_is_served(settings: Settings, tmp_path: Path) -> None:
     found = keys(settings)
     assert not found.ok
-    assert found.mend == "graspd keys add admin --scope admin"
+    assert found.fix == "graspd keys add admin --scope admin"
     assert keys(Settings(data_dir=tmp_path)).condition is Condition.GOOD
 
 
@@ -36,7 +36,7 @@ def test_keys_that_end_soon_are_named_unless_they_were_rotated(settings: Setting
     file.add("robot", Scope.SUBMIT, lifetime=timedelta(days=2))
     found = keys(settings)
     assert found.condition is Condition.WARNING
-    assert found.mend == "graspd keys rotate robot --grace 24h"
+    assert found.fix == "graspd keys rotate robot --grace 24h"
     file.rotate("robot", grace=timedelta(hours=24))
     assert keys(settings).condition is Condition.GOOD
 
@@ -53,7 +53,7 @@ def test_a_service_that_no_key_opens_is_bad(settings: Settings) -> None:
 def test_a_file_that_everybody_reads_or_nobody_can_is_bad(settings: Settings) -> None:
     KeyFile(settings.resolved_keys_file).add("admin", Scope.ADMIN)
     settings.resolved_keys_file.chmod(0o644)
-    assert "chmod 600" in keys(settings).mend
+    assert "chmod 600" in keys(settings).fix
     settings.resolved_keys_file.write_text("{")
     found = keys(settings)
     assert not found.ok

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 from starlette.testclient import TestClient
 
-from graspd.api.access.auth import NotYours, caller, must_own
+from graspd.api.access.auth import ForeignResource, caller, must_own
 from graspd.api.access.keys import Key, KeyFile, Scope
 from graspd.api.app import create_app
 from graspd.service.index.index import Index
@@ -173,7 +173,7 @@ def test_what_has_no_owner_is_changed_by_an_admin_alone(scope: Scope, passes: bo
         if passes:
             must_own("", "hand 'mine'")
         else:
-            with pytest.raises(NotYours, match=r"hand 'mine'.*'me'.*admin"):
+            with pytest.raises(ForeignResource, match=r"hand 'mine'.*'me'.*admin"):
                 must_own("", "hand 'mine'")
     finally:
         caller.reset(token)

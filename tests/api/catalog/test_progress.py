@@ -7,13 +7,13 @@ import io
 import pytest
 from rich.console import Console
 
-from graspd.api.catalog.jobs import Paces, eta_of_job, stage_statuses
+from graspd.api.catalog.jobs import TaskRates, eta_of_job, stage_statuses
 from graspd.api.formatting import duration, metric, percent, size
 from graspd.api.models import Job
 from graspd.client.reports import JobDisplay
 from graspd.service.index.views import JobView, StageProgress, TaskView
 from graspd.service.model.domain import JobRequest
-from graspd.service.model.states import Lane, Stage, State
+from graspd.service.model.states import Priority, Stage, State
 
 
 class Clock:
@@ -48,7 +48,7 @@ def job(*stages: StageProgress, state: State = State.RUNNING) -> JobView:
     return JobView(
         id="j",
         state=state,
-        lane=Lane.INTERACTIVE,
+        priority=Priority.INTERACTIVE,
         request=JobRequest(hand="allegro", object="mug", grasps=64),
         hand_digest="",
         object_digest="",
@@ -61,7 +61,7 @@ def job(*stages: StageProgress, state: State = State.RUNNING) -> JobView:
 
 def test_the_rate_of_a_running_batch_is_what_it_did_since_it_was_first_seen() -> None:
     clock = Clock()
-    paces = Paces(clock)
+    paces = TaskRates(clock)
     stage = StageProgress(stage=Stage.SYNTHESIZE, tasks=1, running=1, done=0.2)
     stage_statuses(job(stage), [task(20)], paces)
     clock.now = 10.0
@@ -74,38 +74,38 @@ def test_the_rate_of_a_running_batch_is_what_it_did_since_it_was_first_seen() ->
 def test_a_stage_that_waits_says_why() -> None:
     waits = task(0).model_copy(update={"state": State.QUEUED, "message": "held back"})
     stage = StageProgress(stage=Stage.SYNTHESIZE, tasks=1, queued=1)
-    (status,) = stage_statuses(job(stage, state=State.QUEUED), [waits], Paces(Clock()))
+    (status,) = stage_statuses(job(stage, state=State.QUEUED), [waits], TaskRates(Clock()))
     assert (status.message, status.rate_per_s) == ("held back", None)
 
 
 def test_a_batch_seen_once_has_no_rate() -> None:
     (status,) = stage_statuses(
-        job(StageProgress(stage=Stage.SYNTHESIZE, tasks=1, running=1, done=0.2)), [task(20)], Paces(Clock())
+        job(StageProgress(stage=Stage.SYNTHESIZE, tasks=1, running=1, done=0.2)), [task(20)], TaskRates(Clock())
     )
     assert (status.rate_per_s, status.eta_s) == (None, None)
 
 
 def test_finished_batches_give_the_rate_when_none_is_seen_running() -> None:
     stage = StageProgress(stage=Stage.SYNTHESIZE, tasks=4, queued=2, succeeded=2, done=2.0, seconds=20.0)
-    (status,) = stage_statuses(job(stage), [], Paces(Clock()))
+    (status,) = stage_statuses(job(stage), [], TaskRates(Clock()))
     assert status.eta_s == pytest.approx(20.0)
 
 
 def test_reused_batches_say_nothing_of_the_rate() -> None:
     stage = StageProgress(stage=Stage.SYNTHESIZE, tasks=4, queued=1, succeeded=3, reused=2, done=3.0, seconds=10.0)
-    (status,) = stage_statuses(job(stage), [], Paces(Clock()))
+    (status,) = stage_statuses(job(stage), [], TaskRates(Clock()))
     assert status.eta_s == pytest.approx(10.0)
     old = stage.model_copy(update={"succeeded": 2, "queued": 2, "seconds": 0.0})
-    assert stage_statuses(job(old), [], Paces(Clock()))[0].eta_s is None
+    assert stage_statuses(job(old), [], TaskRates(Clock()))[0].eta_s is None
 
 
 def test_a_job_has_no_end_in_sight_while_the_pace_of_a_stage_is_unknown() -> None:
     known = StageProgress(stage=Stage.SYNTHESIZE, tasks=2, running=1, succeeded=1, done=1.0, seconds=10.0)
     unknown = StageProgress(stage=Stage.SCENE, tasks=2, queued=2)
     whole = job(known, unknown)
-    assert eta_of_job(whole, stage_statuses(whole, [], Paces(Clock()))) is None
+    assert eta_of_job(whole, stage_statuses(whole, [], TaskRates(Clock()))) is None
     part = job(known)
-    assert eta_of_job(part, stage_statuses(part, [], Paces(Clock()))) == pytest.approx(10.0)
+    assert eta_of_job(part, stage_statuses(part, [], TaskRates(Clock()))) == pytest.approx(10.0)
 
 
 def test_without_a_terminal_progress_is_plain_lines_with_the_end_of_each_stage() -> None:
@@ -128,7 +128,7 @@ def test_without_a_terminal_progress_is_plain_lines_with_the_end_of_each_stage()
                     valid=0,
                     progress=0.5,
                     created="",
-                    stages=stage_statuses(view, [], Paces(Clock())),
+                    stages=stage_statuses(view, [], TaskRates(Clock())),
                 )
             )
     first, last = screen.getvalue().splitlines()

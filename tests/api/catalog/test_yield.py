@@ -1,4 +1,5 @@
-"""Valid yield is of what somebody judged: grasps that nobody judged are no failures, in no number and on no page."""
+"""Valid yield is of what somebody validated: grasps that are not validated are no failures, in no number and on no
+page."""
 
 from __future__ import annotations
 
@@ -17,11 +18,14 @@ from tests.planning import plan_all
 
 @pytest.fixture
 def jobs(http: TestClient, services: Services) -> dict[str, str]:
-    """One job that was judged, and a larger one on the same pair that was not."""
-    judged, unjudged = add_job(services, want="raw"), add_job(services, grasps=320, referee="none", want="raw")
-    for record in (judged, unjudged):
+    """One job that was validated, and a larger one on the same pair that was not."""
+    validated, unvalidated = (
+        add_job(services, want="candidates"),
+        add_job(services, grasps=320, validation="none", want="candidates"),
+    )
+    for record in (validated, unvalidated):
         finish_all(services, record)
-    return {"judged": judged.id, "unjudged": unjudged.id}
+    return {"validated": validated.id, "unvalidated": unvalidated.id}
 
 
 def share(http: TestClient, job: str) -> float:
@@ -29,39 +33,39 @@ def share(http: TestClient, job: str) -> float:
     return sum(row["valid"] for row in rows) / len(rows)
 
 
-def test_the_service_counts_as_tries_only_what_was_judged(http: TestClient, jobs: dict[str, str]) -> None:
+def test_the_service_counts_as_tries_only_what_was_validated(http: TestClient, jobs: dict[str, str]) -> None:
     stats = http.get("/v1/stats").json()
-    assert (stats["tried"], stats["judged"]) == (352, 32)
-    assert stats["valid_yield"] == share(http, jobs["judged"])
+    assert (stats["candidates"], stats["validated"]) == (352, 32)
+    assert stats["valid_yield"] == share(http, jobs["validated"])
 
 
-def test_a_job_tells_its_yield_or_that_nobody_judged(http: TestClient, jobs: dict[str, str]) -> None:
+def test_a_job_tells_its_yield_or_that_nobody_validated(http: TestClient, jobs: dict[str, str]) -> None:
     told = {name: http.get(f"/v1/jobs/{job}").json() for name, job in jobs.items()}
-    assert told["judged"]["valid_yield"] == share(http, jobs["judged"])
-    assert (told["unjudged"]["judged"], told["unjudged"]["valid_yield"]) == (0, None)
+    assert told["validated"]["valid_yield"] == share(http, jobs["validated"])
+    assert (told["unvalidated"]["validated"], told["unvalidated"]["valid_yield"]) == (0, None)
 
 
 def test_a_dataset_of_unjudged_grasps_has_no_yield(http: TestClient, services: Services) -> None:
-    wanted = {"name": "d", "hands": ["allegro"], "objects": ["mug"], "referee": "none"}
+    wanted = {"name": "d", "hands": ["allegro"], "objects": ["mug"], "validation": "none"}
     actions.create(services, DatasetRequest.model_validate(wanted))
     plan_all(services)
     (job,) = services.index.jobs.page().items
     finish_all(services, read_record(JobRecord, services.store, names.job_record(job.id)))
     (cell,) = http.get("/v1/datasets/d/cells").json()["items"]
-    assert (cell["tried"], cell["judged"], cell["valid_yield"]) == (32, 0, None)
+    assert (cell["candidates"], cell["validated"], cell["valid_yield"]) == (32, 0, None)
     assert http.get("/v1/datasets/d").json()["valid_yield"] is None
     for page in ("/datasets/d", "/datasets", "/compare?one=d&other=d", f"/jobs/{job.id}", "/"):
-        assert "not judged" in http.get(page).text, page
+        assert "not validated" in http.get(page).text, page
 
 
-def test_pages_show_the_share_of_the_judged(http: TestClient, jobs: dict[str, str]) -> None:
-    words = f"{int(100 * share(http, jobs['judged']) + 1e-9)} %"
+def test_pages_show_the_share_of_the_validated(http: TestClient, jobs: dict[str, str]) -> None:
+    words = f"{int(100 * share(http, jobs['validated']) + 1e-9)} %"
     home = http.get("/").text
-    assert words in home and "320 more are not judged" in home
+    assert words in home and "320 more are not validated" in home
     assert words in http.get("/datasets").text
 
 
-def test_grasps_that_nobody_judged_are_found_as_such_and_not_among_the_rejected(
+def test_grasps_that_nobody_validated_are_found_as_such_and_not_among_the_rejected(
     http: TestClient, jobs: dict[str, str]
 ) -> None:
     def found(**query: str) -> set[str]:
@@ -71,5 +75,5 @@ def test_grasps_that_nobody_judged_are_found_as_such_and_not_among_the_rejected(
 
     rejected = http.get("/v1/grasps", params={"limit": 200, "valid": "false"}).json()["items"]
     assert rejected and all(row["success"] is False for row in rejected)
-    assert found(judged="false") == found(where="not judged") == {"None"}
-    assert "None" not in found(judged="true") | found(where="judged and not valid")
+    assert found(validated="false") == found(where="not validated") == {"None"}
+    assert "None" not in found(validated="true") | found(where="validated and not valid")

@@ -340,4 +340,4 @@ def test_a_job_with_a_target_says_which_fidelity_was_chosen_and_by_what(graspd: 
     assert told in done.stdout
     assert graspd.json(*asked, "lift>=0.9")["choice"]["reached"] == 0.95
     done = graspd(*asked, "gsr>=0.8")
-    assert done.returncode == 2 and "charts in scenes hold lift, lift_letter, lift_hard, robust" in said(done)
+    assert done.returncode == 2 and "charts in scenes hold lift, lift_dexgraspbench, lift_hard, robust" in said(done)

@@ -17,26 +17,26 @@ from tests.api.factories import add_job, finish_all
 from tests.planning import plan_all
 
 
-@pytest.mark.parametrize("referee", ["none", "certificate"])
-def test_a_report_names_the_standing_of_what_it_counts(services: Services, referee: str) -> None:
-    given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32, "referee": referee}
+@pytest.mark.parametrize("validation", ["none", "standard"])
+def test_a_report_names_the_standing_of_what_it_counts(services: Services, validation: str) -> None:
+    given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32, "validation": validation}
     wanted = DatasetRequest.model_validate(given)
     actions.create(services, wanted)
     plan_all(services)
-    finish_all(services, add_job(services, referee=referee))
+    finish_all(services, add_job(services, validation=validation))
     out = io.StringIO()
     console = Console(file=out, width=200)
     dataset = services.index.datasets.get("k")
     print_estimate(estimate(services.index, wanted), console)
     print_dataset(dataset, console)
     print_cells(dataset, services.index.datasets.cells("k").items, console)
-    made = 32 if referee == "none" else dataset.valid
-    word, other = ("sound", "valid") if referee == "none" else ("valid", "sound")
+    made = 32 if validation == "none" else dataset.valid
+    word, other = ("feasible", "valid") if validation == "none" else ("valid", "feasible")
     assert f"grasps: {made} {word} of 32 tried" in out.getvalue()
-    judged = "not judged" if referee == "none" else "at"
-    assert f"per {word} grasp" in out.getvalue() and f"{made}/32 {judged}" in out.getvalue()
+    validated = "not validated" if validation == "none" else "at"
+    assert f"per {word} grasp" in out.getvalue() and f"{made}/32 {validated}" in out.getvalue()
     assert other not in out.getvalue()
 
 
-def test_raw_grasps_that_nobody_judges_are_merely_kept() -> None:
-    assert JobOptions(want="raw", referee="none").standing == "kept"
+def test_candidate_grasps_that_nobody_judges_are_merely_kept() -> None:
+    assert JobOptions(want="candidates", validation="none").standing == "kept"

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from graspd.client.job_options import Wanted, read_spec, wanted
+from graspd.client.job_options import PlanRequest, read_spec, wanted
 from graspd.service.model.errors import InputError
 from graspd.service.pipeline.datasets.spec import MAX_CELLS
 
@@ -29,7 +29,7 @@ def spec(folder: Path, text: str, name: str = "kitchen.toml") -> Path:
     return folder / name
 
 
-def asked(file: Path | None, *, hands: str | None = None, objects: str | None = None, **options: Any) -> Wanted:
+def asked(file: Path | None, *, hands: str | None = None, objects: str | None = None, **options: Any) -> PlanRequest:
     return wanted(file, name=None, hands=hands, objects=objects, options=options)
 
 

@@ -16,18 +16,18 @@ from tests.planning import plan_all
 
 
 def cell(**fields: object) -> MatrixCell:
-    counts = dict.fromkeys(("jobs", "queued", "running", "failed", "grasps", "valid", "tried"), 0)
+    counts = dict.fromkeys(("jobs", "queued", "running", "failed", "grasps", "valid", "candidates"), 0)
     return MatrixCell.model_validate({"hand": "h", "object": "o"} | counts | fields)
 
 
 @pytest.mark.parametrize(
     ("counts", "state", "shade"),
     [
-        ({"valid": 30, "tried": 40, "judged": 40}, "succeeded", "y8"),
+        ({"valid": 30, "candidates": 40, "validated": 40}, "succeeded", "y8"),
         ({"running": 1, "failed": 1}, "running", "none"),
         ({"queued": 1, "failed": 1}, "queued", "none"),
-        ({"failed": 1, "valid": 0, "tried": 10, "judged": 10}, "failed", "y0"),
-        ({"grasps": 10, "tried": 10}, "succeeded", "none"),
+        ({"failed": 1, "valid": 0, "candidates": 10, "validated": 10}, "failed", "y0"),
+        ({"grasps": 10, "candidates": 10}, "succeeded", "none"),
     ],
 )
 def test_a_cell_tells_its_state_and_yield(counts: dict[str, int], state: str, shade: str) -> None:
@@ -131,11 +131,11 @@ def test_cells_of_one_state_are_a_list(http: TestClient, services: Services) -> 
 @pytest.mark.parametrize(
     ("options", "shown"),
     [
-        ({"referee": "none"}, "32 sound"),
-        ({"referee": "none", "want": "raw"}, "32 kept"),
+        ({"validation": "none"}, "32 feasible"),
+        ({"validation": "none", "want": "candidates"}, "32 kept"),
     ],
 )
-def test_grasps_that_nobody_judged_are_counted_and_not_called_valid(
+def test_grasps_that_nobody_validated_are_counted_and_not_called_valid(
     http: TestClient, services: Services, options: dict[str, str], shown: str
 ) -> None:
     given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
@@ -173,8 +173,8 @@ def test_a_dataset_and_a_job_ask_for_robust_grasps(http: TestClient, services: S
     assert services.index.datasets.get("sure").options.robust == 0.9
     http.post("/submit", data={"hand": "allegro", "object": "mug", "robust": "0.75"})
     assert services.index.jobs.page().items[0].request.robust == 0.75
-    refused = http.post("/submit", data={"hand": "allegro", "object": "mug", "robust": "0.75", "referee": "none"})
-    assert refused.status_code == 422 and "choose a referee" in refused.text
+    refused = http.post("/submit", data={"hand": "allegro", "object": "mug", "robust": "0.75", "validation": "none"})
+    assert refused.status_code == 422 and "choose a validator" in refused.text
 
 
 def test_a_dataset_and_a_job_ask_for_a_payload_and_a_shake(http: TestClient, services: Services) -> None:
@@ -187,5 +187,5 @@ def test_a_dataset_and_a_job_ask_for_a_payload_and_a_shake(http: TestClient, ser
         assert (options.min_payload, options.shake) == (0.5, True)
     refused = http.post("/submit", data={"hand": "allegro", "object": "mug", "shake": "true"})
     assert refused.status_code == 422 and "lifted out of a scene" in refused.text
-    refused = http.post("/submit", data={"hand": "allegro", "object": "mug", "min_payload": "1", "referee": "none"})
-    assert refused.status_code == 422 and "payload is what the referee sees lifted" in refused.text
+    refused = http.post("/submit", data={"hand": "allegro", "object": "mug", "min_payload": "1", "validation": "none"})
+    assert refused.status_code == 422 and "payload is what the validator sees lifted" in refused.text

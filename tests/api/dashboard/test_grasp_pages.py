@@ -10,11 +10,11 @@ import pytest
 from PIL import Image
 from starlette.testclient import TestClient
 
-from graspd.api.catalog.grasps import OUTCOMES, judged_by
+from graspd.api.catalog.grasps import OUTCOMES, validated_by
 from graspd.service.model.metrics import AXIS_MEANINGS, Axis
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.shards import Shard, read_shard
-from graspd.worker.validation.protocol import JudgedBy, Outcome
+from graspd.worker.validation.protocol import Outcome, ValidatedBy
 from tests.api.factories import JOINTS, add_job, finish_all
 
 
@@ -44,14 +44,14 @@ def test_a_grasp_whose_file_is_gone_is_a_clear_error(http: TestClient, services:
     assert manifest.key in answer.text
 
 
-def test_pushes_are_called_what_the_referee_calls_them() -> None:
+def test_pushes_are_called_what_the_validator_calls_them() -> None:
     assert {int(outcome): outcome.name.lower().replace("_", " ") for outcome in Outcome} == OUTCOMES
 
 
 def test_a_verdict_says_whose_it_is() -> None:
-    success, judged = np.array([1, 0], np.int8), np.array([JudgedBy.MUJOCO, JudgedBy.MUJOCO_WARP], np.uint8)
-    files = [{"quality/success": success, "quality/judged_by": judged}, {"quality/success": success}, {}]
-    told = [[judged_by(Shard("base", {}, arrays), row) for row in (0, 1)] for arrays in files]
+    success, validated = np.array([1, 0], np.int8), np.array([ValidatedBy.MUJOCO, ValidatedBy.MUJOCO_WARP], np.uint8)
+    files = [{"quality/success": success, "quality/validated_by": validated}, {"quality/success": success}, {}]
+    told = [[validated_by(Shard("base", {}, arrays), row) for row in (0, 1)] for arrays in files]
     assert told == [["mujoco", "mujoco_warp"], ["mujoco", "mujoco"], [None, None]]
 
 
@@ -86,7 +86,7 @@ def test_depth_and_segmentation_are_pictures_too(http: TestClient, services: Ser
 
 
 def test_an_unknown_channel_is_refused(http: TestClient) -> None:
-    assert http.get("/shards/x/pictures/0.png", params={"channel": "sound"}).status_code == 422
+    assert http.get("/shards/x/pictures/0.png", params={"channel": "feasible"}).status_code == 422
 
 
 @pytest.mark.parametrize(("bounds", "kept"), [({"max_epsilon": 0.3}, True), ({"min_contact_area_cm2": 900}, False)])
@@ -134,7 +134,7 @@ def test_robust_grasps_are_found_by_their_share_and_by_what_they_fail_of_first(
     assert 'name="min_robust_share"' in listed and "Fails first along" in listed
 
 
-def test_grasps_that_were_judged_in_no_other_model_say_nothing_of_it(http: TestClient, services: Services) -> None:
+def test_grasps_that_were_validated_in_no_other_model_say_nothing_of_it(http: TestClient, services: Services) -> None:
     manifest = finish_all(services, add_job(services))[0]
     document = http.get(f"/v1/grasps/{manifest.shard_id}/0").json()
     assert (document["robust_share"], document["robust_weakest"]) == (None, None)

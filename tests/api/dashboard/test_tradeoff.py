@@ -55,9 +55,14 @@ def test_of_penetration_less_is_better() -> None:
 
 
 def lifted(fidelity: str, count: int, *, way: str = IN_SCENE, **fields: object) -> dict[str, object]:
-    """A run in a scene: of 20 tries so many were lifted, in 4 s."""
+    """A run in a scene: of 20 candidates so many were lifted, in 4 s."""
     known = {"method": "fast_graspd", "way": way, "hand": "allegro", "object": "mug", "end_seconds": 4.0}
-    shares = {"lift": count / 20, "lift_letter": count / 20, "lift_hard": count / 40, "robust": 0.9 if count else None}
+    shares = {
+        "lift": count / 20,
+        "lift_dexgraspbench": count / 20,
+        "lift_hard": count / 40,
+        "robust": 0.9 if count else None,
+    }
     return known | {"fidelity": fidelity, "lift_count": count, "valid_per_second": 99.0, **shares} | fields
 
 
@@ -109,7 +114,7 @@ def test_the_page_draws_free_charts_and_those_in_scenes_apart(http: TestClient, 
 def test_a_chart_in_scenes_is_drawn_where_there_is_no_other(http: TestClient, services: Services) -> None:
     publish(services.store, "scene_charts/table", scenes_of("table", lifted("standard", 18)))
     page = http.get("/chart", params={"lifts": "magic"}).text
-    assert "Around free objects" not in page and "Lifted, of all tries [%]</text>" in page
+    assert "Around free objects" not in page and "Lifted, of all candidates [%]</text>" in page
 
 
 def test_the_page_shows_the_chart_that_was_published_last(http: TestClient, services: Services) -> None:

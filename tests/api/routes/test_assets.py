@@ -47,11 +47,11 @@ def test_a_self_test_is_asked_for_with_the_hand_and_shown_with_its_facts(http: T
     assert answer.status_code == 202
     record = load_asset(services.store, AssetKind.HAND, answer.json()["digest"])
     assert record.self_test
-    tried = {"gsr": 0.9, "n": 64, "width_m": 0.04, "by_object": {"box": 0.9}, "says": "ready: 90 % hold"}
-    found = {"verdict": "accept", "message": "", "repairs": [], "facts": {"self_test": tried}}
+    candidates = {"gsr": 0.9, "n": 64, "width_m": 0.04, "by_object": {"box": 0.9}, "says": "ready: 90 % hold"}
+    found = {"verdict": "accept", "message": "", "repairs": [], "facts": {"self_test": candidates}}
     services.index.write.add_asset(record, found)
     shown = http.get("/v1/hands/mine").json()
-    assert shown["facts"]["self_test"] == tried
+    assert shown["facts"]["self_test"] == candidates
     assert "self-test          ready: 90 % hold" in summary(AssetKind.HAND, shown["facts"])
     assert "ready: 90 % hold" in http.get("/hands").text
 

@@ -47,7 +47,7 @@ def test_a_job_in_a_scene_with_auto_says_how_its_fidelity_was_chosen(http: TestC
     assert refused.status_code == 422 and "graspd chart --scene table --publish" in refused.text
     key = publish(services.store, "scene_charts/table", scene_chart())
     refused = http.post("/v1/jobs", json=wanted | {"target": "gsr>=0.6"})
-    assert refused.status_code == 422 and "lift, lift_letter, lift_hard, robust" in refused.text
+    assert refused.status_code == 422 and "lift, lift_dexgraspbench, lift_hard, robust" in refused.text
     answer = http.post("/v1/jobs", json=wanted)
     assert answer.status_code == 202
     choice = {"target": "lift>=0.8", "chart": key, "measured_on": "hand and object", "reached": 0.85}

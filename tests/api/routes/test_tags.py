@@ -99,7 +99,7 @@ def test_the_index_chooses_what_the_shards_choose(
     [
         ("epsilon >", "ends where a value"),
         ("__import__('os')", "there is no '__import__'"),
-        ("sound", "the shards do"),
+        ("feasible", "the shards do"),
         ("simulated_displacement_cm > 1", "the shards do"),
         ("valid and " * 120 + "valid", "1000"),
     ],

@@ -17,22 +17,22 @@ from graspd.service.model.fidelity import resolve_fidelity
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import compose, quat_from_matrix, quat_rotate
 from graspd.service.store.network_file import ProposalNetwork
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.planners import Asked, Wanted, method, planner, synthesize
+from graspd.worker.planners import BatchRequest, PlanRequest, method, planner, synthesize
 from graspd.worker.planners.fast_graspd.pairs import Pair, pair_of
 from graspd.worker.planners.fast_graspd.scene_starts import ROOM, free_ways
 from graspd.worker.planners.fast_graspd.starts import CLEAR, Probe, start_generator
 from graspd.worker.planners.known_networks import keep_file
 from graspd.worker.planners.registry import of_this_machine
-from graspd.worker.run import Run
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.simulation.data import HandState
+from graspd.worker.simulation.environment import Obstacle, Placed
 from graspd.worker.simulation.obstacles import DeviceObstacles
-from graspd.worker.simulation.surroundings import Obstacle, Placed
 from tests.networks import random_network
 
 QUICK = resolve_fidelity("draft").model_copy(
@@ -69,9 +69,11 @@ def keep(network: ProposalNetwork) -> str:
 
 
 def made(hand: HandModel, obj: ObjectModel, network: ProposalNetwork, count: int, **given: Any) -> GraspSet:
-    wanted = Wanted(count, QUICK, given.pop("seed", 1), placed=given.pop("placed", on_table(obj, count)))
+    wanted = PlanRequest(count, QUICK, given.pop("seed", 1), placed=given.pop("placed", on_table(obj, count)))
     options = {"network": keep(network), "starts": 2}
-    return synthesize(hand, obj, wanted, Run(threads=given.pop("threads", 1)), method="learned", options=options)
+    return synthesize(
+        hand, obj, wanted, ExecutionContext(threads=given.pop("threads", 1)), method="learned", options=options
+    )
 
 
 def assert_same(one: GraspSet, other: GraspSet) -> None:
@@ -91,13 +93,15 @@ def test_a_grasp_depends_on_seed_and_index_but_not_on_batch_or_threads(hand, blo
 
 def test_joined_batches_are_those_of_separate_launches(hand, block, network) -> None:
     options = {"network": keep(network), "starts": 2}
-    wanted = [Wanted(2, QUICK, 1, batch, placed=on_table(block, 2)) for batch in (0, 1)]
+    wanted = [PlanRequest(2, QUICK, 1, batch, placed=on_table(block, 2)) for batch in (0, 1)]
     joins = method("learned").joined
     assert joins is not None
-    found = joins(method("learned").options(**options))(hand, block, [Asked(one, Run(threads=1)) for one in wanted])
+    found = joins(method("learned").options(**options))(
+        hand, block, [BatchRequest(one, ExecutionContext(threads=1)) for one in wanted]
+    )
     for one, alone in zip(found, wanted, strict=True):
         assert isinstance(one, GraspSet)
-        assert_same(one, synthesize(hand, block, alone, Run(threads=1), method="learned", options=options))
+        assert_same(one, synthesize(hand, block, alone, ExecutionContext(threads=1), method="learned", options=options))
 
 
 def proposing(network: ProposalNetwork, found: Proposals, anchor: np.ndarray) -> ProposalNetwork:
@@ -177,7 +181,9 @@ def test_what_it_cannot_do_is_said_in_a_line(hand, block, network, tmp_path: Pat
     board = Obstacle.box([0, 0, -0.01, 1, 0, 0, 0], [1, 1, 0.02])
     refused("has none, choose fast_graspd", placed=replace(on_table(block, 1), supports=(board,)))
     with pytest.raises(InputError, match="not known here"):
-        planner("learned", {"network": "e" * 32}, in_scenes=True)(hand, block, Wanted(1, QUICK), Run())
+        planner("learned", {"network": "e" * 32}, in_scenes=True)(
+            hand, block, PlanRequest(1, QUICK), ExecutionContext()
+        )
     # A worker that is told a path reads no file.
     save(network, tmp_path / "net.npz")
     with pytest.raises(InputError, match="option of learned: network"):

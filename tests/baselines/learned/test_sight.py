@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from graspd.baselines.learned.method import ELEVATION, NEAREST_M, Seen
+from graspd.baselines.learned.method import ELEVATION, NEAREST_M, SurfaceView
 from graspd.service.model.transforms import apply, quat_from_axis_angle
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
@@ -20,7 +20,7 @@ def mug() -> ObjectModel:
 
 
 def test_points_lie_on_the_surface_look_at_the_camera_and_nothing_is_before_them(mug: ObjectModel) -> None:
-    seen, rng = Seen.of(mug), np.random.default_rng(3)
+    seen, rng = SurfaceView.of(mug), np.random.default_rng(3)
     mesh = trimesh.Trimesh(apply(POSE, mug.vertices), mug.faces, process=False)
     for _ in range(3):
         camera = seen.camera(POSE, rng)
@@ -38,7 +38,7 @@ def test_points_lie_on_the_surface_look_at_the_camera_and_nothing_is_before_them
 
 
 def test_cameras_stand_where_pictures_have_them(mug: ObjectModel) -> None:
-    seen, rng = Seen.of(mug), np.random.default_rng(0)
+    seen, rng = SurfaceView.of(mug), np.random.default_rng(0)
     middle = apply(POSE, mug.centre_of_mass)
     out = np.array([seen.camera(POSE, rng) - middle for _ in range(200)])
     distance = np.linalg.norm(out, axis=1)
@@ -49,7 +49,7 @@ def test_cameras_stand_where_pictures_have_them(mug: ObjectModel) -> None:
 
 
 def test_few_pixels_still_fill_a_cloud(mug: ObjectModel) -> None:
-    seen = Seen.of(mug)
+    seen = SurfaceView.of(mug)
     rng = np.random.default_rng(0)
     points, _ = seen.cloud(POSE, seen.camera(POSE, rng), 8192, rng)
     assert points.shape == (8192, 3) and np.isfinite(points).all()

@@ -17,7 +17,7 @@ def engine() -> None:
 
 @pytest.fixture(scope="session")
 def free_shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Barrett grasps of a free block, sound or not, as they come."""
+    """Barrett grasps of a free block, feasible or not, as they come."""
     return make(FREE, tmp_path_factory.mktemp("free") / "grasps.h5")
 
 

@@ -9,11 +9,24 @@ from typer.testing import CliRunner, Result
 
 from graspd.cli import build
 
-COMMON = ["--fidelity", "draft", "--want", "raw", "--seed", "3", "--threads", "2"]
+COMMON = ["--fidelity", "draft", "--want", "candidates", "--seed", "3", "--threads", "2"]
 FREE = ["--hand", "barrett", "--object", "block", "-n", "6", *COMMON]
-# Without a referee, so that not all of them lift.
+# Without a validator, so that not all of them lift.
 TABLE = [
-    *("--hand", "barrett", "--object", "bottle", "--scene", "table", "--scenes", "2", "-n", "6", "--referee", "none"),
+    *(
+        "--hand",
+        "barrett",
+        "--object",
+        "bottle",
+        "--scene",
+        "table",
+        "--scenes",
+        "2",
+        "-n",
+        "6",
+        "--validation",
+        "none",
+    ),
     *COMMON,
 ]
 PRESSING = [*TABLE, "--touch", "-1"]

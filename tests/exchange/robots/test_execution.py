@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from graspd.exchange.cases import load_case
+from graspd.exchange.inputs import load_case
 from graspd.exchange.robots.execution import (
     ASSUMED_RAD_S,
     HAND_M_S,
@@ -30,7 +30,7 @@ from graspd.service.store.shards import read_shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions, build
-from graspd.worker.validation.protocol import Test as Trial
+from graspd.worker.validation.protocol import Test as Rollout
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.quality.helpers import grasp_set, posture
 
@@ -70,7 +70,7 @@ def test_a_free_grasp_is_reached_and_left_over_ten_centimetres(free: Executions)
 
 def test_the_open_hand_touches_nothing_of_a_free_object_on_its_way(free: Executions) -> None:
     """MuJoCo is the oracle: its convex pieces of the object stand out from the surface by up to 2 mm."""
-    trial = Trial(build(free.hand, free.obj, decompose(free.obj), MujocoOptions()))
+    rollout = Rollout(build(free.hand, free.obj, decompose(free.obj), MujocoOptions()))
     assert len(free) >= 4
     for start, end in (("standoff", "arrival"), ("arrival", "pregrasp")):
         a, b = free.postures[start], free.postures[end]
@@ -79,9 +79,9 @@ def test_the_open_hand_touches_nothing_of_a_free_object_on_its_way(free: Executi
                 place = (1 - share) * a.hand_pose[row, :3] + share * b.hand_pose[row, :3]
                 turn = slerp(a.hand_pose[row, 3:], b.hand_pose[row, 3:], float(share))
                 joints = (1 - share) * a.joint_positions[row] + share * b.joint_positions[row]
-                trial._put(np.concatenate([place, turn]), joints)
-                mujoco.mj_forward(trial.scene.model, trial.data)
-                assert trial.penetration()[0] < 0.002
+                rollout._put(np.concatenate([place, turn]), joints)
+                mujoco.mj_forward(rollout.scene.model, rollout.data)
+                assert rollout.penetration()[0] < 0.002
 
 
 @pytest.mark.slow

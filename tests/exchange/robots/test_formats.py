@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from graspd import service
-from graspd.exchange.cases import load_case
+from graspd.exchange.inputs import load_case
 from graspd.service.model.transforms import compose, invert
 from graspd.service.store.shards import read_shard, write_shard
 from graspd.worker.hands.kinematics import body_poses
@@ -82,8 +82,8 @@ def test_isaac_names_prims_that_the_usd_export_has(tmp_path: Path) -> None:
         assert stage.GetPrimAtPath(isaac[name]).IsValid()
 
 
-def judged(shard: Path) -> list[bool]:
-    """What the referee says of each row."""
+def validated(shard: Path) -> list[bool]:
+    """What the validator says of each row."""
     case = load_case(shard)
     protocol = "dexgraspbench" if case.placed is None else "lift"
     found = run("evaluate", shard, "--protocol", protocol, "--json")
@@ -91,7 +91,7 @@ def judged(shard: Path) -> list[bool]:
 
 
 @pytest.mark.parametrize("which", ["free_shard", "table_shard", "pressing_shard", "clutter_shard"])
-def test_a_mujoco_scene_replays_to_the_verdict_of_the_referee(
+def test_a_mujoco_scene_replays_to_the_verdict_of_the_validator(
     which: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
     shard = limp(request.getfixturevalue(which), tmp_path / "limp.h5")
@@ -99,7 +99,7 @@ def test_a_mujoco_scene_replays_to_the_verdict_of_the_referee(
     # A script that has only mujoco and numpy must do: -I keeps this checkout out of its reach.
     command = [sys.executable, "-I", str(tmp_path / "replay.py"), str(tmp_path / "scene.xml"), "--json"]
     found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-    verdicts = judged(shard)
+    verdicts = validated(shard)
     assert len(found) == told["grasps"] and set(verdicts) == {True, False}
     assert {name: what == "held" for name, what in found.items()} == {
         name: verdicts[int(name.removeprefix("grasp_"))] for name in found

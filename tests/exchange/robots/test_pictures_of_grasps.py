@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from graspd.exchange.cases import load_case
+from graspd.exchange.inputs import load_case
 from graspd.service.model.transforms import pose_to_matrix, quat_to_matrix
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.rendering.hands import drawn_bodies, hand_solids

@@ -23,9 +23,9 @@ from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import ConflictError, IndexUnavailable, InputError, NotFoundError, StoreUnavailable
 from graspd.service.model.messages import Origin
-from graspd.service.model.planning import Turns, message_of, plan
+from graspd.service.model.planning import RoundRobin, message_of, plan
 from graspd.service.model.records import AttemptRecord, JobRecord
-from graspd.service.model.states import AssetKind, Lane, Stage, State
+from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.version import STAGE_REVISIONS
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
@@ -259,8 +259,8 @@ def test_the_jobs_of_a_key_are_fed_in_turn_and_each_batch_by_batch(services: Ser
     window = services.settings.model_copy(update={"queue_window": 1})
     small = Services(window, services.store, services.index, services.queue)
     for seed in range(2):
-        job_actions.submit(small, request(grasps=320, seed=seed), lane=Lane.BULK)
-    ready = services.index.feed.ready_tasks(Lane.BULK, Turns(), now=time.time(), limit=10)
+        job_actions.submit(small, request(grasps=320, seed=seed), priority=Priority.BULK)
+    ready = services.index.feed.ready_tasks(Priority.BULK, RoundRobin(), now=time.time(), limit=10)
     assert len(ready) == 10
     for job in {task.job.id for task in ready}:
         batches = [task.task.batch for task in ready if task.job.id == job]
@@ -273,10 +273,10 @@ def test_a_key_with_many_jobs_gets_no_more_turns_than_one_with_a_single_job(serv
     for seed in range(5):
         _submit_as(services, "greedy", seed)
     _submit_as(services, "modest", 9)
-    turns = Turns()
+    turns = RoundRobin()
     owners: list[str] = []
     for limit in (1, 2, 3, 10, 4):  # room as it comes up, round by round
-        ready = services.index.feed.ready_tasks(Lane.BULK, turns, now=time.time(), limit=limit)
+        ready = services.index.feed.ready_tasks(Priority.BULK, turns, now=time.time(), limit=limit)
         services.index.live.set_queued([task.task.id for task in ready])
         owners += [task.job.origin.key for task in ready if task.job.origin is not None]
     assert owners.count("greedy") == owners.count("modest") == 10
@@ -294,7 +294,7 @@ def _submit_as(services: Services, key: str, seed: int) -> None:
         revisions=dict(STAGE_REVISIONS),
         hand_digest=hand,
         object_digest=obj,
-        lane=Lane.BULK,
+        priority=Priority.BULK,
         created=timestamp(),
         origin=Origin(key=key),
     )
@@ -307,9 +307,9 @@ def test_a_clock_set_back_does_not_strand_a_task(services: Services) -> None:
     task = services.index.jobs.tasks(job=job.id).items[0]
     a_year = 365 * 86400
     services.index.live.set_waiting([task.id], not_before=time.time() + 60)
-    assert services.index.feed.ready_tasks(Lane.INTERACTIVE, Turns(), now=time.time(), limit=9) == []
+    assert services.index.feed.ready_tasks(Priority.INTERACTIVE, RoundRobin(), now=time.time(), limit=9) == []
     services.index.live.set_waiting([task.id], not_before=time.time() + a_year)
-    assert len(services.index.feed.ready_tasks(Lane.INTERACTIVE, Turns(), now=time.time(), limit=9)) == 1
+    assert len(services.index.feed.ready_tasks(Priority.INTERACTIVE, RoundRobin(), now=time.time(), limit=9)) == 1
 
 
 def test_two_jobs_that_need_one_shard_both_profit_from_it(services: Services) -> None:

@@ -7,10 +7,10 @@ from graspd.service.index.views import UsageDay
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.messages import Origin
-from graspd.service.model.planning import Turns, message_of, plan
+from graspd.service.model.planning import RoundRobin, message_of, plan
 from graspd.service.model.projects import ProjectScope
 from graspd.service.model.records import JobRecord
-from graspd.service.model.states import AssetKind, Lane
+from graspd.service.model.states import AssetKind, Priority
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.records import put_record
 from tests.fakes import make_shard, request
@@ -27,7 +27,7 @@ def enter(services: Services, project: str, seed: int, *, key: str = "", batches
         request=request(grasps=32 * batches, seed=seed),
         hand_digest=hand,
         object_digest=obj,
-        lane=Lane.BULK,
+        priority=Priority.BULK,
         created=timestamp(),
         origin=Origin(key=key or project),
         project=project,
@@ -122,10 +122,10 @@ def test_projects_share_the_queue_evenly_whatever_their_keys_and_jobs_are(servic
         enter(services, "greedy", seed, key=f"greedy-{seed % 3}", batches=6, where=seed * 2)
     enter(services, "modest", 9, batches=12, where=5)
     enter(services, "", 10, key="alone", batches=12, where=13)
-    turns = Turns()
+    turns = RoundRobin()
     queued: dict[str, int] = {"greedy": 0, "modest": 0, "": 0}
     for room in (3, 6, 12, 9):  # as it comes up, round by round
-        ready = services.index.feed.ready_tasks(Lane.BULK, turns, now=2e9, limit=room)
+        ready = services.index.feed.ready_tasks(Priority.BULK, turns, now=2e9, limit=room)
         assert len(ready) == room
         services.index.live.set_queued([task.task.id for task in ready])
         for task in ready:

@@ -15,7 +15,7 @@ from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.planning import message_of, plan
 from graspd.service.model.records import JobRecord
-from graspd.service.model.states import AssetKind, Lane, State
+from graspd.service.model.states import AssetKind, Priority, State
 from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
 from graspd.service.store.records import put_record
@@ -54,7 +54,7 @@ def enter(services: Services, place: int, seed: int, *, batches: int = 1) -> Job
         request=request(grasps=32 * batches, seed=seed),
         hand_digest=hand,
         object_digest=obj,
-        lane=Lane.BULK,
+        priority=Priority.BULK,
         created=timestamp(),
     )
     put_record(services.store, names.job_record(record.id), record)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from graspd.api.uploads import name_of_upload
-from graspd.exchange.lots import plain_name
+from graspd.exchange.plan import plain_name
 from graspd.service.model.errors import InputError
 from graspd.service.model.names import fitted
 

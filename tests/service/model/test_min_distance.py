@@ -37,8 +37,8 @@ def test_another_distance_is_another_job_and_another_shard() -> None:
     assert job_id(far, HAND, OBJECT) != job_id(wish(), HAND, OBJECT) and base(far) != base(wish())
 
 
-def test_raw_grasps_do_not_depend_on_it() -> None:
-    assert base(wish(want="raw", min_distance=0.02)) == base(wish(want="raw"))
+def test_candidate_grasps_do_not_depend_on_it() -> None:
+    assert base(wish(want="candidates", min_distance=0.02)) == base(wish(want="candidates"))
 
 
 @pytest.mark.parametrize("least", [-0.001, 0.2, float("nan"), float("inf")])

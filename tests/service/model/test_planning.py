@@ -16,12 +16,12 @@ from graspd.service.model.planning import (
     batch_ready,
     batch_states,
     job_state,
-    lane_of,
     message_of,
     plan,
+    priority_of,
 )
 from graspd.service.model.records import JobRecord
-from graspd.service.model.states import Lane, Stage, State
+from graspd.service.model.states import Priority, Stage, State
 from tests.fakes import request
 
 HAND, OBJECT = "a" * 32, "b" * 32
@@ -33,7 +33,7 @@ def record(wanted: JobRequest) -> JobRecord:
         request=wanted,
         hand_digest=HAND,
         object_digest=OBJECT,
-        lane=Lane.BULK,
+        priority=Priority.BULK,
         created=timestamp(),
     )
 
@@ -78,8 +78,8 @@ def test_a_plan_makes_each_grasp_once_and_names_nothing_twice(grasps: int, scene
 
 
 def test_a_small_job_is_interactive_and_a_large_one_is_bulk() -> None:
-    assert lane_of(request(grasps=32)) is Lane.INTERACTIVE
-    assert lane_of(request(grasps=100_000)) is Lane.BULK
+    assert priority_of(request(grasps=32)) is Priority.INTERACTIVE
+    assert priority_of(request(grasps=100_000)) is Priority.BULK
 
 
 def test_a_message_is_enough_to_do_the_task() -> None:

@@ -11,7 +11,7 @@ from graspd.service.index.index import Index
 from graspd.service.index.sample import look
 from graspd.service.model.errors import GraspdError, InputError, without_secrets
 from graspd.service.queue.connection import connect
-from graspd.service.run.address import Joining
+from graspd.service.run.address import ListenAddress
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
 from graspd.service.telemetry import JsonLines, _TextLines
@@ -83,4 +83,4 @@ def test_settings_show_no_secret(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_other_machines_join_with_is_not_shown(tmp_path: object) -> None:
-    assert SECRET not in repr(Joining(tmp_path, "host", "127.0.0.1", 1, SECRET))  # type: ignore[arg-type]
+    assert SECRET not in repr(ListenAddress(tmp_path, "host", "127.0.0.1", 1, SECRET))  # type: ignore[arg-type]

@@ -31,13 +31,13 @@ def test_jobs_without_it_keep_their_documents_and_ids() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"robust": 0.5, "referee": "none"}, "choose a referee"),
+        ({"robust": 0.5, "validation": "none"}, "choose a validator"),
         ({"robust": 1.5}, "less than or equal to 1"),
         ({"robust": float("nan")}, "finite"),
         ({"robust_models": 65}, "less than or equal to 64"),
     ],
 )
-def test_what_cannot_be_judged_is_refused(options: dict[str, object], words: str) -> None:
+def test_what_cannot_be_validated_is_refused(options: dict[str, object], words: str) -> None:
     with pytest.raises(ValidationError, match=words):
         request(**options)
 

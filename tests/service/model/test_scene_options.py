@@ -12,7 +12,7 @@ from graspd.service.model.digests import digest_json, job_id, shard_id
 from graspd.service.model.domain import SCENES, JobOptions, JobRequest
 from graspd.service.model.planning import message_of, plan
 from graspd.service.model.records import JobRecord, Member
-from graspd.service.model.states import Lane, Stage
+from graspd.service.model.states import Priority, Stage
 from graspd.service.model.version import STAGE_REVISIONS
 from graspd.service.pipeline.datasets.spec import describe
 from graspd.worker.planners.registry import PLANNERS, method
@@ -34,8 +34,8 @@ PLAIN: dict[str, Any] = {
     "friction": 1.0,
     "want": "valid",
     "budget": 4.0,
-    "referee": "certificate",
-    "audits": 8,
+    "validation": "standard",
+    "rechecks": 8,
     "robustness": 0,
     "options": {},
     "target": "",
@@ -49,7 +49,7 @@ def record(wanted: JobRequest) -> JobRecord:
         request=wanted,
         hand_digest=HAND,
         object_digest=OBJECT,
-        lane=Lane.BULK,
+        priority=Priority.BULK,
         created=timestamp(),
     )
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from graspd.service.pipeline.controller import Duty
+from graspd.service.pipeline.controller import PeriodicDuty
 
 
 class Clock:
@@ -31,7 +31,7 @@ def test_the_pause_follows_from_the_cost(cost_s: float, pause_s: float) -> None:
         clock.spend(cost_s)
         done.append(clock.now)
 
-    duty = Duty(clock, work, 1.0, share=0.2, longest_s=6.0)
+    duty = PeriodicDuty(clock, work, 1.0, share=0.2, longest_s=6.0)
     duty()
     clock.spend(pause_s - 0.01)
     duty()
@@ -44,7 +44,7 @@ def test_the_pause_follows_from_the_cost(cost_s: float, pause_s: float) -> None:
 @pytest.mark.parametrize("work", [lambda: 1 / 0, lambda: True], ids=["broke off", "has more to do"])
 def test_what_is_not_done_is_due_at_once(work: Callable[[], object]) -> None:
     begun: list[int] = []
-    duty = Duty(Clock(), lambda: begun.append(1) or work(), 1.0)  # type: ignore[func-returns-value]
+    duty = PeriodicDuty(Clock(), lambda: begun.append(1) or work(), 1.0)  # type: ignore[func-returns-value]
     for _ in range(2):
         with contextlib.suppress(ZeroDivisionError):
             duty()

@@ -29,8 +29,8 @@ from graspd.service.store.integrity import put_document, put_sealed
 from graspd.service.store.library import builtin_assets, load_check, publish_builtins, store_files
 from graspd.service.store.manifests import load_manifest
 from graspd.service.store.records import (
+    DeletedJob,
     Deletion,
-    Released,
     add_job_event,
     latest,
     publish,
@@ -67,7 +67,7 @@ def full(services: Services) -> Services:
     actions.snapshot(services, "all")
     actions.add_object_set(services, "balls", ["ball"])
     put_record(store, f"{names.DELETIONS}/job/{'e' * 32}.json", Deletion(what="job", id="e" * 32, at=timestamp()))
-    put_record(store, f"{names.RELEASED}/1-{job.id}.json", Released(at=timestamp(), job=record))
+    put_record(store, f"{names.RELEASED}/1-{job.id}.json", DeletedJob(at=timestamp(), job=record))
     gone = Deletion(what="job", id="b" * 32, at=timestamp())
     put_record(store, f"{removed_folder(gone)}/deletion.json", gone)
     put_record(store, f"{removed_folder(gone)}/{names.job_record(gone.id)}", record)
@@ -97,7 +97,7 @@ def keys_of_each_kind(services: Services) -> list[str]:
 
 
 def test_every_flipped_byte_is_found_and_named(full: Services) -> None:
-    draw, missed, tried = random.Random(45), [], 0
+    draw, missed, candidates = random.Random(45), [], 0
     keys = keys_of_each_kind(full)
     for key in keys:
         data = full.store.get(key)
@@ -105,12 +105,12 @@ def test_every_flipped_byte_is_found_and_named(full: Services) -> None:
             overwrite(full.store, key, data[:at] + bytes([data[at] ^ 1 << draw.randrange(8)]) + data[at + 1 :])
             # The file of a shard is examined with its manifest.
             wrong = examine(full.store, re.sub(r"\.h5$", ".json", key))
-            tried += 1
+            candidates += 1
             if wrong is None or wrong.key != key:
                 missed.append((key, at))
         overwrite(full.store, key, data)
     assert missed == []
-    assert tried >= 265
+    assert candidates >= 265
     assert {key.partition("/")[0] for key in keys} == set(FOLDERS)
     assert [wrong for _, wrong in scan(full.store) if wrong is not None] == []
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from graspd.service.model.clock import timestamp
-from graspd.service.model.states import Lane, Stage, State
+from graspd.service.model.states import Priority, Stage, State
 from graspd.service.model.workers import WorkerBeat, own_ability
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
@@ -58,7 +58,7 @@ def test_the_next_stage_is_queued_without_waiting_for_a_sweep(services: Services
 def test_a_task_that_runs_is_not_queued_again_between_two_sweeps(services: Services) -> None:
     controller = Controller(services, clock=Clock())
     controller.round()
-    job_actions.submit(services, request(grasps=96), lane=Lane.BULK)
+    job_actions.submit(services, request(grasps=96), priority=Priority.BULK)
     held = taken(services)
     finish(services, held[0])
     controller.round()
@@ -68,7 +68,7 @@ def test_a_task_that_runs_is_not_queued_again_between_two_sweeps(services: Servi
 def test_many_ends_at_once_are_one_round(services: Services) -> None:
     controller = Controller(services, clock=Clock())
     controller.round()
-    job, _ = job_actions.submit(services, request(grasps=32 * 150), lane=Lane.BULK)
+    job, _ = job_actions.submit(services, request(grasps=32 * 150), priority=Priority.BULK)
     for delivery in taken(services):
         finish(services, delivery)
     controller.round()
@@ -121,7 +121,7 @@ def test_a_fleet_larger_than_the_window_finds_work(services: Services) -> None:
     clock = Clock()
     controller = Controller(small, clock=clock)
     controller.round()
-    job_actions.submit(small, request(grasps=32 * 100), lane=Lane.BULK)
+    job_actions.submit(small, request(grasps=32 * 100), priority=Priority.BULK)
     clock.now += 1.0
     controller.round()
     assert len(services.queue.waiting()) == 40

@@ -19,8 +19,8 @@ from graspd.service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO
 from graspd.service.pipeline.repair import repair
 from graspd.service.queue.port import EventKind
 from graspd.service.store.manifests import ShardManifest, load_manifest, load_shard
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.process.runner import Runner
-from graspd.worker.run import Run
 from graspd.worker.stages.context import TaskContext
 from tests.damage import cut, flip, overwrite, remove
 from tests.fakes import fake_stages, request
@@ -54,7 +54,7 @@ def work_off(services: Services, *, device: str = "cpu", seed: int = 0) -> list[
         # The name of a device is all that these stages see of it.
         runner = Runner(fake_stages(), worker="w", publish=services.queue.publish, check_device=lambda device: None)
         raw = delivery.message.model_dump(mode="json", by_alias=True)
-        outcome = runner.run(raw, TaskContext(services.store, Run(device)))
+        outcome = runner.run(raw, TaskContext(services.store, ExecutionContext(device)))
         services.queue.finish(delivery)  # type: ignore[attr-defined]
         assert outcome is not None
         services.queue.publish(outcome)
@@ -140,8 +140,8 @@ def test_the_command_tells_what_is_damaged_and_exits_with_1(
 
     monkeypatch.setenv("GRASPD_STORE_URL", services.store.url)
     command = ["store", "verify", "--json", "--data-dir", str(services.settings.data_dir)]
-    sound = CliRunner().invoke(app, command)
-    assert (sound.exit_code, json.loads(sound.stdout)["damaged"]) == (0, []), sound.output
+    feasible = CliRunner().invoke(app, command)
+    assert (feasible.exit_code, json.loads(feasible.stdout)["damaged"]) == (0, []), feasible.output
     done = harm(services, shards)
     told = CliRunner().invoke(app, command)
     assert told.exit_code == 1

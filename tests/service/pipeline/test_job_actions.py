@@ -7,7 +7,7 @@ import pytest
 from graspd.service.index.rebuild import differences
 from graspd.service.model import names
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError, QueueUnavailable
-from graspd.service.model.states import AssetKind, Lane, State
+from graspd.service.model.states import AssetKind, Priority, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.library import publish_asset
@@ -80,7 +80,7 @@ def test_a_large_job_fills_the_window_and_no_more(services: Services) -> None:
     small = services.settings.model_copy(update={"queue_window": 10})
     job, _ = job_actions.submit(Services(small, services.store, services.index, services.queue), request(grasps=3200))
     assert len(services.queue.waiting()) == 10
-    assert job.lane is Lane.BULK
+    assert job.priority is Priority.BULK
     assert job.stages[0].tasks == 100
 
 

@@ -15,7 +15,7 @@ from graspd.api.metrics import Metrics, Snapshot
 from graspd.service.index.notes import Damage
 from graspd.service.index.queries import overview
 from graspd.service.model.messages import TaskMessage
-from graspd.service.model.states import Lane, Stage, State
+from graspd.service.model.states import Priority, Stage, State
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.job_actions import submit
 from graspd.service.pipeline.metrics import MOST_KINDS, OTHER_KIND, SERIES, Tally, parse_field
@@ -102,11 +102,11 @@ _BUSY = {
 
 
 def test_depth_age_and_workers_are_told_from_redis(rq_queue: RqQueue) -> None:
-    rq_queue.enqueue(tasks(2), Lane.BULK)
+    rq_queue.enqueue(tasks(2), Priority.BULK)
     rq_queue.connection.sadd(WORKERS, "w1", "gone")
     rq_queue.connection.set(worker_key("w1"), json.dumps(_BUSY), px=400_000)
     found = rq_queue.now(lease_s=600)
-    place = (Lane.BULK, Stage.SYNTHESIZE)
+    place = (Priority.BULK, Stage.SYNTHESIZE)
     assert found.depth[place] == 2
     assert 0 <= found.oldest_s[place] < 60
     assert set(found.workers) == {"w1"}
@@ -121,9 +121,9 @@ def test_the_cost_of_a_look_does_not_grow_with_the_queue(rq_queue: RqQueue) -> N
         after = rq_queue.connection.info("commandstats")
         return sum(after[name]["calls"] - before.get(name, {"calls": 0})["calls"] for name in after)
 
-    rq_queue.enqueue(tasks(1), Lane.BULK)
+    rq_queue.enqueue(tasks(1), Priority.BULK)
     few = commands()
-    rq_queue.enqueue(tasks(40), Lane.BULK)
+    rq_queue.enqueue(tasks(40), Priority.BULK)
     assert commands() == few
 
 
@@ -132,8 +132,8 @@ def test_forged_entries_in_redis_do_not_break_the_metrics(rq_queue: RqQueue) -> 
     rq_queue.connection.sadd(WORKERS, "forged")
     rq_queue.connection.set(worker_key("forged"), b"\xff{")
     found = rq_queue.now(lease_s=6)
-    assert found.depth[Lane.BULK, Stage.SCENE] == 1
-    assert (Lane.BULK, Stage.SCENE) not in found.oldest_s
+    assert found.depth[Priority.BULK, Stage.SCENE] == 1
+    assert (Priority.BULK, Stage.SCENE) not in found.oldest_s
     assert not found.workers
 
 

@@ -16,7 +16,7 @@ from graspd.service.index.rebuild import differences
 from graspd.service.model.clock import timestamp
 from graspd.service.model.planning import message_of, plan
 from graspd.service.model.records import JobRecord
-from graspd.service.model.states import AssetKind, Lane, Stage, State
+from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.version import SCHEMA_OF_RANGES, STAGE_REVISIONS, TASK_SCHEMA
 from graspd.service.model.workers import WorkerBeat
 from graspd.service.pipeline import job_actions
@@ -73,8 +73,8 @@ def measured(services: Services, seconds: float) -> None:
     services.index.write.add_manifest(manifest)
 
 
-def span(services: Services, grasps: int, lane: Lane = Lane.BULK, **changes: object) -> int:
-    return job_actions.prepare(services, request(grasps=grasps, **changes), lane=lane).span
+def span(services: Services, grasps: int, priority: Priority = Priority.BULK, **changes: object) -> int:
+    return job_actions.prepare(services, request(grasps=grasps, **changes), priority=priority).span
 
 
 @given(st.integers(1, 40_000), st.integers(0, 5000), st.integers(0, 300))
@@ -92,7 +92,7 @@ def test_tasks_are_of_one_length_and_no_worker_waits_while_another_has_two(
 def test_a_task_of_a_larger_job_lasts_about_as_long_as_the_settings_say(services: Services) -> None:
     here(services, worker())
     assert span(services, 32 * 100) == 4, "nothing was measured: a stored rate on two cores, 7 s a batch"
-    # Half of what the fakes make is valid, so that a job of so many valid ones takes twice the tries of a batch.
+    # Half of what the fakes make is valid, so that a job of so many valid ones takes twice the candidates of a batch.
     measured(services, 0.5)
     assert 20 <= span(services, 32 * 1000) <= 40
     measured(services, 60.0)
@@ -102,13 +102,13 @@ def test_a_task_of_a_larger_job_lasts_about_as_long_as_the_settings_say(services
 def test_a_job_of_ten_thousand_grasps_makes_few_objects(services: Services) -> None:
     here(services, worker())
     usual = replace(services, settings=Settings(data_dir=services.settings.data_dir))
-    on_two_cores = job_actions.prepare(usual, request(grasps=10_000), lane=Lane.BULK)
+    on_two_cores = job_actions.prepare(usual, request(grasps=10_000), priority=Priority.BULK)
     assert 2 * len(list(plan(on_two_cores))) == 80
     measured(services, 0.1)
-    job = job_actions.prepare(services, request(grasps=10_000), lane=Lane.BULK)
+    job = job_actions.prepare(services, request(grasps=10_000), priority=Priority.BULK)
     assert 2 * len(list(plan(job))) <= 12
     slow = replace(services, settings=services.settings.model_copy(update={"task_s": 0.0}))
-    assert 2 * len(list(plan(job_actions.prepare(slow, request(grasps=10_000), lane=Lane.BULK)))) == 626
+    assert 2 * len(list(plan(job_actions.prepare(slow, request(grasps=10_000), priority=Priority.BULK)))) == 626
 
 
 def test_workers_share_a_job_fairly(services: Services) -> None:
@@ -144,11 +144,11 @@ def test_a_small_job_shows_its_grasps_batch_by_batch_but_for_a_gpu_that_makes_th
 ) -> None:
     measured(services, 0.01)
     here(services, worker())
-    assert span(services, 128, Lane.INTERACTIVE) == 1
+    assert span(services, 128, Priority.INTERACTIVE) == 1
     here(services, worker(device="cuda:0"))
-    assert span(services, 128, Lane.INTERACTIVE) == 4
+    assert span(services, 128, Priority.INTERACTIVE) == 4
     here(services, worker("a", device="cuda:0"), worker("b"))
-    assert span(services, 128, Lane.INTERACTIVE) == 1
+    assert span(services, 128, Priority.INTERACTIVE) == 1
 
 
 def test_pictures_and_older_workers_keep_one_batch_a_task(services: Services) -> None:
@@ -170,7 +170,7 @@ def test_rates_and_workers_are_read_once_for_many_jobs(services: Services) -> No
     job = job_actions.prepare(
         replace(services, settings=services.settings.model_copy(update={"task_s": 0.0})),
         request(grasps=3200),
-        lane=Lane.BULK,
+        priority=Priority.BULK,
     )
     assert ranges.sized(job).span == 4
     measured(services, 0.01)
@@ -183,7 +183,7 @@ def test_a_job_of_ranges_goes_through_its_stages_and_the_index_is_the_store(serv
     bench = Bench(services)
     bench.controller.round()
     here(services, worker())
-    job = job_actions.prepare(services, request(grasps=32 * 6 + 5, scenes=2), lane=Lane.BULK)
+    job = job_actions.prepare(services, request(grasps=32 * 6 + 5, scenes=2), priority=Priority.BULK)
     assert job.span == 4
     job_actions.enter(services, job)
     bench.work_off()
@@ -202,7 +202,7 @@ def test_shards_of_many_batches_enter_the_index_in_short_turns(
 ) -> None:
     bench = Bench(services)
     bench.controller.round()
-    record = job_actions.prepare(services, request(grasps=32 * 64 * 5), lane=Lane.BULK)
+    record = job_actions.prepare(services, request(grasps=32 * 64 * 5), priority=Priority.BULK)
     job, _ = job_actions.enter(services, record.model_copy(update={"span": 64}))
     turns: list[int] = []
     add = Changes.add_manifests

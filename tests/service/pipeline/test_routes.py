@@ -9,8 +9,8 @@ import pytest
 
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.planning import needed_schema
-from graspd.service.model.states import Lane, Stage
-from graspd.service.model.workers import FIRST_SCHEMA, Need, WorkerBeat, own_ability
+from graspd.service.model.states import Priority, Stage
+from graspd.service.model.workers import FIRST_SCHEMA, Requirements, WorkerBeat, own_ability
 from graspd.service.pipeline.routes import Place, Routes
 from graspd.service.queue import entries
 from graspd.service.queue.lists import known_lists, queue_name, queue_names
@@ -19,7 +19,7 @@ from tests.fakes import message_for, request
 
 OWN = own_ability()
 REVISION = OWN.revisions["synthesize"]
-NEED = Need(Stage.SYNTHESIZE, OWN.schemas[0], OWN.schemas[1], REVISION)
+NEED = Requirements(Stage.SYNTHESIZE, OWN.schemas[0], OWN.schemas[1], REVISION)
 
 
 def beat(
@@ -45,7 +45,9 @@ NEXT = beat(revision=REVISION + 1)
         ([beat(schemas=(4, 9))], replace(NEED, schema=2, newest=5), Place()),
     ],
 )
-def test_a_task_goes_where_those_look_who_can_do_it(present: list[WorkerBeat], need: Need, place: Place) -> None:
+def test_a_task_goes_where_those_look_who_can_do_it(
+    present: list[WorkerBeat], need: Requirements, place: Place
+) -> None:
     assert Routes(present).place(need) == place
 
 
@@ -58,7 +60,9 @@ def test_a_task_goes_where_those_look_who_can_do_it(present: list[WorkerBeat], n
         ([beat(schemas=(5, 6))], replace(NEED, newest=4), "schema 4 of tasks is the newest it may have"),
     ],
 )
-def test_what_nobody_can_do_is_held_back_with_the_reason(present: list[WorkerBeat], need: Need, why: str) -> None:
+def test_what_nobody_can_do_is_held_back_with_the_reason(
+    present: list[WorkerBeat], need: Requirements, why: str
+) -> None:
     assert why in Routes(present).place(need).held
 
 
@@ -87,18 +91,18 @@ def test_a_worker_looks_apart_only_for_what_it_can_do() -> None:
 
 def test_tasks_that_wait_apart_are_seen_and_leave_with_those_who_take_them(rq_queue: RqQueue) -> None:
     message = message_for()
-    name = f"rq:queue:{queue_name(Lane.BULK, Stage.SYNTHESIZE, NEED)}"
-    assert rq_queue.enqueue([message], Lane.BULK, apart=True) == 1
+    name = f"rq:queue:{queue_name(Priority.BULK, Stage.SYNTHESIZE, NEED)}"
+    assert rq_queue.enqueue([message], Priority.BULK, apart=True) == 1
     assert rq_queue.connection.llen(name) == 1
     assert rq_queue.waiting() == {message.task_id}
-    assert rq_queue.depths()[Lane.BULK, Stage.SYNTHESIZE] == 1
-    assert rq_queue.now(lease_s=6).depth[Lane.BULK, Stage.SYNTHESIZE] == 1
+    assert rq_queue.depths()[Priority.BULK, Stage.SYNTHESIZE] == 1
+    assert rq_queue.now(lease_s=6).depth[Priority.BULK, Stage.SYNTHESIZE] == 1
     rq_queue.clear_untaken([beat(), NEXT])
     assert rq_queue.waiting() == {message.task_id}
     rq_queue.clear_untaken([NEXT])
     assert rq_queue.waiting() == set()
     assert known_lists(rq_queue.connection) == known_lists(rq_queue.connection)[:8]
-    assert rq_queue.enqueue([message], Lane.BULK) == 1, "nothing of it is left"
+    assert rq_queue.enqueue([message], Priority.BULK) == 1, "nothing of it is left"
 
 
 def test_forged_names_of_lists_are_nobodys(rq_queue: RqQueue) -> None:

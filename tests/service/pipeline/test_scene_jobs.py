@@ -35,7 +35,7 @@ def fail(services: Services, job: JobRecord, batch: int, kind: str, number: int 
         stage=task.stage,
         number=number,
         kind=kind,
-        reason="none of 128 grasps tried is valid in its scene",
+        reason="none of 128 candidates is valid in its scene",
         worker="w",
         ended=timestamp(),
         last=True,
@@ -70,7 +70,7 @@ def test_a_job_ends_when_its_first_batch_finds_nothing_in_its_scenes(services: S
     make(services, job, Stage.SYNTHESIZE, 1)
     fail(services, job, 0, kind)
     ended = services.index.jobs.get(job.id)
-    assert (ended.state, ended.reason) == (State.FAILED, "none of 128 grasps tried is valid in its scene")
+    assert (ended.state, ended.reason) == (State.FAILED, "none of 128 candidates is valid in its scene")
     found = states(services, job)
     assert found[0, Stage.SYNTHESIZE] is State.FAILED
     assert found[1, Stage.SYNTHESIZE] is State.SUCCEEDED, "what is made stays"

@@ -21,7 +21,7 @@ from rq.serializers import JSONSerializer
 from rq.timeouts import BaseDeathPenalty
 from rq.worker import BaseWorker
 
-from graspd.service.model.states import Lane, Stage, State
+from graspd.service.model.states import Priority, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.indexer import Indexer
@@ -31,7 +31,7 @@ from graspd.service.queue.rq_queue import RqQueue, cancel_key, rq_id
 from tests.conftest import PACKAGES, REPOSITORY
 from tests.fakes import request
 
-NAME = queue_name(Lane.INTERACTIVE, Stage.SYNTHESIZE)
+NAME = queue_name(Priority.INTERACTIVE, Stage.SYNTHESIZE)
 #: How long RQ's worker says that its lease lasts [s].
 LEASE_S = 60
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 
 from graspd.service.model.clock import timestamp
-from graspd.service.model.states import Lane, Stage
+from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.lists import queue_name
 from graspd.service.queue.port import Event, EventKind, Report
 from graspd.service.queue.rq_queue import REPORTS, RqQueue
 from tests.fakes import message_for
 from tests.memory_queue import MemoryQueue
 
-WIP = f"rq:wip:{queue_name(Lane.BULK, Stage.SYNTHESIZE)}"
+WIP = f"rq:wip:{queue_name(Priority.BULK, Stage.SYNTHESIZE)}"
 
 
 @pytest.fixture(params=["memory", "redis"])
@@ -41,13 +41,13 @@ def test_all_leases_are_read_in_one_round_trip(rq_queue: RqQueue) -> None:
 
 def test_tasks_are_added_together_and_none_twice(rq_queue: RqQueue) -> None:
     tasks = [message_for().model_copy(update={"task_id": f"{number:032x}"}) for number in range(700)]
-    assert rq_queue.enqueue(tasks[:10], Lane.BULK) == 10
-    assert rq_queue.enqueue(tasks, Lane.BULK) == 690
+    assert rq_queue.enqueue(tasks[:10], Priority.BULK) == 10
+    assert rq_queue.enqueue(tasks, Priority.BULK) == 690
     assert rq_queue.waiting() == {task.task_id for task in tasks}
     assert sum(rq_queue.depths().values()) == 700
-    rq_queue.connection.delete(f"rq:queue:{queue_name(Lane.BULK, Stage.SYNTHESIZE)}")
-    assert rq_queue.enqueue(tasks, Lane.BULK) == 0, "what the queue knows is not added again"
-    assert rq_queue.enqueue(tasks, Lane.BULK, again=True) == 700
+    rq_queue.connection.delete(f"rq:queue:{queue_name(Priority.BULK, Stage.SYNTHESIZE)}")
+    assert rq_queue.enqueue(tasks, Priority.BULK) == 0, "what the queue knows is not added again"
+    assert rq_queue.enqueue(tasks, Priority.BULK, again=True) == 700
 
 
 def test_a_report_replaces_the_last_one_and_goes_with_the_attempt(queue: MemoryQueue | RqQueue) -> None:

@@ -13,7 +13,7 @@ from rq.serializers import JSONSerializer
 
 from graspd.service.model.clock import timestamp
 from graspd.service.model.messages import IngestMessage, TaskMessage
-from graspd.service.model.states import Lane, Stage
+from graspd.service.model.states import Priority, Stage
 from graspd.service.model.workers import WorkerBeat
 from graspd.service.queue.lists import queue_names
 from graspd.service.queue.port import BULK_EVERY, Event, EventKind
@@ -141,9 +141,9 @@ def sides(request: pytest.FixtureRequest) -> tuple[RqQueue, Worker]:
 
 def test_tasks_come_out_as_they_went_in(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
-    assert queue.enqueue([task("a"), task("b")], Lane.BULK) == 2
+    assert queue.enqueue([task("a"), task("b")], Priority.BULK) == 2
     assert queue.waiting() == {"a", "b"}
-    assert queue.depths()[Lane.BULK, Stage.SYNTHESIZE] == 2
+    assert queue.depths()[Priority.BULK, Stage.SYNTHESIZE] == 2
     assert worker.take() == task("a")
     worker.finish()
     assert worker.take() == task("b")
@@ -151,8 +151,8 @@ def test_tasks_come_out_as_they_went_in(sides: tuple[RqQueue, Worker]) -> None:
 
 def test_interactive_tasks_go_before_bulk_but_do_not_starve_it(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
-    queue.enqueue([task(f"bulk{i}") for i in range(20)], Lane.BULK)
-    queue.enqueue([task(f"urgent{i}") for i in range(20)], Lane.INTERACTIVE)
+    queue.enqueue([task(f"bulk{i}") for i in range(20)], Priority.BULK)
+    queue.enqueue([task(f"urgent{i}") for i in range(20)], Priority.INTERACTIVE)
     taken = []
     for _ in range(3 * BULK_EVERY):
         found = worker.take()
@@ -164,7 +164,7 @@ def test_interactive_tasks_go_before_bulk_but_do_not_starve_it(sides: tuple[RqQu
 
 def test_bulk_runs_at_full_rate_while_nothing_is_urgent(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
-    queue.enqueue([task(f"bulk{i}") for i in range(2 * BULK_EVERY)], Lane.BULK)
+    queue.enqueue([task(f"bulk{i}") for i in range(2 * BULK_EVERY)], Priority.BULK)
     for number in range(2 * BULK_EVERY):
         assert worker.take() == task(f"bulk{number}")
         worker.finish()
@@ -173,23 +173,23 @@ def test_bulk_runs_at_full_rate_while_nothing_is_urgent(sides: tuple[RqQueue, Wo
 
 def test_a_waiting_task_is_not_queued_twice(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
-    queue.enqueue([task("a")], Lane.BULK)
-    assert queue.enqueue([task("a")], Lane.BULK) == 0
+    queue.enqueue([task("a")], Priority.BULK)
+    assert queue.enqueue([task("a")], Priority.BULK) == 0
     assert worker.take() is not None
-    assert queue.enqueue([task("a")], Lane.BULK) == 0, "it is running"
+    assert queue.enqueue([task("a")], Priority.BULK) == 0, "it is running"
     assert worker.take() is None
 
 
 def test_the_next_attempt_of_a_task_is_another_entry(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
-    queue.enqueue([task("a")], Lane.BULK)
+    queue.enqueue([task("a")], Priority.BULK)
     worker.take()
-    assert queue.enqueue([task("a", attempt=2)], Lane.BULK) == 1
+    assert queue.enqueue([task("a", attempt=2)], Priority.BULK) == 1
 
 
 def test_a_lease_says_who_holds_which_attempt_of_what(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
-    queue.enqueue([task("a", attempt=2)], Lane.BULK)
+    queue.enqueue([task("a", attempt=2)], Priority.BULK)
     worker.take()
     (lease,) = queue.leases()
     assert (lease.task_id, lease.attempt) == ("a", 2)
@@ -201,7 +201,7 @@ def test_a_lease_says_who_holds_which_attempt_of_what(sides: tuple[RqQueue, Work
 
 def test_a_lease_changes_with_each_sign_of_life_and_not_by_reading(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
-    queue.enqueue([task("a")], Lane.BULK)
+    queue.enqueue([task("a")], Priority.BULK)
     worker.take()
     first = queue.leases()[0].beat
     assert queue.leases()[0].beat == first
@@ -211,7 +211,7 @@ def test_a_lease_changes_with_each_sign_of_life_and_not_by_reading(sides: tuple[
 
 def test_a_worker_whose_lease_was_released_notices(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
-    queue.enqueue([task("a")], Lane.BULK)
+    queue.enqueue([task("a")], Priority.BULK)
     worker.take()
     queue.release(queue.leases()[0])
     assert queue.leases() == []
@@ -221,7 +221,7 @@ def test_a_worker_whose_lease_was_released_notices(sides: tuple[RqQueue, Worker]
 
 def test_a_discarded_task_never_starts(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
-    queue.enqueue([task("a"), task("b")], Lane.BULK)
+    queue.enqueue([task("a"), task("b")], Priority.BULK)
     queue.discard(["a"])
     assert queue.waiting() == {"b"}
     assert worker.take() == task("b")
@@ -229,7 +229,7 @@ def test_a_discarded_task_never_starts(sides: tuple[RqQueue, Worker]) -> None:
 
 def test_a_discarded_running_task_is_told_to_stop(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
-    queue.enqueue([task("a")], Lane.BULK)
+    queue.enqueue([task("a")], Priority.BULK)
     worker.take()
     queue.discard(["a"])
     assert worker.beat() is StopReason.CANCELLED
@@ -238,7 +238,7 @@ def test_a_discarded_running_task_is_told_to_stop(sides: tuple[RqQueue, Worker])
 def test_a_task_queued_again_after_it_was_discarded_runs(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
     queue.discard(["a"])
-    queue.enqueue([task("a")], Lane.BULK)
+    queue.enqueue([task("a")], Priority.BULK)
     worker.take()
     assert worker.beat() is None
 
@@ -279,8 +279,8 @@ def test_any_number_of_readers_follow_the_stream(sides: tuple[RqQueue, Worker]) 
 def test_a_check_travels_like_any_task(sides: tuple[RqQueue, Worker]) -> None:
     queue, _ = sides
     message = IngestMessage(schema_=1, task_id="i", kind="hand", name="h", digest=DIGEST)
-    queue.enqueue([message], Lane.INTERACTIVE)
-    assert queue.depths()[Lane.INTERACTIVE, Stage.INGEST] == 1
+    queue.enqueue([message], Priority.INTERACTIVE)
+    assert queue.depths()[Priority.INTERACTIVE, Stage.INGEST] == 1
 
 
 def test_a_part_is_there_as_long_as_it_says_so(sides: tuple[RqQueue, Worker]) -> None:
@@ -337,11 +337,11 @@ def test_sums_add_up_and_each_name_has_its_own(sides: tuple[RqQueue, Worker]) ->
 
 def test_what_waits_is_told_by_lane_and_stage(sides: tuple[RqQueue, Worker]) -> None:
     queue, _ = sides
-    queue.enqueue([task("x"), task("y"), task("z", stage=Stage.RENDER)], Lane.BULK)
+    queue.enqueue([task("x"), task("y"), task("z", stage=Stage.RENDER)], Priority.BULK)
     shown = queue.now(lease_s=6.0)
     assert {place: depth for place, depth in shown.depth.items() if depth} == {
-        (Lane.BULK, Stage.SYNTHESIZE): 2,
-        (Lane.BULK, Stage.RENDER): 1,
+        (Priority.BULK, Stage.SYNTHESIZE): 2,
+        (Priority.BULK, Stage.RENDER): 1,
     }
     assert shown.depth == queue.depths()
     assert not any(shown.running.values())
@@ -370,7 +370,7 @@ def test_the_stream_of_events_is_bounded(rq_queue: RqQueue, monkeypatch: pytest.
 def test_redis_keeps_nothing_of_a_finished_task(rq_queue: RqQueue) -> None:
     side = RqSide(rq_queue)
     before = {key for key in rq_queue.connection.keys("*") if b"queues" not in key}
-    rq_queue.enqueue([task("a")], Lane.BULK)
+    rq_queue.enqueue([task("a")], Priority.BULK)
     side.take()
     side.finish()
     after = {key for key in rq_queue.connection.keys("*") if b"queues" not in key}

@@ -8,7 +8,7 @@ import pytest
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import quat_from_axis_angle
-from graspd.service.readers.ways import Waypoint, point_at, scene_spec_of, stop_places, way_of, wrists_of
+from graspd.service.readers.trajectories import Waypoint, point_at, scene_spec_of, stop_places, way_of, wrists_of
 from graspd.service.store.shards import Shard, json_attribute
 
 WAYPOINTS = 4

@@ -69,12 +69,12 @@ def test_a_bug_is_not_dressed_up_as_a_mistake() -> None:
 
 
 def test_a_bad_model_names_the_field(capsys: pytest.CaptureFixture[str]) -> None:
-    class Wanted(BaseModel):
+    class PlanRequest(BaseModel):
         grasps: int = Field(ge=1)
 
     @reporting_errors
     def command() -> None:
-        Wanted(grasps=0)
+        PlanRequest(grasps=0)
 
     with pytest.raises(typer.Exit):
         command()

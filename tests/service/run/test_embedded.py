@@ -148,7 +148,7 @@ def test_a_log_of_writes_that_redis_cannot_read_gives_way_to_an_empty_one(
 
     def child() -> Child:
         made = Child("redis", server_command(settings), {}, tmp_path)
-        made.mend = lambda output: give_up_log(settings, output)
+        made.fix = lambda output: give_up_log(settings, output)
         return made
 
     first, second = child(), child()

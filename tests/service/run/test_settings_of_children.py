@@ -24,7 +24,7 @@ VALUES: dict[str, Any] = {
     "metrics_need_key": False,
     "log_level": "DEBUG",
     "log_format": "json",
-    "first_judge": "off",
+    "prefilter": "off",
     "join": "4",
     "worker_number": 0,
     "api_root_path": "/graspd",

@@ -10,7 +10,7 @@ import pytest
 
 from graspd.service.model.errors import DamagedShard
 from graspd.service.model.states import Stage
-from graspd.service.store.integrity import Checked, read_checked
+from graspd.service.store.integrity import CheckedObjects, read_checked
 from graspd.service.store.manifests import ShardManifest, load_shard
 from graspd.service.store.shards import read_shard
 from graspd.service.store.store import Store, open_store
@@ -38,13 +38,13 @@ def test_a_harmed_shard_is_refused_with_its_name(store: Store, shard: ShardManif
     with pytest.raises(DamagedShard, match=shard.shard_id):
         read_checked(store, shard.key, shard.sha256)
     with pytest.raises(DamagedShard, match=shard.shard_id):
-        Checked(store).check(shard.key, shard.sha256)
+        CheckedObjects(store).check(shard.key, shard.sha256)
 
 
 def test_an_intact_shard_is_read_through_once(
     store: Store, shard: ShardManifest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    checked, reads = Checked(store), []
+    checked, reads = CheckedObjects(store), []
     stream = Store.stream
     monkeypatch.setattr(Store, "stream", lambda *args: reads.append(args) or stream(*args))
     for _ in range(3):
@@ -54,7 +54,7 @@ def test_an_intact_shard_is_read_through_once(
 
 @pytest.mark.parametrize("harm", HARMS)
 def test_harm_after_a_check_is_noticed(store: Store, shard: ShardManifest, harm: object) -> None:
-    checked = Checked(store)
+    checked = CheckedObjects(store)
     checked.check(shard.key, shard.sha256)
     harm(store, shard.key)  # type: ignore[operator]
     with pytest.raises(DamagedShard):
@@ -112,7 +112,7 @@ def turn_in_secret(tmp_path: Path, key: str, at: int) -> None:
 
 
 def test_bytes_that_turned_in_secret_are_not_given(tmp_path: Path, store: Store, shard: ShardManifest) -> None:
-    checked = Checked(store)
+    checked = CheckedObjects(store)
     checked.check(shard.key, shard.sha256)
     turn_in_secret(tmp_path, shard.key, 100)
     with pytest.raises(DamagedShard, match=shard.shard_id):
@@ -124,7 +124,7 @@ def test_bytes_that_turned_in_secret_are_not_given(tmp_path: Path, store: Store,
 def test_a_large_file_is_cut_off_before_what_turned(tmp_path: Path, store: Store) -> None:
     data = bytes(range(256)) * 10_000
     store.put("large.bin", data)
-    digest, checked = hashlib.sha256(data).hexdigest(), Checked(store)
+    digest, checked = hashlib.sha256(data).hexdigest(), CheckedObjects(store)
     assert b"".join(checked.stream("large.bin", digest, 0, len(data))) == data
     assert b"".join(checked.stream("large.bin", digest, 1_000_000, 100_000)) == data[1_000_000:1_100_000]
     turn_in_secret(tmp_path, "large.bin", 2_200_000)

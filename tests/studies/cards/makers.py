@@ -125,14 +125,14 @@ def _finish(services: Services, record: JobRecord, change: Callable[[str, str, d
             change(record.request.hand, record.request.object, base)
             made = len(base["quality/valid"])
             rejected = {"diverged": 0, "dropped": made // 4, "gate": 1}
-            tried = made + made // 4 + 1
+            candidates = made + made // 4 + 1
             joints = BARRETT if record.request.hand == "barrett" else _ALLEGRO
             attributes: dict[str, Any] = {
                 "joint_names": list(joints),
                 "mu": 1.0,
                 "want": "valid",
-                "tried": tried,
-                "verdict_level": "certificate",
+                "candidates": candidates,
+                "verdict_level": "standard",
                 "verdict_key": "k",
             }
             if place:
@@ -181,7 +181,7 @@ def _base(rng: np.random.Generator, hand: str, count: int, batch: int) -> dict[s
     columns["quality/valid"] = np.ones(count, np.uint8)
     columns["quality/success"] = np.ones(count, np.int8)
     if batch == 0:
-        columns["quality/audit"] = np.where(np.arange(count) < 8, 1, -1).astype(np.int8)
+        columns["quality/recheck"] = np.where(np.arange(count) < 8, 1, -1).astype(np.int8)
     return columns
 
 

@@ -147,7 +147,7 @@ def test_a_cell_that_failed_is_told_with_its_reason(tmp_path: Path) -> None:
     assert "**barrett on mug lacks 6 of its shards**: the mesh is torn." in found.page
     assert "**Not complete**" in found.page
     failed = next(cell for cell in found.card["cells"] if cell["hand"] == "barrett" and cell["object"] == "mug")
-    assert (failed["grasps"], failed["of_judged"]) == (0, None)
+    assert (failed["grasps"], failed["of_validated"]) == (0, None)
 
 
 def test_a_dataset_without_scenes_has_a_card(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ def matrix(valid: int) -> tuple[Contents, Tally]:
     for name in OBJECTS:
         columns = {"epsilon": [rng.random(50).astype(np.float32)]}
         tally.cells["claw", name] = CellTally(
-            grasps=valid, valid=valid, tried=2 * valid, judged=2 * valid, columns=columns
+            grasps=valid, valid=valid, candidates=2 * valid, validated=2 * valid, columns=columns
         )
     extents = {"extents_m": [0.05, 0.06, 0.1]}
     assets = {name: AssetFacts(name, "d" * 32, facts=extents) for name in OBJECTS}

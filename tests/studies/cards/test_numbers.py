@@ -31,8 +31,10 @@ def test_counts_are_those_of_the_manifests(kitchen: Case) -> None:
     store, shards = kitchen.made.services.store, kitchen.made.snapshot.shards
     base = [load_manifest(store, Stage.SYNTHESIZE, shard.id) for shard in shards if shard.kind == "base"]
     made, valid = kitchen.card["composition"], kitchen.card["validity"]
-    assert made["valid"] == sum(one.valid for one in base) and valid["tried"] == sum(one.tried for one in base)
-    assert (valid["audited"], valid["audit_dropped"]) == (32, 0)
+    assert made["valid"] == sum(one.valid for one in base) and valid["candidates"] == sum(
+        one.candidates for one in base
+    )
+    assert (valid["rechecked"], valid["recheck_dropped"]) == (32, 0)
     assert sum(made["bytes"].values()) == kitchen.made.snapshot.size_bytes
     assert (made["scenes"], made["pictures"]) == (16, 16)
     assert valid["rejected"]["gate"] == len(base)
@@ -81,8 +83,8 @@ def test_only_valid_grasps_count(tmp_path: Path) -> None:
 
 def test_audits_that_overturn_a_verdict_are_told_with_an_interval(tmp_path: Path) -> None:
     def drop(hand: str, obj: str, columns: dict[str, Array]) -> None:
-        if (hand, obj) == ("barrett", "mug") and "quality/audit" in columns:
-            columns["quality/audit"][:2] = 0
+        if (hand, obj) == ("barrett", "mug") and "quality/recheck" in columns:
+            columns["quality/recheck"][:2] = 0
 
     found = changed(tmp_path, drop)
     rate = found.card["validity"]["by_hand"]["barrett"]["false_valid"]
@@ -93,15 +95,15 @@ def test_audits_that_overturn_a_verdict_are_told_with_an_interval(tmp_path: Path
         z / (1 + z * z / n) * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)),
     )
     assert (rate["low"], rate["high"]) == pytest.approx((middle - half, middle + half), abs=1e-6)
-    assert "**Audits overturned 2 of 32 verdicts**" in found.page and "barrett on mug (2 of 8)" in found.page
+    assert "**Rechecks overturned 2 of 32 verdicts**" in found.page and "barrett on mug (2 of 8)" in found.page
 
 
 def test_nothing_is_known_of_no_audits(tmp_path: Path) -> None:
     def without(hand: str, obj: str, columns: dict[str, Array]) -> None:
-        columns.pop("quality/audit", None)
+        columns.pop("quality/recheck", None)
 
     found = changed(tmp_path, without, scenes=0, views=0)
-    assert found.card["validity"]["false_valid"] is None and "**No audits**" in found.page
+    assert found.card["validity"]["false_valid"] is None and "**No rechecks**" in found.page
 
 
 def test_directions_that_no_hand_comes_from_are_told(tmp_path: Path) -> None:
@@ -126,7 +128,8 @@ def test_a_cell_that_ran_out_of_budget_is_told(tmp_path: Path) -> None:
 
     found = changed(tmp_path, few)
     assert (
-        "**1 of 4 cells ran out of budget**" in found.page and "allegro on block (6 of 40 after 8 tries)" in found.page
+        "**1 of 4 cells ran out of budget**" in found.page
+        and "allegro on block (6 of 40 after 8 candidates)" in found.page
     )
 
 
@@ -158,7 +161,14 @@ def test_grasps_that_repeat_are_counted(tmp_path: Path) -> None:
 
 def test_a_dataset_without_flaws_gets_no_findings_of_them(kitchen: Case) -> None:
     told = "\n".join(findings(kitchen.card))
-    for words in ("Audits overturned", "ran out of budget", "equal another", "Mixed", "Licence not recorded", "lacks"):
+    for words in (
+        "Rechecks overturned",
+        "ran out of budget",
+        "equal another",
+        "Mixed",
+        "Licence not recorded",
+        "lacks",
+    ):
         assert words not in told
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from graspd.worker.validation.protocol import HOLD_S, MAX_DISPLACEMENT_M, MAX_ROTATION, Outcome, Test, Trial
+from graspd.worker.validation.protocol import HOLD_S, MAX_DISPLACEMENT_M, MAX_ROTATION, Outcome, Rollout, Test
 
 
 class Scripted(Test):
@@ -25,7 +25,7 @@ class Scripted(Test):
     def _motion(self) -> tuple[float, float]:
         return float(np.linalg.norm(self._offset())), MAX_ROTATION * self._turned(self.elapsed)
 
-    def _judge(self, trial: Trial) -> Outcome:
+    def _validate(self, rollout: Rollout) -> Outcome:
         moved, turned = self._motion()
         if moved >= MAX_DISPLACEMENT_M:
             return Outcome.DISPLACED
@@ -44,16 +44,16 @@ def creeping(share: float) -> Callable[[float], float]:
 
 def test_what_stands_still_is_held_at_the_first_look() -> None:
     push = Scripted(still, still)
-    assert push._hold(Trial()) is Outcome.HELD
+    assert push._hold(Rollout()) is Outcome.HELD
     assert push.elapsed == pytest.approx(0.08)
 
 
 def test_what_creeps_slowly_is_held_early() -> None:
     push = Scripted(creeping(0.4), creeping(0.4))
-    assert push._hold(Trial()) is Outcome.HELD
+    assert push._hold(Rollout()) is Outcome.HELD
     assert push.elapsed == pytest.approx(0.08)
 
 
 def test_what_would_come_near_a_limit_is_watched_until_it_breaks_it() -> None:
-    assert Scripted(creeping(0.7), still)._hold(Trial()) is Outcome.DISPLACED
-    assert Scripted(still, creeping(0.7))._hold(Trial()) is Outcome.ROTATED
+    assert Scripted(creeping(0.7), still)._hold(Rollout()) is Outcome.DISPLACED
+    assert Scripted(still, creeping(0.7))._hold(Rollout()) is Outcome.ROTATED

@@ -1,4 +1,4 @@
-"""The squeeze of a gripper: both pads press with what its drive can, in the referee's engine as on paper."""
+"""The squeeze of a gripper: both pads press with what its drive can, in the validator's engine as on paper."""
 
 from __future__ import annotations
 

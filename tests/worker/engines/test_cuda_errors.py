@@ -11,13 +11,13 @@ import warp as wp
 
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.worker.engines.devices import DeviceLost, check_device, is_out_of_memory
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
 from graspd.worker.planners.fast_graspd import planner
-from graspd.worker.planners.port import Wanted
+from graspd.worker.planners.port import PlanRequest
 from graspd.worker.planners.threads import run_parts
-from graspd.worker.run import Run
 
 #: As Warp 1.19 says it.
 NO_MEMORY = "Failed to allocate 8589934592 bytes on device 'cuda:0'"
@@ -107,8 +107,8 @@ def test_other_errors_are_not_tried_again() -> None:
 def test_grasps_made_in_halves_are_those_of_one_launch(monkeypatch: pytest.MonkeyPatch) -> None:
     hand, block = hand_from_path("barrett"), object_from_path("block")
     fidelity = FIDELITIES["draft"].model_copy(update={"coarse_iterations": 6, "fine_iterations": 6})
-    wanted = Wanted(count=4, fidelity=fidelity)
-    whole = synthesize(hand, block, wanted, Run(threads=1))
+    wanted = PlanRequest(count=4, fidelity=fidelity)
+    whole = synthesize(hand, block, wanted, ExecutionContext(threads=1))
 
     class Small(planner.Data):
         """Of a device with room for two grasps."""
@@ -119,6 +119,6 @@ def test_grasps_made_in_halves_are_those_of_one_launch(monkeypatch: pytest.Monke
             super().__init__(model, batch)  # type: ignore[arg-type]
 
     monkeypatch.setattr(planner, "Data", Small)
-    halves = synthesize(hand, block, wanted, Run(threads=1))
+    halves = synthesize(hand, block, wanted, ExecutionContext(threads=1))
     assert np.array_equal(whole.grasp.hand_pose, halves.grasp.hand_pose)
     assert np.array_equal(whole.grasp.joint_positions, halves.grasp.joint_positions)

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from graspd.commands.curate import app
-from graspd.exchange.cases import expand
+from graspd.exchange.inputs import expand
 from graspd.service.model.errors import InputError
 from graspd.service.readers import Grasps, open_shards
 from graspd.service.store.shards import read_shard, write_shard

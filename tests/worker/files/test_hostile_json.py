@@ -12,7 +12,7 @@ from graspd.commands.studies import _read_maps as read_stability
 from graspd.exchange.bench_hand import _read as read_mapping
 from graspd.exchange.published import friction
 from graspd.service.model.errors import InputError
-from graspd.service.readers.ways import scene_spec_of
+from graspd.service.readers.trajectories import scene_spec_of
 from graspd.service.store.shards import Shard
 from graspd.studies.cards.contents import Contents, with_provenance
 from graspd.worker.files.curation import _short

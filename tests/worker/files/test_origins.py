@@ -11,14 +11,14 @@ import trimesh
 from typer.testing import CliRunner
 
 from graspd.cli import build
-from graspd.exchange.cases import load_case
+from graspd.exchange.inputs import load_case
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.scene_spec import SceneSpec, parse_scene
 from graspd.service.model.transforms import apply
 from graspd.service.store.shards import write_shard
 from graspd.studies.evaluation import evaluate
-from graspd.worker.files.synthesis import Synthesized, synthesized
+from graspd.worker.files.synthesis import SynthesisResult, synthesized
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.rendering.pictures import grasp_pictures
 from graspd.worker.stages.models import object_glb
@@ -26,7 +26,7 @@ from graspd.worker.stages.models import object_glb
 PLACES = {"origin": (0.0, 0.0, 0.0), "6 m": (5.0, -3.0, 2.0), "UTM": (500_000.0, 4_500_000.0, 300.0)}
 AWAY = pytest.mark.parametrize("place", ["6 m", "UTM"])
 SCENES = pytest.mark.parametrize("scene", ["free", "table"])
-REQUEST = JobOptions(grasps=2, want="raw", audits=0, fidelity=FIDELITIES["draft"], seed=1)
+REQUEST = JobOptions(grasps=2, want="candidates", rechecks=0, fidelity=FIDELITIES["draft"], seed=1)
 #: Of positions in the frame of the file [m].
 ROUNDING_M = 1e-6
 
@@ -44,15 +44,15 @@ def boxes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="module")
-def made(boxes: dict[str, Path]) -> dict[tuple[str, str], Synthesized]:
-    def one(place: str, scene: str) -> Synthesized:
+def made(boxes: dict[str, Path]) -> dict[tuple[str, str], SynthesisResult]:
+    def one(place: str, scene: str) -> SynthesisResult:
         where = SceneSpec() if scene == "free" else parse_scene(scene, faces="drawn", touch=None, beside=[])
         return synthesized("barrett", str(boxes[place]), REQUEST, place=where, scenes=1, device="cpu", threads=1)
 
     return {(place, scene): one(place, scene) for place in PLACES for scene in ("free", "table")}
 
 
-def file_of(found: Synthesized, path: Path) -> Path:
+def file_of(found: SynthesisResult, path: Path) -> Path:
     path.write_bytes(write_shard("base", found.arrays, found.attributes))
     return path
 
@@ -133,7 +133,7 @@ def test_a_model_stands_where_its_file_says_in_numbers_about_its_middle(boxes: d
 
 @AWAY
 def test_a_neighbour_may_lie_anywhere_in_its_file_as_well(boxes: dict[str, Path], place: str) -> None:
-    from graspd.worker.scenes.beside import scenes_of
+    from graspd.worker.scenes.placement import scenes_of
 
     spec = SceneSpec(kind="bin", neighbours=[{"object": "box"}])
     block, other = object_from_path("block"), object_from_path(boxes["origin"])

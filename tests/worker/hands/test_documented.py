@@ -13,9 +13,9 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from graspd.cli import build
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import HandModel
 from graspd.worker.rendering import portraits
-from graspd.worker.run import Run
 from graspd.worker.stages import hand_self_test
 from graspd.worker.stages.hand_self_test import SelfTest
 from tests.conftest import REPOSITORY
@@ -61,7 +61,7 @@ def test_a_documented_command_accepts_its_hand(command: str, folder: Path, monke
         assert report["facts"]["preshape"]["joint_12.0"] == 1.2 and "palm" not in report["facts"]["guessed"]
 
 
-def _untried(hand: HandModel, run: Run) -> SelfTest:
+def _untried(hand: HandModel, run: ExecutionContext) -> SelfTest:
     return SelfTest(0.9, 0, 0.04, {}, 0.8, 0)
 
 

@@ -9,11 +9,11 @@ import trimesh
 
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import HandError
-from graspd.worker.certified import certified_grasps
-from graspd.worker.hands import oppositions
+from graspd.worker.generation import validated_grasps
+from graspd.worker.hands import pinch_postures as oppositions
 from graspd.worker.hands.load import load_hand
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.oppositions import require_opposing
+from graspd.worker.hands.pinch_postures import require_opposing
 from tests.worker.hands.grippers import gripper
 from tests.worker.models import object_from_mesh
 
@@ -38,7 +38,7 @@ def pointer() -> HandModel:
 def test_grasps_of_a_hand_without_opposing_digits_are_not_even_planned() -> None:
     ball = object_from_mesh(trimesh.creation.icosphere(2, 0.02))
     with pytest.raises(HandError, match=r"pointer: no two opposing digits.*--root"):
-        certified_grasps(pointer(), ball, JobOptions(want="raw", grasps=1), count=1)
+        validated_grasps(pointer(), ball, JobOptions(want="candidates", grasps=1), count=1)
 
 
 def test_a_gripper_opposes() -> None:

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspd.worker.hands import oppositions
+from graspd.worker.hands import pinch_postures as oppositions
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.oppositions import oppositions_of
+from graspd.worker.hands.pinch_postures import oppositions_of
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from graspd.service.model.transforms import IDENTITY_POSE, apply
+from graspd.worker.hands.flat_pinches import HEIGHTS_M, OVER_M, pinches_of
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.pinches import HEIGHTS_M, OVER_M, pinches_of
 
 HEIGHT_M = 0.012
 

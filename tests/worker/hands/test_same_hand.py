@@ -1,4 +1,4 @@
-"""Two models of one hand: joints by name, bases by fit, fingertips as the judge."""
+"""Two models of one hand: joints by name, bases by fit, fingertips as the validator."""
 
 from __future__ import annotations
 

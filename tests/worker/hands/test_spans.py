@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from graspd.service.model.transforms import IDENTITY_POSE, quat_rotate
+from graspd.worker.hands.grasp_widths import TURNED_M, Size, _Look, spans_of
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.oppositions import oppositions_of
-from graspd.worker.hands.spans import TURNED_M, Size, _Look, spans_of
+from graspd.worker.hands.pinch_postures import oppositions_of
 from graspd.worker.hands.surface import sample_surface
 
 

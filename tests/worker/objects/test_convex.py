@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from graspd.worker.objects.convex import TooMuchWork, coacd_parts
+from graspd.worker.objects.convex import WorkLimitExceeded, coacd_parts
 
 _CORNERS, _FACES = np.eye(4, 3), np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
 
@@ -26,7 +26,7 @@ def ending(code: str, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_more_computing_than_it_may_is_too_much_work(monkeypatch: pytest.MonkeyPatch) -> None:
     endless = "import resource; resource.setrlimit(resource.RLIMIT_CPU, (1, 9))\nwhile True: pass"
     ending(endless, monkeypatch)
-    with pytest.raises(TooMuchWork, match="more than 1 s"):
+    with pytest.raises(WorkLimitExceeded, match="more than 1 s"):
         coacd_parts(_CORNERS, _FACES, {}, 1)
 
 

@@ -85,7 +85,7 @@ def test_a_hand_is_the_same_from_kept_shapes_and_needs_no_scipy(tmp_path: Path) 
     first, again = hand_from_path("barrett"), hand_from_path("barrett")
     assert first.content == again.content
     code = (
-        "import sys; from graspd.worker.hands.load import hand_from_path; import graspd.worker.certified; "
+        "import sys; from graspd.worker.hands.load import hand_from_path; import graspd.worker.generation; "
         "print(hand_from_path('barrett').content, *{'scipy', 'trimesh', 'pydantic_settings'} & set(sys.modules))"
     )
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

@@ -11,13 +11,13 @@ import trimesh
 from graspd.service.model.fidelity import resolve_fidelity
 from graspd.service.model.transforms import apply, quat_from_matrix, quat_rotate
 from graspd.worker.grasps import Posture
+from graspd.worker.hands.flat_pinches import pinches_of
 from graspd.worker.hands.jaws import pads_of
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.oppositions import oppositions_of
-from graspd.worker.hands.pinches import pinches_of
+from graspd.worker.hands.pinch_postures import oppositions_of
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.planners.fast_graspd.across import (
+from graspd.worker.planners.fast_graspd.antipodal_starts import (
     ACROSS,
     NEAR_M,
     Openings,
@@ -28,21 +28,21 @@ from graspd.worker.planners.fast_graspd.across import (
 )
 from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.planners.fast_graspd.pairs import pair_of
+from graspd.worker.planners.fast_graspd.retreat import hindrance
 from graspd.worker.planners.fast_graspd.scene_starts import REACHING, clear_scene_starts, free_ways
 from graspd.worker.planners.fast_graspd.starts import CLEAR, start_generator
-from graspd.worker.planners.fast_graspd.withdrawal import hindrance
 from graspd.worker.simulation.data import HandState
+from graspd.worker.simulation.environment import Environment, Obstacle, Scenes
 from graspd.worker.simulation.obstacles import MARGIN_M, DeviceObstacles, body_room
-from graspd.worker.simulation.surroundings import Obstacle, Scenes, Surroundings
 from tests.worker.models import object_from_mesh
 from tests.worker.simulation.rigs import ball
 
 UP = np.array([0.0, 0, 1])
 
 
-def lying(obj) -> Surroundings:
+def lying(obj) -> Environment:
     """The object on a table as its mesh stands."""
-    return Surroundings((Obstacle.half_space(UP, float(obj.vertices[:, 2].min())),), UP)
+    return Environment((Obstacle.half_space(UP, float(obj.vertices[:, 2].min())),), UP)
 
 
 def on_its_table(obj) -> Scenes:
@@ -75,7 +75,7 @@ def test_pairs_of_a_ball_are_its_chords_within_the_cones() -> None:
 def test_what_a_hand_cannot_span_or_reach_is_told(block, barrett) -> None:
     known = oppositions_of(barrett)
     assert Openings.of(known, block, lying(block)).within_reach
-    deep = Surroundings((Obstacle.half_space(UP, float(block.vertices[:, 2].max()) + 0.01),), UP)
+    deep = Environment((Obstacle.half_space(UP, float(block.vertices[:, 2].max()) + 0.01),), UP)
     assert not Openings.of(known, block, deep).within_reach
     wide = replace(block, vertices=10 * block.vertices, centre_of_mass=10 * block.centre_of_mass)
     opening = Openings.of(known, wide, lying(wide))
@@ -85,7 +85,7 @@ def test_what_a_hand_cannot_span_or_reach_is_told(block, barrett) -> None:
 
 def test_hands_reach_across_what_lies_flat_with_the_ends_of_their_fingertips_from_above(barrett) -> None:
     flat = object_from_mesh(trimesh.creation.box([0.06, 0.06, 0.01]))
-    scene, standing = lying(flat), Surroundings((Obstacle.half_space([1.0, 0, 0], -0.03),), np.array([1.0, 0, 0]))
+    scene, standing = lying(flat), Environment((Obstacle.half_space([1.0, 0, 0], -0.03),), np.array([1.0, 0, 0]))
     opening = Openings.in_scene(barrett, flat, scene)
     assert len(opening.known) == len(pinches_of(barrett, 0.01)) > 0
     assert len(Openings.in_scene(barrett, flat, standing).known) == len(oppositions_of(barrett))
@@ -166,14 +166,14 @@ def test_outlines_tell_how_far_a_hand_must_rise(block, barrett, tips_m) -> None:
     opening = Openings.of(oppositions_of(barrett), block, lying(block))
     uniform, ways = np.random.default_rng(0).random((60, 6)), np.array([[0.0, 0, 1], [0.6, 0, 0.8]])
     table = replace(lying(block).obstacles[0], tips_m=tips_m)
-    scene = Surroundings((table,), UP)
+    scene = Environment((table,), UP)
     found = across(barrett, block, opening, uniform, ways)
     centre = found.pivot + block.centre_of_mass
     told = outlines_of(barrett, oppositions_of(barrett)).lacks(found.posture, found.turn, centre, scene, room=0.006)
     root = centre - np.einsum("nij,j->ni", found.turn, barrett.palm.centre)
     q = found.q(barrett, np.zeros((60, barrett.dofs)))
     posture = Posture(np.concatenate([root, quat_from_matrix(found.turn)], axis=1), barrett.expand(q))
-    room = body_room(barrett, posture, [Surroundings((replace(table, tips_m=None),), UP)])
+    room = body_room(barrett, posture, [Environment((replace(table, tips_m=None),), UP)])
     tip = np.isin(np.arange(barrett.bodies), barrett.fingertips)
     wanted = np.where(tip & (tips_m is not None), 0.0, MARGIN_M) + 0.006
     lack = np.maximum(0.0, (wanted - room).max(axis=1))

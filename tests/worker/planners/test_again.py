@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners.fast_graspd import planner
-from graspd.worker.planners.port import Wanted
-from graspd.worker.run import Run
+from graspd.worker.planners.port import PlanRequest
 
 FIDELITY = FIDELITIES["draft"].model_copy(update={"name": "custom", "finalists": 2, "coarse_iterations": 30})
 
@@ -18,7 +18,9 @@ FIDELITY = FIDELITIES["draft"].model_copy(update={"name": "custom", "finalists":
 def parts(count: int, threads: int = 1) -> planner.Part:
     """The grasps of a batch as one part."""
     hand, obj = hand_from_path("allegro"), object_from_path("block", face_error_m=1e-3)
-    found = planner.optimise_batch(hand, obj, Wanted(count=count, fidelity=FIDELITY, seed=3), Run(threads=threads))
+    found = planner.optimise_batch(
+        hand, obj, PlanRequest(count=count, fidelity=FIDELITY, seed=3), ExecutionContext(threads=threads)
+    )
     assert len(found) == 1
     return found[0]
 

@@ -10,21 +10,21 @@ import pytest
 from graspd.service.model.fidelity import resolve_fidelity
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.worker.control.postures import normal_force, squeeze
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.planners import Wanted, synthesize
+from graspd.worker.planners import PlanRequest, synthesize
 from graspd.worker.planners.fast_graspd import candidates, planner
-from graspd.worker.planners.fast_graspd.candidates import GENTLER, Seated
+from graspd.worker.planners.fast_graspd.candidates import GENTLER, Refinements
 from graspd.worker.planners.fast_graspd.planner import ATTEMPTS, CLOSER
 from graspd.worker.planners.fast_graspd.schedule import PULL
-from graspd.worker.run import Run
 from graspd.worker.scenes.kinds import rest_poses, supports_of
-from graspd.worker.scenes.trial import lift_trial
+from graspd.worker.scenes.rollout import lift_rollout
 from graspd.worker.simulation.data import Data, HandState
-from graspd.worker.simulation.surroundings import Obstacle, Placed
+from graspd.worker.simulation.environment import Obstacle, Placed
 from graspd.worker.validation.decomposition import ConvexPieces
-from graspd.worker.validation.prescreening import SLIPS, push_trial
+from graspd.worker.validation.prescreening import SLIPS, push_rollout
 from tests.worker.models import two_finger_hand
 from tests.worker.quality.helpers import grasp_set, posture
 from tests.worker.simulation.rigs import ball
@@ -43,23 +43,23 @@ def taken(
     scores: list[list[float]],
     monkeypatch: pytest.MonkeyPatch,
     merit: list[list[float]] | None = None,
-    unsound: tuple[int, ...] = (),
+    infeasible: tuple[int, ...] = (),
 ) -> tuple[list[int], list[int], list[int]]:
     """Hands that are taken where hand k of grasp n scores `scores[n][k]` and is the k-th most promising; those that
-    were tried, and those that were seated. Some are unsound."""
+    were tried, and those that were seated. Some are infeasible."""
     monkeypatch.setattr(candidates, "with_postures", plain)
     n, each = np.shape(scores)
     flat, worth = np.ravel(scores), np.ravel(merit if merit is not None else np.tile(0.01 * np.arange(each), (n, 1)))
     tries: list[int] = []
     seats: list[int] = []
 
-    def trial(grasps: GraspSet, which: np.ndarray, beat: np.ndarray) -> np.ndarray:
+    def rollout(grasps: GraspSet, which: np.ndarray, beat: np.ndarray) -> np.ndarray:
         rows = grasps.stability_loss.astype(int)
         assert (which == rows // each).all()
         tries.extend(rows.tolist())
         return flat[rows]
 
-    def seat(rows: np.ndarray, which: np.ndarray) -> Seated:
+    def seat(rows: np.ndarray, which: np.ndarray) -> Refinements:
         assert (rows // each == which[:, None]).all()
         seats.extend(rows.ravel().tolist())
         state = HandState(
@@ -68,10 +68,12 @@ def taken(
             np.zeros((rows.size, 2)),
         )
         flat_rows = rows.ravel()
-        return Seated(state, flat_rows.astype(float), worth[flat_rows].astype(float), np.isin(flat_rows, unsound))
+        return Refinements(
+            state, flat_rows.astype(float), worth[flat_rows].astype(float), np.isin(flat_rows, infeasible)
+        )
 
     placed = Placed(TABLE, np.tile([0, 0, 0, 1.0, 0, 0, 0], (n, 1)), np.arange(n))
-    found = candidates.tried(two_finger_hand(), ball(), np.arange(n * each).reshape(n, each), seat, placed, trial)
+    found = candidates.tried(two_finger_hand(), ball(), np.arange(n * each).reshape(n, each), seat, placed, rollout)
     rows = found.joined().stability_loss.astype(int).tolist()
     assert found.state.pivot[:, 0].tolist() == found.losses.tolist() == rows
     return rows, sorted(tries), sorted(seats)
@@ -102,12 +104,12 @@ def test_what_balances_too_badly_is_not_tried_but_where_there_is_nothing_else(mo
 
 
 def test_what_is_unsound_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    took, tries, _ = taken([[0.5, 3.0], [4.0, 0.5]], monkeypatch, unsound=(0,))
+    took, tries, _ = taken([[0.5, 3.0], [4.0, 0.5]], monkeypatch, infeasible=(0,))
     assert (took, sorted(tries)) == ([1, 3], [1, 2, 3])
 
 
 def test_what_is_unsound_is_taken_where_there_is_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
-    took, tries, _ = taken([[0.5, 0.6]], monkeypatch, unsound=(0, 1))
+    took, tries, _ = taken([[0.5, 0.6]], monkeypatch, infeasible=(0, 1))
     assert (took, tries) == ([0], [])
 
 
@@ -133,13 +135,15 @@ def scene():
 
 def test_a_trial_keeps_what_holds_and_finds_more_whatever_the_threads(scene) -> None:
     hand, obj, placed = scene
-    wanted = Wanted(4, QUICK, seed=4, placed=placed)
-    plain = synthesize(hand, obj, wanted, Run(threads=1))
-    trial = lift_trial(hand, obj, lambda: ConvexPieces((obj.hull_vertices,), 1.0, 0.0, "block"))
-    one, two = (synthesize(hand, obj, replace(wanted, trial=trial), Run(threads=threads)) for threads in (1, 4))
+    wanted = PlanRequest(4, QUICK, seed=4, placed=placed)
+    plain = synthesize(hand, obj, wanted, ExecutionContext(threads=1))
+    rollout = lift_rollout(hand, obj, lambda: ConvexPieces((obj.hull_vertices,), 1.0, 0.0, "block"))
+    one, two = (
+        synthesize(hand, obj, replace(wanted, rollout=rollout), ExecutionContext(threads=threads)) for threads in (1, 4)
+    )
     assert np.array_equal(one.grasp.hand_pose, two.grasp.hand_pose)
     # What merit alone takes is among the candidates: where it holds, so does what is taken.
-    held, before = trial(one, placed) < 1.0 + SLIPS, trial(plain, placed) < 1.0 + SLIPS
+    held, before = rollout(one, placed) < 1.0 + SLIPS, rollout(plain, placed) < 1.0 + SLIPS
     assert held.any()
     assert (held >= before).all()
 
@@ -163,8 +167,8 @@ def test_in_scenes_a_grasp_sets_out_again_while_it_fails_and_once_if_it_lifts_ba
     scene, attempts: list[int], score: float, made: int
 ) -> None:
     hand, obj, placed = scene
-    wanted = Wanted(4, QUICK, seed=4, placed=placed, trial=lambda grasps, *_: np.full(len(grasps), score))
-    found = synthesize(hand, obj, wanted, Run(threads=1))
+    wanted = PlanRequest(4, QUICK, seed=4, placed=placed, rollout=lambda grasps, *_: np.full(len(grasps), score))
+    found = synthesize(hand, obj, wanted, ExecutionContext(threads=1))
     assert sorted(attempts) == sorted([*range(made)] * 4)
     assert found.attempts == 4 * made
 
@@ -176,11 +180,13 @@ def test_a_hand_that_nearly_lifts_squeezes_gently_where_that_helps(scene, better
     def squeezed(grasps: GraspSet, times: float) -> np.ndarray:
         return squeeze(hand, obj, grasps.grasp, total_normal_force=times * normal_force(obj)).joint_positions
 
-    def trial(grasps: GraspSet, *_: object) -> np.ndarray:
+    def rollout(grasps: GraspSet, *_: object) -> np.ndarray:
         usual = np.isclose(grasps.squeeze.joint_positions, squeezed(grasps, 1.0)).all(axis=1)
         return np.where(usual, 1.5, 0.5 if better else 1.6)
 
-    found = synthesize(hand, obj, Wanted(4, QUICK, seed=4, placed=placed, trial=trial), Run(threads=1))
+    found = synthesize(
+        hand, obj, PlanRequest(4, QUICK, seed=4, placed=placed, rollout=rollout), ExecutionContext(threads=1)
+    )
     assert np.allclose(found.squeeze.joint_positions, squeezed(found, times))
     assert not np.allclose(squeezed(found, GENTLER), squeezed(found, 1.0))
 
@@ -188,8 +194,8 @@ def test_a_hand_that_nearly_lifts_squeezes_gently_where_that_helps(scene, better
 def free_case(name: str):
     """A hand, an object, what is wanted of them, and the trial of free grasps."""
     hand, obj = hand_from_path(name), object_from_path("block", face_error_m=QUICK.face_error_m)
-    trial = push_trial(hand, obj, lambda: ConvexPieces((obj.hull_vertices,), 1.0, 0.0, "block"))
-    return hand, obj, Wanted(12, QUICK, seed=4), trial
+    rollout = push_rollout(hand, obj, lambda: ConvexPieces((obj.hull_vertices,), 1.0, 0.0, "block"))
+    return hand, obj, PlanRequest(12, QUICK, seed=4), rollout
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +207,7 @@ def test_of_a_grasps_hands_the_one_that_lies_around_more_of_a_free_object_is_tri
     free, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where nearness outweighs the balance."""
-    hand, obj, wanted, trial = free
+    hand, obj, wanted, rollout = free
     shares, orders = [], []
     near_share, tried = Data.near_share, planner.tried
 
@@ -217,7 +223,7 @@ def test_of_a_grasps_hands_the_one_that_lies_around_more_of_a_free_object_is_tri
     monkeypatch.setattr(planner, "tried", seen)
     monkeypatch.setattr(planner, "NEARNESS", 1e6)
     four = QUICK.model_copy(update={"starts": 4})
-    synthesize(hand, obj, replace(wanted, count=4, fidelity=four, trial=trial), Run(threads=1))
+    synthesize(hand, obj, replace(wanted, count=4, fidelity=four, rollout=rollout), ExecutionContext(threads=1))
     in_order = shares[0][orders[0]]
     assert (np.diff(in_order, axis=1) <= 0).all()
     assert (in_order[:, 0] > in_order[:, 1]).any() and (orders[0][:, 0] > orders[0][:, 1]).any()
@@ -225,18 +231,18 @@ def test_of_a_grasps_hands_the_one_that_lies_around_more_of_a_free_object_is_tri
 
 def test_free_grasps_that_fail_their_trial_set_out_again_and_more_of_them_hold() -> None:
     """Slender fingers: 3, 4 and 8 of 12 hold without a trial with three seeds; with one 7, 8 and 9."""
-    hand, obj, wanted, trial = free_case("shadow")
-    plain = synthesize(hand, obj, wanted, Run(threads=1))
-    tried = synthesize(hand, obj, replace(wanted, trial=trial), Run(threads=1))
-    before, after = trial(plain, None) < 1.0 + SLIPS, trial(tried, None) < 1.0 + SLIPS
+    hand, obj, wanted, rollout = free_case("shadow")
+    plain = synthesize(hand, obj, wanted, ExecutionContext(threads=1))
+    tried = synthesize(hand, obj, replace(wanted, rollout=rollout), ExecutionContext(threads=1))
+    before, after = rollout(plain, None) < 1.0 + SLIPS, rollout(tried, None) < 1.0 + SLIPS
     assert after.sum() > before.sum()
 
 
 def test_what_a_trial_chooses_of_a_free_grasp_depends_on_no_other_grasp_and_no_thread(free) -> None:
-    hand, obj, wanted, trial = free
-    one = synthesize(hand, obj, replace(wanted, trial=trial), Run(threads=1))
-    threads = synthesize(hand, obj, replace(wanted, trial=trial), Run(threads=3))
-    fewer = synthesize(hand, obj, replace(wanted, count=2, trial=trial), Run(threads=1))
+    hand, obj, wanted, rollout = free
+    one = synthesize(hand, obj, replace(wanted, rollout=rollout), ExecutionContext(threads=1))
+    threads = synthesize(hand, obj, replace(wanted, rollout=rollout), ExecutionContext(threads=3))
+    fewer = synthesize(hand, obj, replace(wanted, count=2, rollout=rollout), ExecutionContext(threads=1))
     assert np.array_equal(one.grasp.hand_pose, threads.grasp.hand_pose)
     assert np.array_equal(one.grasp.hand_pose[:2], fewer.grasp.hand_pose)
 
@@ -252,7 +258,7 @@ def test_a_grasp_that_nobody_holds_sets_out_as_often_as_it_may_and_the_least_bad
         scores.extend(9.0 - 0.1 * (len(scores) + np.arange(len(grasps))))
         return np.array(scores[-len(grasps) :])
 
-    found = synthesize(hand, obj, replace(wanted, count=1, trial=never), Run(threads=1))
+    found = synthesize(hand, obj, replace(wanted, count=1, rollout=never), ExecutionContext(threads=1))
     assert attempts == list(range(1 + ATTEMPTS))
     # Half of the hands that set out without a trial at each attempt, and of them those that can be valid are tried.
     assert ATTEMPTS // 2 < len(scores) <= (1 + ATTEMPTS) * QUICK.starts // 2
@@ -265,8 +271,8 @@ def test_a_free_grasp_whose_finger_stands_off_sets_out_again_a_few_times(
 ) -> None:
     hand, obj, wanted, _ = free
     monkeypatch.setattr(planner, "standing_off", lambda hand, obj, grasp, **_: np.ones(len(grasp), bool))
-    trial = lambda grasps, *_: np.full(len(grasps), score)  # noqa: E731
-    synthesize(hand, obj, replace(wanted, count=1, trial=trial), Run(threads=1))
+    rollout = lambda grasps, *_: np.full(len(grasps), score)  # noqa: E731
+    synthesize(hand, obj, replace(wanted, count=1, rollout=rollout), ExecutionContext(threads=1))
     assert attempts == list(range(made))
 
 
@@ -278,14 +284,14 @@ def test_of_free_grasps_that_hold_one_is_chosen_whose_fingers_touch(free, monkey
         seen.append(not seen)
         return np.full(len(grasp), seen[-1])
 
-    trial = lambda grasps, *_: np.full(len(grasps), 0.1 if not seen else 1.5)  # noqa: E731
-    one = replace(wanted, count=1, trial=trial)
+    rollout = lambda grasps, *_: np.full(len(grasps), 0.1 if not seen else 1.5)  # noqa: E731
+    one = replace(wanted, count=1, rollout=rollout)
     monkeypatch.setattr(planner, "CLOSER", 0)
-    first = synthesize(hand, obj, one, Run(threads=1))
+    first = synthesize(hand, obj, one, ExecutionContext(threads=1))
     seen.clear()
     monkeypatch.setattr(planner, "CLOSER", 1)
     monkeypatch.setattr(planner, "standing_off", off_at_first)
-    assert (synthesize(hand, obj, one, Run(threads=1)).grasp.hand_pose != first.grasp.hand_pose).any()
+    assert (synthesize(hand, obj, one, ExecutionContext(threads=1)).grasp.hand_pose != first.grasp.hand_pose).any()
 
 
 def test_hands_are_drawn_to_a_free_object_when_they_first_set_out_and_not_again(
@@ -301,8 +307,8 @@ def test_hands_are_drawn_to_a_free_object_when_they_first_set_out_and_not_again(
 
     monkeypatch.setattr(planner, "_work", watched)
     monkeypatch.setattr(planner, "ATTEMPTS", 2)
-    never = replace(wanted, count=1, trial=lambda grasps, *_: np.full(len(grasps), 9.0))
-    synthesize(hand, obj, never, Run(threads=1))
+    never = replace(wanted, count=1, rollout=lambda grasps, *_: np.full(len(grasps), 9.0))
+    synthesize(hand, obj, never, ExecutionContext(threads=1))
     assert pulls[0] == (PULL, PULL)
     assert len(pulls) > 1
     assert set(pulls[1:]) == {(0.0, 0.0)}
@@ -321,7 +327,7 @@ def test_attempts_made_ahead_give_the_grasps_of_one_after_the_other(free, monkey
     found = {}
     for ahead in (1, 4):
         monkeypatch.setattr(planner, "AHEAD", ahead)
-        found[ahead] = synthesize(hand, obj, replace(wanted, count=16, trial=picky), Run(threads=16))
+        found[ahead] = synthesize(hand, obj, replace(wanted, count=16, rollout=picky), ExecutionContext(threads=16))
     np.testing.assert_array_equal(found[4].grasp.hand_pose, found[1].grasp.hand_pose)
     np.testing.assert_array_equal(found[4].squeeze.joint_positions, found[1].squeeze.joint_positions)
     assert (picky(found[1], None) < 1).sum() > len(found[1].stability_loss) // 2

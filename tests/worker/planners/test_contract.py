@@ -9,12 +9,12 @@ import pytest
 
 from graspd.service.model.errors import TaskCancelled
 from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import PLANNERS, method, synthesize
-from graspd.worker.planners.port import Wanted
-from graspd.worker.run import Run
+from graspd.worker.planners.port import PlanRequest
 
 #: All methods around free objects but fast_graspd, with the options that make them quick.
 PEERS: dict[str, dict[str, object]] = {
@@ -28,8 +28,8 @@ def grasps(name: str, count: int, *, threads: int = 1, seed: int = 0, hand: str 
     return synthesize(
         hand_from_path(hand),
         object_from_path("block"),
-        Wanted(count=count, fidelity=FIDELITIES["draft"], seed=seed),
-        Run(threads=threads),
+        PlanRequest(count=count, fidelity=FIDELITIES["draft"], seed=seed),
+        ExecutionContext(threads=threads),
         method=name,
         options=PEERS[name],
     )
@@ -64,8 +64,8 @@ def test_cancelling_stops_at_the_first_look(name: str) -> None:
         synthesize(
             hand_from_path("barrett"),
             object_from_path("block"),
-            Wanted(count=2, fidelity=FIDELITIES["draft"]),
-            Run(threads=1, progress=progress, cancelled=stop.is_set),
+            PlanRequest(count=2, fidelity=FIDELITIES["draft"]),
+            ExecutionContext(threads=1, progress=progress, cancelled=stop.is_set),
             method=name,
             options=PEERS[name],
         )

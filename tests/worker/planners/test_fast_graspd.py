@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError, TaskCancelled
 from graspd.service.model.fidelity import FIDELITIES, Fidelity
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
 from graspd.worker.planners.fast_graspd import pairs, planner, schedule
-from graspd.worker.planners.port import Wanted
+from graspd.worker.planners.port import PlanRequest
 from graspd.worker.quality.table import measure
-from graspd.worker.run import Run
 from graspd.worker.simulation.projection import ProjectionOptions
 
 DRAFT = FIDELITIES["draft"]
@@ -35,8 +35,8 @@ def grasps(
     seed: int = 0,
     batch: int = 0,
 ) -> GraspSet:
-    wanted = Wanted(count, fidelity, seed, batch)
-    return synthesize(hand_from_path(hand), object_from_path(obj), wanted, Run(threads=threads))
+    wanted = PlanRequest(count, fidelity, seed, batch)
+    return synthesize(hand_from_path(hand), object_from_path(obj), wanted, ExecutionContext(threads=threads))
 
 
 def test_the_same_seed_gives_the_same_grasps_bit_for_bit() -> None:
@@ -73,7 +73,7 @@ def test_grasps_respect_joint_limits_and_unit_quaternions(hand: str) -> None:
 def test_grasps_touch_with_several_links_and_hardly_penetrate(hand: str, obj: str) -> None:
     """Medians over 12 grasps at standard fidelity; limits a third looser than what users are told to expect."""
     found = grasps(12, hand=hand, obj=obj, fidelity=FIDELITIES["standard"], threads=2)
-    quality = measure(hand_from_path(hand), object_from_path(obj), found, friction=1.0, run=Run(threads=2))
+    quality = measure(hand_from_path(hand), object_from_path(obj), found, friction=1.0, run=ExecutionContext(threads=2))
     assert np.median(quality["quality/contact_links"]) >= 3
     assert np.median(quality["quality/penetration_depth_mm"]) < 1.0
     assert np.median(quality["quality/self_penetration_depth_mm"]) < 1.0
@@ -87,7 +87,12 @@ def measured(name: str, hand: str, obj: str) -> dict[str, NDArray[Any]]:
     fidelity = FIDELITIES["standard"].model_copy(update={"name": name})
     found = grasps(24, hand=hand, obj=obj, fidelity=fidelity, threads=2, seed=5)
     return measure(
-        hand_from_path(hand), object_from_path(obj), found, friction=1.0, thresholds_m=[0.005], run=Run(threads=2)
+        hand_from_path(hand),
+        object_from_path(obj),
+        found,
+        friction=1.0,
+        thresholds_m=[0.005],
+        run=ExecutionContext(threads=2),
     )
 
 
@@ -178,12 +183,14 @@ def test_cancelling_stops_within_a_few_iterations() -> None:
         synthesize(
             hand_from_path("allegro"),
             object_from_path("mug"),
-            Wanted(count=4, fidelity=DRAFT),
-            Run(threads=1, progress=progress, cancelled=stop.is_set),
+            PlanRequest(count=4, fidelity=DRAFT),
+            ExecutionContext(threads=1, progress=progress, cancelled=stop.is_set),
         )
     assert len(calls) == 1
 
 
 def test_an_unknown_method_is_refused_with_the_known_ones() -> None:
     with pytest.raises(InputError, match="fast_graspd"):
-        synthesize(hand_from_path("allegro"), object_from_path("mug"), Wanted(count=1, fidelity=DRAFT), method="magic")
+        synthesize(
+            hand_from_path("allegro"), object_from_path("mug"), PlanRequest(count=1, fidelity=DRAFT), method="magic"
+        )

@@ -16,12 +16,12 @@ import trimesh
 
 from graspd.service.model.digests import digest_bytes
 from graspd.service.model.fidelity import FIDELITIES, Fidelity
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import load_object
 from graspd.worker.planners import PLANNERS, method, synthesize
-from graspd.worker.planners.port import Wanted
+from graspd.worker.planners.port import PlanRequest
 from graspd.worker.quality.table import measure
-from graspd.worker.run import Run
 
 #: Knobs that make a call short; the mesh, which is what the fidelities here differ in, stays theirs.
 SHORT: dict[str, Any] = {
@@ -51,7 +51,12 @@ def made(name: str, fidelity: Fidelity) -> dict[str, str]:
     obj = load_object({"egg.stl": egg()}, name="egg", digest="egg", face_error_m=fidelity.face_error_m)
     options = dict(method(name).quick) | ({"grid": 24} if name == "graspd2022" else {})
     found = synthesize(
-        hand, obj, Wanted(count=2, fidelity=fidelity, seed=3), Run(threads=1), method=name, options=options
+        hand,
+        obj,
+        PlanRequest(count=2, fidelity=fidelity, seed=3),
+        ExecutionContext(threads=1),
+        method=name,
+        options=options,
     )
     columns = {
         "faces": obj.faces,
@@ -59,7 +64,7 @@ def made(name: str, fidelity: Fidelity) -> dict[str, str]:
         "joints": found.grasp.joint_positions,
         "pregrasp": found.pregrasp.joint_positions,
         "squeeze": found.squeeze.joint_positions,
-        **measure(hand, obj, found, run=Run(threads=1)),
+        **measure(hand, obj, found, run=ExecutionContext(threads=1)),
     }
     return {column: digest_bytes(values.tobytes()) for column, values in columns.items()}
 

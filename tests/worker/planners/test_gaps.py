@@ -11,14 +11,14 @@ from graspd.service.model.domain import JobOptions
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import IDENTITY_POSE
-from graspd.worker.certified import certified_grasps
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.synthesis import synthesized
+from graspd.worker.generation import validated_grasps
 from graspd.worker.hands.jaws import thinnest_fingertip
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.oppositions import oppositions_of
-from graspd.worker.planners.fast_graspd.across import Openings, crossings_of, room_beside, why_narrow
-from graspd.worker.run import Run
-from graspd.worker.simulation.surroundings import Obstacle, Scenes, Surroundings
+from graspd.worker.hands.pinch_postures import oppositions_of
+from graspd.worker.planners.fast_graspd.antipodal_starts import Openings, crossings_of, room_beside, why_narrow
+from graspd.worker.simulation.environment import Environment, Obstacle, Scenes
 from tests.worker.models import object_from_mesh
 
 UP = np.array([0.0, 0, 1])
@@ -32,14 +32,14 @@ def barrett():
     return hand_from_path("barrett")
 
 
-def beside_walls(gap: float, axes: tuple[int, ...]) -> Surroundings:
+def beside_walls(gap: float, axes: tuple[int, ...]) -> Environment:
     """The box on a table, with a wall as high as itself beside it along +x, +y or both [m]."""
     found = [Obstacle.half_space(UP, -0.5 * SIZE[2])]
     for axis in axes:
         centre, size = np.zeros(3), np.full(3, 0.4)
         centre[axis], size[axis] = 0.5 * SIZE[axis] + gap + 0.01, 0.02
         found.append(Obstacle.box((*centre, *UPRIGHT), size))
-    return Surroundings(tuple(found), UP)
+    return Environment(tuple(found), UP)
 
 
 def test_a_gap_is_named_with_the_fingertip_that_does_not_fit(barrett) -> None:
@@ -55,10 +55,10 @@ def test_a_gap_is_named_with_the_fingertip_that_does_not_fit(barrett) -> None:
 
 def test_what_is_too_wide_or_too_low_is_told(barrett) -> None:
     large = object_from_mesh(trimesh.creation.box([0.4, 0.4, 0.4]))
-    table = Surroundings((Obstacle.half_space(UP, -0.2),), UP)
+    table = Environment((Obstacle.half_space(UP, -0.2),), UP)
     assert f"opens to {1e3 * oppositions_of(barrett).widest:.0f} mm" in str(why_narrow(barrett, large, [table]))
     sheet = object_from_mesh(trimesh.creation.box([0.08, 0.08, 0.004]))
-    table = Surroundings((Obstacle.half_space(UP, -0.002),), UP)
+    table = Environment((Obstacle.half_space(UP, -0.002),), UP)
     assert "lies 4 mm high" in str(why_narrow(hand_from_path("allegro"), sheet, [table]))
 
 
@@ -86,17 +86,17 @@ def test_pairs_with_room_for_fingertips_are_drawn_more_often(barrett) -> None:
 def test_a_batch_without_a_valid_grasp_says_the_reason(barrett) -> None:
     walls = beside_walls(0.008, (0, 1)).obstacles
     scenes = Scenes(walls, np.array([IDENTITY_POSE]))
-    request = JobOptions(grasps=1, budget=1.0, audits=0, scene="table", fidelity=FIDELITIES["draft"])
-    found = certified_grasps(barrett, BOX, request, count=1, scenes=scenes, run=Run(threads=1))
+    request = JobOptions(grasps=1, budget=1.0, rechecks=0, scene="table", fidelity=FIDELITIES["draft"])
+    found = validated_grasps(barrett, BOX, request, count=1, scenes=scenes, run=ExecutionContext(threads=1))
     assert not len(found.grasps)
     assert found.narrow == why_narrow(barrett, BOX, scenes.placed(np.zeros(1, int)).scenes)
     assert "8 mm" in str(found.narrow)
 
 
-def test_raw_grasps_none_of_which_is_valid_come_with_the_reason(tmp_path) -> None:
+def test_candidate_grasps_none_of_which_is_valid_come_with_the_reason(tmp_path) -> None:
     sheet = tmp_path / "sheet.stl"
     trimesh.creation.box([0.08, 0.08, 0.004]).export(sheet)
-    place, request = SceneSpec(kind="table"), JobOptions(want="raw", grasps=1, fidelity="draft", scene="table")
+    place, request = SceneSpec(kind="table"), JobOptions(want="candidates", grasps=1, fidelity="draft", scene="table")
     made = synthesized("allegro", str(sheet), request, place=place, scenes=1)
     found = made.summary()
     assert (found["grasps"], found["valid"], found["reason"]) == (1, 0, None)

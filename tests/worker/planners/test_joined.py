@@ -10,15 +10,15 @@ import pytest
 from graspd.service.model.errors import InputError, MeshError, TaskCancelled
 from graspd.service.model.fidelity import resolve_fidelity
 from graspd.service.model.scene_spec import SceneSpec
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.planners import Asked, Wanted, synthesize
+from graspd.worker.planners import BatchRequest, PlanRequest, synthesize
 from graspd.worker.planners.fast_graspd import planner
 from graspd.worker.planners.fast_graspd.planner import plan_joined
-from graspd.worker.run import Run
 from graspd.worker.scenes.kinds import rest_poses, supports_of
-from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.simulation.environment import Placed
 
 QUICK = resolve_fidelity("draft").model_copy(
     update={"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2}
@@ -31,7 +31,7 @@ def pair():
     return hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
 
 
-def made(pair, asked: list[Asked]) -> list[GraspSet | Exception]:
+def made(pair, asked: list[BatchRequest]) -> list[GraspSet | Exception]:
     return plan_joined(*pair, asked)
 
 
@@ -48,17 +48,17 @@ def assert_same(one: GraspSet | Exception, other: GraspSet) -> None:
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_joined_batches_are_those_of_separate_launches_bit_for_bit(pair, threads: int) -> None:
-    wanted = [Wanted(5, QUICK, 1, 0), Wanted(3, QUICK, 1, 1), Wanted(4, QUICK, 7, 1 << 20)]
-    joined = made(pair, [Asked(one, Run(threads=threads)) for one in wanted])
+    wanted = [PlanRequest(5, QUICK, 1, 0), PlanRequest(3, QUICK, 1, 1), PlanRequest(4, QUICK, 7, 1 << 20)]
+    joined = made(pair, [BatchRequest(one, ExecutionContext(threads=threads)) for one in wanted])
     for one, alone in zip(joined, wanted, strict=True):
-        assert_same(one, synthesize(*pair, alone, Run(threads=1)))
+        assert_same(one, synthesize(*pair, alone, ExecutionContext(threads=1)))
 
 
 def test_a_launch_for_which_memory_does_not_suffice_is_halved_across_batches(
     pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wanted = [Wanted(3, QUICK, 1, 0), Wanted(3, QUICK, 1, 1)]
-    alone = [synthesize(*pair, one, Run(threads=1)) for one in wanted]
+    wanted = [PlanRequest(3, QUICK, 1, 0), PlanRequest(3, QUICK, 1, 1)]
+    alone = [synthesize(*pair, one, ExecutionContext(threads=1)) for one in wanted]
 
     class Small(planner.Data):
         """Of a device with room for two grasps."""
@@ -69,7 +69,9 @@ def test_a_launch_for_which_memory_does_not_suffice_is_halved_across_batches(
             super().__init__(model, capacity)  # type: ignore[arg-type]
 
     monkeypatch.setattr(planner, "Data", Small)
-    for one, other in zip(made(pair, [Asked(one, Run(threads=1)) for one in wanted]), alone, strict=True):
+    for one, other in zip(
+        made(pair, [BatchRequest(one, ExecutionContext(threads=1)) for one in wanted]), alone, strict=True
+    ):
         assert_same(one, other)
 
 
@@ -91,37 +93,45 @@ def test_what_is_the_matter_with_one_batch_leaves_the_others_as_they_are(pair) -
         raise MeshError("no pieces")
 
     wanted = [
-        Wanted(2, QUICK, 1, 0, below, good_enough),
-        Wanted(3, QUICK, 1, 1, on_table(obj, 3, 3), good_enough),
-        Wanted(2, QUICK, 1, 2, on_table(obj, 2, 3), torn),
-        Wanted(2, QUICK, 1, 3, on_table(obj, 2, 3), good_enough),
-        Wanted(3, QUICK, 2, 0, on_table(obj, 3, 4), good_enough),
+        PlanRequest(2, QUICK, 1, 0, below, good_enough),
+        PlanRequest(3, QUICK, 1, 1, on_table(obj, 3, 3), good_enough),
+        PlanRequest(2, QUICK, 1, 2, on_table(obj, 2, 3), torn),
+        PlanRequest(2, QUICK, 1, 3, on_table(obj, 2, 3), good_enough),
+        PlanRequest(3, QUICK, 2, 0, on_table(obj, 3, 4), good_enough),
     ]
-    asked = [Asked(one, Run(threads=1, cancelled=lambda k=k: k == 3)) for k, one in enumerate(wanted)]
+    asked = [
+        BatchRequest(one, ExecutionContext(threads=1, cancelled=lambda k=k: k == 3)) for k, one in enumerate(wanted)
+    ]
     buried, first, broken, stopped, last = made(pair, asked)
     assert isinstance(buried, InputError) and "nothing can reach" in str(buried)
     assert isinstance(broken, MeshError)
     assert isinstance(stopped, TaskCancelled)
     for joined, alone in ((first, wanted[1]), (last, wanted[4])):
-        assert_same(joined, synthesize(hand, obj, alone, Run(threads=1)))
+        assert_same(joined, synthesize(hand, obj, alone, ExecutionContext(threads=1)))
 
 
 def test_a_batch_that_is_cancelled_on_the_way_leaves_the_others_as_they_are(pair) -> None:
-    wanted = [Wanted(2, QUICK, 1, 0), Wanted(2, QUICK, 1, 1)]
+    wanted = [PlanRequest(2, QUICK, 1, 0), PlanRequest(2, QUICK, 1, 1)]
     told: list[str] = []
-    stopping = Run(
+    stopping = ExecutionContext(
         threads=1,
         progress=lambda done, total, message: told.append(message),
         cancelled=lambda: any("coarse" in one for one in told),
     )
-    stopped, kept = made(pair, [Asked(wanted[0], stopping), Asked(wanted[1], Run(threads=1))])
+    stopped, kept = made(
+        pair, [BatchRequest(wanted[0], stopping), BatchRequest(wanted[1], ExecutionContext(threads=1))]
+    )
     assert isinstance(stopped, TaskCancelled)
     assert told == ["starts", "coarse optimization"]
-    assert_same(kept, synthesize(*pair, wanted[1], Run(threads=1)))
+    assert_same(kept, synthesize(*pair, wanted[1], ExecutionContext(threads=1)))
 
 
 def test_where_all_are_cancelled_the_launch_ends(pair) -> None:
-    wanted, told = Wanted(2, QUICK), list[str]()
-    run = Run(threads=1, progress=lambda done, total, message: told.append(message), cancelled=lambda: bool(told))
-    assert all(isinstance(one, TaskCancelled) for one in made(pair, [Asked(wanted, run), Asked(wanted, run)]))
+    wanted, told = PlanRequest(2, QUICK), list[str]()
+    run = ExecutionContext(
+        threads=1, progress=lambda done, total, message: told.append(message), cancelled=lambda: bool(told)
+    )
+    assert all(
+        isinstance(one, TaskCancelled) for one in made(pair, [BatchRequest(wanted, run), BatchRequest(wanted, run)])
+    )
     assert told == ["starts"]

@@ -8,10 +8,11 @@ import trimesh
 
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.studies.stability.assets import ring_hand
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners import Wanted, synthesize
+from graspd.worker.planners import PlanRequest, synthesize
 from graspd.worker.planners.fast_graspd.pairs import pair_of
 from graspd.worker.planners.fast_graspd.starts import (
     CLEAR,
@@ -20,7 +21,6 @@ from graspd.worker.planners.fast_graspd.starts import (
     open_further,
     start_generator,
 )
-from graspd.worker.run import Run
 from graspd.worker.simulation.model import Model
 from tests.worker.simulation.rigs import object_of
 
@@ -64,8 +64,8 @@ def test_a_hand_that_has_a_place_keeps_it(cube: ObjectModel) -> None:
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_a_grasp_that_opened_does_not_depend_on_its_batch(ring: HandModel, cube: ObjectModel, threads: int) -> None:
-    run = Run(threads=threads)
-    many = synthesize(ring, cube, Wanted(5, DRAFT, seed=3), run).grasp
-    few = synthesize(ring, cube, Wanted(2, DRAFT, seed=3), run).grasp
+    run = ExecutionContext(threads=threads)
+    many = synthesize(ring, cube, PlanRequest(5, DRAFT, seed=3), run).grasp
+    few = synthesize(ring, cube, PlanRequest(2, DRAFT, seed=3), run).grasp
     np.testing.assert_array_equal(many.hand_pose[:2], few.hand_pose)
     np.testing.assert_array_equal(many.joint_positions[:2], few.joint_positions)

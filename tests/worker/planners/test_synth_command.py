@@ -1,4 +1,4 @@
-"""`graspd synth`: judged as a job, called what it is, and a file that finds its hand and object again."""
+"""`graspd synth`: validated as a job, called what it is, and a file that finds its hand and object again."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from graspd.service.cli import write_output
 from graspd.service.model.errors import ConflictError, NotFoundError
 from graspd.service.readers import Grasps, open_shards
 from graspd.service.store.shards import Shard, read_shard
-from graspd.worker import certified
+from graspd.worker import generation
 from graspd.worker.files.provenance import object_of_shard
 
 
@@ -56,13 +56,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def judged(folder: Path) -> tuple[Path, dict[str, Any]]:
-    return folder / "judged.h5", synth(folder / "judged.h5", "--budget", "8")
+def validated(folder: Path) -> tuple[Path, dict[str, Any]]:
+    return folder / "validated.h5", synth(folder / "validated.h5", "--budget", "8")
 
 
 @pytest.fixture(scope="module")
-def unjudged(folder: Path) -> tuple[Path, dict[str, Any]]:
-    return folder / "unjudged.h5", synth(folder / "unjudged.h5", "--referee", "none")
+def unvalidated(folder: Path) -> tuple[Path, dict[str, Any]]:
+    return folder / "unvalidated.h5", synth(folder / "unvalidated.h5", "--validation", "none")
 
 
 @pytest.fixture(scope="module")
@@ -77,61 +77,61 @@ def own_mesh(folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def of_own_mesh(folder: Path, own_mesh: Path) -> Path:
-    synth(folder / "own.h5", "--referee", "none", "--keep-largest", obj=own_mesh)
+    synth(folder / "own.h5", "--validation", "none", "--keep-largest", obj=own_mesh)
     return folder / "own.h5"
 
 
-def test_grasps_called_valid_were_judged_as_in_a_job(judged: tuple[Path, dict[str, Any]]) -> None:
-    file, said = judged
+def test_grasps_called_valid_were_validated_as_in_a_job(validated: tuple[Path, dict[str, Any]]) -> None:
+    file, said = validated
     shard = read_shard(file, kind="base")
-    assert (said["grasps"], said["valid"], said["sound"], said["referee"]) == (3, 3, 3, "certificate")
-    assert said["tried"] >= 3 and shard.attributes["tried"] == said["tried"]
+    assert (said["grasps"], said["valid"], said["feasible"], said["validation"]) == (3, 3, 3, "standard")
+    assert said["candidates"] >= 3 and shard.attributes["candidates"] == said["candidates"]
     assert (shard["quality/success"] == 1).all()
-    assert shard.attributes["verdict_level"] == "certificate" and "verdict_key" in shard.attributes
+    assert shard.attributes["verdict_level"] == "standard" and "verdict_key" in shard.attributes
 
 
-def test_grasps_that_nobody_judged_are_sound_and_never_valid(unjudged: tuple[Path, dict[str, Any]]) -> None:
-    file, said = unjudged
+def test_grasps_that_nobody_validated_are_sound_and_never_valid(unvalidated: tuple[Path, dict[str, Any]]) -> None:
+    file, said = unvalidated
     shard = read_shard(file, kind="base")
-    assert (said["grasps"], said["valid"], said["sound"], said["referee"]) == (3, 0, 3, "none")
+    assert (said["grasps"], said["valid"], said["feasible"], said["validation"]) == (3, 0, 3, "none")
     assert shard.attributes["verdict_level"] == "none" and "quality/success" not in shard.arrays
     assert not shard["quality/valid"].any()
 
 
-def test_evaluate_gives_a_verdict_of_each_grasp_that_agrees(judged: tuple[Path, Any]) -> None:
-    done = run("evaluate", judged[0], "--json")
+def test_evaluate_gives_a_verdict_of_each_grasp_that_agrees(validated: tuple[Path, Any]) -> None:
+    done = run("evaluate", validated[0], "--json")
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout.splitlines()[-1])
     assert [(one["file"], one["row"], one["held"]) for one in told["verdicts"]] == [
-        (str(judged[0]), row, True) for row in range(3)
+        (str(validated[0]), row, True) for row in range(3)
     ]
     assert "verdicts" not in told["files"][0]
 
 
-def test_readers_take_grasps_that_nobody_judged_only_when_told(
-    judged: tuple[Path, Any], unjudged: tuple[Path, Any]
+def test_readers_take_grasps_that_nobody_validated_only_when_told(
+    validated: tuple[Path, Any], unvalidated: tuple[Path, Any]
 ) -> None:
-    both = open_shards([judged[0], unjudged[0]])
-    rows = [Grasps(both, columns=["quality/epsilon"], **wish) for wish in ({}, {"unjudged": True}, {"valid": False})]
+    both = open_shards([validated[0], unvalidated[0]])
+    rows = [Grasps(both, columns=["quality/epsilon"], **wish) for wish in ({}, {"unvalidated": True}, {"valid": False})]
     assert [len(found) for found in rows] == [3, 3, 6]
-    assert {both.by_id(sample["shard_id"]).path for sample in rows[1]} == {unjudged[0]}
+    assert {both.by_id(sample["shard_id"]).path for sample in rows[1]} == {unvalidated[0]}
 
 
 @pytest.mark.parametrize("command", ["export", "pictures"])
-def test_export_and_pictures_take_grasps_that_nobody_judged_only_when_told(
-    unjudged: tuple[Path, Any], tmp_path: Path, command: str
+def test_export_and_pictures_take_grasps_that_nobody_validated_only_when_told(
+    unvalidated: tuple[Path, Any], tmp_path: Path, command: str
 ) -> None:
     if command == "export":
-        words: list[str | Path] = ["export", unjudged[0], "--format", "dexgraspbench", "-o", tmp_path / "out"]
+        words: list[str | Path] = ["export", unvalidated[0], "--format", "dexgraspbench", "-o", tmp_path / "out"]
     else:
-        words = ["pictures", unjudged[0], "-n", "1", "--size", "32", "--device", "cpu", "-o", tmp_path / "out.png"]
+        words = ["pictures", unvalidated[0], "-n", "1", "--size", "32", "--device", "cpu", "-o", tmp_path / "out.png"]
     refused = run(*words)
-    assert refused.exit_code == 2 and "take them with --unjudged" in refused.output
+    assert refused.exit_code == 2 and "take them with --unvalidated" in refused.output
     assert not list(tmp_path.iterdir())
-    assert run(*words, "--unjudged").exit_code == 0
+    assert run(*words, "--unvalidated").exit_code == 0
 
 
-def test_the_line_for_people_says_that_nobody_judged(tmp_path: Path) -> None:
+def test_the_line_for_people_says_that_nobody_validated(tmp_path: Path) -> None:
     done = run(
         "synth",
         "--hand",
@@ -144,16 +144,16 @@ def test_the_line_for_people_says_that_nobody_judged(tmp_path: Path) -> None:
         "draft",
         "--device",
         "cpu",
-        "--referee",
+        "--validation",
         "none",
         "-o",
         tmp_path / "g.h5",
     )
-    assert "1 sound of" in done.stdout and "nobody judged" in done.stdout
+    assert "1 feasible of" in done.stdout and "not validated" in done.stdout
     assert "valid" not in done.stdout
 
 
-@pytest.mark.parametrize("words", [("--want", "good"), ("--referee", "judge")])
+@pytest.mark.parametrize("words", [("--want", "good"), ("--validation", "validate")])
 def test_a_word_that_is_none_is_refused_before_the_files_are_read(words: tuple[str, str], tmp_path: Path) -> None:
     done = run("synth", "--hand", "absent.urdf", "--object", "block", "-o", tmp_path / "g.h5", *words)
     assert done.exit_code == 2
@@ -230,13 +230,13 @@ def test_fewer_grasps_than_asked_are_told_with_the_reason_and_exit_code_3(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = folder / "few.h5"
-    monkeypatch.setattr(certified, "passes", lambda columns: np.zeros(len(columns["quality/success"]), np.uint8))
+    monkeypatch.setattr(generation, "passes", lambda columns: np.zeros(len(columns["quality/success"]), np.uint8))
     words = ["--hand", "barrett", "--object", "block", "-n", 2, "--budget", 1, "--json"]
     done = run("synth", *words, "--fidelity", "draft", "--device", "cpu", "-o", out)  # type: ignore[arg-type]
     said = json.loads(done.stdout.splitlines()[-1])
     assert (done.exit_code, said["grasps"], said["valid"], said["wanted"]) == (3, 0, 0, 2), done.output
-    assert sum(said["outcomes"].values()) == said["tried"] == 2
-    assert said["reason"].startswith("found 0 of 2 valid grasps in 2 tries: ")
+    assert sum(said["outcomes"].values()) == said["candidates"] == 2
+    assert said["reason"].startswith("found 0 of 2 valid grasps in 2 candidates: ")
     shard = read_shard(out, kind="base")
     assert shard.attributes["reason"] == said["reason"]
     assert json.loads(str(shard.attributes["outcomes"])) == said["outcomes"]
@@ -244,12 +244,12 @@ def test_fewer_grasps_than_asked_are_told_with_the_reason_and_exit_code_3(
     assert (again.reason, again.outcomes) == (said["reason"], said["outcomes"])
 
 
-def test_all_that_were_asked_need_no_reason(judged: tuple[Path, dict[str, Any]]) -> None:
-    assert judged[1]["reason"] is None and "reason" not in read_shard(judged[0]).attributes
+def test_all_that_were_asked_need_no_reason(validated: tuple[Path, dict[str, Any]]) -> None:
+    assert validated[1]["reason"] is None and "reason" not in read_shard(validated[0]).attributes
 
 
 @pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGTERM])
-def test_who_stops_it_keeps_what_was_judged(
+def test_who_stops_it_keeps_what_was_validated(
     folder: Path, monkeypatch: pytest.MonkeyPatch, asked: signal.Signals
 ) -> None:
     real, out = synth_command.synthesized, folder / f"stopped-{asked}.h5"
@@ -263,7 +263,7 @@ def test_who_stops_it_keeps_what_was_judged(
 
     before = signal.getsignal(asked)
     monkeypatch.setattr(synth_command, "synthesized", stopped)
-    words = ["--hand", "barrett", "--object", "block", "-n", 64, "--budget", 1, "--referee", "none", "--json"]
+    words = ["--hand", "barrett", "--object", "block", "-n", 64, "--budget", 1, "--validation", "none", "--json"]
     done = run("synth", *words, "--fidelity", "draft", "--device", "cpu", "-o", out)  # type: ignore[arg-type]
     shard = read_shard(out, kind="base")
     kept = len(shard["quality/valid"])

@@ -9,13 +9,13 @@ import pytest
 
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.transforms import apply
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
-from graspd.worker.planners.port import Wanted
-from graspd.worker.run import Run
+from graspd.worker.planners.port import PlanRequest
 
 #: Mean distance between the same surface points of two hands [m]. A difference of 5 mm is seen at a glance.
 ALIKE_M = 0.005
@@ -23,7 +23,7 @@ ALIKE_M = 0.005
 
 def test_no_two_grasps_of_a_batch_are_alike() -> None:
     hand = hand_from_path("allegro")
-    found = synthesize(hand, object_from_path("block"), Wanted(count=32, fidelity=FIDELITIES["draft"]))
+    found = synthesize(hand, object_from_path("block"), PlanRequest(count=32, fidelity=FIDELITIES["draft"]))
     points = sample_surface(hand, 200)
     poses = body_poses(hand, found.grasp.hand_pose, found.grasp.joint_positions)
     world = apply(poses[:, points.body], points.position)
@@ -40,7 +40,7 @@ def test_memory_is_flat_over_a_thousand_batches() -> None:
 
     def run(first: int, count: int) -> int:
         for batch in range(first, first + count):
-            synthesize(hand, obj, Wanted(count=4, fidelity=tiny, batch=batch), Run(threads=2))
+            synthesize(hand, obj, PlanRequest(count=4, fidelity=tiny, batch=batch), ExecutionContext(threads=2))
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
     warm = run(0, 100)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from graspd.service.model.messages import TaskMessage
-from graspd.service.model.states import Lane, Stage
+from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
@@ -18,10 +18,10 @@ from graspd.service.store.manifests import shard_exists
 from graspd.service.store.records import task_attempts
 from graspd.service.store.store import Store, open_store
 from graspd.worker.engines.devices import DeviceLost
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.pool.pool import ProcessLost
 from graspd.worker.process import engine, main
 from graspd.worker.process.runner import Runner
-from graspd.worker.run import Run
 from graspd.worker.stages.context import TaskContext
 from tests.fakes import engine_of, fake_synthesize, message_for
 
@@ -42,7 +42,9 @@ def garbled(message: TaskMessage, context: TaskContext) -> Any:
 
 def run(store: Store, message: TaskMessage, stage: Any, check: Any = broken) -> tuple[Event | None, Runner]:
     runner = Runner({Stage.SYNTHESIZE: stage}, worker="w", publish=lambda event: None, check_device=check)
-    return runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(store, Run("cuda:0"))), runner
+    return runner.run(
+        message.model_dump(mode="json", by_alias=True), TaskContext(store, ExecutionContext("cuda:0"))
+    ), runner
 
 
 @pytest.mark.parametrize("stage", [fake_synthesize, garbled])
@@ -89,7 +91,7 @@ def test_the_worker_ends_and_leaves_the_other_tasks(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setattr(engine, "Runner", partial(Runner, check_device=broken))
-    rq_queue.enqueue([message_for(), message_for(seed=1)], Lane.BULK)
+    rq_queue.enqueue([message_for(), message_for(seed=1)], Priority.BULK)
     settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
     with caplog.at_level(logging.ERROR):
         assert not main.run_worker(settings, start=engine_of({Stage.SYNTHESIZE: fake_synthesize})), (

@@ -44,14 +44,14 @@ def test_a_machine_without_a_gpu_works_on_its_processor(tmp_path: Path) -> None:
         ("auto", [{**H100, "free": GIB}], True, Condition.WARNING, "1 of 80 GiB free"),
     ],
 )
-def test_gpus_are_judged(
+def test_gpus_are_validated(
     tmp_path: Path, device: str, there: list[dict[str, Any]], has_driver: bool, condition: Condition, told: str
 ) -> None:
     settings = Settings(data_dir=tmp_path, device=device)
     found = doctor.gpu(settings, child=gpus(*there, driver=[12, 8]), has_driver=lambda: has_driver)
     assert found.condition is condition, found
     assert told in found.message
-    assert bool(found.mend) is (condition is not Condition.GOOD)
+    assert bool(found.fix) is (condition is not Condition.GOOD)
 
 
 def test_an_engine_that_gives_nonsense_is_bad_with_its_reason(tmp_path: Path) -> None:
@@ -59,7 +59,7 @@ def test_an_engine_that_gives_nonsense_is_bad_with_its_reason(tmp_path: Path) ->
     found = doctor.kernels(Settings(data_dir=tmp_path), child=child)
     assert not found.ok
     assert "a ball floats" in found.message
-    assert "/cache/warp" in found.mend
+    assert "/cache/warp" in found.fix
 
 
 def test_a_driver_that_crashes_or_hangs_takes_only_the_child_with_it(tmp_path: Path) -> None:

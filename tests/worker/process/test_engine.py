@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from graspd.service.model.states import Lane
+from graspd.service.model.states import Priority
 from graspd.service.queue.port import EventKind
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.worker.process import main
@@ -50,7 +50,7 @@ class Worker:
 
     def begin(self) -> None:
         """Have it begin a task."""
-        self.queue.enqueue([TASK], Lane.BULK)
+        self.queue.enqueue([TASK], Priority.BULK)
         until(lambda: EventKind.STARTED in self.events(), "the task began")
 
 

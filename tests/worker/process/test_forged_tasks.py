@@ -10,7 +10,7 @@ import pytest
 from rq import Queue
 from rq.serializers import JSONSerializer
 
-from graspd.service.model.states import Lane, Stage
+from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.port import EventKind
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
@@ -44,7 +44,7 @@ class Forged:
 def test_it_is_refused_and_the_worker_goes_on(
     rq_queue: RqQueue, redis_server: str, tmp_path: Path, nonsense: Any
 ) -> None:
-    rq_queue.enqueue([Forged(nonsense)], Lane.BULK)  # type: ignore[list-item]
+    rq_queue.enqueue([Forged(nonsense)], Priority.BULK)  # type: ignore[list-item]
     settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
     assert run_worker(settings, start=engine_of({Stage.SCENE: scene.run}), burst=True), "the worker is none the worse"
     assert rq_queue.leases() == [] and sum(rq_queue.depths().values()) == 0
@@ -78,7 +78,7 @@ FORGERIES: dict[str, Callable[[Any, Path], object]] = {
 def test_what_is_no_task_is_passed_over(rq_queue: RqQueue, redis_server: str, tmp_path: Path, what: str) -> None:
     witness = tmp_path / "witness"
     FORGERIES[what](rq_queue.connection, witness)
-    rq_queue.enqueue([message_for()], Lane.BULK)
+    rq_queue.enqueue([message_for()], Priority.BULK)
     settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
     assert run_worker(settings, start=engine_of({Stage.SYNTHESIZE: fake_synthesize}), burst=True), (
         "the worker is none the worse"

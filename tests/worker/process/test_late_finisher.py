@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from graspd.service.model.messages import TaskMessage
-from graspd.service.model.states import Lane, Stage
+from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.port import EventKind
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
@@ -28,7 +28,7 @@ def test_a_task_that_was_taken_away_ends_in_a_line_and_no_traceback(
         rq_queue.release(lease)
         return fake_synthesize(message, TaskContext(context.store))
 
-    rq_queue.enqueue([message_for()], Lane.BULK)
+    rq_queue.enqueue([message_for()], Priority.BULK)
     settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
     with caplog.at_level(logging.INFO):
         assert run_worker(settings, start=engine_of({Stage.SYNTHESIZE: slow}), burst=True)
@@ -48,12 +48,12 @@ def test_a_worker_that_an_error_broke_off_does_not_say_that_none_waits(
     def broken(*_: object) -> None:
         raise AttributeError("of another version")
 
-    rq_queue.enqueue([message_for()], Lane.BULK)
+    rq_queue.enqueue([message_for()], Priority.BULK)
     with monkeypatch.context() as patch:
         patch.setattr(GraspWorker, "prepare_execution", broken)
         assert not run_worker(settings, start=engine_of(table), burst=True)
     rq_queue.connection.flushdb()
-    rq_queue.enqueue([message_for()], Lane.BULK)
+    rq_queue.enqueue([message_for()], Priority.BULK)
     assert run_worker(settings, start=engine_of(table), max_tasks=1), "as many as were wanted"
 
 
@@ -69,7 +69,7 @@ def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue: RqQueue, red
         threading.Timer(1.0, refuse, [0]).start()
         return fake_synthesize(message, context)
 
-    rq_queue.enqueue([message_for()], Lane.BULK)
+    rq_queue.enqueue([message_for()], Priority.BULK)
     settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
     try:
         assert run_worker(settings, start=engine_of({Stage.SYNTHESIZE: stage}), burst=True)

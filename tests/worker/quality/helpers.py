@@ -57,7 +57,7 @@ def plate_hand(size: tuple[float, float, float] = (0.05, 0.05, 0.01)) -> HandMod
 def pad_hand() -> HandModel:
     """`plate_hand` with round pads that touch where its plates would.
 
-    Of two flat faces that meet the referee's engine keeps one point, anywhere on the face.
+    Of two flat faces that meet the validator's engine keeps one point, anywhere on the face.
     """
     plates, radius = plate_hand(), 0.01
     ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)

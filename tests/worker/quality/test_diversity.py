@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from graspd.exchange.cases import load_case
+from graspd.exchange.inputs import load_case
 from graspd.service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits, evenness
 from graspd.service.model.transforms import apply, quat_from_axis_angle
 from graspd.worker.grasps import Posture

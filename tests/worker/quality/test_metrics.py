@@ -12,6 +12,7 @@ from graspd.service.model.errors import InputError, TaskCancelled
 from graspd.service.model.metrics import GRASP_METRICS
 from graspd.service.model.transforms import compose
 from graspd.service.store.columns import SCHEMAS
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
@@ -26,7 +27,6 @@ from graspd.worker.quality.diversity import explained_variance
 from graspd.worker.quality.probe import HAND_POINTS, REACH_M, Probe
 from graspd.worker.quality.table import MEASURES, measure
 from graspd.worker.quality.volume import SharedVolume, VoxelVolume
-from graspd.worker.run import Run
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.quality.helpers import grasp_set, plate_hand, posture
 
@@ -146,8 +146,8 @@ def test_moving_hand_and_object_together_changes_nothing_but_rounding() -> None:
 
 def test_columns_are_the_schema_and_the_same_for_any_number_of_threads() -> None:
     poses = posture(*(((0, 0, -0.09), (a, a)) for a in np.linspace(0.1, 0.5, 20)))
-    one, two = (measure(two_finger_hand(), BOX, grasp_set(poses), run=Run(threads=n)) for n in (1, 2))
-    # What is optional comes from the referee, or older shards lack it; `valid` comes from the gate.
+    one, two = (measure(two_finger_hand(), BOX, grasp_set(poses), run=ExecutionContext(threads=n)) for n in (1, 2))
+    # What is optional comes from the validator, or older shards lack it; `valid` comes from the gate.
     wanted = {n for n, column in SCHEMAS["base"].items() if n.startswith("quality/") and not column.optional}
     assert set(one) - {"quality/grasp_type", "quality/approach_cell"} == wanted - {"quality/valid"}
     for name in one:
@@ -156,7 +156,7 @@ def test_columns_are_the_schema_and_the_same_for_any_number_of_threads() -> None
 
 def test_cancelled_table_stops() -> None:
     with pytest.raises(TaskCancelled):
-        measure(two_finger_hand(), BOX, grasp_set(closed_on_box(0)), run=Run(cancelled=lambda: True))
+        measure(two_finger_hand(), BOX, grasp_set(closed_on_box(0)), run=ExecutionContext(cancelled=lambda: True))
 
 
 def test_threshold_beyond_reach_is_refused() -> None:

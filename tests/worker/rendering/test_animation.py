@@ -13,7 +13,7 @@ from graspd.exchange.robots.execution import POSTURES, Executions, ToolFrame, st
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import apply, compose, invert
 from graspd.worker.grasps import Posture
-from graspd.worker.rendering.way_pictures import KINDS, animation
+from graspd.worker.rendering.trajectory_pictures import KINDS, animation
 
 SECONDS = [0.5, 0.05, 1.2]
 

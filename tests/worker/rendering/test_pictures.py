@@ -1,4 +1,4 @@
-"""Pictures for people: what must be in them; how they look is for people to judge."""
+"""Pictures for people: what must be in them; how they look is for people to validate."""
 
 from __future__ import annotations
 

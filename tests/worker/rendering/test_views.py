@@ -11,11 +11,11 @@ import trimesh
 from graspd.service.model.errors import InputError, TaskCancelled
 from graspd.service.model.transforms import apply, quat_from_axis_angle
 from graspd.service.store.shards import check_columns
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering import render
 from graspd.worker.rendering.cameras import Cameras
 from graspd.worker.rendering.views import TABLE_SIZE
-from graspd.worker.run import Run
 from tests.worker.models import object_from_mesh
 
 #: What a view promises of its depth [m]; float32 rays over half a metre err by less than a tenth of it.
@@ -239,12 +239,12 @@ def test_a_cancelled_render_stops_between_launches(ball, monkeypatch):
     monkeypatch.setattr("graspd.worker.rendering.tracer.PIXELS_OF_A_CORE", 1)
     answers = iter([False, True])
     with pytest.raises(TaskCancelled):
-        shoot(ball, REST, run=Run(cancelled=lambda: next(answers)))
+        shoot(ball, REST, run=ExecutionContext(cancelled=lambda: next(answers)))
 
 
 def test_progress_ends_with_all_pictures(ball):
     told: list[tuple[float, float, str]] = []
-    shoot(ball, REST, run=Run(progress=lambda *what: told.append(what)))
+    shoot(ball, REST, run=ExecutionContext(progress=lambda *what: told.append(what)))
     assert [done for done, _, _ in told] == sorted(done for done, _, _ in told)
     assert told[-1][:2] == (4.0, 4.0)
 
@@ -269,7 +269,7 @@ def test_memory_stays_flat_over_repeated_renders(ball):
 
 @pytest.mark.parametrize("cores", [1, 3])
 def test_pixels_do_not_depend_on_the_number_of_cores(mug, mug_poses, mug_views, monkeypatch, cores):
-    monkeypatch.setattr("graspd.worker.run.available_cores", lambda: cores)
+    monkeypatch.setattr("graspd.worker.execution_context.available_cores", lambda: cores)
     again = shoot(mug, mug_poses)
     np.testing.assert_array_equal(mug_views["image/rgb"], again["image/rgb"])
     np.testing.assert_array_equal(mug_views["image/depth"], again["image/depth"])

@@ -19,10 +19,10 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
-from graspd.worker.planners.port import Wanted
-from graspd.worker.scenes.beside import gaps_between, joined_pieces, neighbour_of, scenes_of
+from graspd.worker.planners.port import PlanRequest
 from graspd.worker.scenes.clearance import MARGIN_M, approach
-from graspd.worker.scenes.way import plan_way
+from graspd.worker.scenes.placement import gaps_between, joined_pieces, neighbour_of, scenes_of
+from graspd.worker.scenes.trajectory import plan_way
 from tests.worker.models import object_from_mesh
 from tests.worker.simulation.test_solids import geom_distances
 from tests.worker.simulation.test_surroundings import mujoco_room
@@ -95,7 +95,7 @@ def planned():
     spec = SceneSpec(kind="file", supports=(TABLE,), target=target, neighbours=beside)
     scenes, _ = scenes_of(spec, thing, [post, wall], count=1, seed=0)
     placed = scenes.placed(np.zeros(8, int))
-    grasps = synthesize(hand, thing, Wanted(count=8, fidelity=QUICK, seed=4, placed=placed))
+    grasps = synthesize(hand, thing, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=placed))
     return hand, thing, placed, grasps
 
 
@@ -123,16 +123,16 @@ def test_without_its_neighbours_the_same_hand_would_reach_through_them(planned) 
     """The test above would pass for a scene in which nothing is in the way."""
     hand, thing, placed, _ = planned
     alone = type(placed)(placed.supports, placed.object_pose, placed.index)
-    grasps = synthesize(hand, thing, Wanted(count=8, fidelity=QUICK, seed=4, placed=alone))
+    grasps = synthesize(hand, thing, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=alone))
     least = [geom_distances(hand, grasps.grasp, solid) for solid in placed.scenes[0].obstacles[1:]]
     assert np.min(least) < 0
 
 
-def test_synth_with_neighbours_writes_them_and_its_lifts_are_judged_again_alike(tmp_path: Path) -> None:
+def test_synth_with_neighbours_writes_them_and_its_lifts_are_validated_again_alike(tmp_path: Path) -> None:
     out = tmp_path / "g.h5"
     args = ["synth", "--hand", "barrett", "--object", "block", "--scene", "table", "--with", "mug", "--scenes", "1"]
     result = CliRunner().invoke(
-        build(), [*args, "-n", "4", "--want", "raw", "--fidelity", "draft", "-o", str(out), "--json"]
+        build(), [*args, "-n", "4", "--want", "candidates", "--fidelity", "draft", "-o", str(out), "--json"]
     )
     assert result.exit_code == 0, result.output
     said = json.loads(result.stdout.splitlines()[-1])

@@ -9,9 +9,9 @@ import trimesh
 from graspd.service.model.errors import SceneError
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import quat_rotate
-from graspd.worker.scenes.beside import gaps_between, neighbour_of, scenes_of
 from graspd.worker.scenes.kinds import GAP, room_in
 from graspd.worker.scenes.neighbours import BETWEEN
+from graspd.worker.scenes.placement import gaps_between, neighbour_of, scenes_of
 from tests.worker.models import object_from_mesh
 
 

@@ -11,6 +11,7 @@ import pytest
 from graspd.service.model.fidelity import resolve_fidelity
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import IDENTITY_POSE, apply, compose
+from graspd.worker.execution_context import DEFAULT_CONTEXT
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
@@ -23,15 +24,14 @@ from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.planners.fast_graspd.pairs import pair_of
 from graspd.worker.planners.fast_graspd.scene_starts import clear_scene_starts, free_ways
 from graspd.worker.planners.fast_graspd.starts import CLEAR, start_generator
-from graspd.worker.planners.port import Wanted
-from graspd.worker.run import ALONE
+from graspd.worker.planners.port import PlanRequest
 from graspd.worker.scenes.clearance import MARGIN_M, transfer
 from graspd.worker.scenes.kinds import rest_poses, supports_of
-from graspd.worker.scenes.trial import scene_verdicts
-from graspd.worker.scenes.way import plan_way
+from graspd.worker.scenes.rollout import scene_verdicts
+from graspd.worker.scenes.trajectory import plan_way
+from graspd.worker.simulation.environment import Scenes
 from graspd.worker.simulation.mounting import mounting_room
 from graspd.worker.simulation.obstacles import DeviceObstacles
-from graspd.worker.simulation.surroundings import Scenes
 
 QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2})
 
@@ -57,7 +57,7 @@ def table(block: ObjectModel) -> Scenes:
 @pytest.fixture(scope="module")
 def planned(shadow: HandModel, block: ObjectModel, table: Scenes) -> GraspSet:
     placed = table.placed(np.arange(8) % 2)
-    found = synthesize(shadow, block, Wanted(count=8, fidelity=QUICK, seed=4, placed=placed))
+    found = synthesize(shadow, block, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=placed))
     return replace(found, scene=placed.index)
 
 
@@ -103,7 +103,7 @@ def test_the_wrist_is_bent_no_farther_than_the_table_asks(shadow: HandModel, tab
 def test_valid_grasps_have_their_forearm_above_the_table_at_the_stored_angles(
     shadow: HandModel, block: ObjectModel, table: Scenes, planned: GraspSet
 ) -> None:
-    found, columns, _ = scene_verdicts(shadow, block, planned, table, level="lift", pieces=None, run=ALONE)
+    found, columns, _ = scene_verdicts(shadow, block, planned, table, level="lift", pieces=None, run=DEFAULT_CONTEXT)
     assert found.wrist is not None and found.wrist.shape == (8, 2) and found.approach is not None
     assert shadow.mounting is not None and found.lift is not None and found.scene is not None
     clear = np.flatnonzero(columns["quality/clearance_m"] >= MARGIN_M)
@@ -127,13 +127,13 @@ def test_a_grasp_with_its_mounting_in_the_table_is_not_clear(
     ball = ConvexPiece(2, "sphere", (1.0,), IDENTITY_POSE, vertices, faces, "forearm")
     everywhere = replace(shadow.mounting, pieces=(ball,))
     _, columns, counts = scene_verdicts(
-        replace(shadow, mounting=everywhere), block, planned, table, level="lift", pieces=None, run=ALONE
+        replace(shadow, mounting=everywhere), block, planned, table, level="lift", pieces=None, run=DEFAULT_CONTEXT
     )
     assert (columns["quality/success"] == -1).all() and counts["clear"] == 0
 
 
 def test_free_grasps_do_not_depend_on_the_mounting(shadow: HandModel, block: ObjectModel) -> None:
-    wanted = Wanted(count=2, fidelity=QUICK, seed=4)
+    wanted = PlanRequest(count=2, fidelity=QUICK, seed=4)
     ours, bare = (synthesize(hand, block, wanted) for hand in (shadow, replace(shadow, mounting=None)))
     for one, other in ((ours.grasp, bare.grasp), (ours.pregrasp, bare.pregrasp), (ours.squeeze, bare.squeeze)):
         assert np.array_equal(one.hand_pose, other.hand_pose)

@@ -18,11 +18,11 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
-from graspd.worker.planners.port import Wanted
+from graspd.worker.planners.port import PlanRequest
 from graspd.worker.scenes.clearance import MARGIN_M, approach
 from graspd.worker.scenes.kinds import rest_poses, supports_of
-from graspd.worker.scenes.way import plan_way
-from graspd.worker.simulation.surroundings import STANDOFF_M, Obstacle, Placed
+from graspd.worker.scenes.trajectory import plan_way
+from graspd.worker.simulation.environment import STANDOFF_M, Obstacle, Placed
 from tests.worker.simulation.test_surroundings import mujoco_distances, mujoco_room, parted
 
 #: What a draft's finish may lack of a distance that it aims at exactly [m].
@@ -36,7 +36,7 @@ def planned():
     obj = object_from_path("block", face_error_m=QUICK.face_error_m)
     spec = SceneSpec(kind="table")
     placed = Placed(supports_of(spec), rest_poses(spec, obj, count=2, seed=1)["scene/object_pose"], np.arange(8) % 2)
-    return hand, obj, placed, synthesize(hand, obj, Wanted(count=8, fidelity=QUICK, seed=4, placed=placed))
+    return hand, obj, placed, synthesize(hand, obj, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=placed))
 
 
 def test_every_grasp_is_clear_of_the_table_by_mujocos_distances(planned) -> None:
@@ -46,7 +46,7 @@ def test_every_grasp_is_clear_of_the_table_by_mujocos_distances(planned) -> None
         rows = np.flatnonzero(placed.index == number)
         mine = grasps.grasp.take(rows)
         assert mujoco_distances(rest, mine, scene.obstacles[0]).min() >= MARGIN_M
-        # They may touch the table. A draft's few steps of finish leave less than this to mend; then none is clear.
+        # They may touch the table. A draft's few steps of finish leave less than this to fix; then none is clear.
         assert mujoco_distances(tips, mine, scene.obstacles[0]).min() >= -DRAFT_M
 
 
@@ -56,7 +56,7 @@ def test_fingertips_keep_what_the_scene_says_and_no_less() -> None:
     # A thin slice of the block sticks out of the table: what holds it must reach down to there.
     sunk = np.array([[0, 0, float(-obj.vertices[:, 2].max()) + 0.012, 1, 0, 0, 0]])
     placed = Placed(supports, sunk, np.zeros(12, int))
-    found = synthesize(hand, obj, Wanted(count=12, fidelity=QUICK, seed=4, placed=placed)).grasp
+    found = synthesize(hand, obj, PlanRequest(count=12, fidelity=QUICK, seed=4, placed=placed)).grasp
     tips, rest = parted(hand)
     table = placed.scenes[0].obstacles[0]
     lowest = mujoco_distances(tips, found, table)
@@ -89,14 +89,14 @@ def test_the_whole_way_is_as_clear_as_it_says(planned) -> None:
 def test_a_grasp_does_not_depend_on_the_scenes_of_the_others(planned) -> None:
     hand, obj, placed, grasps = planned
     alone = Placed(placed.supports, placed.object_pose, placed.index[:3])
-    found = synthesize(hand, obj, Wanted(count=3, fidelity=QUICK, seed=4, placed=alone))
+    found = synthesize(hand, obj, PlanRequest(count=3, fidelity=QUICK, seed=4, placed=alone))
     assert np.array_equal(found.grasp.hand_pose, grasps.grasp.hand_pose[:3])
 
 
 def test_a_scene_without_obstacles_leaves_the_hand_free_to_come_from_below() -> None:
     hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
     nothing = Placed((), np.array([[0, 0, 0, 1.0, 0, 0, 0]]), np.zeros(8, int))
-    found = synthesize(hand, obj, Wanted(count=8, fidelity=QUICK, seed=4, placed=nothing))
+    found = synthesize(hand, obj, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=nothing))
     below = Obstacle.half_space([0, 0, 1], -0.03)
     assert (mujoco_distances(hand, found.grasp, below) < 0).any()
 
@@ -133,15 +133,15 @@ def test_synth_in_a_scene_counts_grasps_that_lift(tmp_path: Path) -> None:
     shard = read_shard(out, kind="base")
     assert np.array_equal(shard["quality/valid"], shard["quality/success"] == 1)
     assert (np.asarray(shard["quality/clearance_m"]) >= MARGIN_M).all()
-    judged = CliRunner().invoke(build(), ["evaluate", str(out), "--protocol", "lift", "--json"])
-    again = json.loads(judged.stdout.splitlines()[-1])
+    validated = CliRunner().invoke(build(), ["evaluate", str(out), "--protocol", "lift", "--json"])
+    again = json.loads(validated.stdout.splitlines()[-1])
     assert again["gsr"] == said["valid"] / said["grasps"]
     assert again["clear_share"] == 1.0
 
 
 def test_lifting_grasps_of_a_free_object_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "g.h5"
-    args = ["--hand", "barrett", "--object", "block", "-n", "1", "--want", "raw", "--referee", "none"]
+    args = ["--hand", "barrett", "--object", "block", "-n", "1", "--want", "candidates", "--validation", "none"]
     CliRunner().invoke(build(), ["synth", *args, "--fidelity", "draft", "-o", str(out)])
     result = CliRunner().invoke(build(), ["evaluate", str(out), "--protocol", "lift"])
     assert result.exit_code == 2

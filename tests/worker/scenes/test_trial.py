@@ -1,4 +1,4 @@
-"""The trial of candidates is the test of the referee itself, which is then not done again."""
+"""The trial of candidates is the test of the validator itself, which is then not done again."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from graspd.worker.grasps import joined
-from graspd.worker.scenes import trial as trials
-from graspd.worker.scenes.trial import BEST, FALLS, TOUCHES, hold_trial, lift_trial
-from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.scenes import rollout as rollouts
+from graspd.worker.scenes.rollout import BEST, FALLS, TOUCHES, hold_rollout, lift_rollout
+from graspd.worker.simulation.environment import Placed
 from graspd.worker.validation.lift import Lift
-from graspd.worker.validation.lifting import KnownLifts, judge_lifts
-from graspd.worker.validation.prescreening import SLIPS, ShortLifts
+from graspd.worker.validation.lifting import KnownLifts, validate_lifts
+from graspd.worker.validation.prescreening import SLIPS, LiftRollouts
 from graspd.worker.validation.protocol import Test
-from graspd.worker.validation.validator import KnownTrials, judge
+from graspd.worker.validation.validator import KnownRollouts, validate
 from tests.worker.validation.test_lift import BOX, HAND, PLACED, WHOLE, grasp
 from tests.worker.validation.test_prescreening import LEAST
 
@@ -38,8 +38,8 @@ def lifts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def test_a_lift_that_is_known_is_not_simulated_again(lifts: list[int]) -> None:
     known: KnownLifts = {}
-    first = judge_lifts(HAND, BOX, MANY, WHERE, pieces=WHOLE, known=known)
-    again = judge_lifts(HAND, BOX, MANY, WHERE, pieces=WHOLE, known=known)
+    first = validate_lifts(HAND, BOX, MANY, WHERE, pieces=WHOLE, known=known)
+    again = validate_lifts(HAND, BOX, MANY, WHERE, pieces=WHOLE, known=known)
     assert len(lifts) == 3
     assert np.array_equal(first.outcome, again.outcome)
     assert np.array_equal(first.margin, again.margin)
@@ -48,24 +48,24 @@ def test_a_lift_that_is_known_is_not_simulated_again(lifts: list[int]) -> None:
 @pytest.mark.parametrize("other", ["friction", "squeeze", "scene"])
 def test_a_lift_of_anything_else_is_not_known(lifts: list[int], other: str) -> None:
     known: KnownLifts = {}
-    judge_lifts(HAND, BOX, MANY, WHERE, pieces=WHOLE, known=known)
+    validate_lifts(HAND, BOX, MANY, WHERE, pieces=WHOLE, known=known)
     grasps, where = MANY, WHERE
     if other == "squeeze":
         grasps = joined([grasp(squeeze + 1e-6) for squeeze in SQUEEZES])
     if other == "scene":
         where = Placed(PLACED.supports, PLACED.object_pose + np.array([1e-6, 0, 0, 0, 0, 0, 0]), WHERE.index)
-    judge_lifts(HAND, BOX, grasps, where, pieces=WHOLE, hard=other == "friction", known=known)
+    validate_lifts(HAND, BOX, grasps, where, pieces=WHOLE, hard=other == "friction", known=known)
     assert len(lifts) == 6
 
 
-def trial_of(monkeypatch: pytest.MonkeyPatch, scores: list[float], outcomes: dict[bool, list[int]], beat=None):
+def rollout_of(monkeypatch: pytest.MonkeyPatch, scores: list[float], outcomes: dict[bool, list[int]], beat=None):
     """Scores of grasps that the short lift gives `scores`, and the lift test `outcomes` at half the friction (True) and
     at the whole of it."""
     count = len(scores)
     grasps, where = MANY.take(np.zeros(count, int)), Placed(WHERE.supports, WHERE.object_pose, np.zeros(count, int))
     grasps.stability_loss = np.arange(count, dtype=float)
 
-    def judged(hand, obj, some, placed, *, hard=False, **_):
+    def validated(hand, obj, some, placed, *, hard=False, **_):
         rows = some.stability_loss.astype(int)
         outcome = np.array(outcomes[hard])[rows]
         return type("Verdicts", (), {"success": (outcome == 1).astype(int), "outcome": outcome})
@@ -74,17 +74,17 @@ def trial_of(monkeypatch: pytest.MonkeyPatch, scores: list[float], outcomes: dic
         clear = np.ones(len(some), bool)
         return type("Way", (), {"clear": clear, "approach": some.approach, "open": some.coming})
 
-    monkeypatch.setattr(ShortLifts, "scores", lambda *_: np.array(scores))
-    monkeypatch.setattr(trials, "judge_lifts", judged)
-    monkeypatch.setattr(trials, "plan_way", way)
-    return lift_trial(HAND, BOX, lambda: WHOLE)(grasps, where, np.full(count, np.inf) if beat is None else beat)
+    monkeypatch.setattr(LiftRollouts, "scores", lambda *_: np.array(scores))
+    monkeypatch.setattr(rollouts, "validate_lifts", validated)
+    monkeypatch.setattr(rollouts, "plan_way", way)
+    return lift_rollout(HAND, BOX, lambda: WHOLE)(grasps, where, np.full(count, np.inf) if beat is None else beat)
 
 
 LIFTED, TOUCHED, FELL = 1, 3, 5
 
 
 def test_a_score_is_that_of_the_lift(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = trial_of(
+    found = rollout_of(
         monkeypatch,
         [0.2, 0.3, 0.4, 1.2, 1.3, 0.5, 4.0],
         {
@@ -101,27 +101,27 @@ def test_a_hand_that_must_lift_at_half_the_friction_to_be_better_and_does_not_is
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     outcomes = {True: [LIFTED, FELL], False: [LIFTED, LIFTED]}
-    found = trial_of(monkeypatch, [0.2, 0.3], outcomes, np.array([1.5, 1.5]))
+    found = rollout_of(monkeypatch, [0.2, 0.3], outcomes, np.array([1.5, 1.5]))
     assert found == pytest.approx([0.2, 1.5])
 
 
 @pytest.mark.parametrize(("verdict", "score"), [(1, 0.2), (0, SLIPS + 1.0 + FALLS * 0.2)])
-def test_a_free_grasp_that_the_referee_drops_is_no_good_candidate(
+def test_a_free_grasp_that_the_validator_drops_is_no_good_candidate(
     monkeypatch: pytest.MonkeyPatch, verdict: int, score: float
 ) -> None:
-    monkeypatch.setattr(trials, "push_trial", lambda *_: lambda grasps, *_: np.array([0.2, 4.0, 4.0]))
-    monkeypatch.setattr(trials, "judge", lambda *_, **__: type("Verdicts", (), {"success": np.array([verdict])}))
-    assert hold_trial(HAND, BOX, lambda: WHOLE)(MANY, None).tolist() == pytest.approx([score, 4.0, 4.0])
+    monkeypatch.setattr(rollouts, "push_rollout", lambda *_: lambda grasps, *_: np.array([0.2, 4.0, 4.0]))
+    monkeypatch.setattr(rollouts, "validate", lambda *_, **__: type("Verdicts", (), {"success": np.array([verdict])}))
+    assert hold_rollout(HAND, BOX, lambda: WHOLE)(MANY, None).tolist() == pytest.approx([score, 4.0, 4.0])
 
 
 def test_a_verdict_that_is_known_is_not_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
     rows: list[int] = []
-    certificate = Test.certificate
-    monkeypatch.setattr(Test, "certificate", lambda self, given, row: rows.append(row) or certificate(self, given, row))
-    known: KnownTrials = {}
-    first = judge(HAND, BOX, MANY, pieces=WHOLE, known=known)
-    again = judge(HAND, BOX, MANY.take(np.array([2, 0])), pieces=WHOLE, known=known)
+    standard = Test.standard
+    monkeypatch.setattr(Test, "standard", lambda self, given, row: rows.append(row) or standard(self, given, row))
+    known: KnownRollouts = {}
+    first = validate(HAND, BOX, MANY, pieces=WHOLE, known=known)
+    again = validate(HAND, BOX, MANY.take(np.array([2, 0])), pieces=WHOLE, known=known)
     assert sorted(rows) == [0, 1, 2]
     assert np.array_equal(again.outcome, first.outcome[[2, 0]])
-    judge(HAND, BOX, MANY, pieces=WHOLE, hard=True, known=known)
+    validate(HAND, BOX, MANY, pieces=WHOLE, hard=True, known=known)
     assert len(rows) == 6

@@ -9,7 +9,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import build
-from graspd.worker.objects.repair import Repaired
+from graspd.worker.objects.repair import RepairedMesh
 from graspd.worker.simulation import kernels
 from graspd.worker.simulation.data import Data, Schedule
 from graspd.worker.simulation.device import DeviceHand, DeviceObject
@@ -19,7 +19,7 @@ from graspd.worker.simulation.sampling import object_samples
 
 def object_of(mesh: trimesh.Trimesh) -> ObjectModel:
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32)
-    return build(Repaired(vertices, faces), 0.0)
+    return build(RepairedMesh(vertices, faces), 0.0)
 
 
 def ball(radius: float = 0.035, subdivisions: int = 3) -> ObjectModel:

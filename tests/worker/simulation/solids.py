@@ -9,7 +9,7 @@ import numpy as np
 from graspd.service.model.transforms import apply, invert
 from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.hands.surface import piece_distance
-from graspd.worker.simulation.surroundings import Obstacle
+from graspd.worker.simulation.environment import Obstacle
 
 _GOLDEN = (np.sqrt(5) - 1) / 2
 

@@ -13,10 +13,10 @@ import warp as wp
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.worker.control.opening import OPENING_STEPS
 from graspd.worker.control.postures import pregrasp
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import Posture
-from graspd.worker.planners import Wanted
+from graspd.worker.planners import PlanRequest
 from graspd.worker.planners.fast_graspd import planner
-from graspd.worker.run import Run
 from graspd.worker.simulation import launches
 from graspd.worker.simulation.launches import Launches
 from tests.worker.models import object_from_mesh, two_finger_hand
@@ -81,7 +81,9 @@ def forbid_the_host(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def planned() -> planner.Part:
     box = object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.08)))
-    (part,) = planner.optimise_batch(two_finger_hand(), box, Wanted(2, FIDELITY, seed=3), Run("cpu", threads=1))
+    (part,) = planner.optimise_batch(
+        two_finger_hand(), box, PlanRequest(2, FIDELITY, seed=3), ExecutionContext("cpu", threads=1)
+    )
     return part
 
 

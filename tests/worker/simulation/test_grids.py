@@ -1,4 +1,4 @@
-"""Distance grids are kept on the machine: what is read is what was computed, and what is not sound is made anew."""
+"""Distance grids are kept on the machine: what is read is what was computed, and what is not feasible is made anew."""
 
 from __future__ import annotations
 

@@ -10,13 +10,13 @@ import pytest
 from graspd.service.model.transforms import compose, quat_rotate
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
-from graspd.worker.scenes.beside import outer_solid
+from graspd.worker.scenes.placement import outer_solid
 from graspd.worker.simulation.data import Data, HandState
+from graspd.worker.simulation.environment import Environment, Obstacle
 from graspd.worker.simulation.model import LossOptions, Model
 from graspd.worker.simulation.obstacles import DeviceObstacles
 from graspd.worker.simulation.projection import Projection, ProjectionOptions
 from graspd.worker.simulation.record import record_evaluation, record_placement
-from graspd.worker.simulation.surroundings import Obstacle, Surroundings
 from tests.worker.simulation.rigs import ball, rig, still
 from tests.worker.simulation.solids import nearest_edges
 from tests.worker.simulation.test_penalties import RELATIVE, bodies_of, differences
@@ -62,7 +62,7 @@ def simulation_in(hand: HandModel, obstacles: tuple[Obstacle, ...]) -> tuple[Mod
     obj = ball()
     model, data = rig(hand, obj, capacity=1, options=LossOptions(simulate=False, leak=0.0, range_weight=0.0))
     up = np.array([0.0, 0, 1])
-    solids = DeviceObstacles.create(hand, [Surroundings(obstacles, up)], obj.centre_of_mass, "cpu", margin=MARGIN)
+    solids = DeviceObstacles.create(hand, [Environment(obstacles, up)], obj.centre_of_mass, "cpu", margin=MARGIN)
     data.set_scenes(np.zeros(1, int))
     return replace(model, obstacles=solids), data
 

@@ -47,7 +47,7 @@ def evaluated(state: HandState) -> Projection:
     out.data.set_schedule(still_schedule())
     out.data.set_state(state)
     out._depth.fill_(np.inf)
-    launches = out._judged(out._states(state), out._states(state))
+    launches = out._validated(out._states(state), out._states(state))
     out._add_equations(launches)
     launches.run()
     return out

@@ -11,9 +11,9 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
-from graspd.worker.scenes.beside import MOST_PLANES, outer_solid
+from graspd.worker.scenes.placement import MOST_PLANES, outer_solid
+from graspd.worker.simulation.environment import Environment, Obstacle
 from graspd.worker.simulation.obstacles import FAR_M, obstacle_distances
-from graspd.worker.simulation.surroundings import Obstacle, Surroundings
 from tests.worker.models import piece, two_finger_hand
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -42,7 +42,7 @@ def link(kind: str) -> HandModel:
 def distance(kind: str, at: tuple[float, ...], obstacle: Obstacle, turn: tuple[float, ...] = (1, 0, 0, 0)) -> float:
     quaternion = np.array(turn, float) / np.linalg.norm(turn)
     posture = Posture(np.array([[*at, *quaternion]]), np.zeros((1, 2)))
-    return float(obstacle_distances(link(kind), posture, Surroundings((obstacle,), UP))[0])
+    return float(obstacle_distances(link(kind), posture, Environment((obstacle,), UP))[0])
 
 
 EDGE, CORNER = np.sqrt(2), np.sqrt(3)
@@ -101,7 +101,7 @@ def test_no_hand_is_nearer_to_a_solid_than_it_says_by_mujocos_distances(name: st
     quaternion = rng.normal(size=(60, 4))
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     postures = Posture(np.concatenate([rng.normal(size=(60, 3)) * 0.12, quaternion], axis=1), hand.expand(q))
-    found = obstacle_distances(hand, postures, Surroundings((solid,), UP))
+    found = obstacle_distances(hand, postures, Environment((solid,), UP))
     true = geom_distances(hand, postures, solid)
     apart = true > 0
     assert (found[apart] <= true[apart] + 1e-5).all()

@@ -14,6 +14,7 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
+from graspd.worker.simulation.environment import CLEAR_M, Environment, Obstacle, Placed
 from graspd.worker.simulation.obstacles import (
     PosedFeatures,
     body_distances,
@@ -21,7 +22,6 @@ from graspd.worker.simulation.obstacles import (
     obstacle_distances,
     obstacle_room,
 )
-from graspd.worker.simulation.surroundings import CLEAR_M, Obstacle, Placed, Surroundings
 
 TILTED = np.array([0.1, -0.2, 0.3, 0.8, 0.2, -0.4, 0.4]) / [1, 1, 1, 1, 1, 1, 1]
 TILTED[3:] /= np.linalg.norm(TILTED[3:])
@@ -85,7 +85,7 @@ def test_the_distance_of_a_hand_from_a_plane_is_mujocos(name: str) -> None:
     )
     postures = Posture(pose, hand.expand(q))
     plane = Obstacle.half_space([0.3, -0.5, 0.8], -0.2)
-    found = obstacle_distances(hand, postures, Surroundings((plane,), plane.planes[0, :3]))
+    found = obstacle_distances(hand, postures, Environment((plane,), plane.planes[0, :3]))
     np.testing.assert_allclose(found, mujoco_distances(hand, postures, plane), atol=1e-5)
 
 
@@ -95,11 +95,11 @@ def test_fingertips_have_more_room_over_what_they_may_touch_and_nothing_else_has
     table, wall = Obstacle.half_space([0, 0, 1], -0.3), Obstacle.half_space([1, 0, 0], -0.4)
     up = np.array([0.0, 0, 1])
     tips = np.isin(np.arange(hand.bodies), hand.fingertips)
-    alone, beside = (body_distances(hand, posture, Surroundings((one,), up))[0] for one in (table, wall))
+    alone, beside = (body_distances(hand, posture, Environment((one,), up))[0] for one in (table, wall))
     to_touch = replace(table, tips_m=-0.0005)
-    found = body_room(hand, posture, [Surroundings((to_touch, wall), up)])[0]
+    found = body_room(hand, posture, [Environment((to_touch, wall), up)])[0]
     np.testing.assert_array_equal(found, np.minimum(alone + np.where(tips, 0.0025, 0.0), beside))
-    assert obstacle_room(hand, posture, [Surroundings((to_touch, wall), up)])[0] == found.min()
+    assert obstacle_room(hand, posture, [Environment((to_touch, wall), up)])[0] == found.min()
     pose = np.array([0.1, 0, 0, 0.6, 0, 0.8, 0])
     assert to_touch.seen_from(pose).tips_m == -0.0005, "a support keeps what it says wherever it is seen from"
 
@@ -113,7 +113,7 @@ def test_many_hands_have_the_room_of_each_ones_scene(name: str) -> None:
     postures = Posture(pose, hand.expand(rng.uniform(hand.lower, hand.upper, (9, hand.dofs))))
     one, other = Obstacle.half_space([0.3, -0.5, 0.8], -0.1), Obstacle.half_space([0, 1, 0], 0.05)
     up, which = np.array([0.0, 0, 1]), np.arange(9) % 3
-    scenes = [Surroundings((one,), up), Surroundings((one, other), up), Surroundings((), up)]
+    scenes = [Environment((one,), up), Environment((one, other), up), Environment((), up)]
     posed = PosedFeatures.of(hand, postures)
     wanted = np.full(9, np.inf)
     for number, around in enumerate([[one], [one, other], []]):

@@ -10,9 +10,9 @@ import trimesh
 import warp as wp
 
 from graspd.service.model.fidelity import FIDELITIES
-from graspd.worker.planners import Wanted
+from graspd.worker.execution_context import ExecutionContext
+from graspd.worker.planners import PlanRequest
 from graspd.worker.planners.fast_graspd import planner
-from graspd.worker.run import Run
 from graspd.worker.simulation.data import Data
 from graspd.worker.simulation.kernels import packing, wrenches
 from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
@@ -91,7 +91,9 @@ def test_a_batch_has_the_same_bits_where_threads_come_in_any_order(monkeypatch: 
     states = []
     for serial in (True, False):
         monkeypatch.setattr(planner, "Data", partial(Data, serial=serial))
-        (part,) = planner.optimise_batch(two_finger_hand(), box, Wanted(2, FIDELITY, seed=3), Run("cpu", threads=1))
+        (part,) = planner.optimise_batch(
+            two_finger_hand(), box, PlanRequest(2, FIDELITY, seed=3), ExecutionContext("cpu", threads=1)
+        )
         assert part.state is not None
         states.append(part.state)
     for name in ("pivot", "rotation", "q"):

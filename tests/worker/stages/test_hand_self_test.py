@@ -13,13 +13,13 @@ import pytest
 from graspd.service.model.errors import InputError, TaskCancelled
 from graspd.service.model.states import AssetKind
 from graspd.service.store.asset_summary import summary
-from graspd.worker.certified import Certified
+from graspd.worker.execution_context import ExecutionContext
+from graspd.worker.generation import ValidatedBatch
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.oppositions import oppositions_of
+from graspd.worker.hands.pinch_postures import oppositions_of
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.run import Run
 from graspd.worker.stages import hand_self_test
 from graspd.worker.stages.hand_self_test import (
     OF_OPENING,
@@ -39,7 +39,7 @@ _PALM = '<collision><geometry><box size="0.09 0.09 0.02"/></geometry></collision
 _FINGER = '<collision><origin xyz="0 0 0.05"/><geometry><box size="0.012 0.012 0.1"/></geometry></collision>'
 
 
-def held(count: int) -> Certified:
+def held(count: int) -> ValidatedBatch:
     """`count` grasps that hold, equally well."""
     ones = np.ones(count)
     columns = {
@@ -49,7 +49,7 @@ def held(count: int) -> Certified:
         "quality/verdict_outcome": ones[:, None],
     }
     grasps = SimpleNamespace(grasp=SimpleNamespace(take=lambda rows: None))
-    return cast(Certified, SimpleNamespace(columns=columns, grasps=grasps))
+    return cast(ValidatedBatch, SimpleNamespace(columns=columns, grasps=grasps))
 
 
 def test_objects_are_as_wide_as_suits_the_opening() -> None:
@@ -123,7 +123,9 @@ def test_objects_are_no_thinner_than_opposed_pads_come_together(monkeypatch: pyt
 def test_a_busy_machine_leaves_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("time.monotonic", count(0.0, 1e4).__next__)
 
-    def batches(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: Run) -> list[Certified]:
+    def batches(
+        hand: HandModel, obj: ObjectModel, count: int, seed: int, run: ExecutionContext
+    ) -> list[ValidatedBatch]:
         run.progress(1, 10, "planning")
         run.check("planning")
         return [held(count)]
@@ -153,7 +155,7 @@ def test_a_servo_that_is_stiff_for_its_limit_gives_little() -> None:
 def test_a_test_that_ends_badly_is_told_and_stops_nothing(
     error: Exception, says: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def breaks(hand: HandModel, run: Run) -> SelfTest:
+    def breaks(hand: HandModel, run: ExecutionContext) -> SelfTest:
         raise error
 
     monkeypatch.setattr(hand_self_test, "self_test", breaks)
@@ -162,7 +164,7 @@ def test_a_test_that_ends_badly_is_told_and_stops_nothing(
 
 def test_a_test_that_is_stopped_has_no_verdict() -> None:
     with pytest.raises(TaskCancelled):
-        tried_softly(gripper, Run(cancelled=lambda: True))
+        tried_softly(gripper, ExecutionContext(cancelled=lambda: True))
 
 
 @pytest.mark.slow

@@ -83,14 +83,14 @@ def test_a_bad_file_gets_its_verdict_from_the_checking_child(shared_data: Path, 
     known = json.loads((shared_data / "bad" / "INDEX.json").read_text())["inputs"]
     entries = [entry for entry in known if entry["file"] in chosen] if chosen else known
 
-    def judge(entry: dict[str, str]) -> str | None:
+    def validate(entry: dict[str, str]) -> str | None:
         data, start = (shared_data / "bad" / entry["file"]).read_bytes(), computed()
         found = upload(open_store("memory://"), kind_of(entry["file"]), entry["file"], data)
         right = found["verdict"] == entry["expect"] and entry["message_names"].lower() in found["message"].lower()
         return None if right and computed() - start < BOUND_S else f"{entry['file']}: {found}"
 
     with ThreadPoolExecutor(TOGETHER) as pool:
-        wrong = [text for text in pool.map(judge, entries) if text]
+        wrong = [text for text in pool.map(validate, entries) if text]
     assert len(entries) >= (len(chosen) or 40) and not wrong
 
 
@@ -213,8 +213,8 @@ def test_a_mesh_that_costs_too_much_is_refused_and_the_next_one_is_taken(limits:
     found, _ = ingest.check_in_child(AssetKind.OBJECT, "rough", files, context, **limits)  # type: ignore[arg-type]
     assert found["verdict"] == "refuse" and says in found["message"]
     assert computed() - start < BOUND_S
-    sound = {"asset.json": b'{"file": "m.stl"}', **BALL}
-    assert ingest.check_in_child(AssetKind.OBJECT, "ball", sound, context)[0]["verdict"] == "accept"
+    feasible = {"asset.json": b'{"file": "m.stl"}', **BALL}
+    assert ingest.check_in_child(AssetKind.OBJECT, "ball", feasible, context)[0]["verdict"] == "accept"
 
 
 def test_a_small_archive_of_ten_million_faces_is_refused() -> None:

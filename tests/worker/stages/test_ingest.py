@@ -15,8 +15,8 @@ from graspd.service.model.messages import IngestMessage
 from graspd.service.model.states import AssetKind
 from graspd.service.store.library import publish_asset, record_asset, store_files
 from graspd.service.store.store import Store, open_store
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import HandModel
-from graspd.worker.run import Run
 from graspd.worker.stages import hand_self_test, ingest
 from graspd.worker.stages.context import StopReason, TaskContext
 from graspd.worker.stages.hand_self_test import SelfTest
@@ -78,29 +78,29 @@ def test_a_sound_object_is_taken_with_its_facts(context: TaskContext) -> None:
 
 def test_a_hand_is_tried_if_its_record_says_so(context: TaskContext, monkeypatch: pytest.MonkeyPatch) -> None:
     """The trial itself is tested beside it: here that it runs on the hand that was checked, and what is kept."""
-    tried = []
+    candidates = []
 
-    def stand_in(hand: HandModel, run: Run) -> SelfTest:
-        tried.append(hand.name)
+    def stand_in(hand: HandModel, run: ExecutionContext) -> SelfTest:
+        candidates.append(hand.name)
         return SelfTest(0.9, 64, 0.04, {"box": 0.9}, 0.8, 16)
 
     monkeypatch.setattr(hand_self_test, "self_test", stand_in)
     files = {"asset.json": b'{"file": "gripper.urdf"}', "gripper.urdf": gripper_urdf()}
     untried = run(context.store, context, files, AssetKind.HAND)
-    assert not tried and "self_test" not in untried["facts"]  # type: ignore[operator]
+    assert not candidates and "self_test" not in untried["facts"]  # type: ignore[operator]
     asset = store_files(context.store, AssetKind.HAND, "mine", {**files, "note.txt": b"x"}, said={"self_test": True})
     record_asset(context.store, asset)
     message = IngestMessage(schema_=1, task_id="i", kind=AssetKind.HAND, name="mine", digest=asset.digest)
     ingest.run(message, context)
     found = json.loads(context.store.get(names.asset_check(AssetKind.HAND, asset.digest)))
-    assert tried == ["mine"]
+    assert candidates == ["mine"]
     assert found["facts"]["self_test"]["says"] == "ready: 90 % hold, 80 % lift off a table"
 
 
 def test_a_hand_that_finds_no_grasp_is_taken_and_says_why(
     context: TaskContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stand_in(hand: HandModel, run: Run) -> SelfTest:
+    def stand_in(hand: HandModel, run: ExecutionContext) -> SelfTest:
         raise InputError("no way in")
 
     monkeypatch.setattr(hand_self_test, "self_test", stand_in)

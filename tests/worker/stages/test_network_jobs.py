@@ -19,19 +19,19 @@ from graspd.service.model.messages import IngestMessage
 from graspd.service.model.planning import message_of, plan
 from graspd.service.model.records import JobRecord
 from graspd.service.model.scene_spec import has_table, scene_of
-from graspd.service.model.states import AssetKind, Lane, Stage
+from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.queue.port import EventKind
 from graspd.service.store.assets import builtin_files, pack
 from graspd.service.store.library import load_check, publish_asset
 from graspd.service.store.manifests import load_shard
 from graspd.service.store.network_file import NETWORK_FILE, check_network
 from graspd.service.store.store import Store, open_store
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.synthesis import synthesized
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.planners import known_networks as known
 from graspd.worker.planners.registry import of_this_machine
 from graspd.worker.process.runner import Runner
-from graspd.worker.run import Run
 from graspd.worker.scenes.kinds import supports_of
 from graspd.worker.stages import assets, ingest, scene, synthesize
 from graspd.worker.stages.context import TaskContext
@@ -68,7 +68,7 @@ def job_of(store: Store, **options: Any) -> JobRecord:
         request=wanted,
         hand_digest=hand.digest,
         object_digest=obj.digest,
-        lane=Lane.BULK,
+        priority=Priority.BULK,
         created=timestamp(),
     )
 
@@ -78,7 +78,7 @@ def end_of(store: Store, job: JobRecord) -> tuple[EventKind, str]:
     runner = Runner({Stage.SCENE: scene.run, Stage.SYNTHESIZE: synthesize.run}, worker="w", publish=lambda event: None)  # type: ignore[arg-type]
     for task in plan(job):
         message = message_of(job, task, attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
-        event = runner.run(message, TaskContext(store, Run(threads=2)))
+        event = runner.run(message, TaskContext(store, ExecutionContext(threads=2)))
         assert event is not None
         if event.kind is not EventKind.FINISHED:
             break

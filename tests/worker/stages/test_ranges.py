@@ -14,7 +14,7 @@ from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import DamagedShard, TaskCancelled
 from graspd.service.model.planning import message_of, plan
 from graspd.service.model.records import JobRecord
-from graspd.service.model.states import AssetKind, Lane, Stage
+from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.queue.port import EventKind
 from graspd.service.store.assets import builtin_files
 from graspd.service.store.library import publish_asset
@@ -22,10 +22,10 @@ from graspd.service.store.manifests import load_manifest, load_shard
 from graspd.service.store.records import put_record
 from graspd.service.store.shards import Shard
 from graspd.service.store.store import Store, open_store
-from graspd.worker import certified
+from graspd.worker import generation
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.planners import NoPlace
 from graspd.worker.process.runner import Runner
-from graspd.worker.run import Run
 from graspd.worker.stages import scene, synthesize
 from graspd.worker.stages.context import StopReason, TaskContext
 from graspd.worker.stages.ranges import base_rows, batches_of
@@ -51,7 +51,7 @@ def made(store: Store, span: int, **request: Any) -> tuple[JobRecord, list[tuple
         request=wanted,
         hand_digest=hand.digest,
         object_digest=obj.digest,
-        lane=Lane.BULK,
+        priority=Priority.BULK,
         span=span,
         created=timestamp(),
     )
@@ -60,7 +60,9 @@ def made(store: Store, span: int, **request: Any) -> tuple[JobRecord, list[tuple
     found = []
     for task in plan(job):
         message = message_of(job, task, attempt=1, max_attempt=3)
-        event = runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(store, Run(threads=2)))
+        event = runner.run(
+            message.model_dump(mode="json", by_alias=True), TaskContext(store, ExecutionContext(threads=2))
+        )
         assert event is not None and event.kind is EventKind.FINISHED, event
         found.append(
             (task.stage, load_shard(store, task.stage, task.output), load_manifest(store, task.stage, task.output))
@@ -70,8 +72,8 @@ def made(store: Store, span: int, **request: Any) -> tuple[JobRecord, list[tuple
 
 @pytest.mark.parametrize(
     "request_of",
-    [{"scenes": 2}, {"audits": SIZE}, {"scene": "table", "scenes": 2, "budget": 20}],
-    ids=["scenes after", "audits of the first batch", "scenes before"],
+    [{"scenes": 2}, {"rechecks": SIZE}, {"scene": "table", "scenes": 2, "budget": 20}],
+    ids=["scenes after", "rechecks of the first batch", "scenes before"],
 )
 def test_a_range_is_its_batches_one_after_the_other(request_of: dict[str, Any]) -> None:
     apart = made(open_store("memory://"), 1, grasps=2 * SIZE + 1, **request_of)[1]
@@ -92,10 +94,10 @@ def test_a_range_is_its_batches_one_after_the_other(request_of: dict[str, Any]) 
                 np.testing.assert_array_equal(column, parts[0][path])
                 continue
             pieces = [
-                # Only some batches are audited.
+                # Only some batches are rechecked.
                 part[path] if path in part.arrays else np.full(len(part["grasp/hand_pose"]), -1)
                 for part in parts
-                if path in part.arrays or path == "quality/audit"
+                if path in part.arrays or path == "quality/recheck"
             ]
             if path == "grasp/scene_index":
                 assert scenes is not None
@@ -105,8 +107,8 @@ def test_a_range_is_its_batches_one_after_the_other(request_of: dict[str, Any]) 
             np.testing.assert_array_equal(column, np.concatenate(pieces), err_msg=path)
         assert manifest.batches == 3
         assert manifest.valid == sum(one.valid for one in of_parts)
-        assert manifest.tried == sum(one.tried for one in of_parts)
-        assert manifest.audited == sum(one.audited for one in of_parts)
+        assert manifest.candidates == sum(one.candidates for one in of_parts)
+        assert manifest.rechecked == sum(one.rechecked for one in of_parts)
         if stage is Stage.SYNTHESIZE:
             assert whole.attributes["batch_rows"] == str([one.count for one in of_parts])
             assert manifest.info["planned"] == sum(one.info["planned"] for one in of_parts)
@@ -126,7 +128,7 @@ def test_a_base_shard_of_other_batches_is_refused() -> None:
 def test_a_range_tells_how_far_it_is_and_stops_where_it_is_told_to(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("graspd.worker.stages.context.REPORT_EVERY_S", 0.0)
     store = open_store("memory://")
-    job, _ = made(store, 2, grasps=2 * SIZE, want="raw")
+    job, _ = made(store, 2, grasps=2 * SIZE, want="candidates")
     message = message_of(job, next(plan(job)), attempt=1, max_attempt=1)
     told: list[float] = []
 
@@ -137,7 +139,7 @@ def test_a_range_tells_how_far_it_is_and_stops_where_it_is_told_to(monkeypatch: 
 
     for stops_at in (0, 1):
         told.clear()
-        context = TaskContext(store, Run(threads=2), tell=tell)
+        context = TaskContext(store, ExecutionContext(threads=2), tell=tell)
         if stops_at:
             with pytest.raises(TaskCancelled):
                 synthesize.run(message, context)
@@ -153,7 +155,7 @@ def test_a_batch_whose_scenes_leave_no_place_has_no_grasps_but_for_the_first_of_
     monkeypatch: pytest.MonkeyPatch, refused: set[int], rows: str
 ) -> None:
     """As where none is found within the budget: the grasps of the other batches stay."""
-    whole = certified.certified_grasps
+    whole = generation.validated_grasps
 
     def some(*given: Any, batch: int, **options: Any) -> Any:
         if batch in refused:

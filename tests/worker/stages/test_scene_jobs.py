@@ -19,7 +19,7 @@ from graspd.service.model.errors import TaskRefused
 from graspd.service.model.planning import message_of, plan
 from graspd.service.model.records import AttemptRecord, JobRecord
 from graspd.service.model.scene_spec import supports_in
-from graspd.service.model.states import AssetKind, Lane, Stage
+from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.queue.port import EventKind
 from graspd.service.readers import Grasps, Pictures, open_shards
 from graspd.service.store.assets import builtin_files
@@ -28,12 +28,12 @@ from graspd.service.store.manifests import load_manifest, load_shard
 from graspd.service.store.records import put_record, read_record
 from graspd.service.store.shards import Shard
 from graspd.service.store.store import Store, open_store
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.provenance import placed_of_shard
 from graspd.worker.files.synthesis import synthesized
 from graspd.worker.process.runner import Runner
 from graspd.worker.rendering import Extras
 from graspd.worker.rendering import render as pictures
-from graspd.worker.run import Run
 from graspd.worker.stages import render, scene, synthesize
 from graspd.worker.stages.assets import object_of
 from graspd.worker.stages.context import TaskContext, batch_seed
@@ -42,7 +42,7 @@ TABLE = {
     "grasps": 6,
     "fidelity": "draft",
     "seed": 3,
-    "audits": 0,
+    "rechecks": 0,
     "scene": "table",
     "scenes": 2,
     "views": 1,
@@ -72,14 +72,14 @@ class Bench:
             request=wanted,
             hand_digest=hand.digest,
             object_digest=obj.digest,
-            lane=Lane.BULK,
+            priority=Priority.BULK,
             created=timestamp(),
         )
         put_record(self.store, names.job_record(self.job.id), self.job)
         runner = Runner(STAGES, worker="w", publish=lambda event: None)  # type: ignore[arg-type]
         for task in plan(self.job):
             message = message_of(self.job, task, attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
-            event = runner.run(message, TaskContext(self.store, Run(threads=2)))
+            event = runner.run(message, TaskContext(self.store, ExecutionContext(threads=2)))
             assert event is not None
             if event.kind is not EventKind.FINISHED:
                 break
@@ -142,7 +142,7 @@ def test_readers_give_the_way_of_a_grasp_and_the_grasps_of_a_picture(table: Benc
 def test_neighbours_in_a_bin_stand_in_scenes_grasps_and_pictures(table: Bench) -> None:
     bench = Bench(table.store)
     beside = [{"object": "mug"}, {"object": "block"}]
-    bench_of = {"scene": "bin", "neighbours": beside, "want": "raw", "grasps": 2, "scenes": 1}
+    bench_of = {"scene": "bin", "neighbours": beside, "want": "candidates", "grasps": 2, "scenes": 1}
     assert bench.run(**TABLE | bench_of) == (EventKind.FINISHED, "")
     shards = [bench.made(stage) for stage in STAGES]
     for shard in shards:
@@ -204,9 +204,7 @@ def test_a_payload_out_of_reach_fails_the_job_with_what_the_hand_lifts(table: Be
     wanted = {"scene": scene, "scenes": 0, "views": 0, "grasps": 8, "budget": 4, "min_payload": 90}
     kind, words = bench.run(**TABLE | wanted)
     assert kind is EventKind.FAILED
-    assert re.search(
-        r"none of 8 grasps tried is valid: barrett lifts [\d.]+ kg at friction .*; 90 kg are wanted", words
-    )
+    assert re.search(r"none of 8 candidates is valid: barrett lifts [\d.]+ kg at friction .*; 90 kg are wanted", words)
     task = list(plan(bench.job))[-1]
     attempt = read_record(AttemptRecord, table.store, names.attempt(task.id, 1))
     assert (attempt.kind, attempt.last) == ("LoadError", True), "it is not tried again"

@@ -10,13 +10,13 @@ import pytest
 import trimesh
 
 from graspd.worker.grasps import Posture
-from graspd.worker.simulation.surroundings import Obstacle
+from graspd.worker.simulation.environment import Obstacle
 from graspd.worker.validation.compiled import scene_of
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.model import MujocoOptions, build
-from graspd.worker.validation.protocol import Test, Trial
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.protocol import Rollout, Test
+from graspd.worker.validation.validator import validate
 from tests.worker.models import object_from_mesh
 from tests.worker.quality.helpers import grasp_set, pad_hand, plate_hand, posture
 
@@ -55,8 +55,8 @@ class Whole(Test):
         return self.penetration()
 
 
-def told(trials: list[Trial]) -> list[tuple[object, ...]]:
-    return [(t.outcomes, t.margin, t.penetration_m, t.self_penetration_m, t.steps) for t in trials]
+def told(rollouts: list[Rollout]) -> list[tuple[object, ...]]:
+    return [(t.outcomes, t.margin, t.penetration_m, t.self_penetration_m, t.steps) for t in rollouts]
 
 
 @pytest.mark.parametrize("hand", [PADS, PLATES])
@@ -64,17 +64,17 @@ def test_trials_in_kept_models_are_those_of_fresh_ones_bit_for_bit(hand: object)
     rows = [((0, 0, z), (gap, gap)) for z in np.linspace(0.0, 0.055, 4) for gap in (0.0655, 0.071)]
     grasps = grasp_set(posture(*rows))
     fresh = Whole(build(hand, BOX, WHOLE, MujocoOptions()))  # type: ignore[arg-type]
-    wanted = told([fresh.certificate(grasps, row) for row in range(len(grasps))])
+    wanted = told([fresh.standard(grasps, row) for row in range(len(grasps))])
     scene = scene_of(hand, BOX, WHOLE, MujocoOptions())  # type: ignore[arg-type]
     for _ in range(2):
         kept = Test(scene)
-        assert told([kept.certificate(grasps, row) for row in range(len(grasps))]) == wanted
+        assert told([kept.standard(grasps, row) for row in range(len(grasps))]) == wanted
     assert max(t[2] for t in wanted) > 0.0, "some of them reach into the box"  # type: ignore[operator, type-var]
 
 
 def test_verdicts_and_displacements_are_the_same_when_asked_again() -> None:
     grasps = grasp_set(posture(*[((0, 0, z), (0.066, 0.066)) for z in (0.0, 0.02, 0.05)]))
-    first, second = (judge(PADS, BOX, grasps, pieces=WHOLE) for _ in range(2))
+    first, second = (validate(PADS, BOX, grasps, pieces=WHOLE) for _ in range(2))
     assert np.array_equal(first.outcome, second.outcome) and np.array_equal(first.margin, second.margin)
     way = [simulated_displacement_cm(PADS, BOX, grasps.grasp, pieces=WHOLE) for _ in range(2)]
     assert np.array_equal(*way)

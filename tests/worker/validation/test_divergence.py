@@ -12,7 +12,7 @@ from graspd.worker.engines.mujoco_warnings import void
 from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.model import MujocoOptions, build
 from graspd.worker.validation.protocol import Outcome, Test
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.validator import validate
 from tests.worker.validation.test_validator import BOX, PADS, WHOLE, grasp_of
 
 
@@ -24,19 +24,19 @@ class Exploding(Test):
         self.data.qvel[0] = np.inf
 
 
-@pytest.mark.parametrize("level", ["letter", "certificate"])
+@pytest.mark.parametrize("level", ["dexgraspbench", "standard"])
 def test_a_blown_up_push_is_not_held(level: str) -> None:
     test = Exploding(build(PADS, BOX, WHOLE, MujocoOptions()))
-    trial = test.letter(grasp_of(), 0) if level == "letter" else test.certificate(grasp_of(), 0)
-    assert trial.outcomes[0] is Outcome.DIVERGED
-    assert not trial.success
+    rollout = test.dexgraspbench(grasp_of(), 0) if level == "dexgraspbench" else test.standard(grasp_of(), 0)
+    assert rollout.outcomes[0] is Outcome.DIVERGED
+    assert not rollout.success
     # What the guard is for: after MuJoCo's reset the object stands where it began.
     assert test._motion()[0] < 0.05
 
 
-def test_the_next_grasp_is_judged_afresh() -> None:
+def test_the_next_grasp_is_validated_afresh() -> None:
     test = Exploding(build(PADS, BOX, WHOLE, MujocoOptions()))
-    test.certificate(grasp_of(), 0)
+    test.standard(grasp_of(), 0)
     assert void(test.data)
     Test._start(test, grasp_of(), 0)
     assert not void(test.data)
@@ -52,7 +52,7 @@ def test_a_screen_that_blew_up_asks_the_certificate(monkeypatch: pytest.MonkeyPa
             self.data.qvel[0] = np.inf
 
     monkeypatch.setattr(Test, "_push", poisoned)
-    assert judge(PADS, BOX, grasp_of(), level="screen", pieces=WHOLE).success.tolist() == [1]
+    assert validate(PADS, BOX, grasp_of(), level="fast", pieces=WHOLE).success.tolist() == [1]
 
 
 def test_a_displacement_that_is_no_number_is_told_as_none(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -68,5 +68,5 @@ def test_a_displacement_that_is_no_number_is_told_as_none(monkeypatch: pytest.Mo
 
 def test_warnings_leave_no_file_in_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    Exploding(build(PADS, BOX, WHOLE, MujocoOptions())).certificate(grasp_of(), 0)
+    Exploding(build(PADS, BOX, WHOLE, MujocoOptions())).standard(grasp_of(), 0)
     assert list(tmp_path.iterdir()) == []

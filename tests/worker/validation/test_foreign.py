@@ -1,4 +1,4 @@
-"""Grasps judged in another model of their hand: what moves with the model, and what stays with the grasp."""
+"""Grasps validated in another model of their hand: what moves with the model, and what stays with the grasp."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from graspd.studies.evaluation import combine, evaluate
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import Drag, HandModel
 from graspd.worker.hands.same_hand import same_hand
-from graspd.worker.run import Run
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.foreign import driven_as, in_other_model, with_our_shapes, with_their_shapes
 from graspd.worker.validation.key import verdict_key
@@ -73,10 +73,10 @@ def test_the_key_of_a_hand_without_tendons_is_the_one_it_had(tmp_path: Path) -> 
     hand = load(root="palm")
     pieces = decompose(BOX, cache=tmp_path)
     separate = dataclasses.replace(hand, tendons=())
-    keys = {verdict_key(one, BOX, "certificate", False, pieces=pieces) for one in (hand, separate)}
+    keys = {verdict_key(one, BOX, "standard", False, pieces=pieces) for one in (hand, separate)}
     assert len(keys) == 2
     dragged = dataclasses.replace(separate, drag=Drag(np.zeros(hand.bodies), np.zeros(hand.bodies)))
-    assert verdict_key(dragged, BOX, "certificate", False, pieces=pieces) not in keys
+    assert verdict_key(dragged, BOX, "standard", False, pieces=pieces) not in keys
 
 
 def test_a_drive_stays_what_it_is_whether_joints_follow_it_or_hang_on_a_tendon() -> None:
@@ -93,11 +93,11 @@ def test_a_drive_stays_what_it_is_whether_joints_follow_it_or_hang_on_a_tendon()
 
 
 def test_the_first_judge_leaves_hands_with_tendons_to_the_cpu() -> None:
-    assert first_terms(load(root="palm"), "certificate", Run(first_judge="on")) == []
+    assert first_terms(load(root="palm"), "standard", ExecutionContext(prefilter="on")) == []
 
 
 def test_the_same_model_gives_the_same_verdicts(tmp_path: Path) -> None:
-    row = evaluate(plates_case(), judge_hand=same_hand(HAND, HAND), cache=tmp_path)
+    row = evaluate(plates_case(), validation_hand=same_hand(HAND, HAND), cache=tmp_path)
     assert row["foreign_held"] == {"both": 2, "nominal": 0, "foreign": 0, "neither": 1}
     assert (row["agreement"], row["foreign_share"], row["fingertips_mm"]) == (1.0, 1.0, pytest.approx(0.0, abs=1e-6))
     assert [one["held_foreign"] for one in row["verdicts"]] == [True, True, False]
@@ -115,17 +115,17 @@ def test_a_model_with_other_pads_says_otherwise_and_shapes_are_told_to_be_why(tm
     )
     other = dataclasses.replace(HAND, name="shorter", pieces=shorter)
     same = same_hand(HAND, other)
-    row = evaluate(plates_case(), judge_hand=same, cache=tmp_path)
+    row = evaluate(plates_case(), validation_hand=same, cache=tmp_path)
     assert row["foreign_held"] == {"both": 0, "nominal": 2, "foreign": 0, "neither": 1}
     assert (row["foreign_share"], row["agreement"]) == (0.0, pytest.approx(1 / 3))
     ours_in_theirs = dataclasses.replace(same, theirs=with_our_shapes(same))
-    assert evaluate(plates_case(), judge_hand=ours_in_theirs, cache=tmp_path)["foreign_share"] == 1.0
+    assert evaluate(plates_case(), validation_hand=ours_in_theirs, cache=tmp_path)["foreign_share"] == 1.0
     theirs_in_ours = dataclasses.replace(same, theirs=with_their_shapes(same))
-    assert evaluate(plates_case(), judge_hand=theirs_in_ours, cache=tmp_path)["foreign_share"] == 0.0
+    assert evaluate(plates_case(), validation_hand=theirs_in_ours, cache=tmp_path)["foreign_share"] == 0.0
 
 
 def test_rows_add_up_by_their_grasps(tmp_path: Path) -> None:
-    row = evaluate(plates_case(), judge_hand=same_hand(HAND, HAND), cache=tmp_path)
+    row = evaluate(plates_case(), validation_hand=same_hand(HAND, HAND), cache=tmp_path)
     lost = {**row, "foreign_held": {"both": 0, "nominal": 1, "foreign": 1, "neither": 0}, "fingertips_mm": 0.4}
     whole = combine([row, lost])
     assert whole["foreign_held"] == {"both": 2, "nominal": 1, "foreign": 1, "neither": 1}

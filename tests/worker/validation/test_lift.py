@@ -11,8 +11,8 @@ import trimesh
 from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import quat_multiply, quat_rotate
 from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.simulation.environment import Neighbour, Obstacle, Placed
 from graspd.worker.simulation.obstacles import obstacle_distances
-from graspd.worker.simulation.surroundings import Neighbour, Obstacle, Placed
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import RISING, RISING_S, Lift, LiftOutcome
 from graspd.worker.validation.lifting import lift_key
@@ -46,17 +46,17 @@ def lift_test(physics: MujocoOptions | None = None) -> Lift:
     return Lift(build(HAND, BOX, WHOLE, physics or MujocoOptions(), PLACED.supports), PLACED)
 
 
-@pytest.mark.parametrize("level", ["letter", "lift"])
+@pytest.mark.parametrize("level", ["dexgraspbench", "lift"])
 def test_a_firm_squeeze_lifts_the_box(level: str) -> None:
-    trial = getattr(lift_test(), level)(grasp(0.05), 0)
-    assert trial.outcome is LiftOutcome.LIFTED
-    assert trial.margin < 0.5
+    rollout = getattr(lift_test(), level)(grasp(0.05), 0)
+    assert rollout.outcome is LiftOutcome.LIFTED
+    assert rollout.margin < 0.5
 
 
-@pytest.mark.parametrize("level", ["letter", "lift"])
+@pytest.mark.parametrize("level", ["dexgraspbench", "lift"])
 def test_without_a_squeeze_the_box_stays(level: str) -> None:
-    trial = getattr(lift_test(), level)(grasp(-0.005), 0)
-    assert trial.outcome is LiftOutcome.NOT_LIFTED
+    rollout = getattr(lift_test(), level)(grasp(-0.005), 0)
+    assert rollout.outcome is LiftOutcome.NOT_LIFTED
 
 
 def test_glue_lifts_what_the_same_squeeze_does_not_hold() -> None:
@@ -105,7 +105,7 @@ def test_fingertips_press_into_the_table_as_deep_as_it_says_and_no_deeper(tips_m
 
 
 def test_the_letter_does_not_look_at_the_way() -> None:
-    assert lift_test().letter(grasp(0.05, np.array([1.0, 0, 0])), 0).outcome is LiftOutcome.LIFTED
+    assert lift_test().dexgraspbench(grasp(0.05, np.array([1.0, 0, 0])), 0).outcome is LiftOutcome.LIFTED
 
 
 def test_two_lifts_of_one_grasp_say_the_same() -> None:
@@ -149,9 +149,9 @@ def beside(place: tuple[float, float], size: tuple[float, float, float], mass: f
 
 
 def test_a_neighbour_that_stands_aside_changes_nothing() -> None:
-    trial = beside((0.0, 0.3), (0.05, 0.05, 0.1)).lift(grasp(0.05), 0)
-    assert trial.outcome is LiftOutcome.LIFTED
-    assert trial.margin == pytest.approx(lift_test().lift(grasp(0.05), 0).margin, abs=0.02)
+    rollout = beside((0.0, 0.3), (0.05, 0.05, 0.1)).lift(grasp(0.05), 0)
+    assert rollout.outcome is LiftOutcome.LIFTED
+    assert rollout.margin == pytest.approx(lift_test().lift(grasp(0.05), 0).margin, abs=0.02)
 
 
 def test_a_hand_that_comes_through_a_neighbour_has_touched_it() -> None:

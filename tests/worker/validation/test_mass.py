@@ -19,10 +19,10 @@ from graspd.service.store.shards import read_shard
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.objects.options import as_asked
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.simulation.surroundings import Obstacle, Placed
+from graspd.worker.simulation.environment import Obstacle, Placed
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.key import verdict_key
-from graspd.worker.validation.lifting import judge_lifts
+from graspd.worker.validation.lifting import validate_lifts
 from graspd.worker.validation.payload import AMPLITUDE_M, FREQUENCY_HZ, payloads, shake_margins
 from tests.worker.models import object_from_mesh, two_finger_hand
 
@@ -86,24 +86,24 @@ def test_a_lift_has_the_mass_and_the_friction_of_the_object() -> None:
         (1.2 * bears, 1.5 * FRICTION, 1),
     ):
         obj = BOX.weighing(mass=mass, friction=friction)
-        assert judge_lifts(HAND, obj, pinch(), TABLE, pieces=PIECES).success.tolist() == [lifted], (mass, friction)
+        assert validate_lifts(HAND, obj, pinch(), TABLE, pieces=PIECES).success.tolist() == [lifted], (mass, friction)
 
 
 def test_verdicts_of_other_masses_have_other_keys() -> None:
     objects = [BOX, BOX.weighing(mass=0.5), BOX.weighing(friction=0.5), BOX.weighing(mass=0.5).published]
-    keys = [verdict_key(HAND, obj, "certificate", False, pieces=PIECES) for obj in objects]
+    keys = [verdict_key(HAND, obj, "standard", False, pieces=PIECES) for obj in objects]
     assert len(set(keys)) == 3 and keys[0] == keys[3]
 
 
 def test_the_letter_has_the_mass_of_the_protocol() -> None:
     obj = BOX.weighing(mass=0.7, friction=0.4)
-    published = as_asked(obj, JobOptions(referee="letter"))
+    published = as_asked(obj, JobOptions(validation="dexgraspbench"))
     assert (published.mass, published.friction) == (MASS_KG, FRICTION)
     assert as_asked(obj, JobOptions()).mass == 0.7
     asked = as_asked(obj, JobOptions(density=500.0, object_friction=0.8))
     assert (asked.mass, asked.friction) == (pytest.approx(500 * BOX.volume), 0.8)
     with pytest.raises(ValueError, match="letter is DexGraspBench's protocol"):
-        JobOptions(referee="letter", mass=0.5)
+        JobOptions(validation="dexgraspbench", mass=0.5)
 
 
 def test_what_is_said_with_a_job_goes_over_what_the_file_says() -> None:

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from graspd.exchange.cases import load_case
+from graspd.exchange.inputs import load_case
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.validator import validate
 
 THUMB = ("joint_12.0", "joint_13.0", "joint_14.0", "joint_15.0")
 
@@ -25,7 +25,7 @@ def test_a_published_grasp_without_its_thumb_is_refused_with_a_reason(shared_dat
         return Posture(posture.hand_pose, np.where(thumb, away, posture.joint_positions))
 
     without = GraspSet(opened(some.grasp), opened(some.pregrasp), opened(some.squeeze), some.stability_loss)
-    whole, found = (judge(case.hand, case.obj, grasps) for grasps in (some, without))
+    whole, found = (validate(case.hand, case.obj, grasps) for grasps in (some, without))
     assert whole.success.all() and not found.success.any()
     assert all(reason.startswith(("rotated", "displaced", "lost")) for reason in found.reasons)
 
@@ -39,5 +39,5 @@ def test_an_object_that_lies_in_the_open_palm_is_pushed_out_of_it() -> None:
     below = np.array([*obj.centre_of_mass[:2], obj.vertices[:, 2].min() - 0.001])
     pose = np.array([[*(below - rotation @ hand.palm.centre), *turn]])
     flat = Posture(pose, hand.expand(np.clip(np.zeros(hand.dofs), hand.lower, hand.upper)[None]))
-    found = judge(hand, obj, GraspSet(flat, flat, flat, np.full(1, np.nan)))
+    found = validate(hand, obj, GraspSet(flat, flat, flat, np.full(1, np.nan)))
     assert not found.success.any() and found.reasons[0] != "penetration"

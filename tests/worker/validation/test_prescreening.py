@@ -7,7 +7,7 @@ import pytest
 
 from graspd.service.model.matter import ACCELERATION
 from graspd.worker.grasps import GraspSet, joined
-from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.simulation.environment import Placed
 from graspd.worker.validation.prescreening import (
     DEEP,
     GONE,
@@ -17,8 +17,8 @@ from graspd.worker.validation.prescreening import (
     PULL,
     PUSHED,
     SLIPS,
-    ShortLifts,
-    push_trial,
+    LiftRollouts,
+    push_rollout,
 )
 from graspd.worker.validation.protocol import MAX_DISPLACEMENT_M, STAGE_S
 from tests.worker.validation.test_lift import BOX, HAND, PLACED, WHOLE, grasp
@@ -33,7 +33,7 @@ LEAST_AT_HALF = 2 * HANGS * NEWTON
 def scores(*squeezes: float, threads: int = 1) -> np.ndarray:
     placed = Placed(PLACED.supports, PLACED.object_pose, np.zeros(len(squeezes), int))
     grasps: GraspSet = joined([grasp(squeeze) for squeeze in squeezes])
-    return ShortLifts(HAND, BOX, lambda: WHOLE, threads=threads).scores(grasps, placed)
+    return LiftRollouts(HAND, BOX, lambda: WHOLE, threads=threads).scores(grasps, placed)
 
 
 def fallen() -> float:
@@ -59,7 +59,7 @@ def test_what_holds_at_half_the_friction_needs_twice_the_squeeze_for_its_pull() 
 def test_what_must_hold_at_half_the_friction_to_be_better_is_not_asked_of_the_whole() -> None:
     placed = Placed(PLACED.supports, PLACED.object_pose, np.zeros(3, int))
     grasps = joined([grasp(squeeze) for squeeze in (1.1 * LEAST, 2.4 * LEAST, 1.1 * LEAST)])
-    found = ShortLifts(HAND, BOX, lambda: WHOLE).scores(grasps, placed, np.array([1.5, 1.5, np.inf]))
+    found = LiftRollouts(HAND, BOX, lambda: WHOLE).scores(grasps, placed, np.array([1.5, 1.5, np.inf]))
     assert found[0] == 1.5
     assert found[1] < 0.05
     assert SLIPS <= found[2] < SLIPS + 0.05
@@ -69,7 +69,7 @@ def test_pads_that_start_in_the_box_are_no_candidates() -> None:
     deep = grasp(0.05)
     deep.pregrasp.joint_positions[:] += 0.02
     placed = Placed(PLACED.supports, PLACED.object_pose, np.zeros(1, int))
-    assert ShortLifts(HAND, BOX, lambda: WHOLE).scores(deep, placed) == [DEEP]
+    assert LiftRollouts(HAND, BOX, lambda: WHOLE).scores(deep, placed) == [DEEP]
 
 
 def test_threads_and_the_other_grasps_change_no_score() -> None:
@@ -84,7 +84,7 @@ ACROSS = float(np.sqrt(2.0 / 3.0))
 
 def pushed(*squeezes: float, threads: int = 1) -> np.ndarray:
     grasps: GraspSet = joined([grasp(squeeze) for squeeze in squeezes])
-    return push_trial(HAND, BOX, lambda: WHOLE, threads=threads)(grasps, None)
+    return push_rollout(HAND, BOX, lambda: WHOLE, threads=threads)(grasps, None)
 
 
 def test_a_free_box_is_pushed_away_the_less_the_firmer_it_is_held() -> None:
@@ -110,7 +110,7 @@ def test_a_free_box_that_nothing_holds_flies_as_far_as_the_push_takes_it() -> No
 def test_pads_that_start_in_a_free_box_are_no_candidates() -> None:
     deep = grasp(0.05)
     deep.pregrasp.joint_positions[:] += 0.02
-    assert push_trial(HAND, BOX, lambda: WHOLE)(deep, None) == [DEEP]
+    assert push_rollout(HAND, BOX, lambda: WHOLE)(deep, None) == [DEEP]
 
 
 def test_threads_and_the_other_grasps_change_no_score_of_a_push() -> None:

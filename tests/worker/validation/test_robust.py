@@ -11,13 +11,13 @@ import trimesh
 from graspd.service.model.errors import TaskCancelled
 from graspd.service.model.metrics import Axis
 from graspd.worker.control.postures import pregrasp, squeeze
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
-from graspd.worker.run import Run
 from graspd.worker.validation import robust as robustness
 from graspd.worker.validation.decomposition import ConvexPieces
-from graspd.worker.validation.protocol import Outcome, Trial
+from graspd.worker.validation.protocol import Outcome, Rollout
 from graspd.worker.validation.robust import Robustness, models_of, needed, robust
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.validator import validate
 from graspd.worker.validation.variant import NOMINAL, Variant, axes_of
 from graspd.worker.validation.varied import Models
 from tests.worker.models import object_from_mesh
@@ -37,20 +37,20 @@ def many_grasps(count: int = 8) -> GraspSet:
 def by_luck(monkeypatch: pytest.MonkeyPatch, odds: float = 0.7) -> None:
     """Verdicts that follow from the grasp and the variant as a coin does."""
 
-    def certificate(self: Models, grasps: GraspSet, row: int, variant: Variant) -> Trial:
+    def standard(self: Models, grasps: GraspSet, row: int, variant: Variant) -> Rollout:
         words = np.frombuffer(repr((variant, grasps.grasp.hand_pose[row].tolist())).encode(), np.uint8)
         if np.random.default_rng(words.tolist()).random() < odds:
-            return Trial([Outcome.HELD] * 6)
-        return Trial().fail(Outcome.DISPLACED)
+            return Rollout([Outcome.HELD] * 6)
+        return Rollout().fail(Outcome.DISPLACED)
 
-    monkeypatch.setattr(Models, "certificate", certificate)
+    monkeypatch.setattr(Models, "standard", standard)
 
 
 def test_in_models_that_are_all_the_same_a_grasp_holds_in_all_or_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(robustness, "draw", lambda axis, hand, rng: NOMINAL)
     grasps = many_grasps()
     found = robust(PADS, BOX, grasps, models=3, pieces=WHOLE)
-    verdicts = judge(PADS, BOX, grasps, pieces=WHOLE)
+    verdicts = validate(PADS, BOX, grasps, pieces=WHOLE)
     assert found.share.tolist() == verdicts.success.tolist()
     assert {0.0, 1.0} == set(found.share)
     assert ((found.weakest == Axis.NONE) == (verdicts.success == 1)).all()
@@ -78,12 +78,12 @@ def test_judging_that_ends_early_says_of_the_wanted_share_what_all_models_say(
     # What is told of a share is a bound on its right side.
     assert (early.share[reached] <= whole.share[reached]).all()
     assert (early.share[~reached] >= whole.share[~reached]).all()
-    judged = early.held >= 0
-    assert (early.held[judged] == whole.held[judged]).all()
-    assert models == 1 or judged.sum() < whole.held.size
+    validated = early.held >= 0
+    assert (early.held[validated] == whole.held[validated]).all()
+    assert models == 1 or validated.sum() < whole.held.size
 
 
-def test_no_model_is_judged_after_the_share_is_sure(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_model_is_validated_after_the_share_is_sure(monkeypatch: pytest.MonkeyPatch) -> None:
     by_luck(monkeypatch, odds=0.0)
     found = robust(PADS, BOX, many_grasps(), models=8, wanted=0.9, pieces=WHOLE)
     assert ((found.held >= 0).sum(axis=1) == 1).all()
@@ -128,4 +128,4 @@ def test_eight_models_of_a_hand_without_couplings_have_each_axis_once() -> None:
 
 def test_it_stops_when_it_is_told_to() -> None:
     with pytest.raises(TaskCancelled):
-        robust(PADS, BOX, many_grasps(), pieces=WHOLE, run=Run(cancelled=lambda: True))
+        robust(PADS, BOX, many_grasps(), pieces=WHOLE, run=ExecutionContext(cancelled=lambda: True))

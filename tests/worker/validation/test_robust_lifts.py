@@ -11,9 +11,9 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.metrics import Axis
 from graspd.service.model.transforms import quat_from_axis_angle, quat_rotate
 from graspd.worker.grasps import GraspSet, joined
-from graspd.worker.simulation.surroundings import Placed
-from graspd.worker.validation.lift import LiftOutcome, LiftTrial
-from graspd.worker.validation.lifting import judge_lifts
+from graspd.worker.simulation.environment import Placed
+from graspd.worker.validation.lift import LiftOutcome, LiftTest
+from graspd.worker.validation.lifting import validate_lifts
 from graspd.worker.validation.model import FRICTION, HARD, MujocoOptions
 from graspd.worker.validation.protocol import STAGES
 from graspd.worker.validation.robust import robust
@@ -34,20 +34,22 @@ def models(friction: tuple[float, float] = FRICTION) -> Models:
 def by_luck(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lifts that succeed as a coin falls that follows from the grasp and the variant."""
 
-    def lift(self: Models, grasps: GraspSet, row: int, placed: Placed, variant: Variant, **_: object) -> LiftTrial:
+    def lift(self: Models, grasps: GraspSet, row: int, placed: Placed, variant: Variant, **_: object) -> LiftTest:
         words = np.frombuffer(repr((variant, grasps.squeeze.joint_positions[row].tolist())).encode(), np.uint8)
         lifted = np.random.default_rng(words.tolist()).random() < 0.7
-        return LiftTrial(LiftOutcome.LIFTED if lifted else LiftOutcome.NOT_LIFTED)
+        return LiftTest(LiftOutcome.LIFTED if lifted else LiftOutcome.NOT_LIFTED)
 
     monkeypatch.setattr(Models, "lift", lift)
 
 
-@pytest.mark.parametrize("level", ["letter", "lift"])
+@pytest.mark.parametrize("level", ["dexgraspbench", "lift"])
 def test_the_nominal_model_has_the_verdicts_of_the_lift_test_bit_for_bit(level: str) -> None:
-    verdicts = judge_lifts(HAND, BOX, MANY, WHERE, level=level, pieces=WHOLE)  # type: ignore[arg-type]
-    found = [models().lift(MANY, row, WHERE, NOMINAL, letter=level == "letter") for row in range(len(MANY))]
-    assert [trial.outcome for trial in found] == verdicts.outcome.tolist()
-    assert [trial.margin for trial in found] == verdicts.margin.tolist()
+    verdicts = validate_lifts(HAND, BOX, MANY, WHERE, level=level, pieces=WHOLE)  # type: ignore[arg-type]
+    found = [
+        models().lift(MANY, row, WHERE, NOMINAL, dexgraspbench=level == "dexgraspbench") for row in range(len(MANY))
+    ]
+    assert [rollout.outcome for rollout in found] == verdicts.outcome.tolist()
+    assert [rollout.margin for rollout in found] == verdicts.margin.tolist()
     assert {0, 1} == set(verdicts.success.tolist())
 
 
@@ -55,17 +57,17 @@ def test_half_the_friction_is_the_hard_lift() -> None:
     # The hard protocol takes a tenth of the torsional coefficient where the axis keeps the two in proportion.
     around = models((FRICTION[0], FRICTION[1] * HARD[1] / HARD[0]))
     found = [around.lift(MANY, row, WHERE, Variant(friction=HARD[0])) for row in range(len(MANY))]
-    hard = judge_lifts(HAND, BOX, MANY, WHERE, hard=True, pieces=WHOLE)
-    assert [trial.outcome for trial in found] == hard.outcome.tolist()
-    assert [trial.margin for trial in found] == hard.margin.tolist()
-    plain = judge_lifts(HAND, BOX, MANY, WHERE, pieces=WHOLE)
+    hard = validate_lifts(HAND, BOX, MANY, WHERE, hard=True, pieces=WHOLE)
+    assert [rollout.outcome for rollout in found] == hard.outcome.tolist()
+    assert [rollout.margin for rollout in found] == hard.margin.tolist()
+    plain = validate_lifts(HAND, BOX, MANY, WHERE, pieces=WHOLE)
     assert 0 < hard.success.sum() < plain.success.sum()
 
 
 def test_only_what_lifts_is_asked_and_the_first_eight_of_sixteen_models_are_those_of_eight() -> None:
     few = MANY.take(np.array([0, 3]))
     where = WHERE.take(slice(0, 2))
-    held = judge_lifts(HAND, BOX, few, where, pieces=WHOLE).success
+    held = validate_lifts(HAND, BOX, few, where, pieces=WHOLE).success
     assert held.tolist() == [0, 1]
     sixteen, eight = (robust(HAND, BOX, few, held=held, placed=where, models=k, pieces=WHOLE, seed=2) for k in (16, 8))
     assert np.array_equal(sixteen.held[:, :8], eight.held) and np.array_equal(sixteen.axis[:, :8], eight.axis)
@@ -80,9 +82,9 @@ def test_lifts_that_end_early_say_of_the_wanted_share_what_all_of_them_say(
     by_luck(monkeypatch)
     whole, early = (robust(HAND, BOX, MANY, placed=WHERE, pieces=WHOLE, wanted=one) for one in (0.0, wanted))
     assert ((early.share >= wanted - 1e-9) == (whole.share >= wanted - 1e-9)).all()
-    judged = early.held >= 0
-    assert (early.held[judged] == whole.held[judged]).all()
-    assert judged.sum() < whole.held.size
+    validated = early.held >= 0
+    assert (early.held[validated] == whole.held[validated]).all()
+    assert validated.sum() < whole.held.size
 
 
 def test_a_heavier_object_weighs_more_and_takes_more_to_lift() -> None:

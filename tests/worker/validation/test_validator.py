@@ -1,4 +1,4 @@
-"""The referee: what any engine must say of simple grasps, and that its levels say the same."""
+"""The validator: what any engine must say of simple grasps, and that its levels say the same."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from graspd.service.model.errors import InputError, MeshError, TaskCancelled
 from graspd.service.model.matter import MASS_KG
 from graspd.worker.control import postures
 from graspd.worker.control.postures import pregrasp, squeeze
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.convex import union_volume
-from graspd.worker.run import Run
 from graspd.worker.validation import model, protocol
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.key import LEVEL_MOVES, MOVES, Level, verdict_key
 from graspd.worker.validation.model import MujocoOptions, blend, build
 from graspd.worker.validation.protocol import Outcome, Test
 from graspd.worker.validation.robust import robustness
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.validator import validate
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.quality.helpers import pad_hand, plate_hand, posture
 
@@ -54,7 +54,7 @@ def many_grasps() -> GraspSet:
 
 
 def test_a_box_between_pressing_pads_is_held() -> None:
-    verdict = judge(PADS, BOX, grasp_of(), level="letter", pieces=WHOLE)
+    verdict = validate(PADS, BOX, grasp_of(), level="dexgraspbench", pieces=WHOLE)
     assert verdict.reasons == ["held"]
     assert verdict.success.tolist() == [1]
     assert (verdict.outcome == Outcome.HELD).all()
@@ -63,19 +63,19 @@ def test_a_box_between_pressing_pads_is_held() -> None:
 def test_the_same_box_slips_at_friction_0_04() -> None:
     # Two pads of 10 N give 0.8 N of friction against a push of 1 N across; along their normals they need none.
     scene = build(PADS, BOX, WHOLE, MujocoOptions(friction=(0.04, 0.001)))
-    trial = Test(scene).letter(grasp_of(), 0)
-    assert trial.outcomes[:3] == [Outcome.HELD, Outcome.HELD, Outcome.DISPLACED]
+    rollout = Test(scene).dexgraspbench(grasp_of(), 0)
+    assert rollout.outcomes[:3] == [Outcome.HELD, Outcome.HELD, Outcome.DISPLACED]
 
 
 def test_the_same_box_holds_at_friction_0_06() -> None:
     # 1.2 N of friction against 1 N.
     scene = build(PADS, BOX, WHOLE, MujocoOptions(friction=(0.06, 0.001)))
-    assert Test(scene).letter(grasp_of(), 0).success
+    assert Test(scene).dexgraspbench(grasp_of(), 0).success
 
 
 def test_a_free_object_falls() -> None:
     away = posture(((0, 0, -0.5), (0.0, 0.0)))
-    verdict = judge(PADS, BOX, grasp_of(contact=away), pieces=WHOLE)
+    verdict = validate(PADS, BOX, grasp_of(contact=away), pieces=WHOLE)
     assert verdict.reasons == ["displaced under +x"]
 
 
@@ -94,17 +94,17 @@ def test_a_free_object_moves_as_newton_says() -> None:
 def test_a_deep_start_is_refused_as_penetration() -> None:
     deep = posture(((0, 0, 0), (0.08, 0.08)))
     closed = GraspSet(deep, deep, deep, np.full(1, np.nan))
-    verdict = judge(PADS, BOX, closed, pieces=WHOLE)
+    verdict = validate(PADS, BOX, closed, pieces=WHOLE)
     assert verdict.reasons == ["penetration"]
     assert verdict.penetration_depth_mm[0] > 10
 
 
-@pytest.mark.parametrize("level", ["letter", "certificate", "screen"])
+@pytest.mark.parametrize("level", ["dexgraspbench", "standard", "fast"])
 def test_penetration_counts_at_the_pregrasp_where_the_simulation_starts(level: str) -> None:
     deep, clear = posture(((0, 0, 0), (0.08, 0.08))), posture(((0, 0, 0), (0.06, 0.06)))
     from_outside = GraspSet(deep, clear, deep, np.full(1, np.nan))
     from_inside = GraspSet(clear, deep, clear, np.full(1, np.nan))
-    verdicts = [judge(PADS, BOX, g, level=level, pieces=WHOLE) for g in (from_outside, from_inside)]
+    verdicts = [validate(PADS, BOX, g, level=level, pieces=WHOLE) for g in (from_outside, from_inside)]
     assert verdicts[0].penetration_depth_mm[0] > 10
     assert [v.reasons for v in verdicts] == [["held"], ["penetration"]]
 
@@ -155,7 +155,7 @@ def test_the_root_turns_at_an_even_rate_between_two_postures() -> None:
 
 def test_penetration_depth_is_that_of_the_pressed_pads() -> None:
     pressed = posture(((0, 0, 0), (0.068, 0.067)))
-    verdict = judge(PADS, BOX, grasp_of(contact=pressed), pieces=WHOLE)
+    verdict = validate(PADS, BOX, grasp_of(contact=pressed), pieces=WHOLE)
     assert verdict.penetration_depth_mm[0] == pytest.approx(3.0, abs=0.01)
 
 
@@ -177,25 +177,25 @@ def test_a_push_from_the_saved_state_is_a_push_after_closing_anew() -> None:
     assert np.array_equal(*ends)
 
 
-@pytest.mark.parametrize("level", ["certificate", "screen"])
+@pytest.mark.parametrize("level", ["standard", "fast"])
 def test_cheaper_levels_say_what_the_letter_says(level: str) -> None:
     grasps = many_grasps()
-    letter = judge(PADS, BOX, grasps, level="letter", pieces=WHOLE)
-    cheap = judge(PADS, BOX, grasps, level=level, pieces=WHOLE)
-    assert 0 < letter.success.sum() < len(grasps), "the set must hold both kinds"
-    assert cheap.success.tolist() == letter.success.tolist()
-    assert cheap.steps < 0.5 * letter.steps
+    dexgraspbench = validate(PADS, BOX, grasps, level="dexgraspbench", pieces=WHOLE)
+    cheap = validate(PADS, BOX, grasps, level=level, pieces=WHOLE)
+    assert 0 < dexgraspbench.success.sum() < len(grasps), "the set must hold both kinds"
+    assert cheap.success.tolist() == dexgraspbench.success.tolist()
+    assert cheap.steps < 0.5 * dexgraspbench.steps
 
 
 def test_hard_holds_no_more_than_normal() -> None:
     grasps = many_grasps()
-    normal, hard = (judge(PADS, BOX, grasps, hard=h, pieces=WHOLE) for h in (False, True))
+    normal, hard = (validate(PADS, BOX, grasps, hard=h, pieces=WHOLE) for h in (False, True))
     assert (hard.success <= normal.success).all()
     assert normal.key != hard.key
 
 
 def test_verdicts_do_not_depend_on_threads() -> None:
-    one, two = (judge(PADS, BOX, many_grasps(), pieces=WHOLE, run=Run(threads=n)) for n in (1, 2))
+    one, two = (validate(PADS, BOX, many_grasps(), pieces=WHOLE, run=ExecutionContext(threads=n)) for n in (1, 2))
     assert np.array_equal(one.margin, two.margin)
     assert one.key == two.key
 
@@ -212,54 +212,54 @@ def test_progress_is_told_by_one_thread_at_a_time_and_counts_every_grasp() -> No
         time.sleep(0.02)  # long enough for another thread to come in, if it may
         alone.release()
 
-    judge(PADS, BOX, many_grasps(), level="screen", pieces=WHOLE, run=Run(threads=4, progress=progress))
+    validate(PADS, BOX, many_grasps(), level="fast", pieces=WHOLE, run=ExecutionContext(threads=4, progress=progress))
     assert overlaps == 0
     assert told == list(range(1, len(many_grasps()) + 1))
 
 
 def test_everything_that_moves_a_verdict_is_in_its_key() -> None:
     grasps = grasp_of()
-    keys = {judge(PADS, BOX, grasps, pieces=WHOLE).key}
-    keys.add(judge(PADS, BOX, grasp_of(force=10.0), pieces=WHOLE).key)
-    keys.add(judge(dataclasses.replace(PADS, stiffness=np.full(2, 90.0)), BOX, grasps, pieces=WHOLE).key)
-    keys.add(judge(PADS, BOX, grasps, pieces=dataclasses.replace(WHOLE, digest="other")).key)
-    keys.add(judge(PADS, BOX, grasps, level="letter", pieces=WHOLE).key)
+    keys = {validate(PADS, BOX, grasps, pieces=WHOLE).key}
+    keys.add(validate(PADS, BOX, grasp_of(force=10.0), pieces=WHOLE).key)
+    keys.add(validate(dataclasses.replace(PADS, stiffness=np.full(2, 90.0)), BOX, grasps, pieces=WHOLE).key)
+    keys.add(validate(PADS, BOX, grasps, pieces=dataclasses.replace(WHOLE, digest="other")).key)
+    keys.add(validate(PADS, BOX, grasps, level="dexgraspbench", pieces=WHOLE).key)
     assert len(keys) == 5
 
 
 def test_terms_do_not_depend_on_the_grasps_and_follow_everything_else(monkeypatch: pytest.MonkeyPatch) -> None:
-    terms = verdict_key(PADS, BOX, "letter", False, pieces=WHOLE)
-    assert judge(PADS, BOX, grasp_of(force=10.0), level="letter", pieces=WHOLE).terms == terms
+    terms = verdict_key(PADS, BOX, "dexgraspbench", False, pieces=WHOLE)
+    assert validate(PADS, BOX, grasp_of(force=10.0), level="dexgraspbench", pieces=WHOLE).terms == terms
     heavier = dataclasses.replace(PADS, masses=PADS.masses * 2)
     found = {
         terms,
-        verdict_key(PADS, BOX, "letter", True, pieces=WHOLE),
-        verdict_key(PADS, BOX, "screen", False, pieces=WHOLE),
-        verdict_key(heavier, BOX, "letter", False, pieces=WHOLE),
-        verdict_key(PADS, BOX, "letter", False, pieces=dataclasses.replace(WHOLE, digest="other")),
+        verdict_key(PADS, BOX, "dexgraspbench", True, pieces=WHOLE),
+        verdict_key(PADS, BOX, "fast", False, pieces=WHOLE),
+        verdict_key(heavier, BOX, "dexgraspbench", False, pieces=WHOLE),
+        verdict_key(PADS, BOX, "dexgraspbench", False, pieces=dataclasses.replace(WHOLE, digest="other")),
     }
-    for constant in ("postures.TOTAL_NORMAL_FORCE", "referee.protocol.HOLD_S", "referee.model.FRICTION"):
+    for constant in ("postures.TOTAL_NORMAL_FORCE", "validator.protocol.HOLD_S", "validator.model.FRICTION"):
         with monkeypatch.context() as patch:
             patch.setattr(f"graspd.worker.quality.{constant}", 1.5)
-            found.add(verdict_key(PADS, BOX, "letter", False, pieces=WHOLE))
+            found.add(verdict_key(PADS, BOX, "dexgraspbench", False, pieces=WHOLE))
     assert len(found) == 8
 
 
 def test_a_constant_that_moves_no_verdict_moves_no_key(monkeypatch: pytest.MonkeyPatch) -> None:
-    terms = verdict_key(PADS, BOX, "letter", False, pieces=WHOLE)
+    terms = verdict_key(PADS, BOX, "dexgraspbench", False, pieces=WHOLE)
     monkeypatch.setattr(protocol, "UNRELATED", 7, raising=False)
     monkeypatch.setattr(postures, "ROOM_M", 5)
-    assert verdict_key(PADS, BOX, "letter", False, pieces=WHOLE) == terms
+    assert verdict_key(PADS, BOX, "dexgraspbench", False, pieces=WHOLE) == terms
 
 
 def test_a_constant_of_one_level_moves_the_key_of_that_level_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    levels: tuple[Level, ...] = ("letter", "certificate", "screen")
+    levels: tuple[Level, ...] = ("dexgraspbench", "standard", "fast")
 
     def terms() -> list[str]:
         return [verdict_key(PADS, BOX, level, False, pieces=WHOLE) for level in levels]
 
     before = terms()
-    monkeypatch.setattr(protocol, "SCREEN_BAND", (0.2, 4.0))
+    monkeypatch.setattr(protocol, "FAST_BAND", (0.2, 4.0))
     assert [a == b for a, b in zip(before, terms(), strict=True)] == [True, True, False]
 
 
@@ -271,7 +271,7 @@ def test_every_constant_of_the_protocol_is_said_to_move_verdicts_or_not_to() -> 
     still |= {"protocol.STILL", "protocol.LOST"}
     # Of the choice of grasps.
     still |= {"postures.STANDS_OFF_M"}
-    # Of raised pregrasps, which are among the postures that are judged.
+    # Of raised pregrasps, which are among the postures that are validated.
     still |= {f"postures.{name}" for name in ("RAISE_LOOKS", "RAISE_OPEN_M", "RAISE_CLOSING_M", "HIGHEST_RAISE_M")}
     # Of the object of a verdict, which is in its key, and the bound of what is taken.
     still |= {"matter.MASS_KG", "matter.FRICTION", "matter.MOST_KG"}
@@ -321,10 +321,10 @@ def test_a_verdict_does_not_depend_on_the_origin_of_the_mesh() -> None:
     moved = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05), trimesh.transformations.translation_matrix(away)))
     there = ConvexPieces((moved.hull_vertices,), 1.0, 0.0, "box")
     grasps = many_grasps()
-    here = judge(PADS, BOX, grasps, level="letter", pieces=WHOLE)
+    here = validate(PADS, BOX, grasps, level="dexgraspbench", pieces=WHOLE)
     parts = (grasps.grasp, grasps.pregrasp, grasps.squeeze)
     shifted = [Posture(p.hand_pose + np.append(away, np.zeros(4)), p.joint_positions) for p in parts]
-    found = judge(PADS, moved, GraspSet(*shifted, grasps.stability_loss), level="letter", pieces=there)
+    found = validate(PADS, moved, GraspSet(*shifted, grasps.stability_loss), level="dexgraspbench", pieces=there)
     assert 0 < here.success.sum() < len(grasps)
     np.testing.assert_array_equal(found.success, here.success)
 
@@ -396,13 +396,13 @@ def test_only_grasps_that_held_are_tried_with_noise() -> None:
 
 
 def test_unknown_level_is_refused() -> None:
-    with pytest.raises(InputError, match="letter, certificate, screen"):
-        judge(PADS, BOX, grasp_of(), level="quick", pieces=WHOLE)
+    with pytest.raises(InputError, match="dexgraspbench, standard, fast"):
+        validate(PADS, BOX, grasp_of(), level="quick", pieces=WHOLE)
 
 
-def test_cancelled_referee_stops() -> None:
+def test_cancelled_validator_stops() -> None:
     with pytest.raises(TaskCancelled):
-        judge(PADS, BOX, grasp_of(), pieces=WHOLE, run=Run(cancelled=lambda: True))
+        validate(PADS, BOX, grasp_of(), pieces=WHOLE, run=ExecutionContext(cancelled=lambda: True))
 
 
 def test_convex_object_is_its_own_single_piece(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Variants of the referee's model: what each axis changes in the engine, and nothing else."""
+"""Variants of the validator's model: what each axis changes in the engine, and nothing else."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.model import MujocoOptions
 from graspd.worker.validation.protocol import STAGES, Test
 from graspd.worker.validation.refit import fits_of, grown, refitted
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.validator import validate
 from graspd.worker.validation.variant import NOMINAL, SHAPES, Variant, axes_of, draw
 from graspd.worker.validation.varied import Models, VariantTest, seen
 from tests.worker.models import object_from_mesh, piece, two_finger_hand
@@ -138,10 +138,10 @@ def test_fits_that_change_nothing_are_not_offered() -> None:
 
 def test_the_nominal_variant_has_the_verdicts_of_the_judge_bit_for_bit() -> None:
     grasps = many_grasps()
-    verdicts = judge(PADS, BOX, grasps, pieces=WHOLE)
-    found = [models().certificate(grasps, row, NOMINAL) for row in range(len(grasps))]
-    assert [trial.success for trial in found] == (verdicts.success == 1).tolist()
-    assert [trial.margin for trial in found] == verdicts.margin.tolist()
+    verdicts = validate(PADS, BOX, grasps, pieces=WHOLE)
+    found = [models().standard(grasps, row, NOMINAL) for row in range(len(grasps))]
+    assert [rollout.success for rollout in found] == (verdicts.success == 1).tolist()
+    assert [rollout.margin for rollout in found] == verdicts.margin.tolist()
     assert {True, False} == set((verdicts.success == 1).tolist())
 
 
@@ -241,7 +241,7 @@ def test_less_friction_holds_no_more() -> None:
     grasps = many_grasps(force=6.0)
     around = models(friction=(0.3, 0.01))
     shares = [
-        np.mean([around.certificate(grasps, row, Variant(friction=factor)).success for row in range(len(grasps))])
+        np.mean([around.standard(grasps, row, Variant(friction=factor)).success for row in range(len(grasps))])
         for factor in (0.1, 0.5, 1.0, 3.0)
     ]
     assert shares == sorted(shares)

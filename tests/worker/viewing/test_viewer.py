@@ -63,10 +63,10 @@ SCENE = json_attribute(SceneSpec(kind="bin").model_dump(mode="json"))
 
 @pytest.fixture(scope="module")
 def viewer(block) -> Iterator:
-    from graspd.worker.viewing import Shown, Viewer
+    from graspd.worker.viewing import Viewer, ViewerContent
 
     said = {"hand": "two fingers", "object": "block", "scene": SCENE}
-    made = Viewer(Shown(Shard("base", said, arrays(2)), HAND, block), port=0)
+    made = Viewer(ViewerContent(Shard("base", said, arrays(2)), HAND, block), port=0)
     yield made
     made.close()
 
@@ -208,14 +208,14 @@ def test_the_file_that_is_no_shard_is_one_line(tmp_path: Path):
 
 
 def test_links_above_the_root_are_drawn_at_the_angles_of_the_wrist_of_each_grasp(block) -> None:
-    from graspd.worker.viewing import Shown, Viewer
+    from graspd.worker.viewing import Viewer, ViewerContent
 
     # A copy of the hand behind its root serves as a forearm with two wrist joints.
     forearm, mounted = HAND, replace(HAND, mounting=HAND)
     angles = np.array([[0.0, 0], [0.3, 0.6], [0.9, 0.1]])
     said = {"hand": "two fingers", "object": "block", "scene": SCENE}
     shard = Shard("base", said, arrays(2) | {"grasp/wrist_positions": angles})
-    made = Viewer(Shown(shard, mounted, block), port=0)
+    made = Viewer(ViewerContent(shard, mounted, block), port=0)
     try:
         made.choose("all")
         own = len(drawn_bodies(HAND))
@@ -234,14 +234,14 @@ def test_links_above_the_root_are_drawn_at_the_angles_of_the_wrist_of_each_grasp
 
 
 def test_collision_shapes_take_the_place_of_what_the_hand_looks_like(block) -> None:
-    from graspd.worker.viewing import Shown, Viewer
+    from graspd.worker.viewing import Viewer, ViewerContent
 
     seen = '<visual><geometry><sphere radius="0.03"/></geometry></visual>'
     hand = load_hand(
         {"h.urdf": robot(link("palm", BOX + seen), link("a"), joint("j", "palm", "a"))}, name="h", digest=""
     )
     made = Viewer(
-        Shown(Shard("base", {"hand": "h", "object": "block", "scene": SCENE}, arrays(1)), hand, block), port=0
+        ViewerContent(Shard("base", {"hand": "h", "object": "block", "scene": SCENE}, arrays(1)), hand, block), port=0
     )
     try:
         assert [node.visible for node in made.models.bodies] == [True, True]

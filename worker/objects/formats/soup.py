@@ -39,7 +39,7 @@ class Soup:
 
 
 def check_soup(soup: Soup) -> Soup:
-    """The soup itself if it has faces, sound indices and finite vertices."""
+    """The soup itself if it has faces, feasible indices and finite vertices."""
     vertices, faces = soup.vertices, soup.faces
     if not len(faces):
         raise MeshError("the mesh has no faces; export the surface, not points alone")

@@ -17,11 +17,11 @@ from graspd.service.model.transforms import Floats
 from graspd.worker.grasps import GraspSet
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.scene_starts import free_ways
-from graspd.worker.planners.fast_graspd.schedule import WarmStart, in_scene, with_trial
+from graspd.worker.planners.fast_graspd.schedule import WarmStart, in_scene, with_rollout
 from graspd.worker.planners.fast_graspd.starts import start_generator
-from graspd.worker.planners.port import Asked
+from graspd.worker.planners.port import BatchRequest
 from graspd.worker.planners.threads import Steps
-from graspd.worker.simulation.surroundings import Placed, placed_together
+from graspd.worker.simulation.environment import Placed, placed_together
 
 Rows = NDArray[np.intp]
 
@@ -29,13 +29,13 @@ Rows = NDArray[np.intp]
 class Batches:
     """The grasps of several batches, one batch after the other; a row is a grasp."""
 
-    def __init__(self, asked: Sequence[Asked], obj: ObjectModel, warm: WarmStart | None = None) -> None:
+    def __init__(self, asked: Sequence[BatchRequest], obj: ObjectModel, warm: WarmStart | None = None) -> None:
         """All batches have one fidelity, and all or none of them are in scenes with the same fixed surroundings.
         `warm`, in scenes: where their hands set out; None: where `scene_starts` finds."""
         self.asked, self.warm = asked, warm
         wanted = [one.wanted for one in asked]
         in_scenes = wanted[0].placed is not None
-        self.fidelity: Fidelity = _adapted(wanted[0].fidelity, in_scenes=in_scenes, tried=self.has_trial)
+        self.fidelity: Fidelity = _adapted(wanted[0].fidelity, in_scenes=in_scenes, tried=self.has_rollout)
         if warm is not None:
             self.fidelity = warm.adapted(self.fidelity)
         counts = [one.count for one in wanted]
@@ -64,11 +64,11 @@ class Batches:
             self.put_out(owner, error)
 
     @property
-    def has_trial(self) -> bool:
+    def has_rollout(self) -> bool:
         """Whether candidates go through a trial. Around a free object they do where the fidelity seats several."""
         first = self.asked[0].wanted
         several = first.placed is not None or first.fidelity.finalists > 1
-        return several and all(one.wanted.trial is not None for one in self.asked)
+        return several and all(one.wanted.rollout is not None for one in self.asked)
 
     def put_out(self, owner: int, error: Exception) -> None:
         """The batch is made no further; what became of it first stands."""
@@ -116,18 +116,18 @@ class Batches:
             for k in range(made * starts, (made + 1) * starts)
         ]
 
-    def trial(self, grasps: GraspSet, rows: Rows, beat: Floats) -> Floats:
+    def rollout(self, grasps: GraspSet, rows: Rows, beat: Floats) -> Floats:
         """Scores (n,) of grasps for these rows that have scores `beat` (n,) so far, each by the trial of its own batch;
         of a batch that is out every grasp is good enough."""
         owners, scores = self.owner[rows], np.zeros(len(grasps))
         placed = self.placed.take(rows) if self.placed is not None else None
         for owner in distinct_values(owners):
-            trial, own = self.asked[owner].wanted.trial, np.flatnonzero(owners == owner)
-            if trial is None or owner in self.errors:
+            rollout, own = self.asked[owner].wanted.rollout, np.flatnonzero(owners == owner)
+            if rollout is None or owner in self.errors:
                 continue
             try:
-                self._steps[owner](0, "trial")
-                scores[own] = trial(grasps.take(own), placed.take(own) if placed is not None else None, beat[own])
+                self._steps[owner](0, "rollout")
+                scores[own] = rollout(grasps.take(own), placed.take(own) if placed is not None else None, beat[own])
             except Exception as error:
                 self.put_out(owner, error)
         return scores
@@ -136,7 +136,7 @@ class Batches:
 def _adapted(fidelity: Fidelity, *, in_scenes: bool, tried: bool) -> Fidelity:
     if in_scenes:
         return in_scene(fidelity)
-    return with_trial(fidelity) if tried else fidelity
+    return with_rollout(fidelity) if tried else fidelity
 
 
 def finalists(fidelity: Fidelity) -> int:

@@ -15,7 +15,7 @@ from graspd.worker.grasps import GraspSet, Posture, joined
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.data import HandState
-from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.simulation.environment import Placed
 
 #: Hands of each grasp that are seated and tried before the next are: seating costs half of a trial.
 TOGETHER: Final = 2
@@ -42,7 +42,7 @@ def with_postures(
 
 
 @dataclass(frozen=True)
-class Seated:
+class Refinements:
     """Hands after the fine phase, those of a grasp side by side."""
 
     state: HandState
@@ -50,22 +50,22 @@ class Seated:
     """L_stable of each."""
     merit: Floats
     """The smaller the better."""
-    unsound: NDArray[np.bool_]
+    infeasible: NDArray[np.bool_]
     """Whether it is too deep in the object for the geometric gate, or touches it with too few links: no trial can save
     it."""
 
 
-Seat = Callable[[NDArray[np.intp], NDArray[np.intp]], Seated]
+Seat = Callable[[NDArray[np.intp], NDArray[np.intp]], Refinements]
 
 """Seats the hands of some grasps (n,): rows (n, each) of the hands that set out."""
 
-TrialOf = Callable[[GraspSet, NDArray[np.intp], Floats], Floats]
+RolloutOf = Callable[[GraspSet, NDArray[np.intp], Floats], Floats]
 
 """Scores (k,) of grasps for those that are numbered (k,), with the scores to beat; see `worker.planners.Trial`."""
 
 
 @dataclass
-class Taken:
+class Selection:
     """What is taken of each of n grasps so far; nothing where `score` is inf."""
 
     state: HandState
@@ -74,7 +74,7 @@ class Taken:
     grasps: dict[int, GraspSet]
 
     @classmethod
-    def none(cls, count: int, dofs: int) -> Taken:
+    def none(cls, count: int, dofs: int) -> Selection:
         empty = HandState(np.zeros((count, 3)), np.zeros((count, 4)), np.zeros((count, dofs)))
         return cls(empty, np.zeros(count), np.full(count, np.inf), {})
 
@@ -89,15 +89,15 @@ def tried(
     order: NDArray[np.intp],
     seat: Seat,
     placed: Placed | None,
-    trial: TrialOf,
+    rollout: RolloutOf,
     *,
     together: int = TOGETHER,
     device: str = "cpu",
-) -> Taken:
+) -> Selection:
     """Of the hands of each grasp the first that the trial finds good enough, or else the one with the least score.
 
     `together` of each grasp are seated and tried in the order of their merit, then, of grasps that have none yet, as
-    many again. Hands that balance too badly or are unsound are not tried, but the first of each grasp is taken.
+    many again. Hands that balance too badly or are infeasible are not tried, but the first of each grasp is taken.
 
     Args:
         hand: the hand.
@@ -109,13 +109,13 @@ def tried(
         together: hands of each grasp that are seated at once.
         device: finds the postures that the trial needs.
     """
-    taken, left = Taken.none(len(order), hand.dofs), np.arange(len(order))
+    taken, left = Selection.none(len(order), hand.dofs), np.arange(len(order))
     for wave in np.split(order, range(together, order.shape[1], together), axis=1):
         if not len(left):
             break
         seated = seat(wave[left], left)
         for rows in ranked(seated.merit, len(left)).T:
-            worth = ((seated.merit[rows] < HOPEFUL) | (taken.score[left] > POOR)) & ~seated.unsound[rows]
+            worth = ((seated.merit[rows] < HOPEFUL) | (taken.score[left] > POOR)) & ~seated.infeasible[rows]
             open_ = ~(taken.score[left] < 1.0) & (worth | np.isinf(taken.score[left]))
             if not open_.any():
                 continue
@@ -124,20 +124,22 @@ def tried(
             found = with_postures(
                 hand, obj, seated.state[rows[open_]], seated.losses[rows[open_]], where, device=device
             )
-            score = _scores(found, seated.unsound[rows[open_]], which, taken.score[which], trial)
-            _gentler(hand, obj, found, score, which, trial, device)
+            score = _scores(found, seated.infeasible[rows[open_]], which, taken.score[which], rollout)
+            _gentler(hand, obj, found, score, which, rollout, device)
             _take(found, seated, rows[open_], which, score, taken)
         left = left[~(taken.score[left] < 1.0)]
     return taken
 
 
 def _scores(
-    found: GraspSet, unsound: NDArray[np.bool_], which: NDArray[np.intp], beat: Floats, trial: TrialOf
+    found: GraspSet, infeasible: NDArray[np.bool_], which: NDArray[np.intp], beat: Floats, rollout: RolloutOf
 ) -> Floats:
     """(k,) what the trial says of one hand each of the grasps `which` (k,), which have scores `beat` (k,) so far."""
-    score, sound = np.full(len(which), HOPELESS), np.flatnonzero(~unsound)
-    if len(sound):
-        score[sound] = np.nan_to_num(trial(found.take(sound), which[sound], beat[sound]), nan=HOPELESS, posinf=HOPELESS)
+    score, feasible = np.full(len(which), HOPELESS), np.flatnonzero(~infeasible)
+    if len(feasible):
+        score[feasible] = np.nan_to_num(
+            rollout(found.take(feasible), which[feasible], beat[feasible]), nan=HOPELESS, posinf=HOPELESS
+        )
     return score
 
 
@@ -147,7 +149,7 @@ def _gentler(
     found: GraspSet,
     score: Floats,
     which: NDArray[np.intp],
-    trial: TrialOf,
+    rollout: RolloutOf,
     device: str,
 ) -> None:
     """Gives hands (k,) that nearly lift a gentler squeeze where they lift better with it: fingers are springs, and the
@@ -157,14 +159,19 @@ def _gentler(
         return
     gentle = found.take(poor)
     gentle.squeeze = squeeze(hand, obj, gentle.grasp, total_normal_force=GENTLER * normal_force(obj), device=device)
-    again = _scores(gentle, np.zeros(len(poor), bool), which[poor], score[poor], trial)
+    again = _scores(gentle, np.zeros(len(poor), bool), which[poor], score[poor], rollout)
     better = again < score[poor]
     found.squeeze.joint_positions[poor[better]] = gentle.squeeze.joint_positions[better]
     score[poor[better]] = again[better]
 
 
 def _take(
-    found: GraspSet, seated: Seated, rows: NDArray[np.intp], which: NDArray[np.intp], score: Floats, taken: Taken
+    found: GraspSet,
+    seated: Refinements,
+    rows: NDArray[np.intp],
+    which: NDArray[np.intp],
+    score: Floats,
+    taken: Selection,
 ) -> None:
     """Of one hand each (k,) of the grasps `which` (k,) those that are better than what is taken."""
     state, losses = seated.state[rows], seated.losses[rows]

@@ -19,6 +19,7 @@ from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.integers import distinct_values
 from graspd.service.model.transforms import Floats
 from graspd.worker.control.postures import standing_off, touching_links
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet, joined
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -30,7 +31,7 @@ from graspd.worker.planners.fast_graspd.candidates import (
     NEARNESS,
     SCENE_FRICTION,
     TOGETHER,
-    Seated,
+    Refinements,
     best_of_each,
     merits,
     posture_of,
@@ -39,19 +40,18 @@ from graspd.worker.planners.fast_graspd.candidates import (
     with_postures,
 )
 from graspd.worker.planners.fast_graspd.pairs import Pair, pair_of
+from graspd.worker.planners.fast_graspd.retreat import hindrance
 from graspd.worker.planners.fast_graspd.schedule import AROUND, DILATION, WarmStart, coarse_schedule, fine_schedule
 from graspd.worker.planners.fast_graspd.starts import NO_PLACE, Probe
-from graspd.worker.planners.fast_graspd.withdrawal import hindrance
-from graspd.worker.planners.port import Asked, Method, Wanted
+from graspd.worker.planners.port import BatchRequest, Method, PlanRequest
 from graspd.worker.planners.threads import cut, run_parts
 from graspd.worker.quality.gate import MAX_PENETRATION_MM, MIN_CONTACT_LINKS
-from graspd.worker.run import Run
 from graspd.worker.simulation.data import Data, HandState
+from graspd.worker.simulation.environment import Placed
 from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.obstacles import DeviceObstacles
 from graspd.worker.simulation.projection import Projection, ProjectionOptions
-from graspd.worker.simulation.surroundings import Placed
 
 Rows = NDArray[np.intp]
 
@@ -118,16 +118,18 @@ class Part:
         return Part(rows, state, loss, merit, curve, joined(both) if both else None, attempts)
 
 
-def plan(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run, *, warm: WarmStart | None = None) -> GraspSet:
+def plan(
+    hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext, *, warm: WarmStart | None = None
+) -> GraspSet:
     """See `worker.planners.Planner`; `warm` as `Batches` has it."""
-    (found,) = plan_joined(hand, obj, [Asked(wanted, run)], warm=warm)
+    (found,) = plan_joined(hand, obj, [BatchRequest(wanted, run)], warm=warm)
     if isinstance(found, Exception):
         raise found
     return found
 
 
 def plan_joined(
-    hand: HandModel, obj: ObjectModel, asked: Sequence[Asked], *, warm: WarmStart | None = None
+    hand: HandModel, obj: ObjectModel, asked: Sequence[BatchRequest], *, warm: WarmStart | None = None
 ) -> list[GraspSet | Exception]:
     """See `worker.planners.Joined`; `warm` as `Batches` has it."""
     began = time.perf_counter()
@@ -151,24 +153,24 @@ def plan_joined(
     return found
 
 
-def _pair(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> Pair:
+def _pair(hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> Pair:
     return pair_of(hand, obj, wanted.fidelity, run.device, in_scenes=wanted.placed is not None)
 
 
-def optimise_batch(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> list[Part]:
+def optimise_batch(hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> list[Part]:
     """Starts, optimisation and projection of a batch, without the postures around each grasp."""
     return optimise_pair(_pair(hand, obj, wanted, run), wanted, run)
 
 
-def optimise_pair(pair: Pair, wanted: Wanted, run: Run) -> list[Part]:
+def optimise_pair(pair: Pair, wanted: PlanRequest, run: ExecutionContext) -> list[Part]:
     """The same for a pair that is on `run.device` already, and need not be as the fidelity would make it."""
-    batches = Batches([Asked(wanted, run)], pair.fine.obj.model)
+    batches = Batches([BatchRequest(wanted, run)], pair.fine.obj.model)
     parts = optimise(pair, batches, run)
     batches.left()
     return parts
 
 
-def optimise(pair: Pair, batches: Batches, run: Run, *, postures: bool = False) -> list[Part]:
+def optimise(pair: Pair, batches: Batches, run: ExecutionContext, *, postures: bool = False) -> list[Part]:
     """The same for several batches: the parts of those that are not out in the end, and perhaps of others; with the
     `postures` around grasps, if they are wanted.
 
@@ -184,9 +186,9 @@ def optimise(pair: Pair, batches: Batches, run: Run, *, postures: bool = False) 
         return _work(launch, begun.take(np.arange(which.start, which.stop), batches.fidelity.starts))
 
     parts = run_parts(cut(len(rows), run, least=PART), work)
-    if batches.placed is None or batches.has_trial:
+    if batches.placed is None or batches.has_rollout:
         parts = [_tried_again(launch, reduce(Part.followed_by, parts), run)]
-    if not postures or batches.has_trial:
+    if not postures or batches.has_rollout:
         return parts
     whole = reduce(Part.followed_by, parts)
     return run_parts(
@@ -219,9 +221,9 @@ class _Launch:
         friction = FRICTION if self.batches.placed is None else SCENE_FRICTION
         return merits(hand, obj, state, losses, depths, friction=friction, device=device)
 
-    def unsound(self, state: HandState, depths: Floats) -> NDArray[np.bool_]:
+    def infeasible(self, state: HandState, depths: Floats) -> NDArray[np.bool_]:
         """(n,) whether hands of these depths [m] cannot pass the geometric gate; asked of those that will be tried."""
-        if not self.batches.has_trial:
+        if not self.batches.has_rollout:
             return np.zeros(len(depths), bool)
         hand, obj, device = self.pair.hand.model, self.pair.fine.obj.model, self.pair.hand.device
         links = touching_links(hand, obj, posture_of(hand, obj, state), device=device)
@@ -245,7 +247,7 @@ class _Begun:
         return _Begun(self.rows[which], self.state[hands], self.depth[hands], touch)
 
 
-def _begun(launch: _Launch, rows: Rows, run: Run) -> _Begun:
+def _begun(launch: _Launch, rows: Rows, run: ExecutionContext) -> _Begun:
     """The starts of grasps."""
 
     def work(which: range) -> _Begun:
@@ -308,7 +310,7 @@ def _work(launch: _Launch, begun: _Begun) -> Part:
     state = _descend(launches, data, batches, rows, fidelity.coarse_iterations, "coarse optimization", curve)
     losses = _losses(data, len(state.pivot))
     order = np.arange(n * fidelity.starts).reshape(n, -1)
-    if last < fidelity.starts or (batches.has_trial and fidelity.starts > 1):
+    if last < fidelity.starts or (batches.has_rollout and fidelity.starts > 1):
         merit = launch.merits(state, losses)
         if placed is None:
             merit -= NEARNESS * data.near_share(NEAR_M, len(state.pivot))
@@ -316,13 +318,13 @@ def _work(launch: _Launch, begun: _Begun) -> Part:
             merit += hindrance(launch.coarse, state, placed.take(np.repeat(np.arange(n), fidelity.starts)))
         order = ranked(merit, n)[:, :last]
     seats = _Seats(launch, rows, state, losses, curve)
-    if batches.has_trial:
+    if batches.has_rollout:
 
-        def trial(grasps: GraspSet, which: Rows, beat: Floats) -> Floats:
-            return batches.trial(grasps, rows[which], beat)
+        def rollout(grasps: GraspSet, which: Rows, beat: Floats) -> Floats:
+            return batches.rollout(grasps, rows[which], beat)
 
         together = 1 if placed is None else TOGETHER
-        taken = tried(hand, obj, order, seats.seated, placed, trial, together=together, device=pair.hand.device)
+        taken = tried(hand, obj, order, seats.seated, placed, rollout, together=together, device=pair.hand.device)
         found, score = taken.joined(), taken.score
         if placed is None:
             off = standing_off(hand, obj, found.grasp, device=pair.hand.device)
@@ -333,14 +335,14 @@ def _work(launch: _Launch, begun: _Begun) -> Part:
     return Part(rows, seated.state[winners], seated.losses[winners], seated.merit[winners], curve)
 
 
-def _tried_again(launch: _Launch, part: Part, run: Run) -> Part:
+def _tried_again(launch: _Launch, part: Part, run: ExecutionContext) -> Part:
     """Grasps that fail their trial, or of free objects balance poorly, set out again; the first good one stays, or else
     the best.
 
     The last few would leave cores idle, and a hand of a small launch costs a third more: they make some attempts ahead.
     Those after a good one are forgotten, so a grasp is as if it had made one after the other."""
     closer = (STANDS,) * CLOSER + (FAILED,) * (ATTEMPTS - CLOSER)
-    limits: tuple[float, ...] = closer if launch.batches.has_trial else (SET_OUT_AGAIN,)
+    limits: tuple[float, ...] = closer if launch.batches.has_rollout else (SET_OUT_AGAIN,)
     if launch.batches.placed is not None:
         limits = IN_SCENES
     done = 0
@@ -359,7 +361,7 @@ def _tried_again(launch: _Launch, part: Part, run: Run) -> Part:
     return part
 
 
-def _set_out_again(launch: _Launch, rows: Rows, attempt: Rows, run: Run) -> Part:
+def _set_out_again(launch: _Launch, rows: Rows, attempt: Rows, run: ExecutionContext) -> Part:
     """Later attempts (n,) of grasps; the merit of those without a place is inf. Their hands are not pulled: on a bowl's
     wall half as many hold that are."""
     launch = replace(launch, pulled=False)
@@ -394,7 +396,7 @@ class _Seats:
     curve: list[Floats]
     """Goes on with the loss of the first that are seated."""
 
-    def seated(self, rows: NDArray[np.intp], which: NDArray[np.intp]) -> Seated:
+    def seated(self, rows: NDArray[np.intp], which: NDArray[np.intp]) -> Refinements:
         """Hands `rows` (k, each) of the grasps `which` (k,) of this part."""
         launch, flat = self.launch, rows.ravel()
         fidelity, mine = launch.batches.fidelity, self.rows[which]
@@ -411,7 +413,7 @@ class _Seats:
         options = AROUND if launch.batches.placed is None else ProjectionOptions()
         state, depths = Projection(launch.fine, data, options).run(state, fidelity.polish_iterations)
         merit = launch.merits(state, losses, depths) if rows.shape[1] > 1 else np.zeros(len(flat))
-        return Seated(state, losses, merit, launch.unsound(state, depths))
+        return Refinements(state, losses, merit, launch.infeasible(state, depths))
 
 
 def _obstacles(pair: Pair, placed: Placed | None) -> DeviceObstacles | None:

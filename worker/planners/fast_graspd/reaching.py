@@ -17,13 +17,13 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_from_matrix, quat_rotate
+from graspd.worker.hands.grasp_widths import Size, spans_of, widest_span
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.oppositions import Oppositions, oppositions_of
-from graspd.worker.hands.spans import Size, spans_of, widest_span
+from graspd.worker.hands.pinch_postures import Oppositions, oppositions_of
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners.fast_graspd.across import ALIKE_M, BESIDE_M, NOISE, ROOM_M, crossings_of, frames
+from graspd.worker.planners.fast_graspd.antipodal_starts import ALIKE_M, BESIDE_M, NOISE, ROOM_M, crossings_of, frames
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.device import to_wxyz, to_xyzw
 from graspd.worker.simulation.kernels import reaching as kernels

@@ -23,14 +23,14 @@ from graspd.service.model.transforms import (
 )
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners.fast_graspd.across import NEAR_M, Openings, Reaches, across, promising
+from graspd.worker.planners.fast_graspd.antipodal_starts import NEAR_M, Openings, Reaches, across, promising
 from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.planners.fast_graspd.starts import CLEAR, POSTURE_NOISE, TILT, Probe
 from graspd.worker.planners.port import NoPlace
 from graspd.worker.simulation.data import HandState
+from graspd.worker.simulation.environment import STANDOFF_M, Environment, Placed
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.mounting import mounting_lack
-from graspd.worker.simulation.surroundings import STANDOFF_M, Placed, Surroundings
 
 #: Distance from obstacles that a start has besides the margin it keeps later [m].
 ROOM: Final = 0.006
@@ -73,7 +73,7 @@ class _Surface:
         return cls(corners, cross / np.maximum(area, 1e-20)[:, None], np.cumsum(area) / area.sum())
 
 
-def free_ways(scene: Surroundings, obj: ObjectModel) -> Floats:
+def free_ways(scene: Environment, obj: ObjectModel) -> Floats:
     """(K, 3) unit vectors, object frame, along which a ball as wide as a palm leaves the object without touching an
     obstacle on `STANDOFF_M`.
 
@@ -177,7 +177,7 @@ def _depths(
     """(n, len(RETREATS)) depths [m] of hands and their mountings in scenes (n,), from the farthest distance that is
     `worth` it (n, len(RETREATS)) inwards for as long as it is clear; inf elsewhere.
 
-    Most draws fail for what no retreat mends, and hardly any can be clear nearer than where it is not.
+    Most draws fail for what no retreat fixes, and hardly any can be clear nearer than where it is not.
     """
     found, open_ = np.full((len(scene), len(RETREATS)), np.inf), np.ones(len(scene), bool)
     for k in reversed(range(len(RETREATS))):

@@ -11,9 +11,9 @@ import numpy as np
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.transforms import Floats
 from graspd.worker.simulation.data import HandState, Schedule
+from graspd.worker.simulation.environment import Placed
 from graspd.worker.simulation.model import LossOptions, Model
 from graspd.worker.simulation.projection import ProjectionOptions
-from graspd.worker.simulation.surroundings import Placed
 
 #: Rates of Adam: translation [m], rotation [rad], joints [rad].
 COARSE_RATES: Final = (2e-3, 2e-2, 4e-2)
@@ -63,7 +63,7 @@ def in_scene(fidelity: Fidelity) -> Fidelity:
     )
 
 
-def with_trial(fidelity: Fidelity) -> Fidelity:
+def with_rollout(fidelity: Fidelity) -> Fidelity:
     """The fidelity of grasps of a free object whose hands are tried: those that fail are replaced by others, so half as
     many set out at first."""
     return fidelity.model_copy(update={"starts": -(-fidelity.starts // 2)})

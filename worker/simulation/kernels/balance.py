@@ -102,7 +102,7 @@ def nonnegative(
 ):
     """Solve B systems, launched over B. `matrix` (B, K, R) holds the columns of each, `count` (B,) how many are used.
 
-    `x` (B, K); `sound` (B,) is 0 where the steps did not suffice.
+    `x` (B, K); `feasible` (B,) is 0 where the steps did not suffice.
     """
     b = wp.tid()
     work = work_inout

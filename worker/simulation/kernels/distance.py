@@ -1,7 +1,7 @@
 """Distances as metrics need them: exact in sign and value, no smoothing, no gradient.
 
 `worker.simulation.kernels.surface` answers the optimiser's question (smoothed, cheap); this module answers the
-referee's: how far is a point from the mesh itself, and how deep is it in the hand's convex pieces.
+validator's: how far is a point from the mesh itself, and how deep is it in the hand's convex pieces.
 """
 
 import warp as wp

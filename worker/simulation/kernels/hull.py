@@ -316,7 +316,7 @@ def measure_hulls(
     """One hull after the other, each from 7 facets: facet i leaves out corner i, and lies across it from all others.
 
     Points are about a point inside the first simplex; `origin_in` is where distances are taken from. `result_out`:
-    least distance of a facet, at most 0 where the origin is outside; volume, nan where `whole_in` is 0; 1 if sound.
+    least distance of a facet, at most 0 where the origin is outside; volume, nan where `whole_in` is 0; 1 if feasible.
     """
     hull = hull_inout
     for h in range(count_in.shape[0]):

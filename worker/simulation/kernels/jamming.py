@@ -187,7 +187,7 @@ def hand_clearance(
 
 
 @wp.kernel
-def judge_retreat(
+def measure_retreat(
     # In:
     wanted_in: wp.float32,
     step_in: wp.int32,

@@ -1,13 +1,13 @@
 """How fingers open around a grasp: the way each leaves the object, how far it goes, and where it would jam.
 
-Fingers are judged each by itself, hands all at once; a hand or a finger that is done costs nothing more.
+Fingers are validated each by itself, hands all at once; a hand or a finger that is done costs nothing more.
 """
 
 import warp as wp
 
 from graspd.worker.simulation.kernels.chain import Bodies, Chain, joint_axis, joint_value, place_body
 from graspd.worker.simulation.kernels.distance import Skin, nearest
-from graspd.worker.simulation.kernels.touching import Points, Touching, point_of
+from graspd.worker.simulation.kernels.touching import NearbySurface, Points, point_of
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -60,7 +60,7 @@ def body_wrenches(
     points_in: Points,
     # In:
     bodies_in: Bodies,
-    touching_in: Touching,
+    touching_in: NearbySurface,
     reach_in: wp.float32,
     # Out:
     force_out: wp.array2d(dtype=wp.vec3d),
@@ -214,7 +214,7 @@ def finger_clearance(
 
 
 @wp.kernel
-def judge_opening(
+def measure_opening(
     # In:
     wanted_in: wp.float32,
     step_in: wp.array(dtype=wp.int32),

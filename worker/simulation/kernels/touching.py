@@ -29,7 +29,7 @@ class Points:
 
 
 @wp.struct
-class Touching:
+class NearbySurface:
     """What is near the points (B, N) of B hands, within a reach."""
 
     distance: wp.array2d(dtype=wp.float32)  # at most the reach
@@ -55,7 +55,7 @@ def touch(
     bodies_in: Bodies,
     reach_in: wp.float32,
     # Out:
-    touching_out: Touching,
+    touching_out: NearbySurface,
 ):
     """What is near all points of hands. Launch over (B, N / lane)."""
     b, part = wp.tid()
@@ -69,7 +69,7 @@ def touch(
 
 
 @wp.func
-def apart(touching: Touching, radius: wp.float64, b: wp.int32, i: wp.int32, j: wp.int32):
+def apart(touching: NearbySurface, radius: wp.float64, b: wp.int32, i: wp.int32, j: wp.int32):
     """Square of how far apart two contacts are: by place over `radius`, and by direction."""
     place = (wp.vec3d(touching.closest[b, i]) - wp.vec3d(touching.closest[b, j])) / radius
     turn = wp.vec3d(touching.normal[b, i]) - wp.vec3d(touching.normal[b, j])
@@ -82,7 +82,7 @@ def choose(
     points_in: Points,
     finger_in: wp.array(dtype=wp.int32),
     # In:
-    touching_in: Touching,
+    touching_in: NearbySurface,
     near_in: wp.float32,
     far_in: wp.float32,
     facing_in: wp.float64,
@@ -173,7 +173,7 @@ def columns(
     points_in: Points,
     # In:
     bodies_in: Bodies,
-    touching_in: Touching,
+    touching_in: NearbySurface,
     chosen_in: wp.array2d(dtype=wp.int32),
     count_in: wp.array(dtype=wp.int32),
     friction_in: wp.float64,

@@ -1,1 +1,1 @@
-"""The first judge: the certificate's test in MuJoCo Warp, many grasps at once on one device."""
+"""The prefilter: the standard level's test in MuJoCo Warp, many grasps at once on one device."""

@@ -1,4 +1,4 @@
-"""The certificate's schedule for many worlds at once: close, push six ways, watch, and take the next grasp.
+"""The standard level's schedule for many worlds at once: close, push six ways, watch, and take the next grasp.
 
 A tick is what the engine simulates between two looks (`protocol.INTERVAL_S`). After each tick every world looks at its
 own object and goes its own way: worlds do not wait for each other, and one that has decided takes the next grasp of
@@ -41,7 +41,7 @@ class Grasps:
     """What N grasps ask of their worlds."""
 
     queue: wp.array(dtype=wp.int32)
-    """The grasps to judge, in turn."""
+    """The grasps to validate, in turn."""
     start: wp.array2d(dtype=wp.float32)
     """(N, nq) state in the pregrasp."""
     position: wp.array2d(dtype=wp.vec3)

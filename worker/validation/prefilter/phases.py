@@ -1,4 +1,4 @@
-"""What the first judge found out about grasps, and which of its verdicts are clear. The rest is for the CPU."""
+"""What the prefilter found out about grasps, and which of its verdicts are clear. The rest is for the CPU."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from graspd.service.model.transforms import Floats
 from graspd.worker.validation.protocol import Outcome
 
 #: A verdict is clear where the worst motion that was seen is below the first share of its limit, or above the second.
-#: Both engines' margins of a grasp that holds differ by 0.11 at the 99th percentile (benchmarks.first_judge).
+#: Both engines' margins of a grasp that holds differ by 0.11 at the 99th percentile (benchmarks.prefilter).
 BAND: Final = (0.8, 1.2)
 #: Ticks of a push that breaks a limit until it is clear; what is still in the band then is not.
 PATIENCE: Final = 5
@@ -22,13 +22,13 @@ PATIENCE: Final = 5
 #: more than 47. Few creepers would keep a launch waiting.
 MOST_TICKS: Final = 48
 #: One clear verdict in so many is asked of the CPU as well.
-AUDIT_ONE_IN: Final = 50
-#: Raise when the code changes what the first judge says, constants aside.
+RECHECK_ONE_IN: Final = 50
+#: Raise when the code changes what the prefilter says, constants aside.
 REVISION: Final = 1
 
 
 @dataclass(frozen=True)
-class FirstTrials:
+class PrefilterOutcomes:
     """What the worlds say of N grasps."""
 
     outcome: NDArray[np.uint8]
@@ -72,8 +72,8 @@ class FirstTrials:
 
     @staticmethod
     def terms(engine: str) -> list[Any]:
-        """What verdicts of a version of the engine follow from, beside the certificate's own terms."""
-        return [engine, REVISION, *BAND, PATIENCE, MOST_TICKS, AUDIT_ONE_IN]
+        """What verdicts of a version of the engine follow from, beside the standard level's own terms."""
+        return [engine, REVISION, *BAND, PATIENCE, MOST_TICKS, RECHECK_ONE_IN]
 
     def put(self, rows: NDArray[np.intp], again: Self) -> Self:
         """The same with some rows replaced by those of other trials."""

@@ -1,12 +1,12 @@
 """The GPU prefilter in MuJoCo Warp: it gives the clear verdicts, and MuJoCo on the CPU all others and a sample of
 these.
 
-At level `certificate` it only refuses: what clearly fails goes no further, and whatever may hold is certified on the
-CPU. At level `screen` its clear verdicts stand both ways. It has no part in the letter, and none in lifts.
+At level `standard` it only refuses: what clearly fails goes no further, and whatever may hold is certified on the
+CPU. At level `fast` its clear verdicts stand both ways. It has no part in the letter, and none in lifts.
 
-The model is the referee's own, compiled once; what differs between grasps (postures, commands, pushes) is data. A pool
-of worlds takes grasps from a queue on the device, so a launch stays full until the queue is empty, and one graph serves
-any number of grasps.
+The model is the validator's own, compiled once; what differs between grasps (postures, commands, pushes) is data. A
+pool of worlds takes grasps from a queue on the device, so a launch stays full until the queue is empty, and one graph
+serves any number of grasps.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
 from graspd.worker.engines import backend
 from graspd.worker.engines.devices import check_device, is_out_of_memory
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture, joined
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.model import HandModel
-from graspd.worker.run import ALONE, Run
 from graspd.worker.validation import protocol
 from graspd.worker.validation.model import Scene
 from graspd.worker.validation.prefilter import kernels
-from graspd.worker.validation.prefilter.phases import AUDIT_ONE_IN, FirstTrials
-from graspd.worker.validation.protocol import INTERVAL_S, JudgedBy, Outcome, Trial
+from graspd.worker.validation.prefilter.phases import RECHECK_ONE_IN, PrefilterOutcomes
+from graspd.worker.validation.protocol import INTERVAL_S, Outcome, Rollout, ValidatedBy
 
 log = logging.getLogger(__name__)
 
 #: Worlds of a pool, for few grasps and for many: pools of any size would be made anew for nearly every launch.
 WORLDS: Final = {"cuda": (256, 1024), "cpu": (8, 32)}
-#: Pools that are kept, each with its model, arrays and graph: those of the pairs that were judged last.
+#: Pools that are kept, each with its model, arrays and graph: those of the pairs that were validated last.
 _KEPT_POOLS: Final = 4
-#: Share of audited verdicts that the CPU may contradict, beyond one, before the first judge is not believed.
+#: Share of rechecked verdicts that the CPU may contradict, beyond one, before the prefilter is not believed.
 _MOST_CONTRADICTED: Final = 0.05
 
 
@@ -59,7 +59,7 @@ class WorldPool:
         self._steps = round(protocol.INTERVAL_S / scene.physics.timestep)
         self._doublings, self._capacity = 0, 0
         self.launches = 0
-        """Ticks of the last `judge`."""
+        """Ticks of the last `validate`."""
         voiding = (getattr(self._engine.OverflowType, name) for name in _VOIDING)
         self._voiding = int(sum(int(bit) for bit in voiding))
         with wp.ScopedDevice(device):
@@ -69,20 +69,20 @@ class WorldPool:
             self._terms = self._make_terms()
             self._allocate()
 
-    def judge(self, grasps: GraspSet, run: Run = ALONE) -> FirstTrials:
-        """The certificate's test of N grasps.
+    def validate(self, grasps: GraspSet, run: ExecutionContext = DEFAULT_CONTEXT) -> PrefilterOutcomes:
+        """The standard level's test of N grasps.
 
         Raises:
             TaskCancelled: when `run.cancelled()` answers True.
         """
         with wp.ScopedDevice(self.device):
-            found = self._judge(grasps, run)
+            found = self._validate(grasps, run)
             lost = np.flatnonzero(found.overflow)
             while len(lost) and self._doublings < DOUBLINGS:
                 self._doublings += 1
                 log.info("%d of %d grasps need more room for contacts: it is doubled", len(lost), len(grasps))
                 self._allocate()
-                found = found.put(lost, self._judge(grasps.take(lost), run.quiet()))
+                found = found.put(lost, self._validate(grasps.take(lost), run.quiet()))
                 lost = np.flatnonzero(found.overflow)
         return found
 
@@ -112,7 +112,7 @@ class WorldPool:
         worlds.warmstart = wp.zeros((w, model.nv), dtype=wp.float32)
         self._state = wp.zeros(3, dtype=wp.int32)
 
-    def _judge(self, grasps: GraspSet, run: Run) -> FirstTrials:
+    def _validate(self, grasps: GraspSet, run: ExecutionContext) -> PrefilterOutcomes:
         n = len(grasps)
         self._room_for(n)
         starts = self._states(grasps.pregrasp)
@@ -126,7 +126,7 @@ class WorldPool:
         self._simulate(len(queue), run)
         outcome = found.outcome.numpy()[:n].astype(np.uint8)
         outcome[inside, 0] = protocol.Outcome.PENETRATION
-        return FirstTrials(
+        return PrefilterOutcomes(
             outcome=outcome,
             margin=found.margin.numpy()[:n].astype(float),
             penetration_m=depth[:, 0],
@@ -197,7 +197,7 @@ class WorldPool:
             short[first : first + self.worlds] = most > data.naconmax
         return out.numpy().astype(float), short
 
-    def _simulate(self, count: int, run: Run) -> None:
+    def _simulate(self, count: int, run: ExecutionContext) -> None:
         """Tick until no world has a grasp."""
         self.launches = 0
         self._state.assign(np.array([0, self.worlds, count], np.int32))
@@ -209,10 +209,10 @@ class WorldPool:
         )
         while True:
             taken, alive, _ = self._state.numpy()
-            run.progress(min(int(taken), count) - int(alive), count, "first judge")
+            run.progress(min(int(taken), count) - int(alive), count, "prefilter")
             if alive <= 0:
                 return
-            run.check("the first judge")
+            run.check("the prefilter")
             self.launches += 1
             self._tick()
 
@@ -243,25 +243,25 @@ _lock = threading.Lock()
 
 
 @dataclass(frozen=True)
-class Screened:
-    """What the first judge says of N grasps."""
+class PrefilterVerdicts:
+    """What the prefilter says of N grasps."""
 
-    stands: dict[int, Trial]
+    stands: dict[int, Rollout]
     """Verdicts that stand, by row. All other rows are for the CPU."""
-    audited: dict[int, bool]
-    """Verdicts that would stand and are asked of the CPU as well: whether the first judge said that the grasp holds."""
+    rechecked: dict[int, bool]
+    """Verdicts that would stand and are asked of the CPU as well: whether the prefilter said that the grasp holds."""
 
-    def contradicted(self, trials: dict[int, Trial]) -> int:
-        """How many audited verdicts the CPU's trials contradict."""
-        return sum(trials[row].success != held for row, held in self.audited.items())
+    def contradicted(self, rollouts: dict[int, Rollout]) -> int:
+        """How many rechecked verdicts the CPU's trials contradict."""
+        return sum(rollouts[row].success != held for row, held in self.rechecked.items())
 
     def believed(self, contradicted: int) -> bool:
         """Whether the verdicts that stand may stand."""
-        return contradicted <= max(1, _MOST_CONTRADICTED * len(self.audited))
+        return contradicted <= max(1, _MOST_CONTRADICTED * len(self.rechecked))
 
 
-def first_terms(hand: HandModel, level: str, run: Run) -> list[Any]:
-    """The terms of the first judge where it takes part in verdicts of a level, for `verdict_key`; else none.
+def first_terms(hand: HandModel, level: str, run: ExecutionContext) -> list[Any]:
+    """The terms of the prefilter where it takes part in verdicts of a level, for `verdict_key`; else none.
 
     Grippers have none: their flat pads touch in an area, and how the engines spread contacts over it differs. Hands
     with tendons have none: on a tenth of Shadow's grasps the engines differ (docs/explanation/quality.md).
@@ -269,57 +269,59 @@ def first_terms(hand: HandModel, level: str, run: Run) -> list[Any]:
     Raises:
         InputError: it is insisted on, and not installed.
     """
-    if run.first_judge == "off" or level not in ("certificate", "screen"):
+    if run.prefilter == "off" or level not in ("standard", "fast"):
         return []
     if jaws_of(hand) is not None or hand.tendons:
         return []
-    if run.first_judge == "auto" and not (run.device.startswith("cuda") and has_mujoco_warp()):
+    if run.prefilter == "auto" and not (run.device.startswith("cuda") and has_mujoco_warp()):
         return []
-    return FirstTrials.terms(mujoco_warp_version())
+    return PrefilterOutcomes.terms(mujoco_warp_version())
 
 
-def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: Run) -> Screened:
-    """What the first judge says of grasps in a scene; in one launch with those of the others in `run.meeting`.
+def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: ExecutionContext) -> PrefilterVerdicts:
+    """What the prefilter says of grasps in a scene; in one launch with those of the others in `run.meeting`.
 
     Args:
-        scene: the referee's own.
+        scene: the validator's own.
         terms: digest of all that the scene follows from.
         grasps: N grasps.
-        level: certificate or screen.
+        level: standard or fast.
         run: its device is where the worlds are.
 
     Raises:
         TaskCancelled: when `run.cancelled()` answers True.
     """
 
-    def work(asked: Sequence[GraspSet]) -> list[FirstTrials]:
+    def work(asked: Sequence[GraspSet]) -> list[PrefilterOutcomes]:
         with _lock:
             every = joined(asked)
-            found = _pool(scene, terms, run.device, len(every)).judge(every, run if run.meeting is None else ALONE)
+            found = _pool(scene, terms, run.device, len(every)).validate(
+                every, run if run.meeting is None else DEFAULT_CONTEXT
+            )
         check_device(run.device)
         return found.parts([len(one) for one in asked])
 
     postures = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
     if not len(grasps):
-        return Screened({}, {})
+        return PrefilterVerdicts({}, {})
     try:
         if run.meeting is None:
             found = work([postures])[0]
         else:
-            key = ("first judge", terms, run.device)
+            key = ("prefilter", terms, run.device)
             found = run.meeting.ask(key, postures, work, size=len(grasps), cancelled=run.cancelled)
     except RuntimeError as error:
         if not is_out_of_memory(error):
             raise
-        log.warning("%s has no memory for the first judge: the CPU judges %d grasps", run.device, len(grasps))
-        return Screened({}, {})
-    clear = found.clearly_failed | (found.clearly_held if level == "screen" else False)
-    audited = clear & _drawn(grasps)
+        log.warning("%s has no memory for the prefilter: the CPU validates %d grasps", run.device, len(grasps))
+        return PrefilterVerdicts({}, {})
+    clear = found.clearly_failed | (found.clearly_held if level == "fast" else False)
+    rechecked = clear & _drawn(grasps)
     if found.overflow.any():
-        log.warning("%d of %d grasps overflow the first judge; the CPU judges them", found.overflow.sum(), len(grasps))
-    return Screened(
-        {int(row): _trial(found, int(row), scene) for row in np.flatnonzero(clear & ~audited)},
-        {int(row): bool(found.held[row]) for row in np.flatnonzero(audited)},
+        log.warning("%d of %d grasps overflow the prefilter; the CPU validates them", found.overflow.sum(), len(grasps))
+    return PrefilterVerdicts(
+        {int(row): _rollout(found, int(row), scene) for row in np.flatnonzero(clear & ~rechecked)},
+        {int(row): bool(found.held[row]) for row in np.flatnonzero(rechecked)},
     )
 
 
@@ -341,17 +343,17 @@ def _drawn(grasps: GraspSet) -> NDArray[np.bool_]:
     """(N,) one grasp in so many, told by its own numbers: whatever batch it stands in."""
     pose = np.ascontiguousarray(grasps.grasp.hand_pose, float)
     digests = (hashlib.sha256(row.tobytes()).digest() for row in pose)
-    return np.array([int.from_bytes(one[:8], "big") % AUDIT_ONE_IN == 0 for one in digests], bool)
+    return np.array([int.from_bytes(one[:8], "big") % RECHECK_ONE_IN == 0 for one in digests], bool)
 
 
-def _trial(found: FirstTrials, row: int, scene: Scene) -> Trial:
-    return Trial(
+def _rollout(found: PrefilterOutcomes, row: int, scene: Scene) -> Rollout:
+    return Rollout(
         outcomes=[Outcome(int(one)) for one in found.outcome[row]],
         margin=float(found.margin[row]),
         penetration_m=float(found.penetration_m[row]),
         self_penetration_m=float(found.self_penetration_m[row]),
         steps=int(found.ticks[row]) * round(INTERVAL_S / scene.physics.timestep),
-        judged_by=JudgedBy.MUJOCO_WARP,
+        validated_by=ValidatedBy.MUJOCO_WARP,
     )
 
 
@@ -376,7 +378,7 @@ def mujoco_warp_version() -> str:
         InputError: it is not installed.
     """
     if not has_mujoco_warp():
-        raise InputError("the first judge needs mujoco-warp; run pip install 'graspd[gpu]'")
+        raise InputError("the prefilter needs mujoco-warp; run pip install 'graspd[gpu]'")
     return f"mujoco-warp {version('mujoco-warp')}"
 
 

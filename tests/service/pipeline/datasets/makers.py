@@ -30,7 +30,7 @@ def add_asset(services: Services, kind: str, name: str, *, content: str = "", ve
 
 def wanted(name: str = "grasps", **changes: Any) -> DatasetRequest:
     """Two hands x two objects, one batch each."""
-    given = {"hands": ("gripper", "claw"), "objects": ("ball", "cube"), "grasps": 32, "referee": "certificate"}
+    given = {"hands": ("gripper", "claw"), "objects": ("ball", "cube"), "grasps": 32, "validation": "standard"}
     return DatasetRequest.model_validate({"name": name, **given, **changes})
 
 

@@ -29,9 +29,9 @@ def run(services: Services, **changes: object) -> Estimate:
 
 
 def test_what_was_measured_is_what_it_costs(either: Services) -> None:
-    found = run(either, want="raw")
+    found = run(either, want="candidates")
     assert found.seconds == pytest.approx(4 * FAKE_SECONDS)
-    assert (found.cells, found.tasks, found.asked, found.tried) == (4, 4, 128, 128)
+    assert (found.cells, found.tasks, found.asked, found.candidates) == (4, 4, 128, 128)
     assert found.storage_bytes == either.index.datasets.get("grasps").size_bytes
     assert found.valid == either.index.datasets.get("grasps").valid
     assert found.measured_share == 1 and found.unknown == []
@@ -41,10 +41,10 @@ def test_what_was_measured_is_what_it_costs(either: Services) -> None:
 
 
 def test_scenes_cost_their_share(services: Services) -> None:
-    found = run(services, want="raw", scenes=2)
+    found = run(services, want="candidates", scenes=2)
     assert found.seconds_by_stage == pytest.approx({"synthesize": 4 * FAKE_SECONDS, "scene": 4 * FAKE_SECONDS})
     assert found.storage_bytes == services.index.datasets.get("grasps").size_bytes
-    longer = estimate(services.index, wanted(want="raw", scenes=4))
+    longer = estimate(services.index, wanted(want="candidates", scenes=4))
     assert longer.seconds_by_stage["scene"] == pytest.approx(8 * FAKE_SECONDS)
 
 
@@ -52,10 +52,10 @@ def test_valid_grasps_cost_the_tries_that_fail(services: Services) -> None:
     run(services)
     one = estimate(services.index, wanted(hands=("claw",), objects=("cube",), grasps=3200, budget=100))
     (rate,) = one.rates
-    assert one.valid == 3200 and one.tried == round(3200 / rate.valid_yield)
+    assert one.valid == 3200 and one.candidates == round(3200 / rate.valid_yield)
     assert one.seconds == pytest.approx(3200 * rate.seconds_per_valid)
     scarce = estimate(services.index, wanted(hands=("claw",), objects=("cube",), grasps=3200, budget=1))
-    assert scarce.tried == 3200 and scarce.valid == round(3200 * rate.valid_yield)
+    assert scarce.candidates == 3200 and scarce.valid == round(3200 * rate.valid_yield)
 
 
 def test_another_object_takes_the_hand_and_another_hand_takes_all(services: Services) -> None:
@@ -70,7 +70,7 @@ def test_another_object_takes_the_hand_and_another_hand_takes_all(services: Serv
 
 
 def test_a_small_batch_says_less_than_a_whole_one(services: Services) -> None:
-    few = {"hands": ("claw",), "objects": ("cube",), "want": "raw"}
+    few = {"hands": ("claw",), "objects": ("cube",), "want": "candidates"}
     actions.create(services, wanted("few", grasps=2, **few))
     plan_all(services)
     finish(services, jobs_of(services, "few")[0])
@@ -82,7 +82,7 @@ def test_a_small_batch_says_less_than_a_whole_one(services: Services) -> None:
 
 def test_another_recipe_is_not_measured_by_this_one(services: Services) -> None:
     run(services)
-    for changes in ({"fidelity": "draft"}, {"referee": "screen"}, {"want": "raw"}):
+    for changes in ({"fidelity": "draft"}, {"validation": "fast"}, {"want": "candidates"}):
         found = estimate(services.index, wanted(**changes))
         assert all(rate.origin.startswith(ORIGIN) for rate in found.rates) and found.measured_share == 0
 
@@ -184,9 +184,9 @@ def test_what_is_not_known_yet_is_named_and_estimated(services: Services) -> Non
         estimate(services.index, wanted(objects=[f"o{i}" for i in range(60_000)]))
 
 
-@pytest.mark.parametrize(("referee", "word"), [("none", "sound"), ("certificate", "valid")])
-def test_an_estimate_says_what_it_counts(services: Services, referee: str, word: str) -> None:
-    assert estimate(services.index, wanted(referee=referee)).counted == word
+@pytest.mark.parametrize(("validation", "word"), [("none", "feasible"), ("standard", "valid")])
+def test_an_estimate_says_what_it_counts(services: Services, validation: str, word: str) -> None:
+    assert estimate(services.index, wanted(validation=validation)).counted == word
 
 
 def test_grasps_in_scenes_have_a_price_of_their_own(services: Services) -> None:
@@ -194,7 +194,7 @@ def test_grasps_in_scenes_have_a_price_of_their_own(services: Services) -> None:
     run(services, scenes=2)
     stored = estimate(services.index, wanted(scene="table", scenes=2))
     assert {rate.batches for rate in stored.rates} == {0} and all("in a scene" in rate.origin for rate in stored.rates)
-    assert stored.tried > estimate(services.index, wanted(scenes=2)).tried
+    assert stored.candidates > estimate(services.index, wanted(scenes=2)).candidates
     assert stored.storage_by_kind["scene"] == 4 * 2 * STORED_PLACE.size_bytes
     there = wanted(scene="table", scenes=2, name="placed")
     actions.create(services, there)

@@ -10,7 +10,7 @@ from graspd.service.index.rebuild import differences, rebuild
 from graspd.service.model import names
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import ConflictError, InputError, LimitError, NotFoundError
-from graspd.service.model.states import AssetKind, Lane, State
+from graspd.service.model.states import AssetKind, Priority, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
@@ -31,7 +31,7 @@ def test_a_dataset_has_a_job_for_each_hand_and_object(either: Services) -> None:
         for job in jobs_of(either, "grasps")
     ]
     assert pairs == [("gripper", "ball"), ("gripper", "cube"), ("claw", "ball"), ("claw", "cube")]
-    assert {either.index.jobs.get(job).lane for job in jobs_of(either, "grasps")} == {Lane.BULK}
+    assert {either.index.jobs.get(job).priority for job in jobs_of(either, "grasps")} == {Priority.BULK}
     assert {either.index.jobs.get(job).request.scenes for job in jobs_of(either, "grasps")} == {1}
 
 
@@ -129,7 +129,7 @@ def test_status_tells_each_cell(either: Services) -> None:
     assert [cell.grasps for cell in found.cells] == [64, 32, 0, 0]
     assert [cell.progress for cell in found.cells] == [1.0, 0.5, 0.0, 0.0]
     done, failed = found.cells[0], found.cells[2]
-    assert done.valid_yield == done.valid / done.tried and found.cells[3].valid_yield is None
+    assert done.valid_yield == done.valid / done.candidates and found.cells[3].valid_yield is None
     assert (failed.tasks_failed, failed.attempts_failed, failed.reason) == (2, 2, "the mesh is torn")
     whole = found.dataset
     assert (whole.state, whole.grasps, whole.tasks, whole.tasks_done, whole.tasks_failed) == ("running", 96, 8, 3, 2)
@@ -241,7 +241,7 @@ def test_a_large_dataset_leaves_the_queue_to_others(services: Services) -> None:
     actions.create(services, wanted(grasps=320))
     plan_all(services)
     assert len(services.queue.waiting()) == 10
-    assert services.queue.depths()[(Lane.INTERACTIVE, "synthesize")] == 0
+    assert services.queue.depths()[(Priority.INTERACTIVE, "synthesize")] == 0
     assert services.index.datasets.get("grasps").tasks == 40
 
 

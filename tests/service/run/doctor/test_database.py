@@ -68,7 +68,7 @@ def test_a_manifest_that_is_gone_is_bad(kept: Services, look: Look) -> None:
     assert not found.ok
     assert lost.stem in found.message
     assert "not in the store" in found.message
-    assert "index rebuild" in found.mend
+    assert "index rebuild" in found.fix
 
 
 def test_a_row_that_is_gone_is_bad(kept: Services, look: Look) -> None:
@@ -100,7 +100,7 @@ def test_known_damage_is_told_with_its_mend(kept: Services) -> None:
     found = backends.store_damage(kept.settings)
     assert not found.ok
     assert "shards/base/x.h5" in found.message
-    assert found.mend == "graspd admin store verify --repair"
+    assert found.fix == "graspd admin store verify --repair"
 
 
 def test_where_there_is_no_index_none_is_made(tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_a_damaged_file_is_bad_and_left_where_it_is(kept: Services) -> None:
     file.write_bytes(b"no database" * 1000)
     found = backends.index(kept.settings)
     assert not found.ok
-    assert "graspd admin index rebuild" in found.mend
+    assert "graspd admin index rebuild" in found.fix
     assert backends.index_is_store(kept.settings).condition is Condition.SKIPPED
     assert file.read_bytes() == b"no database" * 1000
 
@@ -130,7 +130,7 @@ def test_tables_of_another_version_are_bad_and_left_as_they_are(kept: Services, 
     kept.index.close()
     found = backends.index(kept.settings)
     assert not found.ok
-    assert "graspd admin index rebuild" in found.mend
+    assert "graspd admin index rebuild" in found.fix
     assert backends.index_is_store(kept.settings).condition is Condition.SKIPPED
     with sqlite3.connect(kept.settings.data_dir / "index.sqlite") as connection:
         assert connection.execute("SELECT version_num FROM alembic_version").fetchone() == (revision,)
@@ -155,7 +155,7 @@ def test_a_postgresql_that_is_away_or_refuses_is_bad(tmp_path: Path, postgres_se
     for url in (away, stranger):
         found = backends.index(Settings(data_dir=tmp_path, index_url=url))
         assert not found.ok
-        assert "GRASPD_INDEX_URL" in found.mend
+        assert "GRASPD_INDEX_URL" in found.fix
         assert "hidden" not in str(found)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from graspd.service.model.clock import timestamp
-from graspd.service.model.states import Lane, Stage
+from graspd.service.model.states import Priority, Stage
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.model.workers import WorkerBeat
 from graspd.service.pipeline.leading import PART
@@ -43,7 +43,7 @@ def present(queue: RqQueue, name: str = "w", **facts: Any) -> None:
 def test_a_controller_that_lives_and_one_that_does_not(settings: Settings, rq_queue: RqQueue) -> None:
     found = controller(settings)
     assert not found.ok
-    assert found.mend == "graspd controller"
+    assert found.fix == "graspd controller"
     rq_queue.announce(PART, 60)
     assert controller(settings).condition is Condition.GOOD
 
@@ -58,30 +58,30 @@ def test_workers_that_fit_are_counted(settings: Settings, rq_queue: RqQueue) -> 
 
 
 @pytest.mark.parametrize(
-    ("facts", "told", "mend"),
+    ("facts", "told", "fix"),
     [
         ({"version": "0.0.9"}, "0.0.9 on node1", f"install graspd {PACKAGE_VERSION}"),
         ({"state": "quarantined", "reason": "no driver"}, "no driver", "on node1: graspd doctor"),
     ],
 )
 def test_workers_that_do_not_fit_are_bad(
-    settings: Settings, rq_queue: RqQueue, facts: dict[str, Any], told: str, mend: str
+    settings: Settings, rq_queue: RqQueue, facts: dict[str, Any], told: str, fix: str
 ) -> None:
     present(rq_queue)
     present(rq_queue, "ill", **facts)
     found = workers(settings)
     assert not found.ok
     assert told in found.message
-    assert mend in found.mend
+    assert fix in found.fix
 
 
 def test_tasks_of_a_stage_that_nobody_serves_are_bad(settings: Settings, rq_queue: RqQueue) -> None:
     present(rq_queue, stages=(Stage.INGEST, Stage.SCENE))
-    rq_queue.enqueue([task("a", stage=Stage.RENDER), task("b", stage=Stage.SCENE)], Lane.BULK)
+    rq_queue.enqueue([task("a", stage=Stage.RENDER), task("b", stage=Stage.SCENE)], Priority.BULK)
     found = workers(settings)
     assert not found.ok
     assert "1 tasks wait, and no worker takes render" in found.message
-    assert found.mend == "graspd worker --stages render"
+    assert found.fix == "graspd worker --stages render"
 
 
 def test_where_nothing_runs_nothing_is_asked(tmp_path: Path) -> None:
@@ -167,7 +167,7 @@ def test_a_port_that_is_free_is_good_and_an_address_of_others_is_bad(tmp_path: P
     assert port(Settings(data_dir=tmp_path, port=free)).condition is Condition.GOOD
     found = port(Settings(data_dir=tmp_path, host="192.0.2.1", port=0))
     assert not found.ok
-    assert "GRASPD_HOST" in found.mend
+    assert "GRASPD_HOST" in found.fix
 
 
 def test_the_service_of_the_data_folder_is_asked_where_it_wrote_that_it_is(tmp_path: Path) -> None:

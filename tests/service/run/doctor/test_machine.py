@@ -17,21 +17,21 @@ GIB = 2**30
 @pytest.mark.parametrize(
     ("free", "condition"), [(100 * GIB, Condition.GOOD), (3 * GIB, Condition.WARNING), (GIB // 2, Condition.BAD)]
 )
-def test_room_is_judged_by_the_fullest_disk(tmp_path: Path, free: int, condition: Condition) -> None:
+def test_room_is_validated_by_the_fullest_disk(tmp_path: Path, free: int, condition: Condition) -> None:
     settings = Settings(data_dir=tmp_path / "data", store_url=(tmp_path / "far").as_uri())
     (tmp_path / "far").mkdir()
     found = disk(settings, usage=lambda folder: (0, 0, free if folder == tmp_path / "far" else 200 * GIB))
     assert found.condition is condition
     if condition is not Condition.GOOD:
         assert str(tmp_path / "far") in found.message
-        assert "GRASPD_STORE_URL" in found.mend
+        assert "GRASPD_STORE_URL" in found.fix
 
 
 def test_a_data_folder_that_others_can_read_is_told(tmp_path: Path) -> None:
     tmp_path.chmod(0o755)
     found = data_folder(Settings(data_dir=tmp_path))
     assert found.condition is Condition.WARNING
-    assert found.mend == f"chmod 700 {tmp_path}"
+    assert found.fix == f"chmod 700 {tmp_path}"
     tmp_path.chmod(0o700)
     assert data_folder(Settings(data_dir=tmp_path)).condition is Condition.GOOD
 
@@ -81,10 +81,10 @@ def test_a_library_that_does_not_fit_is_named_with_the_command(requirement: str,
     assert found.ok is (not told)
     if told:
         assert told in found.message
-        assert found.mend == f"pip install '{told.partition(' (')[0]}'"
+        assert found.fix == f"pip install '{told.partition(' (')[0]}'"
 
 
 def test_few_files_and_little_memory_are_told() -> None:
     assert limits(files=4096, memory=16 * GIB).condition is Condition.GOOD
-    assert "ulimit" in limits(files=256, memory=16 * GIB).mend
-    assert "more memory" in limits(files=4096, memory=GIB).mend
+    assert "ulimit" in limits(files=256, memory=16 * GIB).fix
+    assert "more memory" in limits(files=4096, memory=GIB).fix

@@ -10,7 +10,7 @@ import obstore
 import pytest
 from obstore.store import MemoryStore
 
-from graspd.service.run.doctor.backends import judge_store, store
+from graspd.service.run.doctor.backends import check_store, store
 from graspd.service.run.doctor.checks import Condition
 from graspd.service.settings import Settings
 from graspd.service.store.store import Entry, Store, open_store
@@ -41,12 +41,12 @@ def test_a_wrong_secret_is_bad_and_the_mend_names_the_variables(
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "of-somebody-else")
     found = store(Settings(data_dir=tmp_path, store_url=s3_url))
     assert not found.ok
-    assert "AWS_SECRET_ACCESS_KEY" in found.mend
+    assert "AWS_SECRET_ACCESS_KEY" in found.fix
     assert "of-somebody-else" not in str(found)
 
 
 def test_a_store_in_memory_is_gone_with_its_process() -> None:
-    assert judge_store("store", open_store("memory://")).condition is Condition.WARNING
+    assert check_store("store", open_store("memory://")).condition is Condition.WARNING
 
 
 class Overwriting(Store):
@@ -76,6 +76,6 @@ class Keeping(Store):
     ("kind", "word"), [(Overwriting, "overwritten"), (Deaf, "not in the list"), (Keeping, "still there")]
 )
 def test_a_store_that_breaks_a_promise_is_bad(kind: type[Store], word: str) -> None:
-    found = judge_store("store", kind(MemoryStore(), "fake://"))
+    found = check_store("store", kind(MemoryStore(), "fake://"))
     assert not found.ok
     assert word in found.message

@@ -33,6 +33,6 @@ def test_findings_come_in_order_and_one_that_hangs_is_bad() -> None:
         hold.set()
     assert [one.name for one in found] == ["hangs", "breaks", "away", "good"]
     assert [one.condition for one in found] == [Condition.BAD] * 3 + [Condition.GOOD]
-    assert found[0].mend == "restart it"
+    assert found[0].fix == "restart it"
     assert "ZeroDivisionError: by nothing" in found[1].message
     assert found[2].message == "the store is away"

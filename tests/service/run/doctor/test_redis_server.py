@@ -71,7 +71,7 @@ def test_a_policy_that_evicts_is_bad_once_memory_is_bounded(own: Settings, clien
     found = redis(own)
     assert not found.ok
     assert "allkeys-lru" in found.message
-    assert "maxmemory-policy noeviction" in found.mend
+    assert "maxmemory-policy noeviction" in found.fix
 
 
 def test_a_full_memory_is_bad(own: Settings, client: Redis) -> None:
@@ -85,14 +85,14 @@ def test_a_replica_is_bad(own: Settings, client: Redis) -> None:
     client.replicaof("127.0.0.1", str(free_ports(1)[0]))
     found = redis(own)
     assert not found.ok
-    assert "primary" in found.mend
+    assert "primary" in found.fix
 
 
 def test_without_a_log_of_writes_a_crash_costs_a_pause(own: Settings, client: Redis) -> None:
     client.config_set("appendonly", "no")
     found = persistence(own)
     assert (found.ok, found.condition) == (True, Condition.WARNING)
-    assert "appendonly yes" in found.mend
+    assert "appendonly yes" in found.fix
 
 
 def test_a_password_that_is_missing_is_named_and_never_shown(tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_a_password_that_is_missing_is_named_and_never_shown(tmp_path: Path) -> 
         found = [redis(Settings(data_dir=tmp_path, redis_url=url)) for url in (right, f"redis://127.0.0.1:{port}/0")]
         process.terminate()
     assert [one.condition for one in found] == [Condition.GOOD, Condition.BAD]
-    assert "redis://:PASSWORD@" in found[1].mend
+    assert "redis://:PASSWORD@" in found[1].fix
     assert "s3cret" not in str(found)
 
 

@@ -1,4 +1,4 @@
-"""An engine with the arrays of MuJoCo Warp in which MuJoCo itself steps: its verdicts must be the referee's."""
+"""An engine with the arrays of MuJoCo Warp in which MuJoCo itself steps: its verdicts must be the validator's."""
 
 from __future__ import annotations
 

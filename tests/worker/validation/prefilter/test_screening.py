@@ -1,4 +1,4 @@
-"""The first judge beside the CPU: who judges what, and what becomes of verdicts that the CPU contradicts."""
+"""The prefilter beside the CPU: who validates what, and what becomes of verdicts that the CPU contradicts."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ import pytest
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError
 from graspd.service.store.columns import SCHEMAS
-from graspd.worker.certified import scored
+from graspd.worker.execution_context import ExecutionContext
+from graspd.worker.generation import scored
 from graspd.worker.grasps import GraspSet
 from graspd.worker.meeting import Meeting
-from graspd.worker.run import Run
 from graspd.worker.validation.key import Level
-from graspd.worker.validation.prefilter import phases as trials
+from graspd.worker.validation.prefilter import phases as rollouts
 from graspd.worker.validation.prefilter import prefilter as screening
-from graspd.worker.validation.prefilter.phases import FirstTrials
-from graspd.worker.validation.protocol import JudgedBy
-from graspd.worker.validation.validator import Verdicts, judge
+from graspd.worker.validation.prefilter.phases import PrefilterOutcomes
+from graspd.worker.validation.protocol import ValidatedBy
+from graspd.worker.validation.validator import Verdicts, validate
 from tests.worker.validation.prefilter.engine import Stand
 from tests.worker.validation.prefilter.test_worlds import every_kind
 from tests.worker.validation.test_validator import BOX, PADS, WHOLE
 
-ON = Run(first_judge="on", threads=1)
+ON = ExecutionContext(prefilter="on", threads=1)
 
 
 @pytest.fixture(autouse=True)
@@ -38,55 +38,62 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stand]:
     monkeypatch.setattr(screening, "mujoco_warp", lambda: engine)
     monkeypatch.setattr(screening, "mujoco_warp_version", lambda: "stand-in 1")
     monkeypatch.setattr(screening, "jaws_of", lambda hand: None)
-    monkeypatch.setattr(screening, "AUDIT_ONE_IN", 1 << 62)
+    monkeypatch.setattr(screening, "RECHECK_ONE_IN", 1 << 62)
     screening._pools.clear()
     yield engine
     screening._pools.clear()
 
 
-def verdicts(run: Run, level: Level = "certificate", grasps: GraspSet | None = None) -> Verdicts:
-    return judge(PADS, BOX, grasps or every_kind(), level=level, pieces=WHOLE, run=run)
+def verdicts(run: ExecutionContext, level: Level = "standard", grasps: GraspSet | None = None) -> Verdicts:
+    return validate(PADS, BOX, grasps or every_kind(), level=level, pieces=WHOLE, run=run)
 
 
 def test_at_level_certificate_the_first_judge_only_refuses() -> None:
-    alone, found = verdicts(Run()), verdicts(ON)
+    alone, found = verdicts(ExecutionContext()), verdicts(ON)
     np.testing.assert_array_equal(found.outcome, alone.outcome)
-    assert (found.judged_by[found.success == 1] == JudgedBy.MUJOCO).all()
-    assert (found.judged_by == JudgedBy.MUJOCO_WARP).any()
-    assert (alone.judged_by == JudgedBy.MUJOCO).all()
+    assert (found.validated_by[found.success == 1] == ValidatedBy.MUJOCO).all()
+    assert (found.validated_by == ValidatedBy.MUJOCO_WARP).any()
+    assert (alone.validated_by == ValidatedBy.MUJOCO).all()
 
 
 def test_at_level_screen_clear_verdicts_stand_both_ways_and_the_band_is_the_cpus(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    first = verdicts(ON, "screen")
+    first = verdicts(ON, "fast")
     for held in (0, 1):
-        assert (first.judged_by[first.success == held] == JudgedBy.MUJOCO_WARP).any()
-    certificate = verdicts(Run())
-    assert first.level == "screen"
-    np.testing.assert_array_equal(first.success, certificate.success)
-    monkeypatch.setattr(trials, "BAND", (0.0, 1e9))
-    band = verdicts(ON, "screen")
+        assert (first.validated_by[first.success == held] == ValidatedBy.MUJOCO_WARP).any()
+    standard = verdicts(ExecutionContext())
+    assert first.level == "fast"
+    np.testing.assert_array_equal(first.success, standard.success)
+    monkeypatch.setattr(rollouts, "BAND", (0.0, 1e9))
+    band = verdicts(ON, "fast")
     inside = band.outcome[:, 0] == 2
-    assert (band.judged_by[~inside] == JudgedBy.MUJOCO).all()
-    np.testing.assert_array_equal(band.margin[~inside], certificate.margin[~inside])
+    assert (band.validated_by[~inside] == ValidatedBy.MUJOCO).all()
+    np.testing.assert_array_equal(band.margin[~inside], standard.margin[~inside])
 
 
 def test_the_letter_knows_no_first_judge() -> None:
-    found = verdicts(ON, "letter")
-    assert (found.judged_by == JudgedBy.MUJOCO).all()
-    assert found.terms == verdicts(Run(), "letter").terms
+    found = verdicts(ON, "dexgraspbench")
+    assert (found.validated_by == ValidatedBy.MUJOCO).all()
+    assert found.terms == verdicts(ExecutionContext(), "dexgraspbench").terms
 
 
 def test_the_key_says_who_judges() -> None:
-    keys = {verdicts(run).terms for run in (Run(), Run(first_judge="off"), Run(device="cpu", first_judge="auto"))}
+    keys = {
+        verdicts(run).terms
+        for run in (
+            ExecutionContext(),
+            ExecutionContext(prefilter="off"),
+            ExecutionContext(device="cpu", prefilter="auto"),
+        )
+    }
     assert len(keys) == 1
     assert verdicts(ON).terms not in keys
 
 
 def test_grippers_are_the_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(screening, "jaws_of", lambda hand: object())
-    assert screening.first_terms(PADS, "certificate", ON) == []
+    assert screening.first_terms(PADS, "standard", ON) == []
 
 
 def test_who_insists_on_it_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,27 +104,27 @@ def test_who_insists_on_it_is_told_what_to_install(monkeypatch: pytest.MonkeyPat
         verdicts(ON)
 
 
-def lies(found: FirstTrials) -> FirstTrials:
-    """Of every grasp that fails the first judge says that it clearly holds."""
+def lies(found: PrefilterOutcomes) -> PrefilterOutcomes:
+    """Of every grasp that fails the prefilter says that it clearly holds."""
     return dataclasses.replace(found, outcome=np.ones_like(found.outcome), margin=np.zeros(len(found.margin)))
 
 
 def test_a_first_judge_that_the_cpu_contradicts_is_not_believed(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    true = screening.WorldPool.judge
-    monkeypatch.setattr(screening.WorldPool, "judge", lambda *some, **more: lies(true(*some, **more)))
-    unaudited = verdicts(ON, "screen")
-    assert unaudited.success.all()
-    assert unaudited.audited == 0
-    monkeypatch.setattr(screening, "AUDIT_ONE_IN", 2)
+    true = screening.WorldPool.validate
+    monkeypatch.setattr(screening.WorldPool, "validate", lambda *some, **more: lies(true(*some, **more)))
+    not_rechecked = verdicts(ON, "fast")
+    assert not_rechecked.success.all()
+    assert not_rechecked.rechecked == 0
+    monkeypatch.setattr(screening, "RECHECK_ONE_IN", 2)
     with caplog.at_level(logging.WARNING):
-        found = verdicts(ON, "screen")
+        found = verdicts(ON, "fast")
     assert found.contradicted > 1
-    assert found.audited >= found.contradicted
-    assert (found.judged_by == JudgedBy.MUJOCO).all()
-    np.testing.assert_array_equal(found.success, verdicts(Run()).success)
-    assert "the CPU judges all" in caplog.text
+    assert found.rechecked >= found.contradicted
+    assert (found.validated_by == ValidatedBy.MUJOCO).all()
+    np.testing.assert_array_equal(found.success, verdicts(ExecutionContext()).success)
+    assert "the CPU validates all" in caplog.text
 
 
 def test_where_a_gpu_has_no_memory_for_it_the_cpu_judges(
@@ -129,12 +136,12 @@ def test_where_a_gpu_has_no_memory_for_it_the_cpu_judges(
     monkeypatch.setattr(screening, "WorldPool", full)
     with caplog.at_level(logging.WARNING):
         found = verdicts(ON)
-    assert (found.judged_by == JudgedBy.MUJOCO).all()
-    assert "no memory for the first judge" in caplog.text
+    assert (found.validated_by == ValidatedBy.MUJOCO).all()
+    assert "no memory for the prefilter" in caplog.text
 
 
 def test_an_audit_follows_the_grasp_and_not_its_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(screening, "AUDIT_ONE_IN", 2)
+    monkeypatch.setattr(screening, "RECHECK_ONE_IN", 2)
     grasps = every_kind()
     drawn = screening._drawn(grasps)
     assert 0 < drawn.sum() < len(grasps)
@@ -142,28 +149,28 @@ def test_an_audit_follows_the_grasp_and_not_its_batch(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("mode", ["on", "off"])
-def test_a_shard_tells_of_each_grasp_who_judged_it(mode: Any) -> None:
-    request = JobOptions(grasps=1, referee="screen", want="raw", audits=0)
-    run = Run(first_judge=mode, threads=1)
+def test_a_shard_tells_of_each_grasp_who_validated_it(mode: Any) -> None:
+    request = JobOptions(grasps=1, validation="fast", want="candidates", rechecks=0)
+    run = ExecutionContext(prefilter=mode, threads=1)
     found = scored(PADS, BOX, every_kind(), request, pieces=lambda obj: WHOLE, run=run)
     columns = found.columns
-    assert ("quality/judged_by" in columns) == (mode == "on")
-    assert found.verdict_key == verdicts(run, "screen").terms
+    assert ("quality/validated_by" in columns) == (mode == "on")
+    assert found.verdict_key == verdicts(run, "fast").terms
     if mode == "on":
-        assert (columns["quality/judged_by"] == JudgedBy.MUJOCO_WARP).any()
+        assert (columns["quality/validated_by"] == ValidatedBy.MUJOCO_WARP).any()
         assert columns.keys() <= SCHEMAS["base"].keys()
 
 
-def test_members_of_a_meeting_are_judged_in_one_launch() -> None:
+def test_members_of_a_meeting_are_validated_in_one_launch() -> None:
     grasps = every_kind()
     halves = [grasps.take(np.arange(0, 6)), grasps.take(np.arange(6, len(grasps)))]
-    alone = [verdicts(ON, "screen", half) for half in halves]
+    alone = [verdicts(ON, "fast", half) for half in halves]
     with Meeting(2, 64) as meeting:
         run = dataclasses.replace(ON, meeting=meeting)
 
         def member(half: GraspSet) -> Any:
             try:
-                return verdicts(run, "screen", half)
+                return verdicts(run, "fast", half)
             finally:
                 meeting.leave()
 
@@ -172,4 +179,4 @@ def test_members_of_a_meeting_are_judged_in_one_launch() -> None:
     assert meeting.served == [2]
     for one, other in zip(alone, together, strict=True):
         np.testing.assert_array_equal(one.outcome, other.outcome)
-        np.testing.assert_array_equal(one.judged_by, other.judged_by)
+        np.testing.assert_array_equal(one.validated_by, other.validated_by)

@@ -22,15 +22,15 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, spread_directions
+from graspd.worker.hands.flat_pinches import HEIGHTS_M, pinches_of
 from graspd.worker.hands.jaws import thinnest_fingertip
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.oppositions import Oppositions, oppositions_of
-from graspd.worker.hands.pinches import HEIGHTS_M, pinches_of
+from graspd.worker.hands.pinch_postures import Oppositions, oppositions_of
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.simulation.environment import CLEAR_M, Environment
 from graspd.worker.simulation.mounting import OUTERMOST, points_of
 from graspd.worker.simulation.obstacles import MARGIN_M
-from graspd.worker.simulation.surroundings import CLEAR_M, Surroundings
 
 #: Points of the surface that pairs are made of, and how far their line may turn from their normals (cosine): within
 #: the cones of half the friction. With 0.9 Allegro lifts .39 of six objects at half of it and Shadow .30, with these
@@ -137,7 +137,7 @@ class Openings:
 
     @classmethod
     def of(
-        cls, known: Oppositions, obj: ObjectModel, scene: Surroundings, *, tip: float = 0.0, upright: bool = False
+        cls, known: Oppositions, obj: ObjectModel, scene: Environment, *, tip: float = 0.0, upright: bool = False
     ) -> Openings:
         """`tip`: thickness of the fingertips that must fit beside a pair [m]; `upright` as the field."""
         pairs = crossings_of(obj)
@@ -162,7 +162,7 @@ class Openings:
         return cls(pairs, np.cumsum(chance) / chance.sum(), known, scene.up, upright, within_reach)
 
     @classmethod
-    def in_scene(cls, hand: HandModel, obj: ObjectModel, scene: Surroundings) -> Openings:
+    def in_scene(cls, hand: HandModel, obj: ObjectModel, scene: Environment) -> Openings:
         """The same between the pads, or of what lies flat between the ends of fingertips that rest beside it."""
         ends = pinches_of(hand, float(np.ptp(obj.hull_vertices @ scene.up)))
         tip = thinnest_fingertip(hand)
@@ -170,7 +170,7 @@ class Openings:
         return flat if len(flat.sums) else cls.of(oppositions_of(hand), obj, scene, tip=tip)
 
 
-def room_beside(pairs: Crossings, scene: Surroundings, width: float) -> Floats:
+def room_beside(pairs: Crossings, scene: Environment, width: float) -> Floats:
     """(P,) least distance of balls of a diameter beside the ends of pairs from walls and neighbours, not from what the
     object stands on [m]."""
     out = np.full(len(pairs), np.inf)
@@ -251,7 +251,7 @@ def promising(
     opening: Openings,
     uniform: Floats,
     ways: Floats,
-    scene: Surroundings,
+    scene: Environment,
     *,
     room: float,
     keep: int,
@@ -294,7 +294,7 @@ DIRECTIONS: Final = 20
 
 
 @dataclass(frozen=True)
-class Outlines:
+class PostureOutlines:
     """Outermost points of a hand in each of its K opposed postures, from the palm's centre."""
 
     points: Floats
@@ -306,7 +306,7 @@ class Outlines:
     without one."""
 
     def lacks(
-        self, posture: NDArray[np.intp], turn: Floats, centre: Floats, scene: Surroundings, *, room: float
+        self, posture: NDArray[np.intp], turn: Floats, centre: Floats, scene: Environment, *, room: float
     ) -> Floats:
         """(n,) what hands and their mountings lack of the distance from obstacles that they are to keep, and of `room`
         besides [m]; 0 or more.
@@ -325,7 +325,7 @@ class Outlines:
             lack = np.maximum(lack, (wanted - obstacle.distance(place)).max(axis=1))
         return np.maximum(lack, self._mounting_lacks(turn, centre, scene, MARGIN_M + room))
 
-    def _mounting_lacks(self, turn: Floats, centre: Floats, scene: Surroundings, wanted: float) -> Floats:
+    def _mounting_lacks(self, turn: Floats, centre: Floats, scene: Environment, wanted: float) -> Floats:
         """(n,) what mountings at the best of their wrist positions lack of the distance `wanted` from obstacles [m]."""
         least = np.full(len(turn), np.inf if len(self.mounting) else 0.0)
         for points in self.mounting:
@@ -336,12 +336,12 @@ class Outlines:
         return least
 
 
-_known_outlines: LRUCache[tuple[str, bytes], Outlines] = LRUCache(16)
+_known_outlines: LRUCache[tuple[str, bytes], PostureOutlines] = LRUCache(16)
 
 _outline_lock = threading.Lock()
 
 
-def outlines_of(hand: HandModel, postures: Oppositions) -> Outlines:
+def outlines_of(hand: HandModel, postures: Oppositions) -> PostureOutlines:
     """The outlines of opposed postures of a hand, from memory where they are known."""
     key = (hand.content, postures.q.tobytes())
     with _outline_lock:
@@ -350,7 +350,7 @@ def outlines_of(hand: HandModel, postures: Oppositions) -> Outlines:
         return _known_outlines[key]
 
 
-def _outlines(hand: HandModel, q: Floats) -> Outlines:
+def _outlines(hand: HandModel, q: Floats) -> PostureOutlines:
     bodies = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))
     points, tips = [], []
     for tip in (True, False):
@@ -363,7 +363,7 @@ def _outlines(hand: HandModel, q: Floats) -> Outlines:
     mounting = np.zeros((0, 0, 3))
     if hand.mounting is not None:
         mounting = points_of(hand.mounting)[:, :OUTERMOST] - hand.palm.centre
-    return Outlines(np.concatenate(points, axis=1) - hand.palm.centre, np.concatenate(tips), mounting)
+    return PostureOutlines(np.concatenate(points, axis=1) - hand.palm.centre, np.concatenate(tips), mounting)
 
 
 #: A gap that is wider is as good as this, and how exactly others are told [m].
@@ -371,7 +371,7 @@ WIDEST_M: Final = 0.064
 EXACT_M: Final = 0.0005
 
 
-def why_narrow(hand: HandModel, obj: ObjectModel, scenes: Sequence[Surroundings]) -> str | None:
+def why_narrow(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment]) -> str | None:
     """Why no fingertips of a hand can hold an object between them in any of the scenes; None: nothing tells."""
     known, pairs = oppositions_of(hand), crossings_of(obj)
     if not len(known) or not len(pairs):
@@ -398,7 +398,7 @@ def why_narrow(hand: HandModel, obj: ObjectModel, scenes: Sequence[Surroundings]
     )
 
 
-def _widest_gap(pairs: Crossings, fits: NDArray[np.bool_], scene: Surroundings, thin: float) -> float:
+def _widest_gap(pairs: Crossings, fits: NDArray[np.bool_], scene: Environment, thin: float) -> float:
     """The widest ball that fits beside both ends of one of the pairs that fit [m]; steep ones need room below them."""
     level, above = np.abs(pairs.axis @ scene.up) < STEEP, np.ones(len(pairs), bool)
     for obstacle in scene.obstacles:

@@ -20,11 +20,11 @@ from graspd.service.store.shards import Shard
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.simulation.environment import Placed
 
 
 @dataclass(frozen=True)
-class Lot:
+class ExportPart:
     """Grasps of one base shard that are exported."""
 
     id: str
@@ -37,7 +37,7 @@ class Lot:
     rows: NDArray[np.intp]
     """Rows that go into the export."""
     verdict: NDArray[np.int8]
-    """(N,) of the referee on every grasp: 1 held, 0 dropped, -1 nobody judged."""
+    """(N,) of the validator on every grasp: 1 held, 0 dropped, -1 not validated."""
     shard: Shard
     placed: Placed | None = None
 
@@ -112,7 +112,7 @@ def by_scene(found: Sequence[Look]) -> dict[tuple[str, int], list[Look]]:
 
 
 @dataclass
-class Written:
+class ExportSummary:
     """What came of an export."""
 
     counts: dict[str, Any]

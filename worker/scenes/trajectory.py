@@ -27,9 +27,9 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.contact import finger_of_body
 from graspd.worker.quality.probe import Probe, probe_of
 from graspd.worker.scenes.clearance import MARGIN_M, PATH_POSTURES, approach
+from graspd.worker.simulation.environment import RISE_M, STANDOFF_M, Environment, Placed
 from graspd.worker.simulation.mounting import mounting_room, wrist_room
 from graspd.worker.simulation.obstacles import obstacle_room
-from graspd.worker.simulation.surroundings import RISE_M, STANDOFF_M, Placed, Surroundings
 
 _POINTS: Final = 600
 #: Around a free object: tilts of the retreat from the palm's own direction [rad], each to so many sides.
@@ -40,7 +40,7 @@ _FREE_POINTS: Final = (2000, 3000)
 
 
 @dataclass(frozen=True)
-class Way:
+class Trajectory:
     """How N grasps are reached and lifted, in the object frame."""
 
     approach: Floats
@@ -77,7 +77,7 @@ class Way:
         return np.asarray((self.least >= MARGIN_M) & ~self.touching)
 
 
-def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed) -> Way:
+def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed) -> Trajectory:
     """The way of every grasp in its scene: the first direction of retreat that is free, or else the freest."""
     probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
     count, scenes, which = len(grasps), placed.scenes, np.asarray(placed.index, np.intp)
@@ -101,10 +101,12 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
     raised = np.array(grasps.squeeze.hand_pose, float)
     raised[:, :3] += rise
     lift = Posture(moved(raised, np.zeros(3)), np.array(grasps.squeeze.joint_positions, float))
-    return Way(moved(path, np.zeros(3)), came, lift, contact, closing, coming, lifting, touching, wrist, mounting)
+    return Trajectory(
+        moved(path, np.zeros(3)), came, lift, contact, closing, coming, lifting, touching, wrist, mounting
+    )
 
 
-def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Way:
+def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Trajectory:
     """The way of grasps of an object that stands alone: a retreat of `STANDOFF_M` that is free of the object.
 
     The palm's own direction of retreat is tried first, then others ever farther from it. `lift` is the squeeze posture
@@ -122,7 +124,7 @@ def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Way:
     lift = Posture(raised, np.array(grasps.squeeze.joint_positions, float))
     endless = np.full(len(grasps), np.inf)
     still, _ = mounting_room(hand, path[:, -1:], nowhere.scenes)
-    return Way(path, wide.joint_positions, lift, endless, endless, endless, endless, touching, still, endless)
+    return Trajectory(path, wide.joint_positions, lift, endless, endless, endless, endless, touching, still, endless)
 
 
 def _opened(probe: Probe, pregrasp: Posture, joints: Floats) -> Posture:
@@ -150,7 +152,7 @@ def _tilted(axis: Floats, tilt: float, side: int) -> Floats:
 
 
 def _coming(
-    probe: Probe, pregrasp: Posture, scene: Surroundings, ways: Sequence[Floats]
+    probe: Probe, pregrasp: Posture, scene: Environment, ways: Sequence[Floats]
 ) -> tuple[Floats, Floats, NDArray[np.bool_], Floats]:
     """Waypoints (n, W, 7), least distance from obstacles (n,), whether the object is touched (n,), and the direction of
     retreat (n, 3): the first of `ways`, (n, 3) each, that is free, or else the freest.

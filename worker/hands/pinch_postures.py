@@ -222,7 +222,7 @@ def require_opposing(hand: HandModel) -> None:
     """Refuse a hand that can hold nothing, before any work; from memory or this machine's cache where it is known.
 
     Raises:
-        HandError: no two of its surfaces face each other and close; the message says the mend.
+        HandError: no two of its surfaces face each other and close; the message says the fix.
     """
     with _lock:
         if hand.content not in _holding:
@@ -242,7 +242,7 @@ def _is_one_answer(kept: Mapping[str, NDArray[Any]]) -> bool:
 
 
 def _why_not(hand: HandModel) -> HandError:
-    """What is missing of a hand that can hold nothing, and the mend."""
+    """What is missing of a hand that can hold nothing, and the fix."""
     shaped = {piece.body for piece in hand.pieces}
     bare = [hand.body_names[tip] for tip in hand.fingertips if tip not in shaped]
     if bare:

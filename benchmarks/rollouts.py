@@ -1,6 +1,6 @@
-"""What it changes that hands are tried before one is taken: raw free grasps chosen by merit alone, and by the trial.
+"""What it changes that hands are tried before one is taken: free candidates chosen by merit alone, and by the trial.
 
-usage: python -m benchmarks.tried DATA --work WORK --out FOLDER [--hands ...] [--objects ...] [--grasps 8]
+usage: python -m benchmarks.rollouts DATA --work WORK --out FOLDER [--hands ...] [--objects ...] [--grasps 8]
 
 Both ways of a pair are made in one run; times are processor time of one thread, those of planning with the postures
 and, where hands are tried, the trials. DATA holds hands/ and objects/. A pair that WORK knows is not made again.
@@ -17,40 +17,40 @@ import numpy as np
 
 from benchmarks.cells import HANDS, cell_parser, kept_json, write_json
 from graspd.service.model.fidelity import FIDELITIES
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
-from graspd.worker.planners.port import Wanted
+from graspd.worker.planners.port import PlanRequest
 from graspd.worker.quality.table import measure
-from graspd.worker.run import Run
 from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.prescreening import push_trial
-from graspd.worker.validation.validator import judge
+from graspd.worker.validation.prescreening import push_rollout
+from graspd.worker.validation.validator import validate
 
 #: Neither a seed that any setting was chosen with.
 SEED, WARM_SEED = 2027, 1
 FIDELITY = FIDELITIES["standard"]
-WAYS: Final = {"merit": "by merit", "trial": "tried"}
+WAYS: Final = {"merit": "by merit", "rollout": "tried"}
 #: Friction and threshold of ε as in the paper's table 2; its best ten are a third of these at most.
 FRICTION, THRESHOLD_M = 1.0, 0.005
-ONE = Run(threads=1)
+ONE = ExecutionContext(threads=1)
 
 
 def found_of(hand: HandModel, mesh: Path, count: int) -> dict[str, dict[str, Any]]:
     """Of each of `WAYS`: counts, and seconds of all grasps."""
     obj = object_from_path(mesh, face_error_m=FIDELITY.face_error_m)
     pieces = decompose(obj)
-    trials = {"merit": None, "trial": push_trial(hand, obj, lambda: pieces)}
+    rollouts = {"merit": None, "rollout": push_rollout(hand, obj, lambda: pieces)}
     found: dict[str, dict[str, Any]] = {}
-    for way, trial in trials.items():
-        synthesize(hand, obj, Wanted(1, FIDELITY, WARM_SEED, trial=trial), ONE)
+    for way, rollout in rollouts.items():
+        synthesize(hand, obj, PlanRequest(1, FIDELITY, WARM_SEED, rollout=rollout), ONE)
         began = time.process_time()
-        grasps = synthesize(hand, obj, Wanted(count, FIDELITY, SEED, trial=trial), ONE)
+        grasps = synthesize(hand, obj, PlanRequest(count, FIDELITY, SEED, rollout=rollout), ONE)
         planned, began = time.process_time() - began, time.process_time()
-        held = judge(hand, obj, grasps, pieces=pieces, run=ONE).success
-        judged = time.process_time() - began
-        hard = judge(hand, obj, grasps, pieces=pieces, hard=True, run=ONE).success
+        held = validate(hand, obj, grasps, pieces=pieces, run=ONE).success
+        validated = time.process_time() - began
+        hard = validate(hand, obj, grasps, pieces=pieces, hard=True, run=ONE).success
         table = measure(hand, obj, grasps, friction=FRICTION, thresholds_m=[THRESHOLD_M])
         best = np.argsort(-table["quality/epsilon"][:, 0])[: max(1, count // 3)]
         found[way] = {
@@ -58,7 +58,7 @@ def found_of(hand: HandModel, mesh: Path, count: int) -> dict[str, dict[str, Any
             "held": int(held.sum()),
             "hard": int((held & hard).sum()),
             "planned_s": planned,
-            "judged_s": judged,
+            "validated_s": validated,
             "depth_mm": float(np.median(table["quality/penetration_depth_mm"])),
             "area_cm2": float(table["quality/contact_area_cm2"][best].mean()),
             "epsilon": float(table["quality/epsilon"][best].mean()),
@@ -69,11 +69,11 @@ def found_of(hand: HandModel, mesh: Path, count: int) -> dict[str, dict[str, Any
 def row(hand: str, way: str, pairs: list[dict[str, Any]]) -> str:
     """A line of the page: one hand's pairs, one way."""
     grasps, held, hard = (sum(found[key] for found in pairs) for key in ("grasps", "held", "hard"))
-    planned, judged = (1e3 * sum(found[key] for found in pairs) for key in ("planned_s", "judged_s"))
+    planned, validated = (1e3 * sum(found[key] for found in pairs) for key in ("planned_s", "validated_s"))
     worst = min(found["held"] / found["grasps"] for found in pairs)
     cells = [hand, WAYS[way], f"{held / grasps:.2f}", f"{worst:.2f}", f"{hard / grasps:.2f}"]
-    cells += [f"{ms / grasps:.0f}" for ms in (planned, judged)]
-    cells += [f"{(planned + judged) / max(1, count):.0f}" for count in (held, hard)]
+    cells += [f"{ms / grasps:.0f}" for ms in (planned, validated)]
+    cells += [f"{(planned + validated) / max(1, count):.0f}" for count in (held, hard)]
     cells += [f"{np.median([found['depth_mm'] for found in pairs]):.2f}"]
     cells += [f"{np.mean([found['area_cm2'] for found in pairs]):.0f}"]
     cells += [f"{np.mean([found['epsilon'] for found in pairs]):.2f}"]
@@ -88,7 +88,7 @@ def page(done: dict[str, dict[str, dict[str, Any]]], count: int) -> str:
         "worst object",
         "hard",
         "planner ms",
-        "referee ms",
+        "validator ms",
         "ms a valid grasp",
         "ms a hard one",
         "PD mm",
@@ -100,10 +100,10 @@ def page(done: dict[str, dict[str, dict[str, Any]]], count: int) -> str:
         [
             "# Hands that are tried",
             "",
-            f"`python -m benchmarks.tried DATA --out docs/results`: {count} raw standard grasps of each hand on each "
-            f"of {objects} objects, seed {SEED}, free, judged by the certificate, both ways in one run. *By merit*: "
+            f"`python -m benchmarks.rollouts DATA --out docs/results`: {count} standard candidates of each hand on each "
+            f"of {objects} objects, seed {SEED}, free, validated at level standard, both ways in one run. *By merit*: "
             "the hand whose contacts balance best; *tried*: the first that holds in a short test. *hard*: holds at "
-            "half the friction, too. Times are core-ms of a raw grasp, then of one that holds. PD: median of objects' "
+            "half the friction, too. Times are core-ms of a candidate, then of one that holds. PD: median of objects' "
             "medians; CA and ε: means of the best third by ε.",
             "",
             f"| {' | '.join(titles)} |",

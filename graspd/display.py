@@ -77,28 +77,30 @@ def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:
     """A viewer that serves; see `Grasps.view`."""
     try:
         from graspd.worker.files.provenance import hand_of_shard, neighbours_of_shard, object_of_shard
-        from graspd.worker.viewing import Shown, Viewer, missing
+        from graspd.worker.viewing import Viewer, ViewerContent, missing
     except ModuleNotFoundError as error:
         raise ImportError(f"view needs {error.name}; run pip install 'graspd[worker,view]'") from error
     if said := missing():
         raise InputError(said)
     shard = grasps.shard()
-    shown = Shown(shard, hand_of_shard(shard, None), object_of_shard(shard, None), neighbours_of_shard(shard, []))
+    shown = ViewerContent(
+        shard, hand_of_shard(shard, None), object_of_shard(shard, None), neighbours_of_shard(shard, [])
+    )
     return Viewer(shown, host=host, port=port)
 
 
 def _picture(grasps: Grasps) -> bytes:
     from graspd.commands.grasp_sheet import GraspSheet
     from graspd.worker.engines.devices import Device
+    from graspd.worker.execution_context import ExecutionContext
     from graspd.worker.files.provenance import hand_of_shard, object_of_shard
-    from graspd.worker.run import Run
 
     shard, until = grasps.shard(), time.monotonic() + PICTURE_S
     rows = _best(grasps)
     if not len(rows):
         raise InputError("there is no grasp to draw")
     hand, obj = hand_of_shard(shard, None), object_of_shard(shard, None)
-    run = Run(Device("auto").resolve(), cancelled=lambda: time.monotonic() > until)
+    run = ExecutionContext(Device("auto").resolve(), cancelled=lambda: time.monotonic() > until)
     return GraspSheet(shard, hand, obj, rows, "one side", run, EDGE).png(subtitle=f"best {len(rows)} by epsilon")
 
 

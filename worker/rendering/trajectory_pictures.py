@@ -15,7 +15,8 @@ from graspd.service.model.colours import hexadecimal
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import HalfSpace
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, compose
-from graspd.service.readers.ways import Waypoint
+from graspd.service.readers.trajectories import Waypoint
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import moved
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
@@ -37,7 +38,6 @@ from graspd.worker.rendering.pictures import (
 )
 from graspd.worker.rendering.scenery import Box, Look, Shot, Solid, Supports, seen_share, slab_poses, slabs
 from graspd.worker.rendering.tracer import Tracer
-from graspd.worker.run import ALONE, Run
 from graspd.worker.scenes.neighbours import Neighbours
 
 #: Postures that a strip shows; those that a grasp has.
@@ -48,7 +48,7 @@ _AROUND: Final = 16
 _HEIGHTS: Final = tuple(np.radians([20.0, 35.0, 52.0]).tolist())
 #: Two sides of one grasp are this far apart at least [rad], if they can be.
 _APART: Final = np.radians(50.0)
-#: Edge of the pictures that sides are judged by [px].
+#: Edge of the pictures that sides are validated by [px].
 _GLANCE: Final = 48
 #: Towards the lamp where a board is above the object: from before it, as high as a room's window.
 _UNDER_A_BOARD: Final = np.array([0.85, -0.42, 0.32]) / np.linalg.norm([0.85, -0.42, 0.32])
@@ -61,7 +61,7 @@ _BESIDE: Final = Look(hexadecimal("#8d86a3"), roughness=0.6)
 
 
 @dataclass(frozen=True)
-class Around:
+class PictureScenes:
     """Where N grasps are: S scenes of an object with the same supports, or one free object that floats."""
 
     supports: Supports = ()
@@ -73,7 +73,7 @@ class Around:
     wrist: Floats | None = None
     """(N, U) angles of the wrist with which the links above the hand's root are drawn; None: they are not."""
 
-    def centred(self, obj: ObjectModel) -> Around:
+    def centred(self, obj: ObjectModel) -> PictureScenes:
         """The same with `obj`, which they are of, and the neighbours about their middles."""
         if not self.supports:
             return self  # a free object floats wherever the tracer is most exact: about its origin
@@ -89,12 +89,12 @@ def way_pictures(
     hand: HandModel,
     obj: ObjectModel,
     frames: Sequence[Sequence[Waypoint]],
-    around: Around,
+    around: PictureScenes,
     size: tuple[int, int] = (300, 300),
     *,
     sides: int = 1,
     whole: bool = False,
-    run: Run = ALONE,
+    run: ExecutionContext = DEFAULT_CONTEXT,
     samples: int = SAMPLES,
 ) -> NDArray[np.uint8]:
     """Pictures of N grasps, F postures each, from A sides.
@@ -125,7 +125,15 @@ def way_pictures(
 class _Stage:
     """One tracer for all grasps: the frames of one grasp are its worlds."""
 
-    def __init__(self, hand: HandModel, obj: ObjectModel, around: Around, frames: int, run: Run, near_m: float) -> None:
+    def __init__(
+        self,
+        hand: HandModel,
+        obj: ObjectModel,
+        around: PictureScenes,
+        frames: int,
+        run: ExecutionContext,
+        near_m: float,
+    ) -> None:
         self.hand, self.obj, self.frames, self.run = hand, obj.centred, frames, run
         self.centre, self.around = np.array(obj.centre), around.centred(obj)
         around, obj = self.around, self.obj

@@ -94,7 +94,7 @@ class Obstacle:
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class Environment:
     """One scene as a hand that reaches for the object sees it, in the object frame."""
 
     obstacles: tuple[Obstacle, ...]
@@ -108,7 +108,7 @@ class Neighbour:
 
     obj: ObjectModel
     pieces: tuple[Floats, ...]
-    """Corners (V, 3) of each piece: what the referee simulates."""
+    """Corners (V, 3) of each piece: what the validator simulates."""
     solids: tuple[Obstacle, ...]
     """The same pieces, or a little more, with few faces: what a hand stays clear of."""
     error_m: float
@@ -154,10 +154,10 @@ class Placed:
     """(S, M, 7) of the neighbours in the scene frame."""
 
     @cached_property
-    def scenes(self) -> tuple[Surroundings, ...]:
+    def scenes(self) -> tuple[Environment, ...]:
         """The S scenes, seen from the object."""
         return tuple(
-            Surroundings(
+            Environment(
                 tuple(o.seen_from(pose) for o in self.supports) + self._beside(number),
                 quat_rotate(quat_conjugate(pose[3:]), UP),
             )

@@ -16,9 +16,9 @@ from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.planners.fast_graspd.starts import Probe
 from graspd.worker.quality.contact import finger_of_body
 from graspd.worker.simulation.data import HandState
+from graspd.worker.simulation.environment import RISE_M, Environment, Placed
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.mounting import mounting_lack
-from graspd.worker.simulation.surroundings import RISE_M, Placed, Surroundings
 
 #: Shares of their range by which fingers have opened, and how far the hand has moved back [m].
 OUT: Final = ((0.2, 0.0), (0.3, 0.015), (0.4, 0.04))
@@ -66,7 +66,7 @@ def _back(model: Model, state: HandState, scenes: NDArray[np.integer]) -> Floats
     return np.asarray(depth.reshape(len(OUT), n).max(axis=0), float)
 
 
-def _open_above(scene: Surroundings) -> bool:
+def _open_above(scene: Environment) -> bool:
     """Whether nothing but floors, of which a hand that rises comes free, stands around."""
     return all(len(o.planes) == 1 and o.planes[0, :3] @ scene.up > 1 - 1e-6 for o in scene.obstacles)
 

@@ -1,6 +1,6 @@
 """What stands in the way of grasps planned in bins, on shelves and among neighbours: contact, closing, coming or lift.
 
-    python -m benchmarks.scene_ways [--count 24] [--json]
+    python -m benchmarks.scene_trajectories [--count 24] [--json]
 
 Prints Markdown. A hand comes straight over 10 cm. The last column counts grasps for which that alone is not free: what
 an approach that bends could save at most.
@@ -20,10 +20,10 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
-from graspd.worker.planners.port import Wanted
-from graspd.worker.scenes.beside import scenes_of
+from graspd.worker.planners.port import PlanRequest
 from graspd.worker.scenes.clearance import MARGIN_M
-from graspd.worker.scenes.way import Way, plan_way
+from graspd.worker.scenes.placement import scenes_of
+from graspd.worker.scenes.trajectory import Trajectory, plan_way
 
 HANDS: Final = ("barrett", "allegro", "shadow")
 #: Target, kind of its scene, and what stands beside it.
@@ -43,7 +43,7 @@ everything all the way. The others come too near to something at contact, while 
 they come in, straight over 10 cm: what an approach that bends could save at most."""
 
 
-def blocked(way: Way) -> dict[str, int]:
+def blocked(way: Trajectory) -> dict[str, int]:
     """How many grasps are clear, and how many are blocked in each part of their way."""
     parts = {"contact": way.contact, "closing": way.closing, "lift": way.lifting}
     near = {name: distance < MARGIN_M for name, distance in parts.items()}
@@ -56,7 +56,7 @@ def blocked(way: Way) -> dict[str, int]:
 
 
 def run(count: int) -> list[dict[str, Any]]:
-    """A row for each hand and place; `count` raw draft grasps each."""
+    """A row for each hand and place; `count` draft candidates each."""
     fidelity = resolve_fidelity("draft")
     names = {name for target, _, beside in PLACES for name in (target, *beside)}
     things = {name: object_from_path(name, face_error_m=fidelity.face_error_m) for name in names}
@@ -67,7 +67,7 @@ def run(count: int) -> list[dict[str, Any]]:
             spec = SceneSpec(kind=kind, neighbours=tuple({"object": one} for one in beside), touch=2.0)
             scenes, _ = scenes_of(spec, things[target], [things[one] for one in beside], count=SCENES, seed=SEEDS[0])
             placed = scenes.placed(np.arange(count) % SCENES)
-            wanted = Wanted(count=count, fidelity=fidelity, seed=SEEDS[1], placed=placed)
+            wanted = PlanRequest(count=count, fidelity=fidelity, seed=SEEDS[1], placed=placed)
             way = plan_way(hand, things[target], synthesize(hand, things[target], wanted), placed)
             told = {"hand": name, "object": target, "scene": kind, "beside": len(beside), "grasps": count}
             rows.append(told | blocked(way))
@@ -85,7 +85,7 @@ def page(rows: list[dict[str, Any]], total: dict[str, int]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--count", type=int, default=24, help="raw grasps for each hand and place")
+    parser.add_argument("--count", type=int, default=24, help="candidates for each hand and place")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
     rows = run(given.count)

@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from graspd.service.model import transforms
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
-from graspd.worker.hands import kinematics, oppositions, primitives, surface
+from graspd.worker.hands import kinematics, primitives, surface
+from graspd.worker.hands import pinch_postures as oppositions
 from graspd.worker.hands.kinematics import body_poses, generalized_forces
 from graspd.worker.hands.model import HandModel, SurfacePoints
-from graspd.worker.hands.oppositions import Oppositions, oppositions_of
+from graspd.worker.hands.pinch_postures import Oppositions, oppositions_of
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.disk_cache import arrays_kept_or_made
 

@@ -16,7 +16,7 @@ from graspd.worker.files.provenance import hand_of_shard, object_of_shard, place
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.simulation.surroundings import Placed
+from graspd.worker.simulation.environment import Placed
 
 #: JSON files beside shards that hold no grasps.
 BESIDE_SHARDS: Final = ("snapshot.json", "subset.json", "card.json")
@@ -34,8 +34,8 @@ class Case:
     """Coulomb coefficient the file states for its metrics."""
     seconds: float | None = None
     """What making the grasps took, where it is known."""
-    judged: bool = False
-    """Whether those seconds hold the referee's work on them already."""
+    validated: bool = False
+    """Whether those seconds hold the validator's work on them already."""
     published: NDArray[np.int8] | None = None
     """(N,) success as published: 1, 0, -1 unknown."""
     placed: Placed | None = None
@@ -106,7 +106,7 @@ def _shard(path: Path, hand: str | None, obj: str | None) -> Case:
         grasps,
         friction=float(said["mu"]) if "mu" in said else None,  # type: ignore[arg-type]
         seconds=float(said["seconds"]) if "seconds" in said else None,  # type: ignore[arg-type]
-        judged=said.get("verdict_level", "none") != "none",
+        validated=said.get("verdict_level", "none") != "none",
         placed=placed_of_shard(shard),
     )
 

@@ -1,11 +1,11 @@
-"""How often the first judge says what the certificate says, and how many grasps it judges a second.
+"""How often the prefilter says what the standard level says, and how many grasps it validates a second.
 
-usage: python -m benchmarks.first_judge DATA_DIR [--work DIR] [--device cuda:0] [--hands ...] [--objects ...]
-           [--grasps 48] [--speed 256 1024] [--worlds 256 1024] [--out docs/results/first-judge]
-DATA_DIR holds hands/ and objects/. The first judge and the certificate judge the same raw grasps; agreement is that of
-the first judge's clear verdicts. `--speed N` times N grasps (those of the first cell of each hand, moved at random by
+usage: python -m benchmarks.prefilter DATA_DIR [--work DIR] [--device cuda:0] [--hands ...] [--objects ...]
+           [--grasps 48] [--speed 256 1024] [--worlds 256 1024] [--out docs/results/first-validate]
+DATA_DIR holds hands/ and objects/. The prefilter and the standard level validate the same candidates; agreement is that
+of the prefilter's clear verdicts. `--speed N` times N grasps (those of the first cell of each hand, moved at random by
 up to a tenth of a millimetre) in pools of `--worlds`. Prints Markdown; `--out` gets .json and .md. Stopped
-runs go on (see cells.py); the first judge's own verdicts are made anew.
+runs go on (see cells.py); the prefilter's own verdicts are made anew.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.quality.intervals import wilson
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions, build
-from graspd.worker.validation.prefilter.phases import FirstTrials
+from graspd.worker.validation.prefilter.phases import PrefilterOutcomes
 from graspd.worker.validation.prefilter.prefilter import WorldPool, mujoco_warp
 
 OBJECTS = ("005_tomato_soup_can", "025_mug", "011_banana", "035_power_drill")
-#: Largest shift of a grasp that is judged again for its time [m].
+#: Largest shift of a grasp that is validated again for its time [m].
 JITTER_M = 1e-4
 
 
@@ -37,11 +37,11 @@ def pool_of(cell: Cell, device: str, worlds: int) -> WorldPool:
 
 
 def agreement(cell: Cell, device: str) -> dict[str, Any]:
-    """What the first judge says of a cell's grasps beside what the certificate says."""
-    certificate = cell.verdicts("certificate", False)
-    grasps, held = cell.grasps, np.array(certificate["success"]) == 1
+    """What the prefilter says of a cell's grasps beside what the standard level says."""
+    standard = cell.verdicts("standard", False)
+    grasps, held = cell.grasps, np.array(standard["success"]) == 1
     cpu = time.process_time()
-    found = pool_of(cell, device, len(grasps)).judge(grasps)
+    found = pool_of(cell, device, len(grasps)).validate(grasps)
     cpu = time.process_time() - cpu
     holds, fails = found.clearly_held, found.clearly_failed
     return {
@@ -57,7 +57,7 @@ def agreement(cell: Cell, device: str) -> dict[str, Any]:
         "overflows": int(found.overflow.sum()),
         "ticks": int(found.ticks.sum()),
         "cpu_seconds": round(cpu, 2),
-        "certificate_cpu_seconds": round(certificate["cpu_seconds"], 2),
+        "standard_cpu_seconds": round(standard["cpu_seconds"], 2),
     }
 
 
@@ -93,13 +93,13 @@ def speeds(cell: Cell, device: str, counts: list[int], worlds: list[int]) -> Ite
     for size in worlds:
         began = time.perf_counter()
         pool = pool_of(cell, device, size)
-        pool.judge(many(cell.grasps, min(size, 32)))
+        pool.validate(many(cell.grasps, min(size, 32)))
         made = time.perf_counter() - began
         for count in counts:
             grasps = many(cell.grasps, count)
-            pool.judge(grasps)  # arrays and graph of this number of grasps
+            pool.validate(grasps)  # arrays and graph of this number of grasps
             began = time.perf_counter()
-            found: FirstTrials = pool.judge(grasps)
+            found: PrefilterOutcomes = pool.validate(grasps)
             seconds = time.perf_counter() - began
             yield {
                 "hand": cell.hand_name,
@@ -175,7 +175,7 @@ def main() -> None:
     sys.stdout.write("\n".join([f"{engine}", "", *text]))
     if args.out:
         write_json(args.out.with_suffix(".json"), {"engine": engine, "cells": rows, "hands": totals, "speed": timed})
-        args.out.with_suffix(".md").write_text("\n".join([f"# The first judge\n\n{engine}\n", *text]).rstrip() + "\n")
+        args.out.with_suffix(".md").write_text("\n".join([f"# The prefilter\n\n{engine}\n", *text]).rstrip() + "\n")
 
 
 if __name__ == "__main__":

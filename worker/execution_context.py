@@ -12,7 +12,7 @@ from graspd.service.model.errors import TaskCancelled
 from graspd.worker.meeting import Meeting
 from graspd.worker.pool.pool import Pool
 
-FirstJudge = Literal["auto", "on", "off"]
+PrefilterMode = Literal["auto", "on", "off"]
 Progress = Callable[[float, float, str], None]
 
 """Told what is done, of how much, and a word on it; from any thread, often."""
@@ -44,8 +44,9 @@ class Lanes:
 
 
 @dataclass(frozen=True)
-class Run:
-    """Where and how work is done; what it makes does not depend on it, but for the rounding of a GPU and who judges."""
+class ExecutionContext:
+    """Where and how work is done; what it makes does not depend on it, but for the rounding of a GPU and who
+    validates."""
 
     device: str = "cpu"
     """Warp device."""
@@ -55,10 +56,10 @@ class Run:
     cancelled: Cancelled = _never
     meeting: Meeting | None = None
     """Where it meets others like it, to be done with them in one launch; None: it is done by itself."""
-    first_judge: FirstJudge = "auto"
+    prefilter: PrefilterMode = "auto"
     """Whether MuJoCo Warp gives the clear verdicts; auto: on a GPU, where it is installed."""
     pool: Pool | None = None
-    """Processes that judge and measure; None: threads of this one."""
+    """Processes that validate and measure; None: threads of this one."""
     lanes: Lanes | None = None
     """Those beside which it is one; None: all cores are its own."""
 
@@ -70,11 +71,11 @@ class Run:
             every = max(1, every // max(1, others.members)) if others is not None else every
         return every
 
-    def apart(self) -> Run:
+    def apart(self) -> ExecutionContext:
         """The same without the others: for what is done for all of them."""
         return replace(self, meeting=None)
 
-    def part(self, start: float, end: float) -> Run:
+    def part(self, start: float, end: float) -> ExecutionContext:
         """The same for a part of the work, whose progress goes from share `start` to share `end` of the whole."""
 
         def tell(done: float, total: float, message: str) -> None:
@@ -82,7 +83,7 @@ class Run:
 
         return replace(self, progress=tell)
 
-    def quiet(self) -> Run:
+    def quiet(self) -> ExecutionContext:
         """The same for a part of the work that is too short, or too hard to foresee, to tell of."""
         return replace(self, progress=_silent)
 
@@ -95,7 +96,7 @@ class Run:
 class Count:
     """Grasps that are done of a whole, told as they are counted by any thread."""
 
-    def __init__(self, total: int, run: Run, what: str, done: int = 0) -> None:
+    def __init__(self, total: int, run: ExecutionContext, what: str, done: int = 0) -> None:
         self._total, self._run, self._what, self._done = total, run, what, done
         self._lock = threading.Lock()
 
@@ -107,4 +108,4 @@ class Count:
 
 
 #: On the CPU with all its cores; nobody is told, nobody stops it.
-ALONE: Final = Run()
+DEFAULT_CONTEXT: Final = ExecutionContext()

@@ -1,6 +1,6 @@
 """Postures for what lies flat on a support: the ends of opposed fingertips rest on a plane and face each other.
 
-The pads of `worker.hands.oppositions` are farther from the ends of the fingertips than a flat object is high. These
+The pads of `worker.hands.pinch_postures` are farther from the ends of the fingertips than a flat object is high. These
 postures are found in the same way, from the surface within the object's height of the plane.
 """
 
@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from graspd.service.model import transforms
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
-from graspd.worker.hands import closing, kinematics, oppositions, primitives, surface
+from graspd.worker.hands import closing, kinematics, primitives, surface
+from graspd.worker.hands import pinch_postures as oppositions
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, SurfacePoints
-from graspd.worker.hands.oppositions import Oppositions, climbed, opposed_finger, random_postures
+from graspd.worker.hands.pinch_postures import Oppositions, climbed, opposed_finger, random_postures
 from graspd.worker.hands.surface import farthest_points, sample_surface
 from graspd.worker.objects.disk_cache import arrays_kept_or_made
 

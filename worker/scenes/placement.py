@@ -21,7 +21,7 @@ from graspd.worker.objects.mesh_geometry import to_centre, to_file
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes.kinds import SUNK, check_free, inside, rest_poses, room_in, supports_of
 from graspd.worker.scenes.neighbours import drop_together, lay_beside
-from graspd.worker.simulation.surroundings import Neighbour, Obstacle, Scenes
+from graspd.worker.simulation.environment import Neighbour, Obstacle, Scenes
 from graspd.worker.validation.decomposition import decompose
 
 #: Convex pieces of a neighbour at most: no hand is put into a neighbour's hollow, so hollows may be filled.

@@ -12,24 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.run import Run
-from graspd.worker.scenes.way import plan_way
-from graspd.worker.simulation.surroundings import Placed, Scenes
+from graspd.worker.scenes.trajectory import plan_way
+from graspd.worker.simulation.environment import Placed, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.key import Level
 from graspd.worker.validation.lift import LiftOutcome
-from graspd.worker.validation.lifting import KnownLifts, LiftLevel, judge_lifts
-from graspd.worker.validation.prescreening import SLIPS, ShortLifts, push_trial
-from graspd.worker.validation.validator import KnownTrials, judge
+from graspd.worker.validation.lifting import KnownLifts, LiftLevel, validate_lifts
+from graspd.worker.validation.prescreening import SLIPS, LiftRollouts, push_rollout
+from graspd.worker.validation.validator import KnownRollouts, validate
 
 #: Added to the score of a hand that would lift but cannot come: worse than any that can and lets the object fall, since
 #: most of these come freely, better than what is lost.
 BLOCKED: Final = 8.0
-#: Added where only the referee sees the hand touch on its way, for the object's convex pieces stand out from it:
-#: the letter does not ask for the way.
+#: Added where only the validator sees the hand touch on its way, for the object's convex pieces stand out from it:
+#: the DexGraspBench protocol does not ask for the way.
 TOUCHES: Final = 2.0
 #: What a hand that holds for the short time of a trial but does not lift is worse than one that lifts.
 FALLS: Final = 0.4
@@ -37,15 +37,15 @@ FALLS: Final = 0.4
 BEST: Final = 0.99
 
 
-def trial_on(
-    run: Run,
+def rollout_on(
+    run: ExecutionContext,
     hand: HandModel,
     obj: ObjectModel,
     pieces: Callable[[], ConvexPieces],
     *,
     in_scenes: bool,
     known: dict[str, Any] | None = None,
-    level: Level = "certificate",
+    level: Level = "standard",
 ) -> Callable[[GraspSet, Placed | None, Floats], Floats] | None:
     """The trial for what `run` plans on; None: the planner's own merit chooses. `known` keeps the verdicts of `level`.
 
@@ -53,18 +53,18 @@ def trial_on(
     """
     on_gpu = run.device.startswith("cuda")
     if not in_scenes:
-        return None if on_gpu else hold_trial(hand, obj, pieces, known=known, level=level)
+        return None if on_gpu else hold_rollout(hand, obj, pieces, known=known, level=level)
     threads = run.apart().cores if on_gpu else 1
-    return lift_trial(hand, obj, pieces, threads=threads, known=known, level=lift_level(level))
+    return lift_rollout(hand, obj, pieces, threads=threads, known=known, level=lift_level(level))
 
 
-def hold_trial(
+def hold_rollout(
     hand: HandModel,
     obj: ObjectModel,
     pieces: Callable[[], ConvexPieces],
     *,
-    known: KnownTrials | None = None,
-    level: Level = "certificate",
+    known: KnownRollouts | None = None,
+    level: Level = "standard",
 ) -> Callable[[GraspSet, Placed | None, Floats], Floats]:
     """A trial of free grasps as `worker.planners.Wanted` takes it: (N,) scores of short pushes, below 2 for grasps that
     hold the object against the six pushes as well.
@@ -73,25 +73,25 @@ def hold_trial(
         hand: the hand.
         obj: the object.
         pieces: gives the object's convex pieces when they are first needed.
-        known: keeps the verdicts, for the referee.
+        known: keeps the verdicts, for the validator.
         level: of the verdicts.
     """
-    short, run = push_trial(hand, obj, pieces), Run(threads=1)
+    short, run = push_rollout(hand, obj, pieces), ExecutionContext(threads=1)
 
-    def trial(grasps: GraspSet, placed: Placed | None, beat: Floats | None = None) -> Floats:
+    def rollout(grasps: GraspSet, placed: Placed | None, beat: Floats | None = None) -> Floats:
         grasps = grasps.moved(np.zeros(3))
         score = short(grasps, placed, np.zeros(0))
         held = np.flatnonzero(score < SLIPS + 1.0)
         if len(held):
-            verdicts = judge(hand, obj, grasps.take(held), level=level, pieces=pieces(), known=known, run=run)
+            verdicts = validate(hand, obj, grasps.take(held), level=level, pieces=pieces(), known=known, run=run)
             fell = held[verdicts.success != 1]
             score[fell] = SLIPS + 1.0 + FALLS * np.minimum(score[fell], 1.0)
         return score
 
-    return trial
+    return rollout
 
 
-def lift_trial(
+def lift_rollout(
     hand: HandModel,
     obj: ObjectModel,
     pieces: Callable[[], ConvexPieces],
@@ -103,20 +103,20 @@ def lift_trial(
     """A trial as `worker.planners.Wanted` takes it: (N,) scores, below 1 for grasps that lift the object at half the
     friction, and below 2 at the whole of it, and whose way is clear.
 
-    What holds the hanging object for a short time is lifted as the referee does it: a squeeze may turn an object out of
-    the hand slowly at first.
+    What holds the hanging object for a short time is lifted as the validator does it: a squeeze may turn an object out
+    of the hand slowly at first.
 
     Args:
         hand: the hand.
         obj: the object.
         pieces: gives the object's convex pieces when they are first needed.
         threads: of one call; planners on the CPU call from as many threads as they may use.
-        known: keeps the lifts, for the referee.
+        known: keeps the lifts, for the validator.
         level: of the lift test.
     """
-    shorts, run = ShortLifts(hand, obj, pieces, threads=threads), Run(threads=threads)
+    shorts, run = LiftRollouts(hand, obj, pieces, threads=threads), ExecutionContext(threads=threads)
 
-    def trial(grasps: GraspSet, placed: Placed | None, beat: Floats | None = None) -> Floats:
+    def rollout(grasps: GraspSet, placed: Placed | None, beat: Floats | None = None) -> Floats:
         assert placed is not None, "a lift needs a scene"
         beat = np.full(len(grasps), np.inf) if beat is None else beat
         grasps = grasps.moved(np.zeros(3))
@@ -135,7 +135,7 @@ def lift_trial(
 
     def lifted(grasps: GraspSet, placed: Placed, score: Floats, beat: Floats) -> Floats:
         """(k,) scores of hands that hold for a short time and whose way is clear."""
-        lift = partial(judge_lifts, hand, obj, level=level, pieces=pieces(), known=known, run=run)
+        lift = partial(validate_lifts, hand, obj, level=level, pieces=pieces(), known=known, run=run)
         out, barely = np.maximum(score, SLIPS), score >= SLIPS
         some = np.flatnonzero(~barely)
         hard = lift(grasps.take(some), placed.take(some), hard=True).success == 1
@@ -150,7 +150,7 @@ def lift_trial(
         out[touched] = score[touched] + TOUCHES
         return out
 
-    return trial
+    return rollout
 
 
 Arrays = dict[str, NDArray[Any]]
@@ -159,9 +159,10 @@ Arrays = dict[str, NDArray[Any]]
 FARTHEST_M: Final = 1.0
 
 
-def lift_level(referee: str) -> LiftLevel:
-    """The level of the lift test at which a job's referee judges in scenes: the letter is the letter there too."""
-    return "letter" if referee == "letter" else "lift"
+def lift_level(validation: str) -> LiftLevel:
+    """The level of the lift test at which a job's validator validates in scenes: the DexGraspBench protocol is the
+    DexGraspBench protocol there too."""
+    return "dexgraspbench" if validation == "dexgraspbench" else "lift"
 
 
 def scene_verdicts(
@@ -173,9 +174,9 @@ def scene_verdicts(
     level: LiftLevel,
     pieces: ConvexPieces | None,
     known: KnownLifts | None = None,
-    run: Run,
+    run: ExecutionContext,
 ) -> tuple[GraspSet, Arrays, dict[str, int]]:
-    """Plan the way of grasps in their scenes, and judge those that are clear.
+    """Plan the way of grasps in their scenes, and validate those that are clear.
 
     A grasp that does not lift is not lifted at half the friction.
 
@@ -185,9 +186,9 @@ def scene_verdicts(
         grasps: N grasps with `scene`.
         scenes: the scenes.
         level: of the lift test.
-        pieces: the object's convex pieces; None: nobody judges, and grasps are only told clear or not.
+        pieces: the object's convex pieces; None: nothing is validated, and grasps are only told clear or not.
         known: see `judge_lifts`.
-        run: told of grasps judged; asked between grasps whether to stop.
+        run: told of grasps validated; asked between grasps whether to stop.
 
     Returns:
         The grasps with `approach`, `coming`, `lift` and `wrist`; columns of the base shard, `quality/success` being the
@@ -206,14 +207,14 @@ def scene_verdicts(
     if pieces is None:
         return grasps, columns, counts
     common: dict[str, Any] = {"pieces": pieces, "run": run}
-    lifts = judge_lifts(hand, obj, grasps.take(clear), placed.take(clear), level=level, known=known, **common)
+    lifts = validate_lifts(hand, obj, grasps.take(clear), placed.take(clear), level=level, known=known, **common)
     success[clear] = lifts.success
     outcome, margin = np.zeros(count, np.uint8), np.full(count, np.nan)
     outcome[clear], margin[clear] = lifts.outcome, lifts.margin
     lifted = clear[outcome[clear] == LiftOutcome.LIFTED]
     hard = np.full(count, -1, np.int8)
     if len(lifted):
-        hard[lifted] = judge_lifts(
+        hard[lifted] = validate_lifts(
             hand, obj, grasps.take(lifted), placed.take(lifted), level=level, hard=True, known=known, **common
         ).success
     counts |= {"lift": len(lifted), "lift_hard": int((hard == 1).sum())}

@@ -1,9 +1,9 @@
-"""What the cheap levels of the referee cost and how often they say what the letter of the protocol says.
+"""What the cheap levels of the validator cost and how often they say what the unmodified DexGraspBench protocol says.
 
-usage: python -m benchmarks.certificate DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out FILE]
-DATA_DIR holds hands/ and objects/. Prints Markdown; `--out` gets the same as JSON. Stopped runs go on (see cells.py).
-Certified per second are those of both cores: held grasps over half the CPU time, which other programs disturb less
-than wall time.
+usage: python -m benchmarks.validation_levels DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out
+FILE] DATA_DIR holds hands/ and objects/. Prints Markdown; `--out` gets the same as JSON. Stopped runs go on (see
+cells.py). Certified per second are those of both cores: held grasps over half the CPU time, which other programs
+disturb less than wall time.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from benchmarks.cells import cell_parser, cells, write_json
 from graspd.worker.quality.intervals import wilson
 
 CORES = 2
-LEVELS = ("letter", "certificate", "screen")
+LEVELS = ("dexgraspbench", "standard", "fast")
 
 
-def row(found: list[dict[str, Any]], letter: np.ndarray) -> dict[str, Any]:
-    """Numbers of one level over the cells of one hand, against the letter's verdicts."""
+def row(found: list[dict[str, Any]], dexgraspbench: np.ndarray) -> dict[str, Any]:
+    """Numbers of one level over the cells of one hand, against the DexGraspBench protocol's verdicts."""
     held = np.concatenate([np.array(f["success"]) for f in found]) == 1
-    agree = int((held == letter).sum())
+    agree = int((held == dexgraspbench).sum())
     cpu = sum(f["cpu_seconds"] for f in found)
     return {
         "n": len(held),
         "held": float(held.mean()),
         "agreement": agree / len(held),
         "interval": [round(bound, 4) for bound in wilson(agree, len(held))],
-        "false_accepts": int((held & ~letter).sum()),
-        "false_rejects": int((~held & letter).sum()),
-        "cpu_ms_per_raw_grasp": 1e3 * cpu / len(held),
-        "certified_per_second": CORES * float(held.sum()) / cpu,
+        "false_accepts": int((held & ~dexgraspbench).sum()),
+        "false_rejects": int((~held & dexgraspbench).sum()),
+        "cpu_ms_per_candidate": 1e3 * cpu / len(held),
+        "valid_per_second": CORES * float(held.sum()) / cpu,
     }
 
 
@@ -47,12 +47,12 @@ def study(args: argparse.Namespace, hand: str, hard: bool) -> dict[str, Any]:
         for level in LEVELS:
             found[level].append(cell.verdicts(level, hard))  # type: ignore[arg-type]
         sys.stderr.write(f"{hand}{' hard' if hard else ''}: {cell.object_name}\n")
-    letter = np.concatenate([np.array(f["success"]) for f in found["letter"]]) == 1
+    dexgraspbench = np.concatenate([np.array(f["success"]) for f in found["dexgraspbench"]]) == 1
     return {
         "hand": hand,
         "hard": hard,
         "objects": objects,
-        "levels": {level: row(found[level], letter) for level in LEVELS},
+        "levels": {level: row(found[level], dexgraspbench) for level in LEVELS},
     }
 
 
@@ -60,11 +60,11 @@ def lines(one: dict[str, Any]) -> list[str]:
     out = []
     for level, r in one["levels"].items():
         low, high = (f"{100 * bound:.1f}" for bound in r["interval"])
-        agreement = "" if level == "letter" else f"{100 * r['agreement']:.1f} % ({low} to {high})"
-        wrong = "" if level == "letter" else f"{r['false_accepts']}, {r['false_rejects']}"
+        agreement = "" if level == "dexgraspbench" else f"{100 * r['agreement']:.1f} % ({low} to {high})"
+        wrong = "" if level == "dexgraspbench" else f"{r['false_accepts']}, {r['false_rejects']}"
         out.append(
             f"| {one['hand']}{', hard' if one['hard'] else ''} | {level} | {r['n']} | {r['held']:.2f} | {agreement} "
-            f"| {wrong} | {r['cpu_ms_per_raw_grasp']:.0f} | {r['certified_per_second']:.0f} |"
+            f"| {wrong} | {r['cpu_ms_per_candidate']:.0f} | {r['valid_per_second']:.0f} |"
         )
     return out
 
