@@ -39,7 +39,7 @@ class Job(Validated):
     requested: int = Field(description="grasps asked for")
     standing: Literal["valid", "feasible", "kept"] = Field(
         "valid",
-        description="what its kept grasps can be: feasible where nothing is validated, or merely kept if raw were wanted",
+        description="what its kept grasps are: valid, feasible where nothing is validated, or kept candidates",
     )
     progress: float = Field(ge=0, le=1)
     eta_s: float | None = Field(None, description="expected time until the job ends [s]; absent: not known yet")

@@ -37,7 +37,7 @@ from graspd.worker.scenes.placement import gaps_between, neighbour_of, scenes_of
 SEED = 505
 CORES = 2
 FIDELITY = FIDELITIES["standard"]
-TITLES = ("target", "scene", "neighbours", "gap, mm", "validated_batch", "candidates", "clear", "lift", "seconds")
+TITLES = ("target", "scene", "neighbours", "gap, mm", "valid", "candidates", "clear", "lift", "seconds")
 
 
 def study(hand: HandModel, obj: ObjectModel, others: list[ObjectModel], scene: int, seconds: float) -> dict[str, Any]:
@@ -49,14 +49,14 @@ def study(hand: HandModel, obj: ObjectModel, others: list[ObjectModel], scene: i
     gap = min(float(found[0]) for pair, found in gaps_between(things, together, 0.5).items() if pair[0] == 0)
     here = replace(scenes, object_pose=scenes.object_pose[-1:], neighbour_pose=scenes.neighbour_pose[-1:])
     request = JobOptions(grasps=BATCH_SIZE, want="candidates", seed=SEED, fidelity=FIDELITY, rechecks=0)
-    found = {"validated_batch": 0, "candidates": 0, "clear": 0.0, "lift": 0.0}
+    found = {"valid": 0, "candidates": 0, "clear": 0.0, "lift": 0.0}
     validated_grasps(hand, obj, request, count=2, batch=1 << 19, scenes=here, run=ExecutionContext())  # kernels, pieces
     began, batch = time.process_time(), 0
     while (spent := (time.process_time() - began) / CORES) < seconds:
         made = validated_grasps(hand, obj, request, count=BATCH_SIZE, batch=batch, scenes=here, run=ExecutionContext())
         if (time.process_time() - began) / CORES > seconds and batch:
             break  # its verdicts came too late
-        found["validated_batch"] += int(made.columns["quality/valid"].sum())
+        found["valid"] += int(made.columns["quality/valid"].sum())
         found["candidates"] += made.planned
         found["clear"] += made.shares["clear_share"] * made.planned
         found["lift"] += made.shares["lift_share"] * made.planned
@@ -106,7 +106,7 @@ def main() -> None:
             row = {"target": target, "scene": scene, **row}
             rows.append(row)
             sys.stdout.write(
-                f"| {target} | {scene} | {len(others)} | {row['gap']:.0f} | {row['validated_batch']} | {row['candidates']} | "
+                f"| {target} | {scene} | {len(others)} | {row['gap']:.0f} | {row['certified']} | {row['candidates']} | "
                 f"{row['clear']:.2f} | {row['lift']:.2f} | {row['seconds']:.0f} |\n"
             )
             sys.stdout.flush()

@@ -216,7 +216,7 @@ def page(found: DatasetView, cells: list[CellView], facts: dict[str, str], optio
         "| --- | --- |",
         *(f"| {name} | {value} |" for name, value in facts.items()),
         "",
-        "Each cell: valid grasps of those asked for, valid share of the candidates, seconds of a worker per valid grasp.",
+        "Each cell: valid grasps of those asked for, valid share of candidates, seconds of a worker per valid grasp.",
         "",
         f"| object | {' | '.join(found.hands)} |",
         "| --- " * (len(found.hands) + 1) + "|",

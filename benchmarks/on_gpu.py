@@ -117,9 +117,9 @@ def page(result: dict[str, Any]) -> str:
         f"    {result['command']}",
         "",
         f"{result['date']}: {result['device']}, {result['cores']} cores, {result['versions']}. Fidelity *standard*, "
-        f"seed {SEED}. Wall milliseconds for one grasp of a launch on {result['hands_object']}, by one process; validate "
-        f"and table on the CPU's cores, of at most {VALIDATED} grasps. *Moved*: how far any hand lies from where the same "
-        "launch put it before.",
+        f"seed {SEED}. Wall milliseconds for one grasp of a launch on {result['hands_object']}, by one process, then "
+        f"validation and metrics on the CPU, of at most {VALIDATED} grasps. *Moved*: how far a hand lies from where "
+        "the same launch put it before.",
         "",
         "| hand | a launch | planner ms | postures ms | candidates/s | validate ms | table ms | hold | moved mm |",
         "| --- | --: | --: | --: | --: | --: | --: | --: | --: |",

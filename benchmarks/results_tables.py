@@ -161,8 +161,8 @@ def markdown(hand: str, rows: list[dict[str, Any]], total: dict[str, Any], comma
             "",
             f"**GSR {total['gsr']:.3f}, hard {total['gsr_hard']:.3f}; OSR {total['osr']:.2f}, hard "
             f"{total['osr_hard']:.2f}; {total['sgs']:.1f} holding grasps per second of two cores, "
-            f"{total['sgs_without_validation']:.1f} without the validator. {total['robust_many']} of {total['robust_n']} "
-            f"that the standard level holds do in {SHARE} of {ROBUST_MODELS} models around the nominal one.**",
+            f"{total['sgs_without_validation']:.1f} without validation. {total['robust_many']} of {total['robust_n']} "
+            f"that hold at level standard do in {SHARE} of {ROBUST_MODELS} models around the nominal one.**",
             "",
             head,
             "| --- |" + " --: |" * len(PRINTED),
@@ -170,8 +170,8 @@ def markdown(hand: str, rows: list[dict[str, Any]], total: dict[str, Any], comma
             "",
             f"GSR: share that holds, normal and at half the friction. robust: share of {ROBUST_MODELS} models around "
             "the "
-            "nominal one in which a grasp that the standard level holds does, on average. SGS: holding grasps per second, "
-            "made and validated (level *certificate*), seconds being CPU time over two cores. PD, SPD: penetration, "
+            "nominal one in which a valid grasp holds, on average. SGS: holding grasps per second, "
+            "made and validated (*standard*), seconds being CPU time over two cores. PD, SPD: penetration, "
             "self-penetration mm. CDC: contact distance consistency mm. CA cm², ε, Vol at a contact threshold of 5 mm "
             "and μ = 1. IV cm³. SD: simulated displacement cm. D: variance explained by the first component. Medians; "
             "the last row has rates over all grasps and means of the medians.",

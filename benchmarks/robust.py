@@ -134,8 +134,8 @@ def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
     lines = [
         "# How far a verdict can be trusted",
         "",
-        f"Made by `python -m benchmarks.robust`. Raw standard grasps on {', '.join(objects)}, "
-        f"{done[0]['candidates'] // len(objects)} on each; those that the standard level holds in the nominal model ({held}) "
+        f"Made by `python -m benchmarks.robust`. Standard candidates on {', '.join(objects)}, "
+        f"{done[0]['candidates'] // len(objects)} on each; those that hold in the nominal model ({held}) "
         f"were validated again in models that differ in one thing, {draws} draws of each for every grasp "
         "(collision shapes and couplings: each kind once). A hundred percent would be a verdict that no such "
         "difference moves. Cells: share "
@@ -149,7 +149,7 @@ def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
     lines += [f"| {name} | {' | '.join(_cell(one['rows'].get(name)) for one in done)} |" for name in names]
     lines += [
         "",
-        f"As `--robust` validates: {ROBUST_MODELS} models a grasp, each along one axis, the axes in an order at random. "
+        f"As `--robust` validates: {ROBUST_MODELS} models a grasp, each along one axis, axes in random order. "
         "*First "
         "lost to*: what differed in the first model in which a grasp failed, of those that failed in any.",
         "",

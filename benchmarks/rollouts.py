@@ -100,7 +100,7 @@ def page(done: dict[str, dict[str, dict[str, Any]]], count: int) -> str:
         [
             "# Hands that are tried",
             "",
-            f"`python -m benchmarks.rollouts DATA --out docs/results`: {count} standard candidates of each hand on each "
+            f"`python -m benchmarks.rollouts DATA --out docs/results`: {count} candidates of each hand on each "
             f"of {objects} objects, seed {SEED}, free, validated at level standard, both ways in one run. *By merit*: "
             "the hand whose contacts balance best; *tried*: the first that holds in a short test. *hard*: holds at "
             "half the friction, too. Times are core-ms of a candidate, then of one that holds. PD: median of objects' "

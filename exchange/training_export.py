@@ -112,9 +112,7 @@ def _chosen(shard: Shard, format_: str, wishes: TrainingExportOptions) -> np.nda
         return choose(shard, unvalidated=wishes.unvalidated, every=wishes.every)[0]
     validated = validity.validated(shard.arrays)
     if wishes.unvalidated or not validated.any():
-        raise InputError(
-            f"{format_} says of each grasp whether it holds; validate them first: graspd synth without --validation none"
-        )
+        raise InputError(f"{format_} needs a verdict on each grasp: make them without --validation none")
     return validated
 
 

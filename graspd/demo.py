@@ -178,7 +178,7 @@ def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     pictures = grasp_pictures(hand, obj, poses, joints, samples=_SAMPLES)[:, 0]
     # The sheet's typeface has neither Greek letters nor a multiplication sign.
     title = f"{job.hand} on {job.object}"
-    subtitle = f"the best {len(rows)} of {job.grasps} valid grasps by epsilon, of {job.candidates} tried"
+    subtitle = f"the best {len(rows)} of {job.grasps} valid grasps by epsilon, of {job.candidates} candidates"
     return contact_sheet(pictures, figures(base.arrays, rows), title=title, subtitle=subtitle)
 
 

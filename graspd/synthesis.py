@@ -65,7 +65,7 @@ def synthesize(
         touch: distance that fingertips keep from supports [mm]: 2 as the rest of the hand; 0, the default: they may
             touch; down to -1: they may press into it.
         beside: up to eight other objects, files or names, dropped around it.
-        want: valid: `count` valid grasps; raw: `count` candidates.
+        want: valid: `count` valid grasps; candidates: `count` candidates.
         budget: candidates for each grasp wanted, at most.
         min_distance: no two grasps are nearer [m]: mean distance of the same points of the hand, in the object's frame.
         validator: level of the validation in MuJoCo; none: no validation, no valid grasps.

@@ -19,6 +19,7 @@ GONE: Final = {
     "GRASPD_SHARD_PACK": "a task makes one shard of all its batches; unset it, and see GRASPD_TASK_S",
     "GRASPD_KEEPER_SHARDS": "one controller leads and the others stand by; unset it",
     "GRASPD_KEEPER_INTERVAL_S": "it is GRASPD_CONTROLLER_INTERVAL_S now",
+    "GRASPD_FIRST_JUDGE": "it is GRASPD_PREFILTER now",
     "GRASPD_KEEPER_NAME": "it is GRASPD_CONTROLLER_NAME now",
     "GRASPD_SCRUB_MB_PER_S": "it is GRASPD_INTEGRITY_SCAN_MB_PER_S now",
 }
@@ -87,7 +88,7 @@ class Settings(BaseSettings):
         0,
         ge=0,
         le=1024,
-        description="processes of a worker that validate and measure; 1: its own; 0: on a GPU one a core less one, else 1",
+        description="processes for validation and metrics; 1: its own; 0: with a GPU one a core less one, else 1",
     )
     workers_here: int = Field(1, ge=1, description="workers of this machine that share its cores and memory")
     join: str = Field(

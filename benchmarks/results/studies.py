@@ -177,9 +177,7 @@ STUDIES: Final = (
             f"python -m benchmarks.validation_levels DATA --work WORK/cells --objects {_EIGHT} "
             "--out OUT/results/certificate.json",
         ),
-        (
-            f"python -m benchmarks.validation_levels DATA --work WORK/cells {_LITTLE} --out OUT/results/certificate.json",
-        ),
+        (f"python -m benchmarks.validation_levels DATA --work WORK/cells {_LITTLE} --out OUT/results/levels.json",),
         seeds=(7001,),
         prints="results/certificate.md",
     ),

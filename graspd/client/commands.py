@@ -53,7 +53,7 @@ def submit(
     hand: Annotated[str, typer.Option(help="Name of a hand, or a URDF or ZIP to upload.")],
     object: Annotated[str, typer.Option(help="Name of an object, or a mesh file to upload.")],
     grasps: Annotated[int, typer.Option("--grasps", "-n", help="Number of grasps.")] = 32,
-    want: Annotated[str, typer.Option(help="valid: that many valid grasps; raw: that many of any kind.")] = "valid",
+    want: Annotated[str, typer.Option(help="valid: that many valid grasps; candidates: of any kind.")] = "valid",
     budget: Annotated[float, typer.Option(help="Candidates for each valid grasp, at most.")] = 4.0,
     min_distance: Annotated[
         float, typer.Option(help="No two grasps of a batch are nearer [m], by the mean distance of the hand's points.")

@@ -147,13 +147,13 @@ def yield_of(job: JobDetail) -> str:
     """What was found among how many candidates, and what the recheck says, in a line."""
     level = job.request.validation
     if level == "none":
-        return f"{count(job.grasps)} grasps kept in {count(job.candidates)} tries; not validated"
+        return f"{count(job.grasps)} grasps kept of {count(job.candidates)} candidates; not validated"
     recheck = (
         f"; {job.recheck_held} of {job.rechecked} rechecked hold under the DexGraspBench protocol"
         if job.rechecked
         else ""
     )
-    return f"{count(job.valid)} valid grasps in {count(job.candidates)} tries, {level} level{recheck}"
+    return f"{count(job.valid)} valid grasps of {count(job.candidates)} candidates, level {level}{recheck}"
 
 
 def means_of(job: JobDetail) -> str:
@@ -301,7 +301,7 @@ _STYLES: Final = {
 def print_estimate(found: Estimate, console: Console) -> None:
     """Time for some numbers of workers, storage, network, and what the rates are known from."""
     console.print(
-        f"{count(found.cells)} cells, {count(found.asked)} grasps asked for: about {count(found.candidates)} tries, "
+        f"{count(found.cells)} cells, {count(found.asked)} grasps: about {count(found.candidates)} candidates, "
         f"{count(found.valid)} {found.counted}, {count(found.tasks)} tasks",
         soft_wrap=True,
     )
@@ -332,7 +332,7 @@ def print_dataset(dataset: DatasetView, console: Console) -> None:
     left = f", {duration(dataset.eta_s)} left" if dataset.eta_s is not None else ""
     console.print(f"{dataset.name}  {dataset.state.value}  {percent(dataset.progress)}{left}")
     console.print(f"cells: {states}")
-    candidates = f" of {count(dataset.candidates)} tried ({_yield(dataset)})" if dataset.candidates else ""
+    candidates = f" of {count(dataset.candidates)} candidates ({_yield(dataset)})" if dataset.candidates else ""
     console.print(
         f"grasps: {count(dataset.counted)} {dataset.options.standing}{candidates}, {count(dataset.asked)} asked for; "
         f"{count(dataset.shards)} shards, {size(dataset.size_bytes)}; worker time {duration(dataset.seconds)}",

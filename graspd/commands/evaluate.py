@@ -231,7 +231,7 @@ def _foreign(whole: dict[str, Any], name: str) -> str:
     held = whole["foreign_held"]
     share = _cell(whole["foreign_share"], 2)
     return (
-        f"validated with {name}, fingertips within {whole['fingertips_mm']:.2f} mm: GSR {_cell(whole['foreign_gsr'], 2)}; "
+        f"{name}, fingertips within {whole['fingertips_mm']:.2f} mm: GSR {_cell(whole['foreign_gsr'], 2)}; "
         f"of {held['both'] + held['nominal']} that hold nominally {held['both']} hold there ({share}); "
         f"agreement {_cell(whole['agreement'], 2)}"
     )

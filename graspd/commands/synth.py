@@ -62,7 +62,7 @@ def synth(
     object_: Annotated[str, typer.Option("--object", help="a mesh (STL, OBJ, PLY, GLB, OFF) or a built-in object")],
     out: Annotated[Path, typer.Option("-o", "--out", help="HDF5 file to write")],
     grasps: Annotated[int, typer.Option("-n", "--grasps", help="number of grasps", min=1, max=100_000)] = 32,
-    want: Annotated[str, typer.Option(help="valid: that many valid grasps; raw: that many of any kind.")] = "valid",
+    want: Annotated[str, typer.Option(help="valid: that many valid grasps; candidates: of any kind.")] = "valid",
     budget: Annotated[float, typer.Option(help="Grasps tried for each one wanted, at most.", min=1.0, max=100.0)] = 4.0,
     validation: Annotated[
         str,
@@ -205,7 +205,7 @@ def _request(
 ) -> JobOptions:
     """Options of a job with these; InputError for a word that is none."""
     if want not in ("valid", "candidates"):
-        raise InputError(f"unknown --want {want!r}; choose valid or raw")
+        raise InputError(f"unknown --want {want!r}; choose valid or candidates")
     if validation not in (levels := (*get_args(Level), "none")):
         raise InputError(f"unknown validator {validation!r}; choose one of {one_of(validation, levels)}")
     # A recheck is a sample that watches over many jobs; a file can be validated under the DexGraspBench protocol whole.
@@ -263,7 +263,7 @@ def _said(found: dict[str, Any]) -> str:
     word = "valid" if validated else "feasible"
     lines = [
         f"{found['file']}: {found[word]} {word} of {found['candidates']} candidates"
-        f"{', validated at level ' + found['validation'] if validated else '; nobody validated them (--validation none)'}"
+        f"{', validated at level ' + found['validation'] if validated else '; not validated (--validation none)'}"
         f"{' with ' + format(found['mass_kg'], '.3g') + ' kg' if validated else ''}, "
         f"{found['grasps_per_second']:.1f} grasps/s"
     ]
@@ -282,8 +282,8 @@ def _said(found: dict[str, Any]) -> str:
         lines.append(f"{found['shake_share']:.0%} survive the shake")
     if "scene" in found:
         lines.append(
-            f"{found['scene']}, {found['scenes']} scenes: {found['clear_share']:.0%} of the candidates are clear of what "
-            f"stands there, {found['lift_share']:.0%} lift, {found['lift_hard_share']:.0%} at half the friction"
+            f"{found['scene']}, {found['scenes']} scenes: {found['clear_share']:.0%} of the candidates are clear, "
+            f"{found['lift_share']:.0%} lift, {found['lift_hard_share']:.0%} at half the friction"
         )
         lines += [note for note in [rolling_note(found["rolling_scenes"], found["scenes"])] if note]
     if (why := found["reason"] or found.get("narrow")) is not None:

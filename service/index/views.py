@@ -283,7 +283,7 @@ class DeliveryView(View):
     ended: str = Field(description="succeeded, failed or cancelled")
     state: str = Field(description="waiting, delivered or failed")
     attempts: int
-    candidates: str | None = Field(description="when it was tried last")
+    tried: str | None = Field(description="when it was tried last")
     status: int | None = Field(description="HTTP status of the last answer")
     detail: str = Field(description="how the last attempt ended")
 

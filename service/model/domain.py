@@ -69,7 +69,7 @@ class JobOptions(Model):
         "free",
         exclude_if=lambda value: value == "free",
         description="where the grasps are used: free (around an object that floats), table, bin, shelf, or a document "
-        "with supports. If not free they are planned, validated and rendered there, and `grasps` counts those valid there",
+        "with supports. If not free they are planned, validated and rendered there, and `grasps` counts those valid",
     )
     faces: Literal["drawn", "all"] = Field(
         "drawn",
@@ -118,8 +118,8 @@ class JobOptions(Model):
     )
     want: Literal["valid", "candidates"] = Field(
         "valid",
-        description="whether `grasps` counts grasps that are valid (feasible ones where the validator is none), or all that "
-        "were tried",
+        description="valid: `grasps` counts valid grasps (feasible ones without validation); candidates: it counts all "
+        "candidates",
     )
     budget: float = Field(4.0, ge=1, le=100, description="candidates for each valid grasp wanted, at most")
     min_distance: float = Field(
@@ -133,14 +133,14 @@ class JobOptions(Model):
     )
     validation: Literal["dexgraspbench", "standard", "fast", "none"] = Field(
         "standard",
-        description="level at which MuJoCo validates the grasps (screen: on a GPU, MuJoCo Warp gives the clear verdicts); "
-        "none: nobody, grasps are feasible at best",
+        description="level of validation in MuJoCo (fast: on a GPU, MuJoCo Warp gives the clear verdicts); "
+        "none: grasps are feasible at best",
     )
     rechecks: int = Field(
         RECHECKS,
         ge=0,
         le=10_000,
-        description=f"valid grasps of the job that are validated again under the DexGraspBench protocol: the default, {RECHECKS}, are "
+        description=f"valid grasps that are validated at level dexgraspbench; the default, {RECHECKS}, are "
         "spread over the job, one of 64, and take a twentieth of its time; of any other number the first ones",
     )
     robustness: int = Field(0, ge=0, le=20, description="verdicts under noise that each valid grasp gets")
@@ -232,7 +232,7 @@ class JobOptions(Model):
             raise ValueError("mass and density both: give one of them")
         if self.validation == "dexgraspbench" and self.matter:
             raise ValueError(
-                f"validation dexgraspbench is DexGraspBench's protocol, which gives all objects {MASS_KG:g} kg and friction "
+                f"validation dexgraspbench gives all objects {MASS_KG:g} kg and friction "
                 f"{FRICTION:g}: {', '.join(self.matter)} goes with standard, fast or none"
             )
         return self
@@ -343,7 +343,7 @@ class JobOptions(Model):
 
     @property
     def counted(self) -> Literal["valid", "feasible"]:
-        """What the kept grasps are of a job that does not want candidates ones: valid, or feasible where nothing is
+        """What the kept grasps are of a job that wants valid ones: valid, or feasible where nothing is
         validated."""
         return "feasible" if self.validation == "none" else "valid"
 

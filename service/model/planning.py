@@ -319,7 +319,9 @@ def shortfall(
         return None
     lost, tries = told(outcomes), candidates + outcomes.get("repeated", 0)
     ended = limit or f"the budget of {budget:g} candidates for each ended first"
-    return f"found {found:,} of {wanted:,} {counted} grasps in {tries:,} tries{': ' if lost else ''}{lost}; {ended}"
+    return (
+        f"found {found:,} of {wanted:,} {counted} grasps in {tries:,} candidates{': ' if lost else ''}{lost}; {ended}"
+    )
 
 
 def limit_told(hand: str, friction: float, grasps: int, lifts: float, bound: float, wanted: float | None = None) -> str:

@@ -58,7 +58,7 @@ _ALL: Final = (
         "graspd_grasps_total",
         "counter",
         ("verdict",),
-        "grasps kept: all, valid; tried ones: validated",
+        "grasps kept: all, valid; candidates: validated",
         "controller",
     ),
     Series("graspd_shards_total", "counter", ("stage",), "shards written", "controller"),

@@ -15,6 +15,7 @@ from typing import Any, Final, TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from graspd.service.model.messages import IngestMessage, TaskMessage
+from graspd.service.model.renamed import renamed
 from graspd.service.model.states import Stage
 from graspd.service.model.workers import WorkerBeat
 from graspd.service.queue.port import Event, Message, Report
@@ -49,7 +50,7 @@ def message(data: bytes | None) -> Message | None:
     if data is None:
         return None
     try:
-        raw = json.loads(zlib.decompressobj().decompress(data, _MESSAGE_BYTES))[2][0]
+        raw = renamed(json.loads(zlib.decompressobj().decompress(data, _MESSAGE_BYTES))[2][0])
         return (IngestMessage if raw.get("stage") == Stage.INGEST else TaskMessage).model_validate(raw)
     except Exception:  # forged data may fail anywhere
         return None

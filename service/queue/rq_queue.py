@@ -1,6 +1,6 @@
 """The queue on Redis: RQ for tasks and leases, a bounded stream for events.
 
-One RQ queue a priority and stage, so that a worker may serve some stages only. RQ's own retries, scheduler, maintenance
+One RQ queue for each priority and stage: a worker may serve some stages only. RQ's own retries, scheduler, maintenance
 and result storage are not used: each of them loses or repeats work in ways the controller does not.
 """
 

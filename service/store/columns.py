@@ -10,6 +10,13 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.metrics import AXIS_MEANINGS, GRASP_METRICS
 
 ShardKind = Literal["base", "scene", "views"]
+#: Version of each kind's columns. base@1 (graspd 0.2) has other names: `service.model.renamed`.
+_VERSIONS: Final[dict[str, int]] = {"base": 2, "scene": 1, "views": 1}
+
+
+def schema_of(kind: str) -> str:
+    """What a shard of a kind says of its columns, such as `graspd/base@2`."""
+    return f"graspd/{kind}@{_VERSIONS[kind]}"
 
 
 @dataclass(frozen=True)
@@ -296,7 +303,7 @@ _TYPES: Final[Mapping[str, tuple[type, ...]]] = {
 _BASE: Final = ("base",)
 
 ATTRIBUTES: Final[dict[str, RootAttribute]] = {
-    "schema": RootAttribute("text", "`graspd/base@1`, `graspd/scene@1` or `graspd/views@1`"),
+    "schema": RootAttribute("text", "`graspd/base@2`, `graspd/scene@1` or `graspd/views@1`"),
     "hand": RootAttribute("text", "name of the hand"),
     "hand_digest": RootAttribute("text", "digest of the files it came from"),
     "hand_source": RootAttribute("text", "where a command of this machine read it, if it is not built in"),
@@ -327,15 +334,15 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "root_link": RootAttribute("text", "link of the hand whose pose is given"),
     "mu": RootAttribute("number", "Coulomb coefficient of `quality/epsilon` and `quality/wrench_volume`", _BASE),
     "want": RootAttribute(
-        "text", "valid: valid grasps were asked for (feasible ones where nothing is validated); raw: of any kind", _BASE
+        "text", "valid: valid grasps were asked for (feasible ones without validation); candidates: any", _BASE
     ),
     "candidates": RootAttribute("integer", "candidates until the last one kept", _BASE),
-    "outcomes": RootAttribute("text", "JSON: tries that were not kept, by what became of them", _BASE),
+    "outcomes": RootAttribute("text", "JSON: candidates that were not kept, by what became of them", _BASE),
     "reason": RootAttribute("text", "why a command found fewer grasps than asked for; absent: it did not", _BASE),
     "grasps_wanted": RootAttribute("integer", "grasps asked for, where a command was interrupted before", _BASE),
     "robust": RootAttribute(
         "text",
-        "JSON: models around the nominal one in which each valid grasp was validated, and the wanted share; absent: none",
+        "JSON: models around the nominal one that validated each valid grasp, and the wanted share; absent: none",
         _BASE,
     ),
     "verdict_level": RootAttribute("text", "level of the validator, or `none` where not validated", _BASE),

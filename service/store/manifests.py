@@ -20,7 +20,7 @@ from graspd.service.model.metrics import axis_word, indexed
 from graspd.service.model.states import Stage
 from graspd.service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from graspd.service.store import validity
-from graspd.service.store.columns import SCHEMAS, ShardKind
+from graspd.service.store.columns import SCHEMAS, ShardKind, schema_of
 from graspd.service.store.integrity import read_checked
 from graspd.service.store.records import put_record, read_record
 from graspd.service.store.shards import Shard, read_shard
@@ -146,7 +146,7 @@ def manifest_of(
         inputs=message.inputs,
         code_version=PACKAGE_VERSION,
         stage_revision=STAGE_REVISIONS[message.stage],
-        shard_schema=f"graspd/{kind}@1",
+        shard_schema=schema_of(kind),
         created=str(attributes.get("created") or timestamp()),
         device=device,
         seconds=round(seconds, 4),

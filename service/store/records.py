@@ -32,6 +32,7 @@ from graspd.service.model.records import (
     Snapshot,
     Tag,
 )
+from graspd.service.model.renamed import has_old_names, renamed
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.store.integrity import get_document, is_sealed, put_document, put_sealed
 from graspd.service.store.store import Store
@@ -50,6 +51,8 @@ def parse_record(model: type[RecordT], data: bytes, key: str) -> RecordT:
     """A record from its bytes; DamagedError if they are not those that were sealed, or hold no such record."""
     is_sealed(key, [data], len(data))
     try:
+        if has_old_names(data):
+            return model.model_validate(renamed(json.loads(data)))
         return model.model_validate_json(data)
     except ValidationError as error:
         raise DamagedError(

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
+from graspd.service.model.renamed import COLUMNS, renamed
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.service.store.columns import SCHEMAS, Attribute, ShardKind, check_attributes
+from graspd.service.store.columns import SCHEMAS, Attribute, ShardKind, check_attributes, schema_of
 from graspd.service.store.integrity import check_file
 
 Arrays = Mapping[str, NDArray[np.generic]]
@@ -56,7 +57,7 @@ def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attrib
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", libver="v110") as file:
         # Each is written once: HDF5 keeps the bytes of a text that was written over.
-        said = {"schema": f"graspd/{kind}@1", "code_version": PACKAGE_VERSION, "created": timestamp(), **attributes}
+        said = {"schema": schema_of(kind), "code_version": PACKAGE_VERSION, "created": timestamp(), **attributes}
         for name, value in said.items():
             file.attrs[name] = value
         for path, array in arrays.items():
@@ -137,6 +138,20 @@ def read_shard(
     return Shard(found, attributes, arrays, None if isinstance(source, bytes) else source)
 
 
+class ShardH5(h5py.File):  # type: ignore[misc]
+    """The HDF5 file of a shard, where columns and attributes of graspd 0.2 have today's names."""
+
+    def __contains__(self, path: object) -> bool:
+        return super().__contains__(path) or (path in COLUMNS and super().__contains__(COLUMNS[str(path)]))
+
+    def __getitem__(self, path: Any) -> Any:
+        return super().__getitem__(COLUMNS[path] if path in COLUMNS and not super().__contains__(path) else path)
+
+    @property
+    def attrs(self) -> dict[str, Any]:
+        return dict(renamed(dict(super().attrs)))
+
+
 @contextmanager
 def open_shard(source: bytes | Path | io.RawIOBase, *, name: str = "") -> Iterator[h5py.File]:
     """The HDF5 file of a shard, for reading what is needed of it; one in a folder is checked first: `check_file`.
@@ -149,7 +164,7 @@ def open_shard(source: bytes | Path | io.RawIOBase, *, name: str = "") -> Iterat
     if isinstance(source, Path) and source.is_file():
         check_file(source)
     try:
-        file = h5py.File(io.BytesIO(source) if isinstance(source, bytes) else source, "r")
+        file = ShardH5(io.BytesIO(source) if isinstance(source, bytes) else source, "r")
     except OSError:
         if isinstance(source, Path) and not source.is_file():
             raise NotFoundError(f"{name} does not exist, or is no file") from None

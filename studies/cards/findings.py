@@ -52,7 +52,7 @@ def _gaps(card: Row) -> list[str]:
     short = [c for c in card["cells"] if wanted and not c["missing_tasks"] and c["valid"] < c["asked"]]
     if short:
         short.sort(key=lambda cell: cell["valid"] / cell["asked"])
-        each = _listed([f"{_pair(c)} ({c['valid']} of {c['asked']} after {c['candidates']} tries)" for c in short])
+        each = _listed([f"{_pair(c)} ({c['valid']} of {c['asked']} of {c['candidates']} candidates)" for c in short])
         told.append(
             f"**{len(short)} of {len(card['cells'])} cells ran out of budget** before all valid grasps were found: "
             f"{each}."
@@ -72,7 +72,7 @@ def _yields(card: Row) -> str:
     low.sort(key=lambda cell: cell["of_validated"])
     each = _listed([f"{_pair(cell)} ({_percent(cell['of_validated'])})" for cell in low])
     return (
-        f"**Hard pairs**, where under half as many candidates are valid as usual for the hand: {each}. What they hold is a "
+        f"**Hard pairs**, where under half as many candidates are valid as usual for the hand: {each}. They hold a "
         "selection of what was easy."
     )
 
@@ -93,8 +93,8 @@ def _rechecks(card: Row) -> str:
     found = card["validity"]
     if not found["rechecked"]:
         return (
-            "**No rechecks**: no verdict was checked under the unmodified DexGraspBench protocol, so the share of false ones is not "
-            "known."
+            "**No rechecks**: no verdict was checked under the unmodified DexGraspBench protocol, so the share of "
+            "false ones is not known."
         )
     wrong = [
         f"{_pair(cell)} ({cell['recheck_dropped']} of {cell['rechecked']})"
@@ -222,7 +222,7 @@ def _mixed(card: Row) -> list[str]:
         ("levels", "levels of the validator"),
         ("friction", "friction coefficients"),
         ("code_versions", "versions of graspd"),
-        ("wants", "wishes (raw and valid)"),
+        ("wants", "wishes (candidates and valid)"),
         ("devices", "devices"),
     ):
         if len(making[key]) > 1:

@@ -128,7 +128,7 @@ def _summary(card: Row, plots: Mapping[str, str]) -> str:
     lines = [
         f"{made['valid']:,} valid grasps{_places(making)} of {_count(len(made['hands']), 'robot hand')} on "
         f"{_count(len(made['objects']), 'object')}{with_pictures}. Planned by `{by}`, "
-        + (f"validated by MuJoCo (`{validated}`), measured" if validated else "measured, not validated by a validator")
+        + (f"validated by MuJoCo (`{validated}`), measured" if validated else "measured, not validated")
         + f"; made by graspd {' and '.join(making['code_versions'])}."
     ]
     if taken := card["snapshot"]:
@@ -217,12 +217,12 @@ def _validity(card: Row, plots: Mapping[str, str]) -> str:
     elif card["making"]["levels"]:
         text = (
             f"A grasp is valid if the validator says that it holds and it passes the geometric gate: {gate}. "
-            'Rechecked ones were validated again under the unmodified DexGraspBench protocol; "false valid" is the share of them that the '
-            "letter drops."
+            'Rechecked ones were validated again under the unmodified DexGraspBench protocol; "false valid" is the '
+            "share of them that it drops."
         )
     else:
         text = (
-            f"No validator validated, so no grasp is valid. A grasp that passes the geometric gate, {gate}, is feasible: "
+            f"Not validated: no grasp is valid. A grasp that passes the geometric gate, {gate}, is feasible: "
             "whether it holds is not known."
         )
     return f"## Validity\n\n{text}\n\n{validity_table(card)}{_plot('yield.png', plots)}"

@@ -114,7 +114,7 @@ def _head(chart: Row) -> str:
         f"- *valid*: holds in MuJoCo (DexGraspBench protocol, level *{chart['validation']['level']}*) and is feasible\n"
         "- speeds are end to end, as a job works: planned, validated, and measured where it holds; *planner's*: grasps "
         "that hold over the seconds of planner and postures alone; on a CPU a second is one of one core\n"
-        "- *letter*: holds under the unmodified DexGraspBench protocol; *hard*: at half the friction; *robust*: share of "
+        "- *dexgraspbench*: holds under the unmodified protocol; *hard*: at half the friction; *robust*: share of "
         f"{chart['models']} models around the nominal one in which a grasp that holds does, on average\n"
         f"- ε, contact: μ = {chart['friction']:g}, within {1e3 * chart['threshold_m']:g} mm; ε and penetration are "
         "medians of a pair's grasps, then means over the pairs\n"
@@ -127,7 +127,7 @@ def _head(chart: Row) -> str:
 def summary_table(rows: Sequence[Row]) -> str:
     """A row per method and fidelity, the fastest first; bold: on the Pareto front of that accuracy against speed."""
     lines = [
-        "| method | fidelity | batch | valid/s | first valid s | planner's/s | letter | hard | robust | ε | "
+        "| method | fidelity | batch | valid/s | first valid s | planner's/s | dexgraspbench | hard | robust | ε | "
         "penetration mm | grasps |",
         "| --- | --- | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: |",
     ]
@@ -168,7 +168,7 @@ def _ratios(rows: Sequence[Row]) -> str:
     lines = [
         "fast_graspd at its default (standard) against each other method, same run:",
         "",
-        "| against | valid/s | letter | ε | penetration mm |",
+        "| against | valid/s | dexgraspbench | ε | penetration mm |",
         "| --- | --: | --: | --: | --: |",
     ]
     for row in others:
@@ -185,8 +185,8 @@ def _ratios(rows: Sequence[Row]) -> str:
 def runs_table(runs: Sequence[Row]) -> str:
     """A row per run."""
     lines = [
-        "| hand | object | method | fidelity | valid/s | letter | hard | robust | ε | penetration mm | self mm | "
-        "contact cm² |",
+        "| hand | object | method | fidelity | valid/s | dexgraspbench | hard | robust | ε | penetration mm | "
+        "self mm | contact cm² |",
         "| --- | --- | --- | --- | --: | --: | --: | --: | --: | --: | --: | --: |",
     ]
     lines += [

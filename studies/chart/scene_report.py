@@ -110,7 +110,7 @@ def _head(chart: Row) -> str:
         f"- *{FILTERED}*: planned around a free object and put into the same scenes, grasp i into scene i in turn: all "
         "that peers can do\n"
         "- *clear*: free of what stands there, coming, closing and lifting\n"
-        "- *lifted*: clear, and lifted by MuJoCo (level *lift*); *letter*: clear, and lifted by DexGraspBench's test; "
+        "- *lifted*: clear, and lifted by MuJoCo (level *lift*); *dexgraspbench*: lifted in DexGraspBench's test; "
         "*half friction*: lifted at that too; shares of all candidates\n"
         f"- *robust*: share of {chart['models']} models around the nominal one in which a lifted grasp is lifted, on "
         "average\n"
@@ -122,7 +122,7 @@ def _head(chart: Row) -> str:
 
 def _summary(rows: Sequence[Row], second: str) -> str:
     lines = [
-        "| way | method | fidelity | tries | clear | lifted | letter | half friction | robust | "
+        "| way | method | fidelity | n | clear | lifted | dexgraspbench | half friction | robust | "
         f"lifted per {second} | planner's | first, {second.removesuffix('econd')} | pairs with one | "
         "× over filtered |",
         "| --- | --- | --- | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: |",
@@ -148,7 +148,7 @@ def _bold(row: Row, key: str) -> str:
 
 def _runs(runs: Sequence[Row], second: str) -> str:
     lines = [
-        "| hand | object | way | method | fidelity | tries | clear | lifted | letter | half friction | robust | "
+        "| hand | object | way | method | fidelity | n | clear | lifted | dexgraspbench | half friction | robust | "
         f"lifted per {second} |",
         "| --- | --- | --- | --- | --- | --: | --: | --: | --: | --: | --: | --: |",
     ]

@@ -131,7 +131,7 @@ def shape_map(
         BOUNDS,
         reachable(cells, lambda cell: True),
         SHOWS,
-        "ingest refuses what has no inside and says `thin` where walls are; the gate and the validator flag grasps that "
+        "ingest refuses what has no inside and says `thin` where walls are; gate and validator flag grasps that "
         "sink in; a job that finds too few says so",
         "tests/studies/test_stability.py::test_a_shape_is_refused_or_its_grasps_are_sound",
         reach="all: users bring such shapes",

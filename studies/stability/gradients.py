@@ -101,7 +101,7 @@ def gradient_map(
         f"weak: {ANGLE[0]:g}; broken: {ANGLE[1]:g}",
         reachable(cells, lambda cell: True),
         "the descent wanders: losses stay where they were however many iterations are run",
-        "a descent that does not improve stops after `patience` iterations; of several starts the best is kept, validated "
+        "a descent that does not improve stops after `patience` iterations; of several starts the best is kept, judged "
         "by the balance of forces and not by the loss",
         "tests/studies/test_stability.py::test_gradients_agree_at_the_sizes_of_hands_and_their_objects",
         reach="all: `contact_solver` offers each, and objects have every size",

@@ -26,6 +26,7 @@ from graspd.service.model.errors import (
 )
 from graspd.service.model.messages import IngestMessage, Origin, TaskMessage
 from graspd.service.model.records import AttemptRecord
+from graspd.service.model.renamed import renamed
 from graspd.service.model.states import Stage
 from graspd.service.model.workers import need_of, own_ability
 from graspd.service.queue.port import Event, EventKind, Message
@@ -228,7 +229,7 @@ def parse_message(raw: Mapping[str, Any]) -> Message:
         model = IngestMessage if raw.get("stage") == Stage.INGEST else TaskMessage
         # A newer schema may have more fields; what names the task must still be there, so that it can be refused.
         known = {field.alias or name for name, field in model.model_fields.items()}
-        return model.model_validate({key: value for key, value in raw.items() if key in known})
+        return model.model_validate({key: value for key, value in renamed(dict(raw)).items() if key in known})
     except (ValidationError, AttributeError) as error:
         raise TaskRefused(f"the queue holds something that is no task of graspd: {_one_line(error)}") from None
 

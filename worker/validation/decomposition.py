@@ -97,7 +97,7 @@ def decompose(obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
     if pieces.excess_m > MAX_EXCESS_M:
         raise MeshError(
             f"{obj.name}: its {len(pieces)} convex pieces have {pieces.volume_ratio:.2f} times its volume and "
-            f"stand out {pieces.excess_m * 1e3:.1f} mm (limit {MAX_EXCESS_M * 1e3:g} mm); the validator cannot validate it"
+            f"stand out {pieces.excess_m * 1e3:.1f} mm (limit {MAX_EXCESS_M * 1e3:g} mm); it cannot be validated"
         )
     if any(obj.centre):
         pieces = replace(pieces, vertices=tuple(part + obj.centre for part in pieces.vertices))

@@ -1,8 +1,9 @@
 """What a dataset will cost, before it starts: time for 1, 8 and 64 workers, storage, network.
 
-    tries of a cell    = grasps / yield, at most grasps x budget   (candidates: grasps)
-    seconds of a cell  = tries x seconds per candidate + batches x scenes x seconds per scene + pictures x seconds per
-    picture time of W workers  = the larger of seconds / W and rounds of batches x seconds of a batch
+    candidates of a cell = grasps / yield, at most grasps x budget   (candidates: grasps)
+    seconds of a cell  = candidates x seconds per candidate + batches x scenes x seconds per scene
+                         + pictures x seconds per picture
+    time of W workers  = the larger of seconds / W and rounds of batches x seconds of a batch
 
 The rates, each with an interval, come from `service.pipeline.rates`; intervals add, as if all were off
 together. A worker is one process of `graspd worker` on a device like those that were measured.

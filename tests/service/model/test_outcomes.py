@@ -15,8 +15,8 @@ def test_the_counts_are_told_the_most_frequent_first() -> None:
     lost = totals([{"slipped": 4, "no_place": 1}, {"slipped": 1, "turned": 2, "alike": 0}])
     assert lost == {"no_place": 1, "turned": 2, "slipped": 5}
     assert shortfall(0, 2, "valid", 8, 4, lost) == (
-        "found 0 of 2 valid grasps in 8 candidates: 5 slipped, 2 turned in the hand, 1 without a clear place or way in the "
-        "scene; the budget of 4 candidates for each ended first"
+        "found 0 of 2 valid grasps in 8 candidates: 5 slipped, 2 turned in the hand, 1 without a clear place or way in "
+        "the scene; the budget of 4 candidates for each ended first"
     )
 
 
