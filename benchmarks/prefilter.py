@@ -1,7 +1,7 @@
 """How often the prefilter says what the standard level says, and how many grasps it validates a second.
 
 usage: python -m benchmarks.prefilter DATA_DIR [--work DIR] [--device cuda:0] [--hands ...] [--objects ...]
-           [--grasps 48] [--speed 256 1024] [--worlds 256 1024] [--out docs/results/first-validate]
+           [--grasps 48] [--speed 256 1024] [--worlds 256 1024] [--out docs/results/prefilter]
 DATA_DIR holds hands/ and objects/. The prefilter and the standard level validate the same candidates; agreement is that
 of the prefilter's clear verdicts. `--speed N` times N grasps (those of the first cell of each hand, moved at random by
 up to a tenth of a millimetre) in pools of `--worlds`. Prints Markdown; `--out` gets .json and .md. Stopped

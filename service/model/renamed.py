@@ -1,4 +1,7 @@
-"""Names of graspd 0.2 in stores, shards and queues, and their names since. Nothing writes the old ones."""
+"""Names of graspd 0.2 in stores, shards and queues, and their names since.
+
+Old names are read everywhere. They are written only in tasks that a worker of 0.2 does.
+"""
 
 from __future__ import annotations
 
@@ -29,6 +32,8 @@ COLUMNS: Final = {
     "quality/recheck": "quality/audit",
     "quality/validated_by": "quality/judged_by",
 }
+#: Revision that graspd 0.2 makes of each stage.
+_REVISIONS: Final = {"synthesize": 23, "scene": 2, "render": 4}
 _OLD: Final = re.compile(rb'"(?:' + b"|".join([*map(str.encode, KEYS), *map(str.encode, _LEVELS), b"raw"]) + rb')"')
 
 
@@ -48,3 +53,14 @@ def renamed(value: Any) -> Any:
     if isinstance(value, list):
         return [renamed(inner) for inner in value]
     return value
+
+
+def for_worker_of(revision: int, stage: str, message: dict[str, Any]) -> dict[str, Any]:
+    """A task message with the names that workers of its revision read: in a rolling upgrade some are of 0.2."""
+    request = message.get("request")
+    if not isinstance(request, dict) or not 0 < revision <= _REVISIONS.get(stage, 0):
+        return message
+    values = {key: {new: old for old, new in names.items()} for key, names in VALUES.items()}
+    request = {key: values[key].get(value, value) if key in values else value for key, value in request.items()}
+    keys = {new: old for old, new in KEYS.items()}
+    return message | {"request": {keys.get(key, key): value for key, value in request.items()}}

@@ -24,6 +24,7 @@ from rq.serializers import JSONSerializer
 
 from graspd.service.model.clock import age_of
 from graspd.service.model.errors import QueueUnavailable
+from graspd.service.model.renamed import for_worker_of
 from graspd.service.model.states import Priority, Stage
 from graspd.service.model.workers import WorkerBeat, need_of
 from graspd.service.queue import entries
@@ -393,7 +394,9 @@ class RqQueue:
     def _job(self, message: Message) -> Job:
         return new_job(
             TASK_FUNCTION,
-            message.model_dump(mode="json", by_alias=True),
+            for_worker_of(
+                getattr(message, "revision", 0), message.stage, message.model_dump(mode="json", by_alias=True)
+            ),
             id=rq_id(message.task_id, message.attempt),
             connection=self.connection,
             description=f"{message.stage} {message.task_id}",
