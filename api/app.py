@@ -23,7 +23,7 @@ from graspd.api.middleware.rate_limit import RateLimit, Rates
 from graspd.api.middleware.request_context import Head, RequestContext, RootPath, SameOrigin
 from graspd.api.routes import assets, datasets, grasps, jobs, shards, system, webhooks
 from graspd.api.routes.assets import asset_router
-from graspd.api.routes.dependencies import EXPORTS, FORMS, UPLOADS, Turns, provide
+from graspd.api.routes.dependencies import EXPORTS, FORMS, UPLOADS, RequestLimiter, provide
 from graspd.service.index.rebuild import complete_if_new
 from graspd.service.model.errors import InputError, UnavailableError
 from graspd.service.model.states import AssetKind
@@ -90,8 +90,8 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
     app.state.keys, app.state.proxy = keys, proxy
     provide(app, opened)
     app.state.metrics = Metrics()
-    app.state.uploads, app.state.forms = Turns(UPLOADS), Turns(FORMS)
-    app.state.exports = Turns(EXPORTS)
+    app.state.uploads, app.state.forms = RequestLimiter(UPLOADS), RequestLimiter(FORMS)
+    app.state.exports = RequestLimiter(EXPORTS)
     problems.install(app, problem_page)
     pages.install(app, opened)
     for router in (*_ROUTERS, *map(asset_router, AssetKind), *datasets.routers, *pages.routers):

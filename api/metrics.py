@@ -9,9 +9,9 @@ from typing import Any, Final
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 
-from graspd.service.index.queries.overview import IndexNow
+from graspd.service.index.queries.overview import IndexStatus
 from graspd.service.pipeline.metrics import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S, parse_field
-from graspd.service.queue.port import QueueNow
+from graspd.service.queue.port import QueueStatus
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 
@@ -57,7 +57,7 @@ class Snapshot:
             if seconds is not None:
                 self._set("graspd_part_latency_seconds", part, value=seconds)
 
-    def add_queue(self, queue: QueueNow, *, is_kept: bool) -> None:
+    def add_queue(self, queue: QueueStatus, *, is_kept: bool) -> None:
         for (priority, stage), depth in queue.depth.items():
             self._set("graspd_queue_depth", priority, stage, value=depth)
             oldest = queue.oldest_s.get((priority, stage), 0.0)
@@ -70,7 +70,7 @@ class Snapshot:
             self._set("graspd_worker_lease_age_seconds", name, beat.device, value=age_s)
         self._set("graspd_controller_up", value=float(is_kept))
 
-    def add_index(self, index: IndexNow) -> None:
+    def add_index(self, index: IndexStatus) -> None:
         for state, count in index.jobs.items():
             self._set("graspd_jobs_unfinished", state, value=count)
             self._set("graspd_job_oldest_seconds", state, value=index.oldest_s[state])

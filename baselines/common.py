@@ -40,7 +40,7 @@ GROUND: Final = Fidelity(
 _lock = threading.Lock()
 
 
-class Kept(Generic[T]):
+class PairCache(Generic[T]):
     """What a method makes once of a pair and its options, kept for the pairs used last."""
 
     def __init__(self, make: Callable[..., T], size: int = 4) -> None:

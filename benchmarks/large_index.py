@@ -27,7 +27,7 @@ from graspd.service.index.tables import attempts, grasps, jobs, metadata, shards
 from graspd.service.model import names
 from graspd.service.model.digests import digest_json, job_id
 from graspd.service.model.domain import JobRequest
-from graspd.service.model.metrics import Indexed, indexed
+from graspd.service.model.metrics import IndexLevel, indexed
 from graspd.service.model.planning import PlannedTask, plan
 from graspd.service.model.records import AttemptRecord, JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
@@ -41,7 +41,7 @@ _CHUNK: Final = 20_000
 #: Of a hundred jobs so many are in each state; the running ones are half done.
 _MIX: Final = {State.SUCCEEDED: 88, State.RUNNING: 4, State.QUEUED: 3, State.FAILED: 3, State.CANCELLED: 2}
 #: Metrics that every grasp has.
-_NAMES: Final = tuple(metric.name for metric in indexed(Indexed.SORTED) if not metric.optional)
+_NAMES: Final = tuple(metric.name for metric in indexed(IndexLevel.SORTED) if not metric.optional)
 _SCALES: Final = dict(zip(_NAMES, (0.25, 0.8, 9.0, 0.3, 0.8, 0.1, 0.05), strict=True))
 
 

@@ -32,7 +32,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.scenes.placement import scenes_of
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.compiled import scene_of
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.lift import LiftOutcome
@@ -166,7 +166,9 @@ def every(grasps: GraspSet) -> NDArray[np.intp]:
     return np.tile(np.arange(len(grasps)), 1 + len(FORCES_N))
 
 
-def valid_grasps(given: Any, hand: HandModel, mesh: Path, mass: float) -> tuple[GraspSet, ObjectModel, Placed | None]:
+def valid_grasps(
+    given: Any, hand: HandModel, mesh: Path, mass: float
+) -> tuple[GraspSet, ObjectModel, PlacedGrasps | None]:
     """Grasps of an object about its centre, and their scenes; None: the object is free."""
     obj = object_from_path(str(mesh), face_error_m=FIDELITIES["standard"].face_error_m).weighing(mass=mass)
     request = JobOptions(grasps=given.grasps, rechecks=0, seed=given.seed)

@@ -36,7 +36,7 @@ from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.quality.intervals import wilson
 from graspd.worker.quality.table import measure
 from graspd.worker.scenes.trajectory import plan_way
-from graspd.worker.simulation.environment import RISE_M, Obstacle, Placed
+from graspd.worker.simulation.environment import RISE_M, Obstacle, PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.lift import Lift, LiftOutcome
 from graspd.worker.validation.lifting import validate_lifts
@@ -91,7 +91,7 @@ LIFTS |= {
 class Pick(Lift):
     """Lifts on given terms."""
 
-    def __init__(self, scene: Any, placed: Placed, terms: Terms) -> None:
+    def __init__(self, scene: Any, placed: PlacedGrasps, terms: Terms) -> None:
         super().__init__(scene, placed)
         self.terms = terms
 
@@ -131,12 +131,12 @@ class Pick(Lift):
         return Outcome.ROTATED if self._motion()[1] >= TURNED else Outcome.HELD
 
 
-def on_table(case: Case) -> Placed:
+def on_table(case: Case) -> PlacedGrasps:
     """The object as the scan stands, z up, on a table under its lowest point."""
     low = float(case.obj.vertices[:, 2].min())
     table = Obstacle.half_space((0, 0, 1), 0.0)
     pose = np.array([[0, 0, -low, 1, 0, 0, 0]], float)
-    return Placed((table,), pose, np.zeros(len(case.grasps), np.intp))
+    return PlacedGrasps((table,), pose, np.zeros(len(case.grasps), np.intp))
 
 
 def picked(case: Case, pieces: ConvexPieces, terms: Terms) -> dict[str, Any]:

@@ -26,7 +26,7 @@ import typer
 
 from graspd.service.readers import Grasps, Pictures, ShardCache, Shards, open_shards, prefetched
 from graspd.service.readers.grasps import DEFAULT_COLUMNS
-from graspd.service.readers.pictures import Place
+from graspd.service.readers.pictures import PictureAddress
 from graspd.service.store.store import open_store
 from tests.servers import S3Server
 
@@ -62,7 +62,7 @@ def plain_bulk(shards: Shards) -> int:
     return _whole(shards, "views", PICTURE)
 
 
-def plain_drawn(shards: Shards, order: Sequence[int], places: Sequence[Place]) -> int:
+def plain_drawn(shards: Shards, order: Sequence[int], places: Sequence[PictureAddress]) -> int:
     """The same pictures in a drawn order: each opens its file."""
     for index in order:
         with h5py.File(shards.path(places[index].file), "r") as opened:

@@ -38,7 +38,7 @@ from graspd.worker.scenes.clearance import MARGIN_M
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.scenes.rollout import rollout_on
 from graspd.worker.scenes.trajectory import plan_way
-from graspd.worker.simulation.environment import Placed, Scenes
+from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.lifting import validate_lifts
 from graspd.worker.validation.validator import validate
@@ -127,7 +127,7 @@ def _validated(
     hand: HandModel,
     obj: ObjectModel,
     grasps: GraspSet,
-    placed: Placed,
+    placed: PlacedGrasps,
     pieces: ConvexPieces,
     *,
     only_lift: bool = False,

@@ -21,7 +21,7 @@ from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, inve
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.scenes.kinds import supports_of
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 
 Row = dict[str, Any]
 
@@ -31,7 +31,7 @@ TABLETOP: Final = "tabletop"
 SAME: Final = 1e-9
 
 
-def check_table(placed: Placed) -> None:
+def check_table(placed: PlacedGrasps) -> None:
     """Raises InputError unless the scenes are a table with its top at z = 0 and nothing else."""
     table = placed.supports[0].planes if len(placed.supports) == 1 else np.zeros((0, 4))
     if table.shape != (1, 4) or not np.allclose(table[0], [0, 0, 1, 0], rtol=0, atol=SAME):
@@ -59,14 +59,14 @@ def is_tabletop(row: Row) -> bool:
     return any(part.startswith(TABLETOP) for part in str(row.get("scene_path", "")).split("/"))
 
 
-def placed_of(obj_pose: Floats) -> Placed:
+def placed_of(obj_pose: Floats) -> PlacedGrasps:
     """The tables that N grasps are on, which fingertips may touch, from their objects' poses (N, 7): equal ones are one
     scene."""
     _, first, index = np.unique(np.round(obj_pose / SAME), axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     number = np.empty(len(order), np.intp)
     number[order] = np.arange(len(order))
-    return Placed(supports_of(SceneSpec(kind="table")), obj_pose[first[order]], number[index.reshape(-1)])
+    return PlacedGrasps(supports_of(SceneSpec(kind="table")), obj_pose[first[order]], number[index.reshape(-1)])
 
 
 def object_of_scene(file: Path, scene_path: str) -> Row:

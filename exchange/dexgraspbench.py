@@ -43,7 +43,7 @@ from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 
 Row = dict[str, Any]
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
@@ -82,7 +82,12 @@ def read(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
 
 
 def write(
-    hand: HandModel, obj: ObjectModel, grasps: GraspSet, rows: Sequence[int], folder: Path, placed: Placed | None = None
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    rows: Sequence[int],
+    folder: Path,
+    placed: PlacedGrasps | None = None,
 ) -> list[Path]:
     """Write grasps with all that DexGraspBench's evaluator reads: laid over its checkout, the folder is complete.
 
@@ -148,7 +153,7 @@ def models_of(hand: HandModel, folder: Path) -> list[HandMapping]:
     return [ours, *filter(None, [of_the_benchmark(hand)])]
 
 
-def experiment(placed: Placed | None) -> str:
+def experiment(placed: PlacedGrasps | None) -> str:
     """Name of the experiment: free grasps and grasps on tables are two."""
     return NAME if placed is None else f"{NAME}_{TABLETOP}"
 

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from graspd.exchange.dexgraspnet2_graspness import SceneGraspness, surface_samples
 from graspd.exchange.imported import ImportedGrasps, completed, joints_by_name, scaled_object, verdicts
-from graspd.exchange.plan import ExportPart, ExportSummary, Look, by_scene, looks, plain_name
+from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, by_scene, looks, plain_name
 from graspd.service.model.base import why
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, apply, compose, invert, pose_from_matrix, pose_to_matrix
@@ -115,7 +115,9 @@ def write(
     return done
 
 
-def _numbers(held: bool, scenes: list[list[Look]], known: dict[str, ExportPart], out: frozenset[str]) -> Iterator[int]:
+def _numbers(
+    held: bool, scenes: list[list[PictureReference]], known: dict[str, ExportPart], out: frozenset[str]
+) -> Iterator[int]:
     """Of the scenes of one side, as its splits have them."""
     count = sum((known[some[0].base].name in out) is held for some in scenes)
     room = [number for numbers in (HELD_OUT if held else TRAIN) for number in numbers]
@@ -126,7 +128,12 @@ def _numbers(held: bool, scenes: list[list[Look]], known: dict[str, ExportPart],
 
 
 def _write_scene(
-    some: list[Look], pictures: Pictures, top: Path, name: str, noise: DepthNoise | None, graspness: SceneGraspness
+    some: list[PictureReference],
+    pictures: Pictures,
+    top: Path,
+    name: str,
+    noise: DepthNoise | None,
+    graspness: SceneGraspness,
 ) -> None:
     path, values = top / "scenes" / name / CAMERA, top / "dex_graspness_new" / name / CAMERA
     kinds = ((path / "depth_gt", "png"), (path / "label_gt", "png"), (path / "meta", "mat"), (values, "npy"))
@@ -170,12 +177,12 @@ def _again(file: Path, copy: Path) -> None:
         shutil.copyfile(file, copy)
 
 
-def _camera(look: Look) -> Floats:
+def _camera(look: PictureReference) -> Floats:
     """(7,) where the camera stands on the table."""
     return invert(pose_from_matrix(look.extrinsics))
 
 
-def _write_grasps(look: Look, lot: ExportPart, folder: Path, graspness: SceneGraspness) -> None:
+def _write_grasps(look: PictureReference, lot: ExportPart, folder: Path, graspness: SceneGraspness) -> None:
     names = lot.hand.joint_names
     if taken := set(names) & {*_PLACE, *_OURS, *_NUMPYS}:
         raise InputError(f"{lot.hand.name} has a joint {sorted(taken)[0]!r}, which is a key of DexGraspNet 2.0's files")

@@ -25,7 +25,7 @@ from graspd.exchange.bench_hand import COLLECTED, HandMapping
 from graspd.exchange.bench_object import SET, write_object, write_table
 from graspd.exchange.bench_scene import TABLETOP, check_table
 from graspd.exchange.dexgraspbench import POSTURES, experiment, models_of, postures
-from graspd.exchange.plan import ExportPart, ExportSummary, Look, looks, object_points
+from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, looks, object_points
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, invert
 from graspd.service.readers import DepthNoise, Pictures
@@ -123,7 +123,7 @@ def _clouds(
     return sum(number + 1 for number in written.values()), len(bare)
 
 
-def points_of(pictures: Pictures, look: Look, noise: DepthNoise | None, *, on_table: bool) -> Floats:
+def points_of(pictures: Pictures, look: PictureReference, noise: DepthNoise | None, *, on_table: bool) -> Floats:
     """(P, 3) what a picture shows of its object, in the table's frame, or where it is none in the object's own [m]."""
     points = object_points(pictures[look.index], look.index, noise)
     return points if on_table else apply(invert(look.object_pose), points)

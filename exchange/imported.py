@@ -24,7 +24,7 @@ from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class ImportedGrasps:
     """Factor that the source puts on the object's mesh."""
     published: NDArray[np.int8] | None = None
     """(N,) success as published: 1, 0, -1 unknown."""
-    placed: Placed | None = None
+    placed: PlacedGrasps | None = None
     """The scenes that the grasps are for, if any."""
 
 

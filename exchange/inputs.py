@@ -16,7 +16,7 @@ from graspd.worker.files.provenance import hand_of_shard, object_of_shard, place
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 
 #: JSON files beside shards that hold no grasps.
 BESIDE_SHARDS: Final = ("snapshot.json", "subset.json", "card.json")
@@ -38,7 +38,7 @@ class Case:
     """Whether those seconds hold the validator's work on them already."""
     published: NDArray[np.int8] | None = None
     """(N,) success as published: 1, 0, -1 unknown."""
-    placed: Placed | None = None
+    placed: PlacedGrasps | None = None
     """The scenes that the grasps were planned in, if any."""
 
     @property

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from graspd.exchange.bench_scene import placed_of
 from graspd.exchange.huggingface import png
 from graspd.exchange.imported import ImportedGrasps, joints_by_name, scaled_object, verdicts
-from graspd.exchange.plan import ExportPart, ExportSummary, Look, by_scene, looks
+from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, by_scene, looks
 from graspd.service import parquet
 from graspd.service.model.base import why
 from graspd.service.model.errors import InputError
@@ -106,7 +106,9 @@ def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: fro
     return done
 
 
-def _seen(lot: ExportPart, seen: Mapping[tuple[str, int], list[Look]]) -> Iterator[tuple[int, Look]]:
+def _seen(
+    lot: ExportPart, seen: Mapping[tuple[str, int], list[PictureReference]]
+) -> Iterator[tuple[int, PictureReference]]:
     """The lot's rows with a picture of their scene."""
     assert lot.placed is not None
     for k, row in enumerate(lot.rows.tolist()):
@@ -131,7 +133,7 @@ class _Writer:
         self._size: tuple[int, ...] = ()
         self._values: dict[str, list[NDArray[Any]]] = {}
 
-    def file(self, episodes: Sequence[tuple[ExportPart, int, Look]]) -> None:
+    def file(self, episodes: Sequence[tuple[ExportPart, int, PictureReference]]) -> None:
         """Write a file, each episode a row group."""
         number = len(self.episodes) // _EPISODES
         width = 7 + len(self.hand.joint_names)
@@ -150,7 +152,9 @@ class _Writer:
         )
         parquet.write(path, parquet.schema_of(columns | NUMBERS), (self._episode(*one, place) for one in episodes))
 
-    def _episode(self, lot: ExportPart, row: int, look: Look, place: Mapping[str, int]) -> list[dict[str, Any]]:
+    def _episode(
+        self, lot: ExportPart, row: int, look: PictureReference, place: Mapping[str, int]
+    ) -> list[dict[str, Any]]:
         way = postures_of(lot, row).astype(np.float32)
         colour = np.asarray(self.pictures[look.index]["image/rgb"])
         if self._size not in ((), colour.shape):

@@ -20,7 +20,7 @@ from graspd.service.store.shards import Shard
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class ExportPart:
     verdict: NDArray[np.int8]
     """(N,) of the validator on every grasp: 1 held, 0 dropped, -1 not validated."""
     shard: Shard
-    placed: Placed | None = None
+    placed: PlacedGrasps | None = None
 
     @property
     def tag(self) -> str:
@@ -63,7 +63,7 @@ def held_out(kinds: Mapping[str, str], share: float) -> frozenset[str]:
 
 
 @dataclass(frozen=True)
-class Look:
+class PictureReference:
     """One picture: where it is among the pictures, and of what."""
 
     index: int
@@ -80,7 +80,7 @@ class Look:
     """Rows of the base shard whose grasps are taken in this scene."""
 
 
-def looks(pictures: Pictures) -> Iterator[Look]:
+def looks(pictures: Pictures) -> Iterator[PictureReference]:
     """The pictures, none of whose pixels is read. Of a pair the left one."""
     for index, place in enumerate(pictures.places):
         camera = pictures.columns_of(place, ("camera/extrinsics", "camera/eye"))
@@ -90,7 +90,7 @@ def looks(pictures: Pictures) -> Iterator[Look]:
         found = pictures.scenes_of(place).grasps(place.scene, extrinsics)
         pose = compose(invert(pose_from_matrix(extrinsics)), found["object/pose"])
         rows = np.asarray(found["grasp/base_row"], np.intp)
-        yield Look(index, found["base_id"], place.file.id, place.scene, extrinsics, pose, rows)
+        yield PictureReference(index, found["base_id"], place.file.id, place.scene, extrinsics, pose, rows)
 
 
 #: The right eye of a pair, as `camera/eye` tells it.
@@ -103,9 +103,9 @@ def object_points(sample: Mapping[str, Any], index: int, noise: DepthNoise | Non
     return view.points(*view.pixels(whole=False))
 
 
-def by_scene(found: Sequence[Look]) -> dict[tuple[str, int], list[Look]]:
+def by_scene(found: Sequence[PictureReference]) -> dict[tuple[str, int], list[PictureReference]]:
     """Pictures of each scene of each views shard, in their order."""
-    scenes: dict[tuple[str, int], list[Look]] = {}
+    scenes: dict[tuple[str, int], list[PictureReference]] = {}
     for look in found:
         scenes.setdefault((look.shard, look.scene), []).append(look)
     return scenes

@@ -24,7 +24,7 @@ from graspd.worker.quality.diversity import explained_variance, hand_points, nea
 from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
 from graspd.worker.quality.table import DEFAULT_FRICTION, measure
 from graspd.worker.scenes.trajectory import plan_way
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.foreign import foreign_verdicts, share_counts
@@ -134,7 +134,7 @@ def _pushed(
 
 def _lifted_out(
     case: Case,
-    placed: Placed,
+    placed: PlacedGrasps,
     level: LiftLevel,
     in_others: InOthers,
     *,
@@ -191,7 +191,7 @@ def _success(case: Case, verdicts: Verdicts | None, seconds: float) -> dict[str,
     return row
 
 
-def _with_ways(case: Case, placed: Placed) -> tuple[GraspSet, NDArray[np.bool_]]:
+def _with_ways(case: Case, placed: PlacedGrasps) -> tuple[GraspSet, NDArray[np.bool_]]:
     """The grasps with their way, and (N,) whether it is clear."""
     way, grasps = plan_way(case.hand, case.obj, case.grasps, placed), case.grasps
     if grasps.approach is None or grasps.coming is None:

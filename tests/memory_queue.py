@@ -15,7 +15,7 @@ from graspd.service.queue.port import (
     Event,
     Lease,
     Message,
-    QueueNow,
+    QueueStatus,
     Report,
     priority_order,
 )
@@ -166,10 +166,10 @@ class MemoryQueue(RqQueue):
             if self._lease[0] == holder:
                 self._lease = ("", 0.0)
 
-    def now(self, *, lease_s: float) -> QueueNow:
+    def now(self, *, lease_s: float) -> QueueStatus:
         running = Counter((Priority.BULK, held.message.stage) for held in self._held.values())
         pulses = {name: (beat, 0.0) for name, beat in self._workers.items()}
-        return QueueNow(depth=self.depths(), running=running, workers=pulses)
+        return QueueStatus(depth=self.depths(), running=running, workers=pulses)
 
     def count(self, amounts: Mapping[str, float]) -> None:
         for name, amount in amounts.items():

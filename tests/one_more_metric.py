@@ -17,7 +17,7 @@ from graspd.service.model import metrics
 
 NAME, TITLE, MEANING = "finger_force_n", "Finger force", "largest force of a finger"
 ROW = metrics.GraspMetric(
-    NAME, "N", MEANING, title=TITLE, optional=True, indexed=metrics.Indexed.OFFERED, bounds=(0, 50), digits=1
+    NAME, "N", MEANING, title=TITLE, optional=True, indexed=metrics.IndexLevel.OFFERED, bounds=(0, 50), digits=1
 )
 
 

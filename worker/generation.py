@@ -27,7 +27,7 @@ from graspd.worker.grasps import GraspSet, joined, joined_columns
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.pinch_postures import require_opposing
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners import NoPlace, PlanRequest, Rollout, fitting_pairs, method, synthesize
+from graspd.worker.planners import NoStartFound, PlanRequest, Rollout, fitting_pairs, method, synthesize
 from graspd.worker.planners.fast_graspd.antipodal_starts import why_narrow
 from graspd.worker.quality.diversity import POINTS, distinct, hand_points
 from graspd.worker.quality.gate import GATES, failed_gate, passes
@@ -35,7 +35,7 @@ from graspd.worker.quality.table import measure
 from graspd.worker.rounds import ROUND_STRIDE, Arrays, Round, enough, lanes_of, next_round, taken
 from graspd.worker.scenes.rollout import lift_level, rollout_on, scene_verdicts
 from graspd.worker.side_by_side import side_by_side
-from graspd.worker.simulation.environment import Placed, Scenes
+from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.key import verdict_key
@@ -274,18 +274,18 @@ class _Work:
         self._rollout()  # once, and not by every lane
         known = self.candidates > 0
 
-        def lane(part: range, own: ExecutionContext) -> Round | NoPlace:
+        def lane(part: range, own: ExecutionContext) -> Round | NoStartFound:
             try:
                 return self._lane(number, part, begun, known, own)
-            except NoPlace as error:
+            except NoStartFound as error:
                 return error
 
         found = side_by_side(parts, lane, run, size=len)
-        if len(refused := [one for one in found if isinstance(one, NoPlace)]) == len(found):
+        if len(refused := [one for one in found if isinstance(one, NoStartFound)]) == len(found):
             why = self._narrow()
-            raise NoPlace(f"{refused[0]}: {why}") if why else refused[0]
+            raise NoStartFound(f"{refused[0]}: {why}") if why else refused[0]
         made = [
-            self._lane(number, part, begun, True, run.quiet()) if isinstance(one, NoPlace) else one
+            self._lane(number, part, begun, True, run.quiet()) if isinstance(one, NoStartFound) else one
             for part, one in zip(parts, found, strict=True)
         ]
         self.candidates += len(rows)
@@ -533,7 +533,7 @@ class _Work:
         seconds["validation"] += found.seconds
         return found.columns
 
-    def _placed(self, grasps: GraspSet) -> Placed | None:
+    def _placed(self, grasps: GraspSet) -> PlacedGrasps | None:
         """The grasps' scenes; None: the object is free."""
         if self.scenes is None:
             return None

@@ -34,7 +34,7 @@ from graspd.service.model.metrics import (
     DIRECTION_CELLS,
     GRASP_METRICS,
     GraspType,
-    Indexed,
+    IndexLevel,
     entropy_bits,
     evenness,
     indexed,
@@ -49,7 +49,7 @@ from graspd.service.store.shards import Shard, read_shard
 from graspd.service.store.store import Store
 
 _KEPT_HISTOGRAMS: Final = 256
-MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(metric.name for metric in indexed(Indexed.OFFERED))
+MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(metric.name for metric in indexed(IndexLevel.OFFERED))
 
 
 class Grasps:

@@ -33,7 +33,7 @@ from graspd.service.model.states import Priority, Stage
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.identity import check_queue
 from graspd.service.pipeline.leading import PART
-from graspd.service.queue.port import QueueNow
+from graspd.service.queue.port import QueueStatus
 
 _DAMAGE_SHOWN: Final = 5
 _JOBS_WATCHED: Final = 20
@@ -150,7 +150,7 @@ class Overview:
             else wanted - self._services.index.jobs.out_of_scope(wanted, project_scope())
         )
 
-    def _queue_now(self) -> QueueNow:
+    def _queue_now(self) -> QueueStatus:
         # A worker's registration lives for whole seconds: see `worker.process.heartbeat`.
         return self._services.queue.now(lease_s=max(2, round(self._services.settings.lease_s)))
 

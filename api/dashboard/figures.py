@@ -258,7 +258,7 @@ PITCH: Final = (40, 30)
 
 
 @dataclass(frozen=True)
-class Square:
+class CellSquare:
     """A cell as it is drawn."""
 
     outcome: Outcome
@@ -276,7 +276,7 @@ class Panel:
     x: str
     y: str
     columns: list[str]
-    rows: list[tuple[str, list[Square | None]]]
+    rows: list[tuple[str, list[CellSquare | None]]]
     line: str
     """Points of the boundary that theory gives, over the cells."""
 
@@ -347,9 +347,9 @@ def _panel(one: StabilityMap, name: str) -> Panel:
     return Panel(name, one.x, one.y, [tick(x) for x in xs], rows, points)
 
 
-def _square(one: StabilityMap, cell: MapCell, *, ringed: bool) -> Square:
+def _square(one: StabilityMap, cell: MapCell, *, ringed: bool) -> CellSquare:
     value = cell.note or (f"{cell.value:.3g}" if cell.value == cell.value else "no value")
-    return Square(
+    return CellSquare(
         outcome=cell.outcome,
         text=cell.text,
         said=f"{one.x} {tick(cell.x)}, {one.y} {tick(cell.y)}: {cell.outcome}; {value}",

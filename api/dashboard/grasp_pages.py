@@ -34,12 +34,12 @@ from graspd.api.routes.grasps import exported
 from graspd.service.index.views import GraspView, TagView
 from graspd.service.model.base import TagName
 from graspd.service.model.errors import InputError
-from graspd.service.model.metrics import AXIS_MEANINGS, GRASP_METRICS, GraspType, Indexed, indexed
+from graspd.service.model.metrics import AXIS_MEANINGS, GRASP_METRICS, GraspType, IndexLevel, indexed
 from graspd.service.model.states import AssetKind
 
 PAGE_SIZES: Final = {"cards": 24, "table": 50}
 #: Sort key, label, unit of the metrics that lists of grasps show.
-COLUMNS: Final = tuple((metric.name, metric.column_title, metric.unit) for metric in indexed(Indexed.OFFERED))
+COLUMNS: Final = tuple((metric.name, metric.column_title, metric.unit) for metric in indexed(IndexLevel.OFFERED))
 #: Metrics of which less is better: a first click sorts them upwards.
 _LESS_IS_BETTER: Final = frozenset(metric.name for metric in indexed() if metric.less_is_better)
 #: Metrics that stand beside the verdict of a grasp.
@@ -93,7 +93,7 @@ def grasps_page(
         models=shards.assets_of({grasp.shard_id for grasp in rows}) if view == "cards" else {},
         columns=COLUMNS,
         weakest=list(_WEAKEST.items()),
-        limits={metric.name: metric.limits for metric in indexed(Indexed.OFFERED)},
+        limits={metric.name: metric.limits for metric in indexed(IndexLevel.OFFERED)},
         sort=query.sort,
         # The default is no part of an address.
         sorts=[("" if key == GraspQuery().sort else key, label) for key, label, _ in COLUMNS],

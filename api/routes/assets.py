@@ -20,7 +20,7 @@ from graspd.api.routes.dependencies import (
     AssetsOf,
     Cursor,
     Limit,
-    Turns,
+    RequestLimiter,
     is_known,
     link_next,
     may_read,
@@ -103,7 +103,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
         ] = False,
     ) -> AssetView:
         limit = request.app.state.settings.max_upload_bytes
-        uploads: Turns = request.app.state.uploads
+        uploads: RequestLimiter = request.app.state.uploads
         if self_test and kind is not AssetKind.HAND:
             raise InputError("self_test: only a hand can be tried")
         asset = await uploads.run(
@@ -231,7 +231,7 @@ async def correct_hand(
     name: str, body: CorrectionRequest, request: Request, response: Response, assets: AssetsOf
 ) -> AssetView:
     """A hand of the same files with these corrections; a worker checks it. `name` may be a digest."""
-    uploads: Turns = request.app.state.uploads
+    uploads: RequestLimiter = request.app.state.uploads
     asset = await uploads.run(store_correction, assets, name, body, body.name)
     response.headers["Location"] = f"/v1/hands/{asset.name}"
     response.headers["Retry-After"] = "1"

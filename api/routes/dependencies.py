@@ -119,7 +119,7 @@ _WAITING: Final = 32
 _PATIENCE_S: Final = 20.0
 
 
-class Turns:
+class RequestLimiter:
     """A bounded number of threads, and of requests that wait for one.
 
     Args:

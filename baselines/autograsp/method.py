@@ -26,7 +26,7 @@ from graspd.worker.hands.model import HandModel, JointType, SurfacePoints
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
 from graspd.worker.planners.port import Method, Options, Planner, PlanRequest
-from graspd.worker.planners.threads import Steps, cut, run_parts
+from graspd.worker.planners.threads import StepCounter, cut, run_parts
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import Model
@@ -48,7 +48,7 @@ class Autograsp:
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
         began = time.perf_counter()
         pair = ground_of(hand, obj, run.device, kernels)
-        steps = Steps(3 * wanted.count, run)
+        steps = StepCounter(3 * wanted.count, run)
 
         def work(indices: range) -> HandState:
             n = len(indices)

@@ -31,7 +31,7 @@ from graspd.worker.objects.distance import sample_faces
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
 from graspd.worker.planners.port import Method, Options, Planner, PlanRequest
-from graspd.worker.planners.threads import Steps, cut, run_parts
+from graspd.worker.planners.threads import StepCounter, cut, run_parts
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.kernels import optimizers
 from graspd.worker.simulation.launches import Launches
@@ -63,7 +63,7 @@ class Dfc:
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
         began = time.perf_counter()
         pair = ground_of(hand, obj, run.device, kernels)
-        steps = Steps(wanted.count * (self.options.steps + 1), run)
+        steps = StepCounter(wanted.count * (self.options.steps + 1), run)
 
         def work(indices: range) -> tuple[HandState, Floats]:
             starts = sample_starts(hand, obj, seed=wanted.seed, batch=wanted.batch, indices=indices)
@@ -231,7 +231,7 @@ class Descent:
         out.add(optimizers.advance, 1, inputs=[], outputs=[s.iteration])
         return out
 
-    def run(self, steps: int, tell: Steps) -> None:
+    def run(self, steps: int, tell: StepCounter) -> None:
         """So many proposals; raises TaskCancelled through `tell`."""
         for first in range(0, steps, CHUNK):
             count = min(CHUNK, steps - first)

@@ -15,7 +15,7 @@ import warp as wp
 from numpy.typing import NDArray
 from pydantic import Field
 
-from graspd.baselines.common import Kept, free_starts, grasp_set, ground_of, joined
+from graspd.baselines.common import PairCache, free_starts, grasp_set, ground_of, joined
 from graspd.baselines.graspd2022 import kernels
 from graspd.service.model.cores import available_cores
 from graspd.service.model.transforms import Floats, quat_rotate
@@ -26,7 +26,7 @@ from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
 from graspd.worker.planners.port import Method, Options, Planner, PlanRequest
-from graspd.worker.planners.threads import Steps, cut, run_parts
+from graspd.worker.planners.threads import StepCounter, cut, run_parts
 from graspd.worker.simulation.data import Data, HandState, Schedule
 from graspd.worker.simulation.device import DeviceObject
 from graspd.worker.simulation.kernels import surface
@@ -50,7 +50,7 @@ class Search:
         self.grid = distance_grid(pair.fine.obj, cells)
         self.points = sample_surface(pair.hand.model, POINTS)
 
-    def run(self, starts: HandState, *, steps: int, tell: Steps) -> tuple[HandState, Floats]:
+    def run(self, starts: HandState, *, steps: int, tell: StepCounter) -> tuple[HandState, Floats]:
         """The hands after `steps` iterations, and the residual of their forces against the task, (n,) of 1."""
         batch = _Batch(self, _retreated(self.pair, starts), steps)
         n = len(starts.pivot)
@@ -61,7 +61,7 @@ class Search:
         return batch.data.state(n), batch.residual()
 
 
-_searches: Final = Kept(Search)
+_searches: Final = PairCache(Search)
 
 
 class Graspd2022:
@@ -74,7 +74,7 @@ class Graspd2022:
         began = time.perf_counter()
         pair: Pair = ground_of(hand, obj, run.device, kernels)
         search = _searches(pair, self.options.grid)
-        steps = Steps(wanted.count * (self.options.steps + 1), run)
+        steps = StepCounter(wanted.count * (self.options.steps + 1), run)
 
         def work(indices: range) -> tuple[HandState, Floats]:
             starts = free_starts(pair, seed=wanted.seed, batch=wanted.batch, indices=indices)

@@ -21,7 +21,7 @@ from pydantic import Field
 
 from graspd.baselines.autograsp import kernels as closing_kernels
 from graspd.baselines.autograsp.method import HandCloser
-from graspd.baselines.common import Kept, grasp_set, ground_of, inside_points, joined
+from graspd.baselines.common import PairCache, grasp_set, ground_of, inside_points, joined
 from graspd.baselines.graspit import kernels
 from graspd.baselines.graspit.schedule import FIRST_STEP
 from graspd.service.model.errors import InputError
@@ -33,7 +33,7 @@ from graspd.worker.hands.model import HandModel, SurfacePoints
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
 from graspd.worker.planners.port import Method, Options, Planner, PlanRequest
-from graspd.worker.planners.threads import Steps, cut, run_parts
+from graspd.worker.planners.threads import StepCounter, cut, run_parts
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.device import to_wxyz, to_xyzw
 from graspd.worker.simulation.model import body_points
@@ -70,7 +70,7 @@ class Search:
         out.clash = wp.array(clash_grid(self.pair, self.eigen), dtype=wp.int32)
         return out
 
-    def run(self, seeds: list[list[int]], *, steps: int, keep: int, tell: Steps) -> HandState:
+    def run(self, seeds: list[list[int]], *, steps: int, keep: int, tell: StepCounter) -> HandState:
         """The `keep` best states of each chain, best first, those of a chain side by side.
 
         Args:
@@ -120,7 +120,7 @@ class Search:
         return HandState(pivot.numpy().astype(float), to_wxyz(rotation.numpy().astype(float)), q.numpy().astype(float))
 
 
-_searches: Final = Kept(Search)
+_searches: Final = PairCache(Search)
 
 
 class GraspitOptions(Options):
@@ -144,7 +144,7 @@ class Graspit:
         search = _searches(pair)
         keep, moves = self.options.keep, self.options.steps - FIRST_STEP
         chains = -(-wanted.count // keep)
-        steps = Steps(chains * moves, run)
+        steps = StepCounter(chains * moves, run)
 
         def work(indices: range) -> HandState:
             seeds = [[wanted.seed, wanted.batch, chain] for chain in indices]

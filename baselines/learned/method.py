@@ -28,7 +28,7 @@ from graspd.worker.planners.fast_graspd.starts import CLEAR, Probe
 from graspd.worker.planners.known_networks import keep_file, kept
 from graspd.worker.planners.port import BatchRequest, Method, Options, PlanRequest
 from graspd.worker.simulation.data import HandState
-from graspd.worker.simulation.environment import UP, Obstacle, Placed
+from graspd.worker.simulation.environment import UP, Obstacle, PlacedGrasps
 from graspd.worker.simulation.model import Model
 
 
@@ -99,7 +99,13 @@ class Seeds:
         return fidelity.model_copy(update={"starts": self.starts, "finalists": finalists})
 
     def __call__(
-        self, model: Model, generators: list[np.random.Generator], *, each: int, placed: Placed, ways: Sequence[Floats]
+        self,
+        model: Model,
+        generators: list[np.random.Generator],
+        *,
+        each: int,
+        placed: PlacedGrasps,
+        ways: Sequence[Floats],
     ) -> tuple[HandState, Floats]:
         """See `scene_starts.clear_scene_starts`.
 
@@ -118,7 +124,7 @@ class Seeds:
         return state, depth
 
     def _proposed(
-        self, model: Model, generators: list[np.random.Generator], each: int, placed: Placed
+        self, model: Model, generators: list[np.random.Generator], each: int, placed: PlacedGrasps
     ) -> tuple[HandState, Floats]:
         """Hands (n * draws) as proposed, open, those of a start side by side, and (n * draws, 3) ways out; object
         frame."""
@@ -156,7 +162,7 @@ def table_height(supports: Sequence[Obstacle]) -> float:
 
 
 def _clear(
-    model: Model, drawn: HandState, away: Floats, scene: NDArray[np.intp], placed: Placed
+    model: Model, drawn: HandState, away: Floats, scene: NDArray[np.intp], placed: PlacedGrasps
 ) -> tuple[HandState, Floats]:
     """Of the hands of each start (n) the one that is clear at the fewest steps back, and its depth (n,) [m]; inf where
     there is none. What a hand lacks of its room from obstacles it is raised first."""

@@ -22,7 +22,7 @@ from graspd.worker.planners.port import PlanRequest
 from graspd.worker.scenes.clearance import MARGIN_M
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.scenes.trajectory import Trajectory, plan_way
-from graspd.worker.simulation.environment import Obstacle, Placed, Scenes
+from graspd.worker.simulation.environment import Obstacle, PlacedGrasps, Scenes
 from graspd.worker.validation.lift import Lift
 from graspd.worker.validation.model import MujocoOptions, Scene, build
 from graspd.worker.validation.protocol import Outcome, Rollout
@@ -44,10 +44,10 @@ class OnTable:
         return Scenes(supports_of(spec), rest_poses(spec, self.subject.obj, count=1, seed=SEED)["scene/object_pose"])
 
     @cached_property
-    def placed(self) -> Placed:
+    def placed(self) -> PlacedGrasps:
         return self.scenes.placed(np.arange(self.subject.count) % len(self.scenes.object_pose))
 
-    def planned(self, placed: Placed) -> GraspSet:
+    def planned(self, placed: PlacedGrasps) -> GraspSet:
         wanted = PlanRequest(self.subject.count, PLAIN, SEED, placed=placed)
         return synthesize(self.subject.hand, self.subject.obj, wanted, ExecutionContext(threads=1))
 
@@ -60,7 +60,7 @@ class OnTable:
         return plan_way(self.subject.hand, self.subject.obj, self.grasps, self.placed)
 
     @cached_property
-    def clear(self) -> tuple[GraspSet, Placed]:
+    def clear(self) -> tuple[GraspSet, PlacedGrasps]:
         """The grasps that come in clear, with their ways, and their scenes."""
         way, rows = self.way, np.flatnonzero(self.way.clear)
         ready = replace(self.grasps, approach=way.approach, coming=way.open, lift=way.lift)
@@ -151,7 +151,7 @@ def slabs(tables: list[OnTable]) -> Row:
     half, slab = 0.0, 0.0
     clear = []
     for one in tables:
-        on_slab = Placed((SLAB,), one.placed.object_pose, one.placed.index)
+        on_slab = PlacedGrasps((SLAB,), one.placed.object_pose, one.placed.index)
         with cpu() as clock:
             one.planned(one.placed)
         half += clock.seconds

@@ -23,7 +23,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.table import measure
-from graspd.worker.simulation.environment import CLEAR_M, RISE_M, STANDOFF_M, UP, Environment, Obstacle, Placed
+from graspd.worker.simulation.environment import CLEAR_M, RISE_M, STANDOFF_M, UP, Environment, Obstacle, PlacedGrasps
 from graspd.worker.simulation.obstacles import obstacle_room
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import LiftOutcome
@@ -189,7 +189,7 @@ def carried_out(
         lift=Posture(compose(back, raised), squeeze),
         scene=index,
     )
-    placed = Placed(table().obstacles, lying, index)
+    placed = PlacedGrasps(table().obstacles, lying, index)
     lifts = validate_lifts(hand, obj, grasps, placed, pieces=pieces)
     lift, hard = lifts.outcome == LiftOutcome.LIFTED, np.zeros(len(own), bool)
     rows = np.flatnonzero(lift)

@@ -17,7 +17,7 @@ from graspd.worker.grasps import GraspSet, joined
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes.trajectory import plan_way
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.simulation.obstacles import MARGIN_M, obstacle_room
 
 #: Grasps whose way is planned at a time.
@@ -93,13 +93,13 @@ def _to_be_proposed(scenes: Sequence[Scene], rows: Floats) -> TrainedModel:
 
 def _stands(free: GraspSet, order: NDArray[np.intp], pose: Floats, hand: HandModel) -> NDArray[np.bool_]:
     """(N,) whether the hand stands clear of the table at the grasp."""
-    scene = Placed(table().obstacles, pose[None], np.zeros(1, np.intp)).scenes
+    scene = PlacedGrasps(table().obstacles, pose[None], np.zeros(1, np.intp)).scenes
     return np.asarray(obstacle_room(hand, free.grasp.take(order), list(scene)) >= MARGIN_M)
 
 
 def _on_their_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, pose: Floats) -> GraspSet:
     """Those of the grasps whose way in and out is clear, with it."""
-    placed = Placed(table().obstacles, pose[None], np.zeros(len(grasps), np.intp))
+    placed = PlacedGrasps(table().obstacles, pose[None], np.zeros(len(grasps), np.intp))
     way = plan_way(hand, obj, grasps, placed)
     found = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift, scene=placed.index)
     return found.take(np.flatnonzero(way.clear))

@@ -12,7 +12,7 @@ import yaml
 from graspd.exchange.plan import plain_name, prim_names
 from graspd.exchange.robots.arm import Arm, Description
 from graspd.exchange.robots.execution import Executions, Path, RobotTrajectory
-from graspd.exchange.robots.reach import World
+from graspd.exchange.robots.reach import ArmScene
 from graspd.service.model.transforms import Floats, compose, invert
 
 
@@ -23,7 +23,7 @@ class Carrier:
     arm: Arm
     base: Floats
     """(7,) its base in the frame of the grasps."""
-    world: World
+    world: ArmScene
     paths: list[list[Path]]
     """Of each grasp; joints are the arm's, then the hand's."""
 

@@ -23,7 +23,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, JointType
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes.trajectory import plan_free_way
-from graspd.worker.simulation.environment import STANDOFF_M, Placed
+from graspd.worker.simulation.environment import STANDOFF_M, PlacedGrasps
 
 #: Postures of a grasp in their order. The hand comes from `standoff` to `arrival` with open fingers, takes the shape of
 #: `pregrasp`, closes to `grasp`, is commanded to `squeeze`, and rises to `lift`.
@@ -58,7 +58,7 @@ class Executions:
     """(N, 7) the object at rest."""
     postures: dict[str, Posture]
     """The N postures of each of `POSTURES`; hand poses are those of the root link."""
-    placed: Placed | None
+    placed: PlacedGrasps | None
     """The scene of each grasp, if they have one."""
     quality: dict[str, NDArray[Any]]
     """(N,) verdicts and metrics: valid, success, epsilon."""
@@ -114,7 +114,7 @@ def executions(
     grasps: GraspSet,
     *,
     rows: NDArray[np.intp],
-    placed: Placed | None,
+    placed: PlacedGrasps | None,
     tool: ToolFrame,
     quality: dict[str, NDArray[Any]],
 ) -> Executions:

@@ -71,7 +71,7 @@ class ReachSearch:
             raise InputError("arms need mink; run pip install 'graspd[arm]'") from None
         self.arm, self.found = arm, found
         supports = () if found.placed is None else found.placed.supports
-        self.world = World(arm, base, found.hand, pieces, supports)
+        self.world = ArmScene(arm, base, found.hand, pieces, supports)
         self._mink = mink
         self._model = arm_spec(arm, base).compile()
         self._configuration = mink.Configuration(self._model)
@@ -210,7 +210,7 @@ def arm_spec(arm: Arm, base: Floats) -> Any:
     return spec
 
 
-class World:
+class ArmScene:
     """The arm with its hand among what stands around it. Not for several threads at once."""
 
     def __init__(

@@ -36,7 +36,7 @@ class IndexCompleteness:
 
 
 @dataclass(frozen=True)
-class Marked:
+class StoreMark:
     """What tells whether the index is as old as the store."""
 
     mark: str = ""
@@ -113,13 +113,13 @@ class Notes:
             value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _CHANGES))
         return int(value or 0)
 
-    def marked(self) -> Marked:
+    def marked(self) -> StoreMark:
         """The mark of the index."""
         with self.database.reading() as connection:
             value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _MARK))
-        return Marked(**value) if value else Marked()
+        return StoreMark(**value) if value else StoreMark()
 
-    def set_marked(self, marked: Marked, *, within: Connection | None = None) -> None:
+    def set_marked(self, marked: StoreMark, *, within: Connection | None = None) -> None:
         with self.database.writing(within) as connection:
             upsert(connection, notes, [{"name": _MARK, "value": asdict(marked)}])
 

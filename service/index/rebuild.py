@@ -15,7 +15,7 @@ from sqlalchemy.exc import DataError
 
 from graspd.service.index.changes.rows import QUIET
 from graspd.service.index.index import Index
-from graspd.service.index.notes import Marked
+from graspd.service.index.notes import StoreMark
 from graspd.service.index.tables import LIVE_COLUMNS, LIVE_TABLES, metadata
 from graspd.service.model import names
 from graspd.service.model.errors import DamagedError, InputError, NotFoundError
@@ -64,7 +64,7 @@ def rebuild(index: Index, store: Store, *, progress: Callable[[str, int], None] 
         for table in metadata.tables.values():
             if table.name not in LIVE_TABLES:
                 connection.execute(delete(table))
-        index.notes.set_marked(Marked(mark := newest_mark(store), mark), within=connection)
+        index.notes.set_marked(StoreMark(mark := newest_mark(store), mark), within=connection)
         made.assets()
         made.jobs()
         made.shards()

@@ -23,7 +23,7 @@ from sqlalchemy import (
     false,
 )
 
-from graspd.service.model.metrics import Indexed, indexed
+from graspd.service.model.metrics import IndexLevel, indexed
 
 metadata: Final = MetaData()
 jobs: Final = Table(
@@ -149,7 +149,7 @@ shards: Final = Table(
     Index("shards_charged", "created", "charged", "kind", "device", "count", "valid", "seconds", "size_bytes"),
 )
 #: Metrics by which grasps are bounded and sorted.
-METRICS: Final = tuple(metric.name for metric in indexed(Indexed.SORTED))
+METRICS: Final = tuple(metric.name for metric in indexed(IndexLevel.SORTED))
 grasps: Final = Table(
     "grasps",
     metadata,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
 from pydantic import BaseModel, Field, create_model
 
-from graspd.service.model.metrics import Indexed, indexed
+from graspd.service.model.metrics import IndexLevel, indexed
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     SortedName = str
     OfferedName = str
 else:
-    SortedName = Literal[tuple(metric.name for metric in indexed(Indexed.SORTED))]
-    OfferedName = Literal[tuple(metric.name for metric in indexed(Indexed.OFFERED))]
+    SortedName = Literal[tuple(metric.name for metric in indexed(IndexLevel.SORTED))]
+    OfferedName = Literal[tuple(metric.name for metric in indexed(IndexLevel.OFFERED))]
 
 
 def values(*, optional: bool, default: Any = ...) -> dict[str, Any]:
     """Fields of a model that tells an indexed metric each: those that every shard has, or those that it may lack."""
     # Those by which grasps are sorted come first: so manifests have it.
-    chosen = sorted(indexed(), key=lambda metric: metric.indexed < Indexed.SORTED)
+    chosen = sorted(indexed(), key=lambda metric: metric.indexed < IndexLevel.SORTED)
     return {
         metric.name: (int | None if metric.whole else float | None, Field(default, description=metric.meaning))
         for metric in chosen
@@ -32,13 +32,13 @@ def values(*, optional: bool, default: Any = ...) -> dict[str, Any]:
 
 def means() -> dict[str, Any]:
     """Fields of a model that tells the mean of each metric that is offered; absent: None."""
-    return {metric.name: (float | None, None) for metric in indexed(Indexed.OFFERED)}
+    return {metric.name: (float | None, None) for metric in indexed(IndexLevel.OFFERED)}
 
 
 def filters() -> dict[str, Any]:
     """Fields `min_...` and `max_...` of a query, for each metric that is offered."""
     fields: dict[str, Any] = {}
-    for metric in indexed(Indexed.OFFERED):
+    for metric in indexed(IndexLevel.OFFERED):
         low, high = metric.limits
         bound = Annotated[float | None, Field(ge=low, le=high, allow_inf_nan=False)]
         fields |= {f"{end}_{metric.name}": (bound, None) for end in ("min", "max")}

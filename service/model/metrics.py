@@ -19,7 +19,7 @@ from typing import Final, Literal
 _SYMBOL: Final = 4
 
 
-class Indexed(IntEnum):
+class IndexLevel(IntEnum):
     """What the index knows of a metric; each includes those before it."""
 
     NO = 0
@@ -51,7 +51,7 @@ class GraspMetric:
     """A number that stands for a kind: sums and means of it say nothing."""
     optional: bool = False
     """A shard may lack it."""
-    indexed: Indexed = Indexed.NO
+    indexed: IndexLevel = IndexLevel.NO
     bounds: tuple[float, float] = (0, math.inf)
     """Least and largest value that a filter may name."""
     less_is_better: bool = False
@@ -96,7 +96,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="ε (Ferrari-Canny)",
         short="ε",
         swept=True,
-        indexed=Indexed.OFFERED,
+        indexed=IndexLevel.OFFERED,
         digits=2,
         plot="whole",
     ),
@@ -107,7 +107,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="Wrench space volume",
         short="Vol",
         swept=True,
-        indexed=Indexed.SORTED,
+        indexed=IndexLevel.SORTED,
         digits=1,
     ),
     GraspMetric(
@@ -116,7 +116,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "hand surface closer to the object than the threshold",
         title="Contact area",
         swept=True,
-        indexed=Indexed.OFFERED,
+        indexed=IndexLevel.OFFERED,
         digits=0,
         plot="whole",
     ),
@@ -126,7 +126,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "volume shared by hand and object",
         title="Intersection volume",
         short="Intersection",
-        indexed=Indexed.OFFERED,
+        indexed=IndexLevel.OFFERED,
         less_is_better=True,
         digits=3,
         plot="cut",
@@ -136,7 +136,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "mm",
         "deepest hand-object penetration",
         title="Penetration",
-        indexed=Indexed.OFFERED,
+        indexed=IndexLevel.OFFERED,
         less_is_better=True,
         digits=2,
         plot="cut",
@@ -146,7 +146,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "mm",
         "deepest hand-hand penetration",
         title="Self-penetration",
-        indexed=Indexed.SORTED,
+        indexed=IndexLevel.SORTED,
         less_is_better=True,
         digits=2,
     ),
@@ -168,7 +168,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="Verdicts that survive noise",
         short="Robustness",
         optional=True,
-        indexed=Indexed.KEPT,
+        indexed=IndexLevel.KEPT,
         bounds=(0, 1),
         digits=2,
         plot="whole",
@@ -181,7 +181,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="Models survived",
         short="Robust",
         optional=True,
-        indexed=Indexed.OFFERED,
+        indexed=IndexLevel.OFFERED,
         bounds=(0, 1),
         digits=2,
         plot="whole",
@@ -193,7 +193,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "object's own on; nan: not measured",
         title="Payload",
         optional=True,
-        indexed=Indexed.OFFERED,
+        indexed=IndexLevel.OFFERED,
         bounds=(0, 100),
         digits=2,
         plot="cut",
@@ -206,7 +206,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="Motion when shaken",
         short="Shaken",
         optional=True,
-        indexed=Indexed.OFFERED,
+        indexed=IndexLevel.OFFERED,
         less_is_better=True,
         digits=2,
         plot="cut",
@@ -218,7 +218,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="Clearance in its scene",
         short="Clearance",
         optional=True,
-        indexed=Indexed.OFFERED,
+        indexed=IndexLevel.OFFERED,
         bounds=(-1, 1),
         digits=4,
     ),
@@ -228,7 +228,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "hand bodies within 2 mm of the object",
         title="Links in contact",
         whole=True,
-        indexed=Indexed.KEPT,
+        indexed=IndexLevel.KEPT,
         digits=0,
     ),
     GraspMetric(
@@ -239,7 +239,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         whole=True,
         code=True,
         optional=True,
-        indexed=Indexed.SORTED,
+        indexed=IndexLevel.SORTED,
         bounds=(0, 3),
     ),
     GraspMetric(
@@ -251,7 +251,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         whole=True,
         code=True,
         optional=True,
-        indexed=Indexed.KEPT,
+        indexed=IndexLevel.KEPT,
         bounds=(0, 47),
     ),
     GraspMetric(
@@ -259,14 +259,14 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "1",
         "planner's L_stable; nan: the planner has none",
         title="Stability loss",
-        indexed=Indexed.SORTED,
+        indexed=IndexLevel.SORTED,
         bounds=(-math.inf, math.inf),
         less_is_better=True,
     ),
 )
 
 
-def indexed(least: Indexed = Indexed.KEPT) -> tuple[GraspMetric, ...]:
+def indexed(least: IndexLevel = IndexLevel.KEPT) -> tuple[GraspMetric, ...]:
     """Metrics of which the index knows that much."""
     return tuple(metric for metric in GRASP_METRICS if metric.indexed >= least)
 

@@ -45,7 +45,7 @@ class Flag:
 
 
 @dataclass(frozen=True)
-class OfMetric:
+class MetricComparison:
     """A metric that is not a code, compared with a number."""
 
     name: str
@@ -55,7 +55,7 @@ class OfMetric:
 
 
 @dataclass(frozen=True)
-class OfWord:
+class WordComparison:
     """`hand` or `object`, = or != a word."""
 
     name: str
@@ -64,7 +64,7 @@ class OfWord:
 
 
 @dataclass(frozen=True)
-class OfType:
+class TypeComparison:
     """The type of a grasp, = or != one; a grasp that tells none fails both."""
 
     op: str
@@ -72,14 +72,14 @@ class OfType:
 
 
 @dataclass(frozen=True)
-class Not:
+class Negation:
     """What is not so."""
 
     part: Node
 
 
 @dataclass(frozen=True)
-class Joined:
+class Connective:
     """All of its parts, or any of them."""
 
     word: str
@@ -87,7 +87,7 @@ class Joined:
     parts: tuple[Node, ...]
 
 
-Node = Flag | OfMetric | OfWord | OfType | Not | Joined
+Node = Flag | MetricComparison | WordComparison | TypeComparison | Negation | Connective
 
 
 def parsed(text: str) -> Node:
@@ -136,13 +136,13 @@ class _Parser:
         parts = [part()]
         while self._takes("word", word):
             parts.append(part())
-        return parts[0] if len(parts) == 1 else Joined(word, tuple(parts))
+        return parts[0] if len(parts) == 1 else Connective(word, tuple(parts))
 
     def _factor(self, depth: int) -> Node:
         if depth > _DEEPEST:
             raise InputError(f"the expression is nested more than {_DEEPEST} deep")
         if self._takes("word", "not"):
-            return Not(self._factor(depth + 1))
+            return Negation(self._factor(depth + 1))
         if self._takes("op", "("):
             inner = self.expression(depth + 1)
             if not self._takes("op", ")"):
@@ -171,7 +171,7 @@ class _Parser:
             return _of_word(name, op, value)
         if value.kind != "number":
             raise InputError(f"{name} is compared with a number, not with {value.text!r}")
-        return OfMetric(name, op, float(value.text))
+        return MetricComparison(name, op, float(value.text))
 
     def _takes(self, kind: str, text: str) -> bool:
         if self.at < len(self.tokens) and self.tokens[self.at] == _Token(kind, text):
@@ -192,7 +192,7 @@ def _of_word(name: str, op: str, value: _Token) -> Node:
     if value.kind not in ("word", "quoted"):
         raise InputError(f"{name} is compared with a word, not with {value.text!r}")
     if name != "type":
-        return OfWord(name, op, value.text)
+        return WordComparison(name, op, value.text)
     if value.text not in _TYPES:
         raise InputError(f"there is no type {value.text!r}; choose one of {one_of(value.text, _TYPES)}")
-    return OfType(op, GraspType[value.text.upper()])
+    return TypeComparison(op, GraspType[value.text.upper()])

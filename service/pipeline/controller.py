@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from graspd.service.index.notes import Marked
+from graspd.service.index.notes import StoreMark
 from graspd.service.index.queries.feed import ReadyTask
 from graspd.service.index.rebuild import complete_if_new, rebuild
 from graspd.service.model import names
@@ -178,9 +178,9 @@ class Controller:
         present, changes = notes.marked(), notes.changes()
         if changes != present.changes or self._made:
             fresh = next_mark(present.mark)
-            notes.set_marked(Marked(fresh, newest_mark(self._services.store), changes))
+            notes.set_marked(StoreMark(fresh, newest_mark(self._services.store), changes))
             set_mark(self._services.store, fresh)
-            notes.set_marked(Marked(fresh, fresh, changes))
+            notes.set_marked(StoreMark(fresh, fresh, changes))
             self._known, self._made = fresh, False
 
     def _pass_on_reports(self) -> None:

@@ -30,7 +30,7 @@ _NEAR: Final[tuple[tuple[Near, tuple[str, ...]], ...]] = (
 )
 
 
-class Found(NamedTuple):
+class ChosenFidelity(NamedTuple):
     """A fidelity, and why it."""
 
     fidelity: str
@@ -44,7 +44,7 @@ class _Chart:
 
     key: str
     content: Row
-    found: dict[tuple[str, str, str, str], Found] = field(default_factory=dict)
+    found: dict[tuple[str, str, str, str], ChosenFidelity] = field(default_factory=dict)
 
     @cached_property
     def pairs(self) -> set[tuple[str, str]]:
@@ -136,7 +136,7 @@ def parse_target(text: str, *, in_scene: bool = False) -> tuple[str, float]:
 
 def cheapest(
     chart: Row, target: str, *, method: str, hand: str, object_: str, offered: Sequence[str] = OFFERED
-) -> Found:
+) -> ChosenFidelity:
     """The fidelity of a method with most valid grasps per second among those that meet a target.
 
     What was measured of this very hand and object counts; else of this hand; else everything. In a chart of scenes
@@ -173,7 +173,7 @@ def cheapest(
         best = (max if more else min)(value for _, value in known.values())
         raise InputError(f"no fidelity of {method} meets {target}; the best measured {metric} is {best:.3g}")
     chosen = max(good, key=lambda name: known[name][0])
-    return Found(chosen, measured_on, known[chosen][1])
+    return ChosenFidelity(chosen, measured_on, known[chosen][1])
 
 
 def _nearest(runs: Sequence[Row], metric: str, wanted: Mapping[str, str]) -> tuple[Near, list[Row]] | None:

@@ -39,12 +39,12 @@ _INSIDE: Final = tuple(
 )
 
 
-class Refused(InputError):
+class RefusedAddress(InputError):
     """The address names a machine that webhooks may not reach."""
 
 
 @dataclass(frozen=True)
-class Answer:
+class Response:
     """What came back: a status, and in a few words why there is none."""
 
     status: int | None
@@ -96,7 +96,7 @@ def reachable(host: str, port: int, allowed: Networks) -> list[str]:
     for one in found:
         address = ipaddress.ip_address(one.partition("%")[0])
         if not is_public(address) and not any(address in network for network in allowed):
-            raise Refused(
+            raise RefusedAddress(
                 "the address is not one of the public internet; the operator may allow it: GRASPD_WEBHOOK_NETWORKS"
             )
     return found
@@ -121,7 +121,7 @@ def _looked_up(host: str, port: int) -> list[Any]:
 
 def post(
     url: str, body: bytes, headers: Mapping[str, str], *, allowed: Networks = (), patience_s: float = PATIENCE_S
-) -> Answer:
+) -> Response:
     """Send a body and tell the status of the answer. Never raises for what the other side does."""
     parts = urlsplit(url)
     host = parts.hostname or ""
@@ -130,10 +130,10 @@ def post(
     try:
         addresses = reachable(host, port, allowed)
         connection = _Connection(parts.scheme, host, port, addresses, patience_s)
-    except Refused as error:
-        return Answer(None, str(error), is_final=True)
+    except RefusedAddress as error:
+        return Response(None, str(error), is_final=True)
     except (OSError, ValueError):
-        return Answer(None, "the host of the address cannot be looked up")
+        return Response(None, "the host of the address cannot be looked up")
     # The time-out of a socket begins anew with each byte; this ends the whole.
     end = threading.Timer(patience_s, connection.cut)
     end.daemon = True
@@ -143,9 +143,9 @@ def post(
         answer = connection.getresponse()
         answer.read(_READ_BYTES)
         moved = "; redirects are not followed" if 300 <= answer.status < 400 else ""
-        return Answer(answer.status, f"answered {answer.status}{moved}")
+        return Response(answer.status, f"answered {answer.status}{moved}")
     except (OSError, http.client.HTTPException, ValueError) as error:
-        return Answer(None, f"{type(error).__name__}: {str(error)[:150]}" if str(error) else "no answer in time")
+        return Response(None, f"{type(error).__name__}: {str(error)[:150]}" if str(error) else "no answer in time")
     finally:
         end.cancel()
         connection.close()

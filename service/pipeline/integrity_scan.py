@@ -39,7 +39,7 @@ class Interrupted(Exception):
     """The process is to stop, or somebody else reads through the store."""
 
 
-class Turn:
+class ReadPermit:
     """The right to read through the store: one has it at a time, a `store verify` before the controller."""
 
     def __init__(self, services: Services, *, is_controller: bool, clock: Callable[[], float] = time.monotonic) -> None:
@@ -75,7 +75,7 @@ class IntegrityScan:
     ) -> None:
         self._services, self._stop, self._clock = services, stop, clock
         self._rate = services.settings.integrity_scan_mb_per_s * 2**20
-        self._turn = Turn(services, is_controller=True, clock=clock)
+        self._turn = ReadPermit(services, is_controller=True, clock=clock)
         self._paid = clock()
         self._looked = clock()
 

@@ -11,7 +11,7 @@ from graspd.service.model.workers import Capabilities, Requirements, WorkerBeat,
 
 
 @dataclass(frozen=True)
-class Place:
+class Route:
     """Where a task goes."""
 
     apart: bool = False
@@ -30,7 +30,7 @@ class Routes:
                 if beat.ability not in self._here[stage]:
                     self._here[stage].append(beat.ability)
 
-    def place(self, need: Requirements) -> Place:
+    def place(self, need: Requirements) -> Route:
         """Of a task.
 
         What every worker of its stage can do goes to all of them, and what some can do to those. What none can do is
@@ -39,5 +39,5 @@ class Routes:
         here = self._here.get(need.stage) or [own_ability()]
         lacking = {one.lacks(need) for one in here} - {""}
         if all(one.lacks(need) for one in here):
-            return Place(held=f"held back, no worker that is here can do it: {'; '.join(sorted(lacking))}")
-        return Place(apart=bool(lacking))
+            return Route(held=f"held back, no worker that is here can do it: {'; '.join(sorted(lacking))}")
+        return Route(apart=bool(lacking))

@@ -22,7 +22,7 @@ from graspd.service.index.views import EndView
 from graspd.service.model.errors import UnavailableError
 from graspd.service.model.webhooks import SIGNATURE, secret_of, signature
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.http_client import Answer, Networks, networks, post
+from graspd.service.pipeline.http_client import Networks, Response, networks, post
 
 log = logging.getLogger(__name__)
 #: Deliveries under way at once, and of them those to addresses that failed last.
@@ -32,7 +32,7 @@ _PAUSE_S: Final = 1.0
 #: To sum up a large dataset takes a while.
 _DATASETS_EVERY_S: Final = 5.0
 _FORGET_EVERY_S: Final = 3600.0
-Post = Callable[..., Answer]
+Post = Callable[..., Response]
 
 
 class WebhookDispatcher:

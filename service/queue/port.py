@@ -107,7 +107,7 @@ Place = tuple[Priority, Stage]
 
 
 @dataclass(frozen=True)
-class QueueNow:
+class QueueStatus:
     """Waiting and running tasks; the living workers by name, each with the time since its last beat by Redis's clock
     [s]. Places without a task may be left out."""
 

@@ -46,7 +46,7 @@ from graspd.service.queue.lists import (
     without_takers,
     workers_key,
 )
-from graspd.service.queue.port import Event, Lease, Message, Place, QueueNow, Report
+from graspd.service.queue.port import Event, Lease, Message, Place, QueueStatus, Report
 from graspd.service.settings import Settings
 
 EVENTS: Final = "graspd:events"
@@ -302,7 +302,7 @@ class RqQueue:
         with _mapped(), suppress(LockError):
             self.connection.lock(LEAD).do_release(holder)
 
-    def now(self, *, lease_s: float) -> QueueNow:
+    def now(self, *, lease_s: float) -> QueueStatus:
         """Lengths, ages and workers for the metrics, at a cost that does not grow with the queue.
 
         Args:
@@ -332,7 +332,7 @@ class RqQueue:
             beat.name: (beat, max(0.0, lease_s - (left_ms or 0) / 1000))
             for beat, left_ms in zip(beats, since[len(lists) :], strict=True)
         }
-        return QueueNow(depth, oldest, running, workers)
+        return QueueStatus(depth, oldest, running, workers)
 
     def count(self, amounts: Mapping[str, float]) -> None:
         """Add to sums that outlive this process."""

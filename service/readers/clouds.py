@@ -16,7 +16,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.pinhole import back_project, fitted_normals, surface_normals
 from graspd.service.model.transforms import Floats
 from graspd.service.readers.depth_noise import DepthNoise, incidence, noise_of
-from graspd.service.readers.pictures import Pictures, Place, Scenes
+from graspd.service.readers.pictures import PictureAddress, Pictures, Scenes
 from graspd.service.store.shards import Shard
 
 Array = NDArray[Any]
@@ -191,8 +191,8 @@ class Clouds(Sequence[dict[str, Any]]):
         return _NOWHERE
 
 
-def _by_scene(places: Sequence[Place]) -> list[list[Place]]:
-    found: dict[tuple[str, int], list[Place]] = {}
+def _by_scene(places: Sequence[PictureAddress]) -> list[list[PictureAddress]]:
+    found: dict[tuple[str, int], list[PictureAddress]] = {}
     for place in places:
         found.setdefault((place.file.id, place.scene), []).append(place)
     return list(found.values())
@@ -214,7 +214,7 @@ def _voxels(points: Floats, edge: float, draw: np.random.Generator) -> Ints:
     return order[np.unique(cubes, axis=0, return_index=True)[1]]
 
 
-def _words(place: Place) -> tuple[int, int]:
+def _words(place: PictureAddress) -> tuple[int, int]:
     """Numbers that follow from what a picture is of, whatever its file is called."""
     name = f"{place.file.hand}/{place.file.object}/{place.file.batch}"
     return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8]), place.row

@@ -38,7 +38,7 @@ _TABLES: Final = 4096
 
 
 @dataclass(frozen=True)
-class Place:
+class PictureAddress:
     """Where a picture lies."""
 
     file: ShardFile
@@ -109,7 +109,7 @@ class Pictures(Sequence[dict[str, Any]]):
         self._which = {"clear": clear, "valid": valid, "unvalidated": unvalidated}
         self._scenes: OrderedDict[str, Scenes] = OrderedDict()
         self._tables: OrderedDict[str, RowTable] = OrderedDict()
-        self._places: list[Place] = []
+        self._places: list[PictureAddress] = []
         for file in shards.of("views"):
             self._add(file, with_grasps_only=with_grasps_only)
 
@@ -126,11 +126,11 @@ class Pictures(Sequence[dict[str, Any]]):
         return sample | self.scenes_of(place).grasps(place.scene, extrinsics) | place.names
 
     @property
-    def places(self) -> Sequence[Place]:
+    def places(self) -> Sequence[PictureAddress]:
         """Where each picture lies."""
         return self._places
 
-    def columns_of(self, place: Place, columns: Iterable[str]) -> dict[str, Array]:
+    def columns_of(self, place: PictureAddress, columns: Iterable[str]) -> dict[str, Array]:
         """Some columns of one picture.
 
         Raises:
@@ -145,7 +145,7 @@ class Pictures(Sequence[dict[str, Any]]):
             row, wanted, lambda ranges: reader.read(key, ranges, row, lambda other: table.ranges(other, wanted))
         )
 
-    def scenes_of(self, place: Place) -> Scenes:
+    def scenes_of(self, place: PictureAddress) -> Scenes:
         """The scenes of the picture's shard with the grasps that this reader keeps."""
         return self._scenes_of(place.scene_shard)
 
@@ -169,7 +169,7 @@ class Pictures(Sequence[dict[str, Any]]):
         held = self._scenes_of(scene_shard)
         for row, scene in enumerate(scenes):
             if not with_grasps_only or held.count(int(scene)):
-                self._places.append(Place(file, scene_shard, int(scene), row))
+                self._places.append(PictureAddress(file, scene_shard, int(scene), row))
 
     def _table(self, file: ShardFile, columns: Sequence[str]) -> RowTable:
         table = self._tables.get(file.id)

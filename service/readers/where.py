@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.metrics import GRASP_METRICS, GraspMetric
-from graspd.service.model.where import Flag, Joined, Node, Not, OfMetric, OfType, parsed
+from graspd.service.model.where import Connective, Flag, MetricComparison, Negation, Node, TypeComparison, parsed
 from graspd.service.store import validity
 from graspd.service.store.manifests import INDEX_THRESHOLD_M
 
@@ -49,19 +49,19 @@ def parse(text: str) -> Test:
 
 def _mask(node: Node, columns: Mapping[str, Array], said: Mapping[str, Any]) -> Mask:
     count = len(columns["quality/valid"])
-    if isinstance(node, Joined):
+    if isinstance(node, Connective):
         join = operator.or_ if node.word == "or" else operator.and_
         return reduce(join, (_mask(part, columns, said) for part in node.parts))
-    if isinstance(node, Not):
+    if isinstance(node, Negation):
         return ~_mask(node.part, columns, said)
     if isinstance(node, Flag):
         return _flag(node.name, columns)
     compare = _OPERATORS[node.op]
-    if isinstance(node, OfMetric):
+    if isinstance(node, MetricComparison):
         values = value_of(_METRICS[node.name], columns)
         with np.errstate(invalid="ignore"):
             return np.isfinite(values) & np.asarray(compare(values, node.bound))
-    if isinstance(node, OfType):
+    if isinstance(node, TypeComparison):
         kinds = np.asarray(columns.get("quality/grasp_type", np.full(count, -1)))
         return np.asarray(compare(kinds, int(node.kind))) & (kinds >= 0)
     return np.full(count, bool(compare(str(said.get(node.name, "")), node.word)))

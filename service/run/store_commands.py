@@ -37,13 +37,13 @@ def verify(
     from graspd.service.pipeline.backends import Services
     from graspd.service.pipeline.identity import identify_if_redis_answers
     from graspd.service.pipeline.integrity import MISSING, scan
-    from graspd.service.pipeline.integrity_scan import Turn
+    from graspd.service.pipeline.integrity_scan import ReadPermit
     from graspd.service.pipeline.repair import repair as fix
 
     services = Services.open(load_settings(data_dir=data_dir), make=False)
     if repair:
         identify_if_redis_answers(services)
-    turn = Turn(services, is_controller=False)
+    turn = ReadPermit(services, is_controller=False)
     try:
         if not turn.is_mine():
             raise ConflictError("another `graspd admin store verify` reads this store; wait until it is done")

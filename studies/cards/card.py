@@ -16,7 +16,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.pipeline.datasets.export import path_of
 from graspd.service.readers import ShardFile, Shards
 from graspd.service.store.shards import open_shard
-from graspd.studies.cards.contents import Contents, Piece, pieces
+from graspd.studies.cards.contents import Contents, ShardContents, pieces
 from graspd.studies.cards.numbers import numbers
 from graspd.studies.cards.page import page
 from graspd.studies.cards.plots import draw
@@ -81,7 +81,7 @@ def checksums(contents: Contents) -> Iterator[str]:
             yield f"{hashlib.file_digest(opened, 'sha256').hexdigest()}  {path.relative_to(root)}\n"
 
 
-def _counted(found: Iterator[Piece], total: int, progress: Progress) -> Iterator[Piece]:
+def _counted(found: Iterator[ShardContents], total: int, progress: Progress) -> Iterator[ShardContents]:
     for number, piece in enumerate(found, start=1):
         yield piece
         progress(number, total)

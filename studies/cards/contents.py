@@ -50,7 +50,7 @@ class AssetFacts:
 
 
 @dataclass(frozen=True)
-class Gap:
+class MissingBatches:
     """Batches of a cell that the snapshot lacks, and why."""
 
     tasks: int
@@ -67,7 +67,7 @@ class Contents:
     objects: Mapping[str, AssetFacts]
     snapshot: Snapshot | None = None
     record: DatasetRecord | None = None
-    gaps: Mapping[Pair, Gap] = field(default_factory=dict)
+    gaps: Mapping[Pair, MissingBatches] = field(default_factory=dict)
     root: Path | None = None
     """Folder of the shards, where they are files."""
 
@@ -202,15 +202,17 @@ def _digests(shards: Shards, kind: AssetKind) -> dict[str, str]:
     return found
 
 
-def _gaps(store: Store, record: DatasetRecord, taken: Snapshot) -> dict[Pair, Gap]:
+def _gaps(store: Store, record: DatasetRecord, taken: Snapshot) -> dict[Pair, MissingBatches]:
     """What the record plans and the snapshot does not hold."""
     there = {shard.id for shard in taken.shards}
-    gaps: dict[Pair, Gap] = {}
+    gaps: dict[Pair, MissingBatches] = {}
     for cell in record.cells():
         missing = [task for task in plan(job_of(cell, record.options, record.revisions)) if task.output not in there]
         if missing:
             reasons = (attempts[-1].reason for task in missing if (attempts := task_attempts(store, task.id)))
-            gaps[cell.hand.name, cell.object.name] = Gap(len(missing), next(reasons, "not made yet, or cancelled"))
+            gaps[cell.hand.name, cell.object.name] = MissingBatches(
+                len(missing), next(reasons, "not made yet, or cancelled")
+            )
     return gaps
 
 
@@ -234,7 +236,7 @@ _THREADS: Final = 8
 
 
 @dataclass(frozen=True)
-class Piece:
+class ShardContents:
     """One shard: its columns, and what its attributes and its manifest say of it."""
 
     file: ShardFile
@@ -249,7 +251,7 @@ class Piece:
     revision: int | None = None
 
 
-def pieces(contents: Contents) -> Iterator[Piece]:
+def pieces(contents: Contents) -> Iterator[ShardContents]:
     """Every shard, in the order of `Shards`; the next ones are fetched meanwhile, a bounded number at a time."""
     sizes = {shard.id: shard.size_bytes for shard in contents.snapshot.shards} if contents.snapshot else {}
     with ThreadPoolExecutor(_THREADS, thread_name_prefix="card") as pool:
@@ -258,7 +260,7 @@ def pieces(contents: Contents) -> Iterator[Piece]:
             yield from pool.map(lambda file: _piece(contents, file, sizes.get(file.id)), some)
 
 
-def _piece(contents: Contents, file: ShardFile, size: int | None) -> Piece:
+def _piece(contents: Contents, file: ShardFile, size: int | None) -> ShardContents:
     manifest = _manifest(contents, file)
     if manifest is not None and file.kind == "views":
         return _unopened(file, manifest)
@@ -269,7 +271,7 @@ def _piece(contents: Contents, file: ShardFile, size: int | None) -> Piece:
         rows = len(opened[{"base": "quality/valid", "scene": "grasp/valid", "views": "camera/eye"}[file.kind]])
     if manifest is not None:
         said = {**_unopened(file, manifest).said, **said}
-    return Piece(
+    return ShardContents(
         file,
         columns,
         said,
@@ -290,7 +292,7 @@ def _manifest(contents: Contents, file: ShardFile) -> ShardManifest | None:
         return None
 
 
-def _unopened(file: ShardFile, manifest: ShardManifest) -> Piece:
+def _unopened(file: ShardFile, manifest: ShardManifest) -> ShardContents:
     said: dict[str, Any] = {
         "seconds": manifest.seconds,
         "device": manifest.device,
@@ -304,7 +306,7 @@ def _unopened(file: ShardFile, manifest: ShardManifest) -> Piece:
     }
     if file.kind == "base":
         said["candidates"] = manifest.candidates
-    return Piece(file, {}, said, manifest.size_bytes, manifest.count, manifest.info, manifest.stage_revision)
+    return ShardContents(file, {}, said, manifest.size_bytes, manifest.count, manifest.info, manifest.stage_revision)
 
 
 def _plain(value: Any) -> Any:

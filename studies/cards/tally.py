@@ -15,7 +15,7 @@ from graspd.service.model.metrics import BANDS, DIRECTION_CELLS, GRASP_METRICS, 
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.service.store import validity
 from graspd.service.store.manifests import INDEX_THRESHOLD_M
-from graspd.studies.cards.contents import AssetFacts, Contents, Pair, Piece
+from graspd.studies.cards.contents import AssetFacts, Contents, Pair, ShardContents
 from graspd.worker.grasps import Posture
 from graspd.worker.quality.diversity import cells_of
 
@@ -184,7 +184,7 @@ _ATTRIBUTES: Final = (
 )
 
 
-def tally_of(contents: Contents, pieces: Iterable[Piece]) -> Tally:
+def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
     """Add up all pieces; those of a batch must come in the order base, scene, views, as `pieces` gives them."""
     tally = Tally()
     valid: dict[str, Array] = {}
@@ -205,7 +205,7 @@ def tally_of(contents: Contents, pieces: Iterable[Piece]) -> Tally:
     return tally
 
 
-def _note(tally: Tally, cell: CellTally, piece: Piece) -> None:
+def _note(tally: Tally, cell: CellTally, piece: ShardContents) -> None:
     """What does not depend on the kind of shard."""
     kind = piece.file.kind
     tally.shards[kind] += 1
@@ -225,7 +225,7 @@ def _note(tally: Tally, cell: CellTally, piece: Piece) -> None:
             tally.parts[name.removesuffix("_seconds")] += value
 
 
-def _add_base(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts) -> Array:
+def _add_base(tally: Tally, cell: CellTally, piece: ShardContents, hand: AssetFacts) -> Array:
     """Add a base shard; returns its mask (N,) of valid grasps."""
     columns = piece.columns
     valid = validity.valid(columns)
@@ -254,7 +254,7 @@ def _add_base(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts) -> 
     return valid
 
 
-def _add_postures(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts, valid: Array) -> None:
+def _add_postures(tally: Tally, cell: CellTally, piece: ShardContents, hand: AssetFacts, valid: Array) -> None:
     pose = np.asarray(piece.columns["grasp/hand_pose"], float)[valid]
     joints = np.asarray(piece.columns["grasp/joint_positions"], float)[valid]
     if (approach := hand.facts.get("palm_approach")) is not None:
@@ -269,7 +269,9 @@ def _add_postures(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts,
         use.add(tuple(names), joints)
 
 
-def _add_scene(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts, valid: Mapping[str, Array]) -> None:
+def _add_scene(
+    tally: Tally, cell: CellTally, piece: ShardContents, hand: AssetFacts, valid: Mapping[str, Array]
+) -> None:
     columns = piece.columns
     cell.scenes += len(columns["scene/object_pose"])
     index = np.asarray(columns["grasp/base_index"])

@@ -39,7 +39,7 @@ from graspd.worker.quality.table import measure
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.scenes.rollout import lift_rollout
 from graspd.worker.scenes.trajectory import plan_way
-from graspd.worker.simulation.environment import Placed, Scenes
+from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.lifting import validate_lifts
 from graspd.worker.validation.robust import robust
@@ -62,7 +62,7 @@ _NOTHING: Final = {**{f"{name}_count": 0 for name in SHARES}, "robust_sum": 0.0,
 
 
 @dataclass
-class Place:
+class ObjectScenes:
     """An object in its scenes, which are made when the first setting that is not kept is tried."""
 
     thing: ChartObject
@@ -111,7 +111,7 @@ def scene_chart(
     """
     runs: list[Row] = []
     for thing in things:
-        place = Place(thing, spec)
+        place = ObjectScenes(thing, spec)
         for hand in hands:
             for setting, way in _ways(settings):
                 runs.append(_kept(setting, way, hand, place, models, work))
@@ -129,7 +129,7 @@ def _ways(settings: Sequence[Setting]) -> list[tuple[Setting, str]]:
     return found
 
 
-def _kept(setting: Setting, way: str, hand: HandModel, place: Place, models: int, work: Path | None) -> Row:
+def _kept(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, models: int, work: Path | None) -> Row:
     """What the setting finds on the pair, from its file where it was found before."""
     said = {
         "way": way,
@@ -158,7 +158,7 @@ def _kept(setting: Setting, way: str, hand: HandModel, place: Place, models: int
     return found
 
 
-def _tried(setting: Setting, way: str, hand: HandModel, place: Place, models: int) -> Row:
+def _tried(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, models: int) -> Row:
     """Counts, shares and speed of one setting on one pair."""
     obj = place.thing.load(setting.knobs.face_error_m)
     placed = place.scenes.placed(np.arange(setting.batch) % len(place.scenes.object_pose))
@@ -171,14 +171,14 @@ def _tried(setting: Setting, way: str, hand: HandModel, place: Place, models: in
         began = clock()
         grasps = _planned(setting, hand, obj, placed, rollout)
         row["seconds"] = clock() - began
-        validated = Validated(hand, place, grasps, placed)
+        validated = ValidatedGrasps(hand, place, grasps, placed)
         row["end_seconds"] = clock() - began
         each = row["end_seconds"] / setting.batch
         row["first_seconds"] = each * few
         if each < _SHORT_S:
             began = clock()
             start = placed.take(slice(0, few))
-            Validated(hand, place, _planned(setting, hand, obj, start, rollout), start)
+            ValidatedGrasps(hand, place, _planned(setting, hand, obj, start, rollout), start)
             row["first_seconds"] = clock() - began
         row |= validated.counts(models)
     except InputError as error:
@@ -190,12 +190,18 @@ def _tried(setting: Setting, way: str, hand: HandModel, place: Place, models: in
     return {**row, **told, "scenes": len(place.scenes.object_pose), "note": note}
 
 
-def _first(placed: Placed) -> Placed:
+def _first(placed: PlacedGrasps) -> PlacedGrasps:
     return placed.take(slice(0, 1))
 
 
 def _planned(
-    setting: Setting, hand: HandModel, obj: ObjectModel, placed: Placed, rollout: Rollout | None, *, warm: bool = False
+    setting: Setting,
+    hand: HandModel,
+    obj: ObjectModel,
+    placed: PlacedGrasps,
+    rollout: Rollout | None,
+    *,
+    warm: bool = False,
 ) -> GraspSet:
     """Grasps that are planned in the scenes with a trial, or around a free object without."""
     options = {**setting.options, **(setting.warm if warm else {})}
@@ -209,10 +215,10 @@ def _planned(
     return synthesize(hand, obj, wanted, setting.run, method=setting.method, options=options)
 
 
-class Validated:
+class ValidatedGrasps:
     """Grasps with their way and the verdict of the lift, and measured where that is one."""
 
-    def __init__(self, hand: HandModel, place: Place, grasps: GraspSet, placed: Placed) -> None:
+    def __init__(self, hand: HandModel, place: ObjectScenes, grasps: GraspSet, placed: PlacedGrasps) -> None:
         way = plan_way(hand, place.true, grasps, placed)
         self.grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
         self.hand, self.place, self.placed = hand, place, placed

@@ -39,7 +39,7 @@ DEFAULT: Final = FIDELITIES["standard"]
 
 
 @dataclass(frozen=True)
-class Turn:
+class KnobValue:
     """One knob at one value."""
 
     knob: str
@@ -63,15 +63,15 @@ def _options(**changes: Any) -> Change:
     return change
 
 
-def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[Turn]:
+def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[KnobValue]:
     """All knobs, few of them, or the named ones; each has the default among its values.
 
     Raises:
         InputError: a name that is no knob's.
     """
 
-    def knob(name: str, values: Sequence[tuple[str, dict[str, Any]]]) -> list[Turn]:
-        return [Turn(name, text, DEFAULT.model_copy(update=change)) for text, change in values]
+    def knob(name: str, values: Sequence[tuple[str, dict[str, Any]]]) -> list[KnobValue]:
+        return [KnobValue(name, text, DEFAULT.model_copy(update=change)) for text, change in values]
 
     def points(coarse: int, fine: int) -> tuple[str, dict[str, Any]]:
         return f"{coarse}, {fine}", {"coarse_points": coarse, "fine_points": fine}
@@ -90,12 +90,14 @@ def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[Turn]:
         *knob("contact solver", [(s, {"contact_solver": s}) for s in ("direct", "jacobi", "gauss_seidel")]),
     ]
     passes = LossOptions().passes
-    found += [Turn("solver passes", str(n), change=None if n == passes else _options(passes=n)) for n in (1, 2, 4, 8)]
-    found += [Turn("queries", "shared"), Turn("queries", "one per velocity", change=asking_each)]
     found += [
-        Turn("culling", "grid and band"),
-        Turn("culling", "band", change=_options(exact_below=1.0)),
-        Turn("culling", "none", change=_options(exact_below=1.0, band=0.3)),
+        KnobValue("solver passes", str(n), change=None if n == passes else _options(passes=n)) for n in (1, 2, 4, 8)
+    ]
+    found += [KnobValue("queries", "shared"), KnobValue("queries", "one per velocity", change=asking_each)]
+    found += [
+        KnobValue("culling", "grid and band"),
+        KnobValue("culling", "band", change=_options(exact_below=1.0)),
+        KnobValue("culling", "none", change=_options(exact_below=1.0, band=0.3)),
     ]
     known = list(dict.fromkeys(turn.knob for turn in found))
     if unknown := [name for name in knobs if name not in known]:
@@ -122,7 +124,7 @@ def sweep(
     processor seconds on a CPU, which do not depend on what else the machine does, in seconds on a GPU.
     """
     wp.load_module(module=kernels, device=run.device)
-    default = Turn("", "default")
+    default = KnobValue("", "default")
     true = thing.load(TRUE_ERROR_M)
     pieces = decompose(true)
     cells: dict[tuple[str, str], Rollout] = {}
@@ -149,12 +151,14 @@ def sweep(
     return rows
 
 
-def _setting(turn: Turn, batch: int, run: ExecutionContext) -> Setting:
+def _setting(turn: KnobValue, batch: int, run: ExecutionContext) -> Setting:
     make = partial(_make, turn=turn, run=run)
     return Setting("fast_graspd", turn.value, turn.fidelity, batch=batch, run=run, make=make)
 
 
-def _make(hand: HandModel, obj: ObjectModel, count: int, seed: int, *, turn: Turn, run: ExecutionContext) -> GraspSet:
+def _make(
+    hand: HandModel, obj: ObjectModel, count: int, seed: int, *, turn: KnobValue, run: ExecutionContext
+) -> GraspSet:
     began = time.perf_counter()
     pair = (turn.change or _same)(pair_of(hand, obj, turn.fidelity, run.device))
     parts = optimise_pair(pair, PlanRequest(count, turn.fidelity, seed), run)

@@ -8,7 +8,7 @@ from graspd.api.metrics import Metrics, Snapshot
 from graspd.service.model.states import Stage
 from graspd.service.model.workers import WorkerBeat
 from graspd.service.pipeline.metrics import SERIES
-from graspd.service.queue.port import QueueNow
+from graspd.service.queue.port import QueueStatus
 
 STATES = ("checking", "idle", "busy", "stopping", "quarantined")
 
@@ -20,7 +20,7 @@ def test_workers_are_counted_in_every_state_that_they_can_be_in() -> None:
         WorkerBeat(str(i), "h", 1, "cpu", "CPU", tuple(Stage), "0", state, "", "", "")
         for i, state in enumerate(["idle", "quarantined", "quarantined"])
     ]
-    snapshot.add_queue(QueueNow(workers={beat.name: (beat, 0.1) for beat in beats}), is_kept=True)
+    snapshot.add_queue(QueueStatus(workers={beat.name: (beat, 0.1) for beat in beats}), is_kept=True)
     text = Metrics().render(snapshot).decode()
     assert all(state in SERIES["graspd_workers"].meaning for state in STATES)
     counts = {state: float(text.partition(f'graspd_workers{{state="{state}"}} ')[2].split()[0]) for state in STATES}
@@ -30,5 +30,5 @@ def test_workers_are_counted_in_every_state_that_they_can_be_in() -> None:
 @pytest.mark.parametrize("lives", [True, False])
 def test_the_controller_is_up_while_one_gives_signs_of_life(lives: bool) -> None:
     snapshot = Snapshot()
-    snapshot.add_queue(QueueNow(), is_kept=lives)
+    snapshot.add_queue(QueueStatus(), is_kept=lives)
     assert f"graspd_controller_up {float(lives)}" in Metrics().render(snapshot).decode().splitlines()

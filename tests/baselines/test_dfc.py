@@ -12,7 +12,7 @@ from graspd.baselines.dfc import kernels
 from graspd.baselines.dfc.method import DISTANCE, Descent, sample_starts
 from graspd.baselines.dfc.schedule import step_size, temperature
 from graspd.worker.execution_context import DEFAULT_CONTEXT
-from graspd.worker.planners.threads import Steps
+from graspd.worker.planners.threads import StepCounter
 from graspd.worker.simulation.data import HandState
 from tests.worker.models import object_from_mesh, two_finger_hand
 
@@ -118,7 +118,7 @@ def test_a_fall_is_always_accepted_and_a_rise_with_its_boltzmann_factor() -> Non
 
 def test_annealing_ends_at_a_lower_energy_than_it_began() -> None:
     found = descent()
-    tell = Steps(1, DEFAULT_CONTEXT)
+    tell = StepCounter(1, DEFAULT_CONTEXT)
     found.run(1, tell)
     before = found.energies()[0] @ WEIGHTS
     found.run(1500, tell)

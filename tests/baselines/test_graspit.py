@@ -13,7 +13,7 @@ from graspd.baselines.graspit.method import Search, eigengrasps, virtual_contact
 from graspd.baselines.graspit.schedule import FIRST_STEP, acceptance, jump_share, temperature
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.planners.threads import Steps
+from graspd.worker.planners.threads import StepCounter
 from tests.worker.models import object_from_mesh, two_finger_hand
 
 
@@ -111,7 +111,7 @@ def test_annealing_lowers_the_energy_and_stops_at_its_step() -> None:
         ground_of(two_finger_hand(), object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05))), "cpu", kernels)
     )
     told: list[float] = []
-    steps = Steps(1e6, ExecutionContext(progress=lambda done, total, message: told.append(done)))
+    steps = StepCounter(1e6, ExecutionContext(progress=lambda done, total, message: told.append(done)))
     few = search.run([[0, 0, c] for c in range(4)], steps=FIRST_STEP + 50, keep=1, tell=steps)
     assert told[-1] == 4 * 50
     many = search.run([[0, 0, c] for c in range(4)], steps=FIRST_STEP + 2000, keep=1, tell=steps)
@@ -122,7 +122,7 @@ def test_the_states_kept_of_a_chain_differ() -> None:
     search = Search(
         ground_of(two_finger_hand(), object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05))), "cpu", kernels)
     )
-    kept = search.run([[3]], steps=FIRST_STEP + 1500, keep=4, tell=Steps(1, DEFAULT_CONTEXT))
+    kept = search.run([[3]], steps=FIRST_STEP + 1500, keep=4, tell=StepCounter(1, DEFAULT_CONTEXT))
     apart = np.linalg.norm(kept.pivot[:, None] - kept.pivot[None], axis=2)
     assert len(kept.pivot) == 4
     assert np.any(apart[np.triu_indices(4, 1)] > 0.005)

@@ -22,7 +22,7 @@ from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.simulation.environment import Obstacle, Placed
+from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from tests.exchange.bench_loader import PREFIX, files_of, load, tabletop_test
 
 CONFIG, EXPERIMENT = "graspd_barrett", "graspd_tabletop"
@@ -234,4 +234,4 @@ def test_free_grasps_and_grasps_on_tables_do_not_mix(
 )
 def test_a_scene_that_its_test_does_not_know_is_refused(supports: tuple[Obstacle, ...]) -> None:
     with pytest.raises(InputError, match="--scene table"):
-        check_table(Placed(supports, invert(np.array([[0, 0, 0, 1.0, 0, 0, 0]])), np.zeros(1, np.intp)))
+        check_table(PlacedGrasps(supports, invert(np.array([[0, 0, 0, 1.0, 0, 0, 0]])), np.zeros(1, np.intp)))

@@ -15,7 +15,7 @@ import trimesh
 from graspd.exchange import dexgraspnet2
 from graspd.exchange.dexgraspnet2 import load_npz
 from graspd.exchange.dexgraspnet2_graspness import surface_samples
-from graspd.exchange.plan import Look
+from graspd.exchange.plan import PictureReference
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, apply, compose, pose_from_matrix
 from graspd.service.readers import Pictures, open_shards
@@ -270,7 +270,7 @@ def test_no_pictures_no_scenes(on_tables: Path, tmp_path: Path) -> None:
 def test_pictures_of_scenes_in_which_no_grasp_is_clear_are_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    none = Look(0, "base", "views", 0, np.eye(4), IDENTITY_POSE, np.zeros(0, np.intp))
+    none = PictureReference(0, "base", "views", 0, np.eye(4), IDENTITY_POSE, np.zeros(0, np.intp))
     monkeypatch.setattr(dexgraspnet2, "looks", lambda pictures: [none])
     lots: list[Any] = [SimpleNamespace(id="base")]
     with pytest.raises(InputError, match="no grasp is valid and clear"):

@@ -18,7 +18,7 @@ from graspd.service.store.store import open_store
 from graspd.studies.chart.chart import settings_of
 from graspd.studies.chart.report import markdown
 from graspd.studies.chart.statistics import first_valid, pareto, summed
-from graspd.studies.chart.sweeps import Turn, _make, asking_each, turns
+from graspd.studies.chart.sweeps import KnobValue, _make, asking_each, turns
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
@@ -222,7 +222,7 @@ def test_asking_for_distances_anew_changes_no_grasp() -> None:
     hand, obj = hand_from_path("barrett"), object_from_path("block")
     little = FIDELITIES["draft"].model_copy(update={"coarse_iterations": 12, "fine_iterations": 5})
     shared, anew = (
-        _make(hand, obj, 2, 0, turn=Turn("queries", "", little, change), run=ExecutionContext(threads=1))
+        _make(hand, obj, 2, 0, turn=KnobValue("queries", "", little, change), run=ExecutionContext(threads=1))
         for change in (None, asking_each)
     )
     np.testing.assert_array_equal(shared.grasp.hand_pose, anew.grasp.hand_pose)

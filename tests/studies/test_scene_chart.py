@@ -151,7 +151,9 @@ def test_seconds_are_those_of_the_clock_of_the_settings_device(monkeypatch: pyte
     (setting,) = settings_of(
         ["fast_graspd"], ["draft"], batches=[2], peer_batch=2, options=[], quick=True, run=ExecutionContext("cuda:0", 1)
     )
-    place = scenes.Place(ChartObject("block", lambda error: object_from_path("block", face_error_m=error)), TABLE)
+    place = scenes.ObjectScenes(
+        ChartObject("block", lambda error: object_from_path("block", face_error_m=error)), TABLE
+    )
     row = scenes._tried(setting, FILTERED, hand_from_path("barrett"), place, 1)
     assert asked == ["cuda:0"]
     assert (row["seconds"], row["end_seconds"], row["valid_per_second"]) == (7.0, 14.0, pytest.approx(2 / 7, rel=1e-4))

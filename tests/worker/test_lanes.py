@@ -19,7 +19,7 @@ from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.planners import NoPlace, PlanRequest, synthesize
+from graspd.worker.planners import NoStartFound, PlanRequest, synthesize
 from graspd.worker.rounds import LANE, lanes_of
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.side_by_side import side_by_side
@@ -118,7 +118,7 @@ def test_a_lane_without_a_place_ends_blocked_where_another_has_one(
     def narrow(hand: Any, obj: Any, wanted: PlanRequest, *rest: Any, **named: Any) -> GraspSet:
         if wanted.first in without and not wanted.others_have_place:
             refused.append(wanted.first)
-            raise NoPlace("no place")
+            raise NoStartFound("no place")
         return whole(hand, obj, wanted, *rest, **named)
 
     wish = REQUEST.model_copy(update={"want": "candidates", "validation": "none"})
@@ -130,7 +130,7 @@ def test_a_lane_without_a_place_ends_blocked_where_another_has_one(
     assert refused == [LANE]
     assert_same(found, free)
     without = (0, LANE)
-    with pytest.raises(NoPlace):
+    with pytest.raises(NoStartFound):
         validated_grasps(*pair, wish, count=COUNT, scenes=scenes, run=ExecutionContext(threads=2))
 
 

@@ -211,7 +211,7 @@ class Openings:
         out.run(OPENING_STEPS + 1)
 
     def _jams(self) -> Any:
-        out, shape = jamming.Jams(), (self.count, self.fingers_count)
+        out, shape = jamming.FingerJams(), (self.count, self.fingers_count)
         with wp.ScopedDevice(self.posing.device):
             out.going = wp.full(self.count, 1, dtype=wp.int32)
             out.share = wp.full(shape, 1.0, dtype=wp.float64)

@@ -23,7 +23,7 @@ from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.posed import posing_of
-from graspd.worker.simulation.environment import CLEAR_M, Placed
+from graspd.worker.simulation.environment import CLEAR_M, PlacedGrasps
 from graspd.worker.simulation.obstacles import body_room, obstacle_room
 
 #: Distance that opening fingers keep from obstacles [m].
@@ -51,7 +51,7 @@ OF_WEIGHT: Final = (10.0, 50.0)
 
 
 def pregrasp(
-    hand: HandModel, obj: ObjectModel, grasp: Posture, placed: Placed | None = None, *, device: str = "cpu"
+    hand: HandModel, obj: ObjectModel, grasp: Posture, placed: PlacedGrasps | None = None, *, device: str = "cpu"
 ) -> Posture:
     """N postures from which the hand closes.
 
@@ -72,7 +72,9 @@ def pregrasp(
     return found if placed is None else raised(hand, grasp, found, placed)
 
 
-def wide_open(hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: Placed, *, device: str = "cpu") -> Floats:
+def wide_open(
+    hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: PlacedGrasps, *, device: str = "cpu"
+) -> Floats:
     """(N, J) joint positions in which a hand comes to its pregrasp: fingers plainly opened as far as `WIDE` of their
     range, or until they would run into one another or into an obstacle."""
     posing, joints = (
@@ -150,7 +152,7 @@ def standing_off(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: s
     return np.asarray(((gap > near) & (gap < far)).any(axis=1))
 
 
-def _in_the_way(hand: HandModel, opening: Openings, placed: Placed | None) -> Blocked | None:
+def _in_the_way(hand: HandModel, opening: Openings, placed: PlacedGrasps | None) -> Blocked | None:
     """What obstacles are in the way of opening fingers."""
     if placed is None:
         return None
@@ -165,7 +167,7 @@ def _in_the_way(hand: HandModel, opening: Openings, placed: Placed | None) -> Bl
     return blocked
 
 
-def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: Placed) -> Floats:
+def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: PlacedGrasps) -> Floats:
     """(B, fingers) least room of each finger, as `body_room` has it, on paths (B, K, D); inf: no finger."""
     count, steps, _ = paths.shape
     finger = fingers_of_bodies(hand)
@@ -189,7 +191,7 @@ RAISE_LOOKS: Final = tuple(np.arange(8) / 8)
 HIGHEST_RAISE_M: Final = 0.008
 
 
-def raised(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: Placed) -> Posture:
+def raised(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: PlacedGrasps) -> Posture:
     """Pregrasps (N) whose root went against gravity by what the hand lacks of its room on the straight way from there
     to the grasp; those that lack nothing, or too much, are as they were."""
     poses = np.array(pregrasp.hand_pose, float)
@@ -206,7 +208,7 @@ def raised(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: Placed) -
     return Posture(poses, pregrasp.joint_positions)
 
 
-def _lack(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: Placed) -> Floats:
+def _lack(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: PlacedGrasps) -> Floats:
     """(n, looks) what hands lack of their room at the shares `RAISE_LOOKS` of their way."""
     share = np.array(RAISE_LOOKS)[None, :, None]
     pose = (1 - share) * pregrasp.hand_pose[:, None] + share * grasp.hand_pose[:, None]

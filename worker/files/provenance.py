@@ -38,7 +38,7 @@ from graspd.worker.objects.prepare import load_object, object_from_path
 from graspd.worker.scenes.kinds import supports_of
 from graspd.worker.scenes.neighbours import Neighbours
 from graspd.worker.scenes.placement import neighbour_of
-from graspd.worker.simulation.environment import Placed, Scenes
+from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 
 #: What a file may be called that describes a hand or an object.
 SUFFIXES: Final = {AssetKind.HAND: (".urdf", ".xml", ".zip"), AssetKind.OBJECT: (*READERS, ".zip")}
@@ -66,7 +66,7 @@ class AssetReference:
 
 
 @dataclass(frozen=True)
-class Found:
+class AssetFiles:
     """Its files, and the options to read them with."""
 
     files: dict[str, bytes]
@@ -82,7 +82,7 @@ def remembered(hand: str, obj: str, options: Mapping[str, Any]) -> dict[str, Att
     return found | ({"object_options": json_attribute(dict(options))} if options else {})
 
 
-def find(sought: AssetReference) -> Found:
+def find(sought: AssetReference) -> AssetFiles:
     """The files of a hand or object: built in, at the path the shard notes, in the store, or in the shard's folder.
 
     Raises:
@@ -91,7 +91,7 @@ def find(sought: AssetReference) -> Found:
     if sought.name in builtin_names(sought.kind):
         files = builtin_files(sought.kind, sought.name)
         if digest_files(sought.kind, files) == sought.digest:
-            return Found(files, {})
+            return AssetFiles(files, {})
     looked: list[str] = []
     for path in _paths(sought, looked):
         if (found := at(sought, path)) is not None:
@@ -113,13 +113,13 @@ def _paths(sought: AssetReference, looked: list[str]) -> Iterator[Path]:
         yield Path(sought.source)
 
 
-def _stored(sought: AssetReference, looked: list[str]) -> Found | None:
+def _stored(sought: AssetReference, looked: list[str]) -> AssetFiles | None:
     from graspd.service.settings import Settings
 
     url = Settings().resolved_store_url
     looked.append(f"in the store {url}")
     try:
-        return Found(load_asset_files(open_store(url, make=False), sought.kind, sought.digest), {})
+        return AssetFiles(load_asset_files(open_store(url, make=False), sought.kind, sought.digest), {})
     except GraspdError:
         return None
 
@@ -133,7 +133,7 @@ def _beside(sought: AssetReference, looked: list[str]) -> Iterator[Path]:
     yield from (path for _, path in zip(range(LOOKED_AT), fitting, strict=False))
 
 
-def at(sought: AssetReference, path: Path) -> Found | None:
+def at(sought: AssetReference, path: Path) -> AssetFiles | None:
     """The files at a path, if they are what is sought."""
     try:
         if not path.is_file():
@@ -144,7 +144,7 @@ def at(sought: AssetReference, path: Path) -> Found | None:
         return None
     for options in ({}, dict(sought.options or {})):
         if digest_variant(digest, options) == sought.digest:
-            return Found(files, {**stated, **options})
+            return AssetFiles(files, {**stated, **options})
     return None
 
 
@@ -178,11 +178,11 @@ def hand_of_shard(shard: Shard, given: str | None) -> HandModel:
     return load_hand(found.files, name=wanted.name, digest=wanted.digest, options=found.options)
 
 
-def hand_files_of_shard(shard: Shard, given: str | None) -> Found:
+def hand_files_of_shard(shard: Shard, given: str | None) -> AssetFiles:
     """The files of `hand_of_shard`, with the options to read them with."""
     if given:
         _, files, stated = files_from_path(given)
-        return Found(files, stated)
+        return AssetFiles(files, stated)
     return find(_wanted(shard, AssetKind.HAND))
 
 
@@ -208,7 +208,7 @@ def _object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
     return obj
 
 
-def _loaded(wanted: AssetReference, found: Found, face_error_m: float) -> ObjectModel:
+def _loaded(wanted: AssetReference, found: AssetFiles, face_error_m: float) -> ObjectModel:
     return load_object(
         found.files, name=wanted.name, digest=wanted.digest, face_error_m=face_error_m, options=found.options
     )
@@ -271,7 +271,7 @@ def _neighbour(shard: Shard, name: str, digest: str, source: str) -> ObjectModel
     return _loaded(wanted, find(wanted), NEIGHBOUR_FACE_ERROR_M)
 
 
-def placed_of_shard(shard: Shard) -> Placed | None:
+def placed_of_shard(shard: Shard) -> PlacedGrasps | None:
     """The scenes that the grasps of a base shard were planned in; None: they were planned around a free object.
 
     Raises:

@@ -11,21 +11,30 @@ from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fitting import fitting_pairs
-from graspd.worker.planners.port import BatchRequest, Joined, Method, NoPlace, Options, Planner, PlanRequest, Rollout
+from graspd.worker.planners.port import (
+    BatchPlanner,
+    BatchRequest,
+    Method,
+    NoStartFound,
+    Options,
+    Planner,
+    PlanRequest,
+    Rollout,
+)
 from graspd.worker.planners.registry import GROUP, PLANNERS, joined, method, method_names, planner
 
 __all__ = [
     "GROUP",
     "PLANNERS",
+    "BatchPlanner",
     "BatchRequest",
-    "Joined",
-    "Method",
-    "NoPlace",
-    "Options",
-    "Planner",
     "ExecutionContext",
-    "Rollout",
+    "Method",
+    "NoStartFound",
+    "Options",
     "PlanRequest",
+    "Planner",
+    "Rollout",
     "fitting_pairs",
     "method",
     "method_names",

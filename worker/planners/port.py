@@ -17,16 +17,16 @@ from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 
 #: Scores (N,) of N grasps, in their scenes or around a free object (None): the smaller the better, below 1 good enough
 #: to look at no other candidate, from 2 on so bad that others are worth their time. The third argument has the score of
 #: what each would replace, inf where there is nothing: a trial may end as soon as it is not better by a class (0, 1).
 #: Called by several threads at once.
-Rollout = Callable[[GraspSet, Placed | None, NDArray[np.float64]], NDArray[np.float64]]
+Rollout = Callable[[GraspSet, PlacedGrasps | None, NDArray[np.float64]], NDArray[np.float64]]
 
 
-class NoPlace(InputError):
+class NoStartFound(InputError):
     """No grasp of a batch finds where to start in its scenes."""
 
 
@@ -39,7 +39,7 @@ class PlanRequest:
     seed: int = 0
     batch: int = 0
     """Number of the batch among those of one seed."""
-    placed: Placed | None = None
+    placed: PlacedGrasps | None = None
     """Their scenes: grasp i in scene `placed.index[i]`; None: around a free object."""
     rollout: Rollout | None = None
     """What several candidates of a grasp go through before one is chosen; None: the planner's own merit chooses."""
@@ -74,7 +74,7 @@ class BatchRequest:
     run: ExecutionContext
 
 
-class Joined(Protocol):
+class BatchPlanner(Protocol):
     """Makes several batches of a hand on an object in one launch: of one fidelity, on one device, all around a free
     object or all in scenes with the same supports and neighbours (`Placed.fixed`).
 
@@ -113,7 +113,7 @@ class Method:
     """The options it takes."""
     uses: tuple[str, ...] = ()
     """Knobs of `Fidelity` that move its grasps; the others are ignored."""
-    joined: Callable[[Any], Joined] | None = None
+    joined: Callable[[Any], BatchPlanner] | None = None
     """From the options to what makes several batches in one launch; None: it makes them one after the other."""
     files: Mapping[str, Callable[[Path], str]] = field(default_factory=dict)
     """Options that are files to who has them: each with what keeps such a file in this process and gives its digest,

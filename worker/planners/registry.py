@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from graspd.service.model.base import refusal
 from graspd.service.model.errors import InputError, known_names
 from graspd.service.model.libraries import imports
-from graspd.worker.planners.port import Joined, Method, Options, Planner
+from graspd.worker.planners.port import BatchPlanner, Method, Options, Planner
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint, EntryPoints
@@ -74,7 +74,7 @@ def planner(name: str, options: Mapping[str, Any] | None = None, *, in_scenes: b
     return known.planner(_options(name, options))
 
 
-def joined(name: str, options: Mapping[str, Any] | None = None) -> Joined | None:
+def joined(name: str, options: Mapping[str, Any] | None = None) -> BatchPlanner | None:
     """What makes several batches of a method in one launch; None: the method makes them one after the other."""
     make = method(name).joined
     return make(_options(name, options)) if make is not None else None

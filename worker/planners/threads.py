@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
-class Steps:
+class StepCounter:
     """Counts work done by all threads; looks at cancellation."""
 
     def __init__(self, total: float, run: ExecutionContext) -> None:

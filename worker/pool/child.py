@@ -22,7 +22,7 @@ from graspd.service.model.libraries import imports, own_process
 
 
 @dataclass(frozen=True)
-class Order:
+class WorkItem:
     """A piece of work: `work(shared, part)`."""
 
     work: Callable[[Any, Any], Any]
@@ -64,7 +64,7 @@ def serve(connection: Connection, modules: Sequence[str]) -> None:
 def _answer(order: bytes, kept: dict[str, Any]) -> bytes:
     """Pickled: whether it was done, and the result or the error."""
     try:
-        wanted: Order = pickle.loads(order)
+        wanted: WorkItem = pickle.loads(order)
         for key in wanted.forget:
             kept.pop(key, None)
         if wanted.shared is not None:

@@ -29,7 +29,7 @@ from typing import Any, Final
 
 from graspd.service.model.cores import ROOT, available_cores, available_memory
 from graspd.service.model.errors import GraspdError, TaskCancelled
-from graspd.worker.pool.child import Order
+from graspd.worker.pool.child import WorkItem
 
 log = logging.getLogger(__name__)
 #: Modules whose work the processes do for a worker; named and not imported: a worker is there before its engine is.
@@ -216,14 +216,14 @@ class _Place:
             return True
         return self._connection.poll()
 
-    def _order(self, request: _Request, part: Any) -> Order:
+    def _order(self, request: _Request, part: Any) -> WorkItem:
         forget = list[str]()
         known = request.key in self._kept
         self._kept[request.key] = None
         self._kept.move_to_end(request.key)
         while len(self._kept) > KEPT:
             forget.append(self._kept.popitem(last=False)[0])
-        return Order(request.work, request.key, None if known else request.pickled, tuple(forget), part)
+        return WorkItem(request.work, request.key, None if known else request.pickled, tuple(forget), part)
 
     def _stop(self) -> str:
         """End the process if it runs; how it ended."""

@@ -105,7 +105,7 @@ class Engine:
         self._runner = Runner(
             table, worker=self._setup.worker, publish=lambda event: self._say("event", event), fitness=self._fitness
         )
-        self._surroundings = Surroundings(settings, store, device)
+        self._surroundings = TaskResources(settings, store, device)
         self.update(device_name=device.name)
         device.find_out(lambda: self.update(device=device.resolve(), device_name=device.name))
 
@@ -173,7 +173,7 @@ class Engine:
             self._connection.send((word, about))
 
 
-class Surroundings:
+class TaskResources:
     """What a task gets besides its message, and what its worker counts.
 
     Engines and drivers leak: a worker that grew makes room for a new one.

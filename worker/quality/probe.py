@@ -41,7 +41,7 @@ FACING_COS: Final = -0.5
 
 
 @dataclass(frozen=True)
-class Touch:
+class NearestPoints:
     """Where the hand points of B grasps are and what of the object is near them; in the object frame, metres."""
 
     bodies: Floats
@@ -59,7 +59,7 @@ class Touch:
 
 
 @dataclass(frozen=True)
-class Distances(Touch):
+class Distances(NearestPoints):
     """The same, and what else touches; P pieces."""
 
     piece_distance: Floats
@@ -177,13 +177,13 @@ class Probe:
         body, position = self.points.body, self.points.position
         return _turned(bodies, body, position) + bodies[:, body, :3]
 
-    def touch(self, posture: Posture, *, reach: float = REACH_M) -> Touch:
+    def touch(self, posture: Posture, *, reach: float = REACH_M) -> NearestPoints:
         """What of the object is near the hand points of B postures, within `reach` [m]."""
         bodies = body_poses(self.hand, posture.hand_pose, posture.joint_positions)
         points = self.posed_points(bodies)
         shape = points.shape[:2]
         distance, closest, normal = self.signed_distance(points.reshape(-1, 3), reach=reach)
-        return Touch(
+        return NearestPoints(
             bodies=bodies,
             hand_points=points,
             hand_normals=_turned(bodies, self.points.body, self.points.normal),
@@ -201,7 +201,7 @@ class Probe:
             self_depth=self.self_depth(found.bodies, found.hand_points).max(axis=1),
         )
 
-    def facing(self, found: Touch) -> NDArray[np.bool_]:
+    def facing(self, found: NearestPoints) -> NDArray[np.bool_]:
         """(B, N) points whose hand surface looks at the object: only there can it press."""
         cosine = np.einsum("bni,bni->bn", found.hand_normals, found.normal)
         facing: NDArray[np.bool_] = cosine < FACING_COS

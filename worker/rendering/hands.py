@@ -18,11 +18,11 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.robot import Ints
 from graspd.worker.hands.visuals import NO_VISUALS, VisualMesh
 from graspd.worker.objects.mesh_geometry import corner_normals
-from graspd.worker.rendering.scenery import Look, Solid
+from graspd.worker.rendering.scenery import Appearance, Solid
 
-_HAND: Final = Look(hexadecimal("#59636e"), roughness=0.42, metalness=0.35)
-_PALM: Final = Look(hexadecimal("#434b54"), roughness=0.48, metalness=0.35)
-_TIP: Final = Look(hexadecimal("#2fa7a0"), roughness=0.38)
+_HAND: Final = Appearance(hexadecimal("#59636e"), roughness=0.42, metalness=0.35)
+_PALM: Final = Appearance(hexadecimal("#434b54"), roughness=0.48, metalness=0.35)
+_TIP: Final = Appearance(hexadecimal("#2fa7a0"), roughness=0.38)
 #: Where a hand waits that a scene does not show: under the floor, out of every picture [m].
 _AWAY_M: Final = -50.0
 
@@ -48,21 +48,21 @@ class DrawnHand:
         return bodies
 
     @property
-    def parts(self) -> tuple[Part, ...]:
+    def parts(self) -> tuple[MovingSolid, ...]:
         """The drawn solids."""
         return drawn_parts(self.hand, mounted=self.wrist is not None)
 
 
 @dataclass(frozen=True)
-class Part:
+class MovingSolid:
     """A solid of one look that moves with a body."""
 
     body: int
     solid: Solid
-    look: Look
+    look: Appearance
 
 
-def hand_parts(hand: HandModel) -> tuple[Part, ...]:
+def hand_parts(hand: HandModel) -> tuple[MovingSolid, ...]:
     """What is drawn of a hand: its visual meshes in their colours; of bodies without any, the collision pieces.
 
     Where no visual element states a colour, palm, fingers and fingertips have looks of their own.
@@ -73,7 +73,7 @@ def hand_parts(hand: HandModel) -> tuple[Part, ...]:
         return _parts[hand.content]
 
 
-def drawn_parts(hand: HandModel, *, mounted: bool) -> tuple[Part, ...]:
+def drawn_parts(hand: HandModel, *, mounted: bool) -> tuple[MovingSolid, ...]:
     """What is drawn of a hand, and if it is `mounted` of the links above its root, whose bodies are numbered anew."""
     above = hand.mounting if mounted else None
     return hand_parts(hand) + (() if above is None else hand_parts(above))
@@ -103,16 +103,16 @@ def hand_solids(hand: HandModel) -> list[Solid]:
     return [part.solid for part in hand_parts(hand)]
 
 
-def hand_looks(hand: HandModel) -> list[Look]:
+def hand_looks(hand: HandModel) -> list[Appearance]:
     """The material of each drawn solid."""
     return [part.look for part in hand_parts(hand)]
 
 
-_parts: LRUCache[str, tuple[Part, ...]] = LRUCache(16)
+_parts: LRUCache[str, tuple[MovingSolid, ...]] = LRUCache(16)
 _lock = threading.Lock()
 
 
-def _drawn(hand: HandModel) -> Iterator[Part]:
+def _drawn(hand: HandModel) -> Iterator[MovingSolid]:
     seen = {mesh.body for mesh in hand.visuals.meshes}
     for body in range(hand.bodies):
         if body not in seen:
@@ -123,17 +123,17 @@ def _drawn(hand: HandModel) -> Iterator[Part]:
             if mesh.body == body:
                 of_colour.setdefault(mesh.colour, []).append(mesh)
         for colour, meshes in of_colour.items():
-            look = _own_look(hand, body) if colour is None else Look(linear(*colour), roughness=0.45)
-            yield Part(body, _merge([(m.vertices, m.faces) for m in meshes]), look)
+            look = _own_look(hand, body) if colour is None else Appearance(linear(*colour), roughness=0.45)
+            yield MovingSolid(body, _merge([(m.vertices, m.faces) for m in meshes]), look)
 
 
-def _pieces(hand: HandModel, body: int) -> Iterator[Part]:
+def _pieces(hand: HandModel, body: int) -> Iterator[MovingSolid]:
     pieces = [(piece.vertices, piece.faces) for piece in hand.pieces if piece.body == body]
     if pieces:
-        yield Part(body, _merge(pieces), _own_look(hand, body))
+        yield MovingSolid(body, _merge(pieces), _own_look(hand, body))
 
 
-def _own_look(hand: HandModel, body: int) -> Look:
+def _own_look(hand: HandModel, body: int) -> Appearance:
     """Material of a body without a colour: palm, finger or fingertip."""
     if body in hand.fingertips:
         return _TIP

@@ -20,7 +20,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.cameras import Cameras, intrinsics, look_at
 from graspd.worker.rendering.hands import drawn_bodies, hand_looks, hand_solids
 from graspd.worker.rendering.kernels.shading import CATCHER
-from graspd.worker.rendering.scenery import Box, Lamp, Look, Shot, Solid
+from graspd.worker.rendering.scenery import Appearance, Box, CameraShot, Lamp, Solid
 from graspd.worker.rendering.tracer import Tracer
 
 THREE_SIDES: Final = tuple(np.radians([-35.0, 85.0, 205.0]).tolist())
@@ -37,8 +37,8 @@ _FILL: Final = 0.86
 #: Left of the camera, above it, in front of the object: camera looks along -x of the turned world.
 TOWARD_LAMP: Final = np.array([0.45, -0.45, 0.77]) / np.linalg.norm([0.45, -0.45, 0.77])
 FLOOR_SIZE: Final = (6.0, 6.0, 0.02)
-FLOOR: Final = Look((1.0, 1.0, 1.0), pattern=CATCHER)
-OBJECT_LOOK: Final = Look(hexadecimal("#dd7432"), roughness=0.5)
+FLOOR: Final = Appearance((1.0, 1.0, 1.0), pattern=CATCHER)
+OBJECT_LOOK: Final = Appearance(hexadecimal("#dd7432"), roughness=0.5)
 STUDIO: Final = Lamp(
     key=(1.85, 1.8, 1.7),
     sky=(0.76, 0.79, 0.84),
@@ -118,7 +118,7 @@ def _shoot(
     sides = []
     for azimuth in azimuths:
         angles = np.array([side_of(hand, world) + azimuth for world in bodies])
-        shot = Shot(
+        shot = CameraShot(
             world=np.arange(worlds, dtype=np.int32),
             extrinsics=np.stack([_camera(obj, points[w], angles[w], k, size) for w in range(worlds)]),
             intrinsics=k,

@@ -32,7 +32,7 @@ from graspd.worker.rendering.pictures import (
     TOWARD_LAMP,
     fit_camera,
 )
-from graspd.worker.rendering.scenery import Box, Look, Shot, Solid
+from graspd.worker.rendering.scenery import Appearance, Box, CameraShot, Solid
 from graspd.worker.rendering.tracer import Tracer
 
 #: Size of one picture of a portrait [px].
@@ -41,14 +41,14 @@ _SAMPLES: Final = 16
 _CAPTION: Final = 30
 #: Share of the way from open to closed at which a hand is shown closing.
 _CLOSING_SHARE: Final = 0.6
-_ARROW: Final = Look(hexadecimal("#dd7432"), roughness=0.5)
-_CLOSING: Final = Look(hexadecimal("#2fa7a0"), roughness=0.5)
-_PAD: Final = Look(hexadecimal("#d6409f"), roughness=0.5)
+_ARROW: Final = Appearance(hexadecimal("#dd7432"), roughness=0.5)
+_CLOSING: Final = Appearance(hexadecimal("#2fa7a0"), roughness=0.5)
+_PAD: Final = Appearance(hexadecimal("#d6409f"), roughness=0.5)
 #: Radius of a dot of a pad over the largest extent of the hand; dots of a pad at most.
 _DOT_SHARE: Final = 0.008
 _DOTS: Final = 60
 #: Axes x, y, z of the palm's frame.
-_AXES: Final = tuple(Look(hexadecimal(code), roughness=0.5) for code in ("#c8343c", "#3c9a4a", "#3566c8"))
+_AXES: Final = tuple(Appearance(hexadecimal(code), roughness=0.5) for code in ("#c8343c", "#3c9a4a", "#3566c8"))
 _FRAME_SHARE: Final = 0.25
 _CLOSING_ARROW_SHARE: Final = 0.22
 #: Share of the housing in a picture through which one looks.
@@ -155,7 +155,12 @@ def write_png(image: Image.Image, path: Path) -> None:
 
 
 def _shoot(
-    solids: Sequence[Solid], poses: Floats, looks: list[Look], points: Floats, azimuths: Sequence[float], device: str
+    solids: Sequence[Solid],
+    poses: Floats,
+    looks: list[Appearance],
+    points: Floats,
+    azimuths: Sequence[float],
+    device: str,
 ) -> NDArray[np.uint8]:
     """(W, H, W, 3) pictures of W worlds, each from its azimuth; every camera takes in the same points."""
     worlds, (width, height) = len(poses), SIZE
@@ -164,7 +169,7 @@ def _shoot(
     stage = Tracer([Box(FLOOR_SIZE), *solids], device)
     stage.place(np.concatenate([np.tile(floor, (worlds, 1, 1)), poses], axis=1), [[FLOOR, *looks]] * worlds)
     k = intrinsics(width, height, FIELD_OF_VIEW)
-    shot = Shot(
+    shot = CameraShot(
         world=np.arange(worlds, dtype=np.int32),
         extrinsics=np.stack([fit_camera(points, angle, k, SIZE) for angle in azimuths]),
         intrinsics=k,

@@ -31,11 +31,11 @@ from graspd.worker.rendering.hands import DrawnHand
 from graspd.worker.rendering.kernels.shading import GRAIN, PLAIN, SPECKLE, TILES
 from graspd.worker.rendering.scenery import (
     TABLE,
+    Appearance,
     Box,
+    CameraShot,
     Lamp,
-    Look,
     Pictures,
-    Shot,
     Solid,
     Supports,
     seen_share,
@@ -124,7 +124,7 @@ class Setting:
         self.object_pose = np.asarray(poses, float)[:, 0]
         self._poses = np.stack([scene.poses for scene in scenes])
         self.looks = [scene.looks for scene in scenes]
-        self.shot = Shot(
+        self.shot = CameraShot(
             world=np.repeat(np.arange(len(poses), dtype=np.int32), plan.placements * plan.eyes),
             extrinsics=np.concatenate([scene.extrinsics for scene in scenes]),
             intrinsics=plan.intrinsics,
@@ -197,7 +197,7 @@ class _Scene:
         # Drawn last: neighbours and walls do not change how the rest of the scene looks.
         others = [object_look(rng) for _ in objects[1:]]
         walls = table_look(rng) if len(supports) > 1 else table
-        self.looks: list[Look] = [
+        self.looks: list[Appearance] = [
             *(table if k == 0 or isinstance(s, HalfSpace) else walls for k, s in enumerate(supports)),
             thing,
             *others,
@@ -240,34 +240,34 @@ def hsv(hue: float, saturation: float, value: float) -> Colour:
     return linear(*colorsys.hsv_to_rgb(hue % 1.0, saturation, value))
 
 
-def table_look(rng: np.random.Generator) -> Look:
+def table_look(rng: np.random.Generator) -> Appearance:
     """Wood, stone, tiles or a plain cloth."""
     kind = int(rng.integers(4))
     scale = float(rng.uniform(0.7, 1.5))
     if kind == 0:
         base, second = _WOODS[rng.integers(len(_WOODS))]
-        return Look(hexadecimal(base), hexadecimal(second), GRAIN, scale, float(rng.uniform(0.45, 0.8)))
+        return Appearance(hexadecimal(base), hexadecimal(second), GRAIN, scale, float(rng.uniform(0.45, 0.8)))
     if kind == 1:
         base, second = _STONES[rng.integers(len(_STONES))]
-        return Look(hexadecimal(base), hexadecimal(second), SPECKLE, scale, float(rng.uniform(0.5, 0.8)))
+        return Appearance(hexadecimal(base), hexadecimal(second), SPECKLE, scale, float(rng.uniform(0.5, 0.8)))
     base = _CLOTHS[rng.integers(len(_CLOTHS))]
     if kind == 2:
-        return Look(hexadecimal(base), hexadecimal("#8b8883"), TILES, scale, float(rng.uniform(0.45, 0.7)))
-    return Look(hexadecimal(base), pattern=PLAIN, roughness=float(rng.uniform(0.7, 0.95)))
+        return Appearance(hexadecimal(base), hexadecimal("#8b8883"), TILES, scale, float(rng.uniform(0.45, 0.7)))
+    return Appearance(hexadecimal(base), pattern=PLAIN, roughness=float(rng.uniform(0.7, 0.95)))
 
 
-def object_look(rng: np.random.Generator) -> Look:
+def object_look(rng: np.random.Generator) -> Appearance:
     """Glazed, painted, brushed or speckled, any hue."""
     hue, kind = float(rng.uniform()), int(rng.integers(4))
     base = hsv(hue, float(rng.uniform(0.3, 0.75)), float(rng.uniform(0.5, 0.9)))
     if kind == 0:
-        return Look(base, roughness=float(rng.uniform(0.2, 0.35)))
+        return Appearance(base, roughness=float(rng.uniform(0.2, 0.35)))
     if kind == 1:
-        return Look(hsv(hue, 0.15, 0.75), roughness=float(rng.uniform(0.35, 0.55)), metalness=1.0)
+        return Appearance(hsv(hue, 0.15, 0.75), roughness=float(rng.uniform(0.35, 0.55)), metalness=1.0)
     if kind == 2:
         second = hsv(hue + float(rng.uniform(-0.08, 0.08)), 0.6, 0.45)
-        return Look(base, second, SPECKLE, float(rng.uniform(1.0, 3.0)), float(rng.uniform(0.4, 0.7)))
-    return Look(base, roughness=float(rng.uniform(0.5, 0.8)))
+        return Appearance(base, second, SPECKLE, float(rng.uniform(1.0, 3.0)), float(rng.uniform(0.4, 0.7)))
+    return Appearance(base, roughness=float(rng.uniform(0.5, 0.8)))
 
 
 def lamp(rng: np.random.Generator) -> Lamp:

@@ -32,7 +32,7 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Look:
+class Appearance:
     """Material of one solid. Colours are linear RGB."""
 
     base: tuple[float, float, float]
@@ -69,7 +69,7 @@ class Pictures:
 
 
 @dataclass(frozen=True)
-class Shot:
+class CameraShot:
     """Which world each camera looks into, and how the light falls."""
 
     world: NDArray[np.int32]

@@ -29,14 +29,14 @@ from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.rendering.annotate import box_corners
 from graspd.worker.rendering.kernels import exposure, rays
 from graspd.worker.rendering.kernels.shading import Light, Material
-from graspd.worker.rendering.scenery import Box, Look, Pictures, Shot, Solid
+from graspd.worker.rendering.scenery import Appearance, Box, CameraShot, Pictures, Solid
 
 #: Pixels between two looks at whether to stop: what a core traces in a fifth of a second, and what a GPU holds at once.
 PIXELS_OF_A_CORE: Final = 100_000
 PIXELS_OF_A_GPU: Final = 4_000_000
 #: By which bounds are wider than their solid, so that rounding in float32 costs no ray [m].
 _SLACK_M: Final = 1e-5
-_PLACED: Final[Any] = rays.Placed
+_PLACED: Final[Any] = rays.PlacedSolid
 #: Radius of the lamp's disc seen from the table [rad].
 LAMP_RADIUS: Final = np.radians(3.5)
 #: Sine of the elevation above which the sky shines.
@@ -82,7 +82,7 @@ class Tracer:
         self._corner_normals = wp.array(np.concatenate(normals), dtype=wp.vec3f, device=self.device)
         self._corners = np.stack([_corners(solid) for solid in self.solids])
 
-    def place(self, poses: Floats, looks: Sequence[Sequence[Look]]) -> None:
+    def place(self, poses: Floats, looks: Sequence[Sequence[Appearance]]) -> None:
         """Puts the solids where they belong.
 
         Args:
@@ -100,7 +100,7 @@ class Tracer:
 
     def shoot(
         self,
-        shot: Shot,
+        shot: CameraShot,
         run: ExecutionContext = DEFAULT_CONTEXT,
     ) -> Pictures:
         """Traces all cameras.
@@ -130,7 +130,7 @@ class Tracer:
 class _Film:
     """What all pictures of a shot have in common, on the device."""
 
-    def __init__(self, tracer: Tracer, shot: Shot) -> None:
+    def __init__(self, tracer: Tracer, shot: CameraShot) -> None:
         self._tracer, self._shot, device = tracer, shot, tracer.device
         passes = light_passes(shot.samples, shot.toward_lamp)
         self._passes = _structs(passes, exposure.LightPass, device)

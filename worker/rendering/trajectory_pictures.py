@@ -36,7 +36,7 @@ from graspd.worker.rendering.pictures import (
     hand_points,
     side_of,
 )
-from graspd.worker.rendering.scenery import Box, Look, Shot, Solid, Supports, seen_share, slab_poses, slabs
+from graspd.worker.rendering.scenery import Appearance, Box, CameraShot, Solid, Supports, seen_share, slab_poses, slabs
 from graspd.worker.rendering.tracer import Tracer
 from graspd.worker.scenes.neighbours import Neighbours
 
@@ -55,9 +55,9 @@ _UNDER_A_BOARD: Final = np.array([0.85, -0.42, 0.32]) / np.linalg.norm([0.85, -0
 #: Hand parts farther than this from the object do not draw the camera back [m].
 _NEAR_M: Final = 0.14
 _HIGH_M: Final = 3.0
-_TABLE: Final = Look(hexadecimal("#b9bfc2"), roughness=0.85)
-_WALL: Final = Look(hexadecimal("#7f97a5"), roughness=0.8)
-_BESIDE: Final = Look(hexadecimal("#8d86a3"), roughness=0.6)
+_TABLE: Final = Appearance(hexadecimal("#b9bfc2"), roughness=0.85)
+_WALL: Final = Appearance(hexadecimal("#7f97a5"), roughness=0.8)
+_BESIDE: Final = Appearance(hexadecimal("#8d86a3"), roughness=0.6)
 
 
 @dataclass(frozen=True)
@@ -189,8 +189,8 @@ class _Stage:
 
     def _shot(
         self, world: NDArray[np.intp], cameras: Floats, k: Floats, size: tuple[int, int], angle: float, samples: int
-    ) -> Shot:
-        return Shot(
+    ) -> CameraShot:
+        return CameraShot(
             world=world.astype(np.int32),
             extrinsics=cameras,
             intrinsics=k,

@@ -17,7 +17,7 @@ from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes.trajectory import plan_way
-from graspd.worker.simulation.environment import Placed, Scenes
+from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.key import Level
 from graspd.worker.validation.lift import LiftOutcome
@@ -46,7 +46,7 @@ def rollout_on(
     in_scenes: bool,
     known: dict[str, Any] | None = None,
     level: Level = "standard",
-) -> Callable[[GraspSet, Placed | None, Floats], Floats] | None:
+) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats] | None:
     """The trial for what `run` plans on; None: the planner's own merit chooses. `known` keeps the verdicts of `level`.
 
     Around free objects a GPU plans faster than the processor tries; in scenes it waits, for all threads that there are.
@@ -65,7 +65,7 @@ def hold_rollout(
     *,
     known: KnownRollouts | None = None,
     level: Level = "standard",
-) -> Callable[[GraspSet, Placed | None, Floats], Floats]:
+) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """A trial of free grasps as `worker.planners.Wanted` takes it: (N,) scores of short pushes, below 2 for grasps that
     hold the object against the six pushes as well.
 
@@ -78,7 +78,7 @@ def hold_rollout(
     """
     short, run = push_rollout(hand, obj, pieces), ExecutionContext(threads=1)
 
-    def rollout(grasps: GraspSet, placed: Placed | None, beat: Floats | None = None) -> Floats:
+    def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
         grasps = grasps.moved(np.zeros(3))
         score = short(grasps, placed, np.zeros(0))
         held = np.flatnonzero(score < SLIPS + 1.0)
@@ -99,7 +99,7 @@ def lift_rollout(
     threads: int = 1,
     known: KnownLifts | None = None,
     level: LiftLevel = "lift",
-) -> Callable[[GraspSet, Placed | None, Floats], Floats]:
+) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """A trial as `worker.planners.Wanted` takes it: (N,) scores, below 1 for grasps that lift the object at half the
     friction, and below 2 at the whole of it, and whose way is clear.
 
@@ -116,7 +116,7 @@ def lift_rollout(
     """
     shorts, run = LiftRollouts(hand, obj, pieces, threads=threads), ExecutionContext(threads=threads)
 
-    def rollout(grasps: GraspSet, placed: Placed | None, beat: Floats | None = None) -> Floats:
+    def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
         assert placed is not None, "a lift needs a scene"
         beat = np.full(len(grasps), np.inf) if beat is None else beat
         grasps = grasps.moved(np.zeros(3))
@@ -133,7 +133,7 @@ def lift_rollout(
         score[held[free]] = lifted(coming, where.take(free), score[held[free]], beat[held[free]])
         return score
 
-    def lifted(grasps: GraspSet, placed: Placed, score: Floats, beat: Floats) -> Floats:
+    def lifted(grasps: GraspSet, placed: PlacedGrasps, score: Floats, beat: Floats) -> Floats:
         """(k,) scores of hands that hold for a short time and whose way is clear."""
         lift = partial(validate_lifts, hand, obj, level=level, pieces=pieces(), known=known, run=run)
         out, barely = np.maximum(score, SLIPS), score >= SLIPS

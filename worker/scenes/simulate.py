@@ -61,7 +61,7 @@ _SCENE = """
 
 
 @dataclass(frozen=True)
-class Rest:
+class RestPose:
     """Where a drop ended."""
 
     pose: Floats
@@ -109,7 +109,7 @@ def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     for scene in range(count):
         rest, rng = _redo_until_rest(table, obj.name, (seed, scene)), np.random.default_rng([seed, scene, MAX_ATTEMPTS])
         face, pose = steadied(obj.centred, table.faces, rest.face, rest.pose, rng)
-        rests.append(Rest(pose, face, rest.seconds))
+        rests.append(RestPose(pose, face, rest.seconds))
     poses = moved(np.array([rest.pose for rest in rests]).reshape(count, 7), np.zeros(3))
     return {
         "scene/object_pose": to_file(poses, obj.centre),
@@ -206,7 +206,7 @@ def _build(obj: ObjectModel) -> _Table:
     )
 
 
-def _redo_until_rest(table: _Table, name: str, key: tuple[int, int]) -> Rest:
+def _redo_until_rest(table: _Table, name: str, key: tuple[int, int]) -> RestPose:
     for attempt in range(MAX_ATTEMPTS):
         rest = _drop_once(table, np.random.default_rng([*key, attempt]))
         if rest is not None:
@@ -214,7 +214,7 @@ def _redo_until_rest(table: _Table, name: str, key: tuple[int, int]) -> Rest:
     raise MeshError(f"{name!r} did not come to rest in any of {MAX_ATTEMPTS} drops; is it a perfect ball?")
 
 
-def _drop_once(table: _Table, rng: np.random.Generator) -> Rest | None:
+def _drop_once(table: _Table, rng: np.random.Generator) -> RestPose | None:
     """One drop; None if it timed out, rolled away, or stands on no face or on one that it topples from."""
     quaternion = rng.normal(size=4)
     quaternion /= np.linalg.norm(quaternion)
@@ -233,7 +233,7 @@ def _drop_once(table: _Table, rng: np.random.Generator) -> Rest | None:
         return None
     pose = lay_flat(table.faces, face, np.concatenate([data.qpos[:3], quaternion]))
     away = float(np.hypot(*(pose[:3] + quat_rotate(pose[3:], table.centre))[:2]))
-    return Rest(pose, face, seconds) if away < REACH else None
+    return RestPose(pose, face, seconds) if away < REACH else None
 
 
 def _run(table: _Table) -> float | None:

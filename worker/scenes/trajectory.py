@@ -27,7 +27,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.contact import finger_of_body
 from graspd.worker.quality.probe import Probe, probe_of
 from graspd.worker.scenes.clearance import MARGIN_M, PATH_POSTURES, approach
-from graspd.worker.simulation.environment import RISE_M, STANDOFF_M, Environment, Placed
+from graspd.worker.simulation.environment import RISE_M, STANDOFF_M, Environment, PlacedGrasps
 from graspd.worker.simulation.mounting import mounting_room, wrist_room
 from graspd.worker.simulation.obstacles import obstacle_room
 
@@ -77,7 +77,7 @@ class Trajectory:
         return np.asarray((self.least >= MARGIN_M) & ~self.touching)
 
 
-def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed) -> Trajectory:
+def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: PlacedGrasps) -> Trajectory:
     """The way of every grasp in its scene: the first direction of retreat that is free, or else the freest."""
     probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
     count, scenes, which = len(grasps), placed.scenes, np.asarray(placed.index, np.intp)
@@ -114,7 +114,7 @@ def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Trajec
     """
     hand_points, object_points = _FREE_POINTS
     probe = probe_of(hand, obj, hand_points=hand_points, object_points=object_points)
-    nowhere = Placed((), IDENTITY_POSE[None], np.zeros(len(grasps), np.intp))
+    nowhere = PlacedGrasps((), IDENTITY_POSE[None], np.zeros(len(grasps), np.intp))
     wide = _opened(probe, grasps.pregrasp, wide_open(hand, obj, grasps.pregrasp, nowhere))
     pointing = quat_rotate(wide.hand_pose[:, 3:], hand.palm.approach)
     ways = [-pointing, *(_tilted(-pointing, tilt, side) for tilt in TILTS for side in range(SIDES))]
@@ -209,7 +209,7 @@ OPENNESS: Final = (1.0, 0.5, 0.0)
 
 
 def come_open(
-    probe: Probe, pregrasp: Posture, wide: Floats, wrist: Floats, placed: Placed
+    probe: Probe, pregrasp: Posture, wide: Floats, wrist: Floats, placed: PlacedGrasps
 ) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
     """Waypoints (n, W, 7), joints (n, J) of the hand that comes, the least distance of it and its mounting, at wrist
     angles (n, K), from obstacles (n,) and whether it touches the object (n,): wide open if it can, its fingers far from
@@ -244,7 +244,7 @@ def come_open(
 
 
 def _seen(
-    probe: Probe, pregrasp: Posture, opened: Floats, wrist: Floats, way: Floats, placed: Placed
+    probe: Probe, pregrasp: Posture, opened: Floats, wrist: Floats, way: Floats, placed: PlacedGrasps
 ) -> tuple[Floats, Floats]:
     """Least distance (n,) from obstacles of hands that come open along directions `way` (n, 3) on their mountings, and
     of hands from the object until they have closed to the pregrasp."""

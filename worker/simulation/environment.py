@@ -133,14 +133,14 @@ class Scenes:
         """The same scenes with `obj`, which they are of, and the neighbours about their middles."""
         return Scenes(self.supports, *_centred(obj, self.object_pose, self.neighbours, self.neighbour_pose))
 
-    def placed(self, index: NDArray[np.intp]) -> Placed:
+    def placed(self, index: NDArray[np.intp]) -> PlacedGrasps:
         """Grasps in these scenes, by the number of the scene (N,)."""
         index = np.asarray(index, np.intp)
-        return Placed(self.supports, self.object_pose, index, self.neighbours, self.neighbour_pose)
+        return PlacedGrasps(self.supports, self.object_pose, index, self.neighbours, self.neighbour_pose)
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedGrasps:
     """N grasps, each in one of S scenes that have the same supports and neighbours."""
 
     supports: tuple[Obstacle, ...]
@@ -180,7 +180,7 @@ class Placed:
         """The scenes, without the grasps."""
         return Scenes(self.supports, self.object_pose, self.neighbours, self.neighbour_pose)
 
-    def centred(self, obj: ObjectModel) -> Placed:
+    def centred(self, obj: ObjectModel) -> PlacedGrasps:
         """The same grasps' scenes with `obj`, which they are of, and the neighbours about their middles."""
         return self.everywhere.centred(obj).placed(self.index)
 
@@ -196,7 +196,7 @@ class Placed:
             solid.moved(pose) for one, pose in zip(self.neighbours, poses, strict=True) for solid in one.solids
         )
 
-    def take(self, rows: NDArray[np.intp] | slice) -> Placed:
+    def take(self, rows: NDArray[np.intp] | slice) -> PlacedGrasps:
         """Some of the grasps, in the order of `rows`."""
         taken = replace(self, index=self.index[rows])
         vars(taken)["scenes"] = self.scenes  # they are the same: not to be made anew
@@ -212,7 +212,7 @@ def _centred(
     return to_centre(object_pose, obj.centre), tuple(one.about_centre or one for one in neighbours), poses
 
 
-def placed_together(parts: Sequence[Placed]) -> Placed:
+def placed_together(parts: Sequence[PlacedGrasps]) -> PlacedGrasps:
     """Grasps of several sets, one after the other, each in its own scenes; supports and neighbours are the same."""
     first = parts[0]
     if len(parts) == 1:

@@ -18,7 +18,7 @@ from graspd.service.model.states import Stage
 from graspd.service.store.columns import Attribute
 from graspd.worker.files.provenance import base_attributes
 from graspd.worker.generation import ValidatedBatch
-from graspd.worker.planners import NoPlace, planner
+from graspd.worker.planners import NoStartFound, planner
 from graspd.worker.scenes.kinds import supports_of
 from graspd.worker.scenes.placement import neighbour_of
 from graspd.worker.simulation.environment import Scenes
@@ -63,11 +63,11 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
             pieces=lambda prepared: pieces_of(context.store, prepared),
             run=context.run,
             checked=partial(_check_hope, message, in_scenes=bool(scenes)),
-            empty_on=(NoPlace,) if scenes else (),
+            empty_on=(NoStartFound,) if scenes else (),
         )
     except InputError as error:
         # Of hand and object there are errors of their own; what is left is that no hand finds a way in.
-        if scenes and type(error) in (InputError, NoPlace):
+        if scenes and type(error) in (InputError, NoStartFound):
             raise SceneError(str(error)) from None
         raise
     made = [_output(one, part) for one, part in zip(found, columns or [{}] * len(found), strict=True)]

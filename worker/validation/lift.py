@@ -22,7 +22,7 @@ from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import Floats, invert, quat_conjugate, quat_multiply, quat_rotate, slerp
 from graspd.worker.engines.mujoco_warnings import void
 from graspd.worker.grasps import GraspSet, Posture
-from graspd.worker.simulation.environment import RISE_M, Placed
+from graspd.worker.simulation.environment import RISE_M, PlacedGrasps
 from graspd.worker.validation.model import Scene, blend
 from graspd.worker.validation.protocol import (
     MAX_PENETRATION_M,
@@ -83,7 +83,7 @@ class LiftTest:
 class Lift(Test):
     """Runs lifts of grasps in one scene with supports. Not for several threads at once."""
 
-    def __init__(self, scene: Scene, placed: Placed) -> None:
+    def __init__(self, scene: Scene, placed: PlacedGrasps) -> None:
         super().__init__(scene)
         self.placed = placed
         self._goal = np.zeros(3)

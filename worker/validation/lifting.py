@@ -19,7 +19,7 @@ from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation import environment as surroundings
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation import lift as protocol
 from graspd.worker.validation.compiled import answers, scene_of
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
@@ -62,7 +62,7 @@ def validate_lifts(
     hand: HandModel,
     obj: ObjectModel,
     grasps: GraspSet,
-    placed: Placed,
+    placed: PlacedGrasps,
     *,
     level: LiftLevel = "lift",
     hard: bool = False,
@@ -123,7 +123,7 @@ def validate_lifts(
     )
 
 
-def lift_of(grasps: GraspSet, row: int, placed: Placed, *, hard: bool) -> str:
+def lift_of(grasps: GraspSet, row: int, placed: PlacedGrasps, *, hard: bool) -> str:
     """Digest of all that a lift of one grasp depends on besides hand, object, level and fixed surroundings."""
     number = int(placed.index[row])
     around = [array[row] for array in (grasps.approach, grasps.coming) if array is not None]
@@ -132,7 +132,7 @@ def lift_of(grasps: GraspSet, row: int, placed: Placed, *, hard: bool) -> str:
     return postures_key(terms, grasps.take(slice(row, row + 1)))
 
 
-def require_ways(grasps: GraspSet, placed: Placed, level: LiftLevel) -> None:
+def require_ways(grasps: GraspSet, placed: PlacedGrasps, level: LiftLevel) -> None:
     """
     Raises:
         InputError: unknown level, or no scene or approach to lift from.
@@ -144,7 +144,7 @@ def require_ways(grasps: GraspSet, placed: Placed, level: LiftLevel) -> None:
 
 
 def lift_key(
-    hand: HandModel, obj: ObjectModel, placed: Placed, level: LiftLevel, hard: bool, *, pieces: ConvexPieces
+    hand: HandModel, obj: ObjectModel, placed: PlacedGrasps, level: LiftLevel, hard: bool, *, pieces: ConvexPieces
 ) -> str:
     """Digest of the terms of a lift: those of the six pushes, the supports, and the constants of the lift."""
     pushes = verdict_key(hand, obj, "dexgraspbench" if level == "dexgraspbench" else "standard", hard, pieces=pieces)

@@ -41,7 +41,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.contact import choose_contacts
 from graspd.worker.quality.posed import posing_of
 from graspd.worker.quality.wrench_space import EDGES, cone_edges
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.compiled import measured, scene_of
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.model import Scene
@@ -171,7 +171,7 @@ def payloads(
     grasps: GraspSet,
     *,
     pieces: ConvexPieces,
-    placed: Placed | None = None,
+    placed: PlacedGrasps | None = None,
     held: NDArray[np.bool_] | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
@@ -244,7 +244,7 @@ def limit_of(
     grasps: GraspSet,
     *,
     pieces: ConvexPieces,
-    placed: Placed | None = None,
+    placed: PlacedGrasps | None = None,
     wanted: float | None = None,
     least: int = LEAST,
     run: ExecutionContext = DEFAULT_CONTEXT,
@@ -315,7 +315,7 @@ def shake_margins(
     hand: HandModel,
     obj: ObjectModel,
     grasps: GraspSet,
-    placed: Placed,
+    placed: PlacedGrasps,
     *,
     pieces: ConvexPieces,
     held: NDArray[np.bool_] | None = None,

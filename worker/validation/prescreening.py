@@ -25,7 +25,7 @@ from graspd.worker.engines.mujoco_warnings import void
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.compiled import scene_of
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import Lift, LiftOutcome
@@ -76,7 +76,7 @@ class Frictions:
 class LiftRollout(Lift):
     """Runs short lifts of grasps in one scene. Not for several threads at once."""
 
-    def __init__(self, scenes: Frictions, placed: Placed) -> None:
+    def __init__(self, scenes: Frictions, placed: PlacedGrasps) -> None:
         super().__init__(scenes.half, placed)
         self._scenes = scenes
 
@@ -152,7 +152,9 @@ class _Shorts:
         self._scenes: Frictions | None = None
         self._lock = threading.Lock()
 
-    def _each(self, test: Callable[[Frictions], Callable[[int], _T]], count: int, placed: Placed | None) -> list[_T]:
+    def _each(
+        self, test: Callable[[Frictions], Callable[[int], _T]], count: int, placed: PlacedGrasps | None
+    ) -> list[_T]:
         """What a test says of each of `count` grasps; `test` makes one for a thread."""
         scenes = self._compiled(placed)
 
@@ -166,7 +168,7 @@ class _Shorts:
         with ThreadPoolExecutor(len(parts), thread_name_prefix="short-test") as pool:
             return [answer for part in pool.map(work, parts) for answer in part]
 
-    def _compiled(self, placed: Placed | None) -> Frictions:
+    def _compiled(self, placed: PlacedGrasps | None) -> Frictions:
         with self._lock:
             if self._scenes is None:
                 pieces = self._pieces()
@@ -181,7 +183,7 @@ class _Shorts:
 class LiftRollouts(_Shorts):
     """Short lifts of grasps in their scenes."""
 
-    def scores(self, grasps: GraspSet, placed: Placed, beat: Floats | None = None) -> Floats:
+    def scores(self, grasps: GraspSet, placed: PlacedGrasps, beat: Floats | None = None) -> Floats:
         """(N,) see `ShortLift.score`."""
         least = np.full(len(grasps), np.inf) if beat is None else beat
 
@@ -202,7 +204,7 @@ class PushRollouts(_Shorts):
 
 def push_rollout(
     hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1
-) -> Callable[[GraspSet, Placed | None, Floats], Floats]:
+) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """A trial of free grasps as `worker.planners.Wanted` takes it: (N,) scores, below 1 for grasps that hold the object
     under short pushes at half the friction, and below 2 at the whole of it.
 
@@ -214,7 +216,7 @@ def push_rollout(
     """
     pushes = PushRollouts(hand, obj, pieces, threads=threads)
 
-    def rollout(grasps: GraspSet, placed: Placed | None, beat: Floats | None = None) -> Floats:
+    def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
         return pushes.scores(grasps)
 
     return rollout

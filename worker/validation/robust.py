@@ -25,7 +25,7 @@ from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.key import Level
 from graspd.worker.validation.lifting import LiftLevel, require_ways
@@ -99,7 +99,7 @@ def robust(
     grasps: GraspSet,
     *,
     held: NDArray[np.generic] | None = None,
-    placed: Placed | None = None,
+    placed: PlacedGrasps | None = None,
     level: LiftLevel = "lift",
     models: int = ROBUST_MODELS,
     wanted: float = 0.0,

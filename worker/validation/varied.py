@@ -16,7 +16,7 @@ from graspd.service.model.transforms import Floats, compose, invert, quat_from_a
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.simulation.environment import Neighbour, Obstacle, Placed
+from graspd.worker.simulation.environment import Neighbour, Obstacle, PlacedGrasps
 from graspd.worker.validation.compiled import scene_of
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import Lift, LiftTest
@@ -60,7 +60,7 @@ class Models:
         return test.standard(self._taken(test.scene, seen(self.obj, grasps, row, variant)), 0)
 
     def lift(
-        self, grasps: GraspSet, row: int, placed: Placed, variant: Variant, *, dexgraspbench: bool = False
+        self, grasps: GraspSet, row: int, placed: PlacedGrasps, variant: Variant, *, dexgraspbench: bool = False
     ) -> LiftTest:
         """What the lift test says of a grasp in a variant; the nominal one has that of `judge_lifts` bit for bit.
 
@@ -76,7 +76,7 @@ class Models:
         one, where = seen(self.obj, grasps, row, variant), placed.take(slice(row, row + 1))
         if moves_object(variant):
             pose = compose(placed.object_pose[number], motion_of(self.obj, variant))
-            where = Placed(
+            where = PlacedGrasps(
                 placed.supports,
                 pose[None],
                 np.zeros(1, np.intp),
@@ -160,7 +160,7 @@ class VariantLift(_OneByOne, Lift):
 
     __test__ = False
 
-    def __init__(self, scene: Scene, placed: Placed, variant: Variant, lags: Floats | None) -> None:
+    def __init__(self, scene: Scene, placed: PlacedGrasps, variant: Variant, lags: Floats | None) -> None:
         super().__init__(scene, placed)
         self._weight, self._lags = variant.mass, lags
 

@@ -47,7 +47,7 @@ from graspd.service.model.metrics import indexed
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import Grasp
 from graspd.service.model.states import Stage
-from graspd.service.model.where import Flag, Joined, Node, Not, OfMetric, OfType, parsed
+from graspd.service.model.where import Connective, Flag, MetricComparison, Negation, Node, TypeComparison, parsed
 
 Metric = SortedName
 
@@ -185,7 +185,7 @@ class Tagged:
 
 
 @dataclass(frozen=True)
-class Where:
+class ExpressionCondition:
     """Grasps of which an expression is true; it is served by no index."""
 
     node: Node
@@ -198,7 +198,7 @@ class Where:
         return truth(self.node, rows.c)
 
 
-Test = Condition | Tagged | Where
+Test = Condition | Tagged | ExpressionCondition
 
 
 def conditions(where: GraspFilter | None) -> list[Test]:
@@ -220,7 +220,7 @@ def conditions(where: GraspFilter | None) -> list[Test]:
     if where.tag is not None:
         found.append(Tagged(where.tag))
     if where.where is not None:
-        found.append(Where(parsed(where.where)))
+        found.append(ExpressionCondition(parsed(where.where)))
     if where.project is not None:
         found.append(
             Condition(
@@ -394,20 +394,20 @@ def truth(node: Node, grasps: Columns) -> ColumnElement[bool]:
     Raises:
         InputError: it asks for what the index does not hold.
     """
-    if isinstance(node, Joined):
+    if isinstance(node, Connective):
         return (or_ if node.word == "or" else and_)(*(truth(part, grasps) for part in node.parts))
-    if isinstance(node, Not):
+    if isinstance(node, Negation):
         return not_(truth(node.part, grasps))
     if isinstance(node, Flag):
         if node.name not in _FLAGS:
             raise _unknown(node.name)
         # A test for truth is false of NULL.
         return _FLAGS[node.name](grasps)
-    if isinstance(node, OfMetric):
+    if isinstance(node, MetricComparison):
         if node.name not in _METRICS:
             raise _unknown(node.name)
         return _known(grasps[node.name], node.op, node.bound)
-    if isinstance(node, OfType):
+    if isinstance(node, TypeComparison):
         return _known(grasps.grasp_type, node.op, int(node.kind))
     return _OPERATORS[node.op](grasps[node.name], node.word)
 

@@ -179,7 +179,7 @@ UNFINISHED: Final = (State.QUEUED, State.RUNNING)
 
 
 @dataclass(frozen=True)
-class IndexNow:
+class IndexStatus:
     """Unfinished jobs, and what was made in the last minute."""
 
     jobs: Mapping[State, int]
@@ -190,7 +190,7 @@ class IndexNow:
     """Objects of the store that are known to be damaged or missing, counted up to `MOST_JOBS`."""
 
 
-def read_index(database: Database) -> IndexNow:
+def read_index(database: Database) -> IndexStatus:
     """Unfinished jobs up to `MOST_JOBS`, the oldest of each state, and the shards of the last minute."""
     since = datetime.now(UTC) - timedelta(seconds=RATE_WINDOW_S)
     counted, oldest = {}, {}
@@ -201,7 +201,7 @@ def read_index(database: Database) -> IndexNow:
             oldest[state] = (first and age_of(first)) or 0.0
         damaged = int(connection.scalar(count_damage()) or 0)
         made, valid = connection.execute(made_since(since)).one()
-    return IndexNow(counted, oldest, int(made or 0) / RATE_WINDOW_S, int(valid or 0) / RATE_WINDOW_S, damaged)
+    return IndexStatus(counted, oldest, int(made or 0) / RATE_WINDOW_S, int(valid or 0) / RATE_WINDOW_S, damaged)
 
 
 def count_jobs(state: State) -> Select[Any]:

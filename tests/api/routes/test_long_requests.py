@@ -10,7 +10,7 @@ import pytest
 from fastapi import FastAPI
 
 from graspd.api.routes import assets
-from graspd.api.routes.dependencies import Turns
+from graspd.api.routes.dependencies import RequestLimiter
 from graspd.service.model.errors import UnavailableError
 from tests.waiting import PATIENCE_S
 
@@ -51,7 +51,7 @@ def test_sixty_uploads_that_take_long_keep_no_other_request_waiting(
 
 def test_a_turn_that_does_not_come_in_time_is_refused() -> None:
     async def use() -> None:
-        turns = Turns(1, patience_s=0.05)
+        turns = RequestLimiter(1, patience_s=0.05)
         hold = threading.Event()
         first = asyncio.create_task(turns.run(hold.wait, PATIENCE_S))
         await asyncio.sleep(0)

@@ -22,7 +22,7 @@ from graspd.service.index.outbox import note_ends
 from graspd.service.index.rebuild import rebuild
 from graspd.service.model.webhooks import MOST_HOOKS, WAITS_S, Webhook
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.http_client import Answer
+from graspd.service.pipeline.http_client import Response
 from graspd.service.pipeline.webhook_dispatcher import AT_ONCE, SLOW_AT_ONCE, WebhookDispatcher
 from graspd.service.settings import Settings
 from tests.api.factories import add_job, finish_all
@@ -45,10 +45,10 @@ class Ear:
     def __init__(self, services: Services) -> None:
         self.services = services
         self.heard: list[tuple[str, bytes, dict[str, str]]] = []
-        self.answer = Answer(200)
+        self.answer = Response(200)
         self.dispatcher = WebhookDispatcher(services, threading.Event(), send=self.send)
 
-    def send(self, url: str, body: bytes, headers: dict[str, str], **_: Any) -> Answer:
+    def send(self, url: str, body: bytes, headers: dict[str, str], **_: Any) -> Response:
         self.heard.append((url, body, headers))
         return self.answer
 
@@ -125,7 +125,7 @@ def test_what_is_not_taken_is_tried_again_with_longer_waits_and_then_given_up(
 ) -> None:
     hook = add(http)
     end_a_job(services)
-    ear.answer = Answer(500, "answered 500")
+    ear.answer = Response(500, "answered 500")
     assert ear.round() == 1 and ear.round() == 0
     for pause in WAITS_S:
         assert ear.round(pause + 1) == 1
@@ -246,14 +246,14 @@ class Silent(Ear):
         self.let_go = threading.Event()
         self.good = threading.Event()
 
-    def send(self, url: str, body: bytes, headers: dict[str, str], **_: Any) -> Answer:
+    def send(self, url: str, body: bytes, headers: dict[str, str], **_: Any) -> Response:
         if "//dead" in url:
             self.asked.append(url)
             self.let_go.wait(60)
-            return Answer(None, "no answer in time")
+            return Response(None, "no answer in time")
         self.heard.append((url, body, headers))
         self.good.set()
-        return Answer(200)
+        return Response(200)
 
 
 @pytest.mark.parametrize(("dead", "theirs"), [(20, "a"), (20, "b"), (3 * AT_ONCE, "a")])
@@ -297,13 +297,13 @@ def test_a_burst_of_ends_is_told_without_a_pause_between_them(
 
 def test_an_address_that_failed_rests_with_all_that_waits_for_it(services: Services, ear: Ear) -> None:
     hooks(services, 1, "a", "busy")
-    ear.answer = Answer(503, "answered 503")
+    ear.answer = Response(503, "answered 503")
     for number in range(3):
         end_jobs_of(services, "a", str(number))
     assert ear.round() == 1 and ear.round() == 0
     end_jobs_of(services, "a", "new")
     assert ear.round() == 0
-    ear.answer = Answer(200)
+    ear.answer = Response(200)
     assert [ear.round(WAITS_S[0] + 1), ear.round(), ear.round(), ear.round(), ear.round()] == [1, 1, 1, 1, 0]
     assert [json.loads(body)["subject"] for _, body, _ in ear.heard] == ["a0", "a0", "a1", "a2", "anew"]
 
@@ -326,6 +326,6 @@ def test_an_address_that_may_not_be_reached_is_given_up_at_once(services: Servic
     hooks(services, 1, "a", "inside")
     end_jobs_of(services, "a", "1")
     end_jobs_of(services, "a", "2")
-    ear.answer = Answer(None, "the address is not one of the public internet", is_final=True)
+    ear.answer = Response(None, "the address is not one of the public internet", is_final=True)
     assert ear.round() == 1 and ear.round(10 * WAITS_S[-1]) == 0
     assert {one.state for one in services.index.outbox.log(f"a{0:031}")} == {"failed"}

@@ -31,7 +31,7 @@ from graspd.worker.planners.known_networks import keep_file
 from graspd.worker.planners.registry import of_this_machine
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.simulation.data import HandState
-from graspd.worker.simulation.environment import Obstacle, Placed
+from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from graspd.worker.simulation.obstacles import DeviceObstacles
 from tests.networks import random_network
 
@@ -56,9 +56,9 @@ def network(hand: HandModel) -> ProposalNetwork:
     return random_network(hand.joint_names, hand=hand.name, digest=hand.digest)
 
 
-def on_table(obj: ObjectModel, count: int, seed: int = 0) -> Placed:
+def on_table(obj: ObjectModel, count: int, seed: int = 0) -> PlacedGrasps:
     poses = rest_poses(TABLE, obj, count=2, seed=seed)["scene/object_pose"]
-    return Placed(supports_of(TABLE), poses, np.arange(count) % 2)
+    return PlacedGrasps(supports_of(TABLE), poses, np.arange(count) % 2)
 
 
 def keep(network: ProposalNetwork) -> str:
@@ -113,7 +113,7 @@ def proposing(network: ProposalNetwork, found: Proposals, anchor: np.ndarray) ->
     return replace(network, weights=weights, mean=rows, std=np.full_like(rows, 1e-4))
 
 
-def started(pair: Pair, seeds: Seeds, placed: Placed, each: int) -> tuple[HandState, np.ndarray, Probe]:
+def started(pair: Pair, seeds: Seeds, placed: PlacedGrasps, each: int) -> tuple[HandState, np.ndarray, Probe]:
     hand, obj = pair.hand.model, pair.coarse.obj.model
     obstacles = DeviceObstacles.create(hand, placed.scenes, obj.centre_of_mass, "cpu")
     model = pair.model(pair.coarse, obstacles)

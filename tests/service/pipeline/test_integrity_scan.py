@@ -11,7 +11,7 @@ from graspd.service.model import names
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.controller import Controller
 from graspd.service.pipeline.integrity import FOLDERS, MISSING, NO_MANIFEST
-from graspd.service.pipeline.integrity_scan import IntegrityScan, Interrupted, Turn
+from graspd.service.pipeline.integrity_scan import IntegrityScan, Interrupted, ReadPermit
 from graspd.service.settings import Settings
 from graspd.service.store.manifests import ShardManifest
 from graspd.service.store.store import open_store
@@ -127,21 +127,21 @@ def test_a_small_store_is_not_read_over_and_over(services: Services, shards: lis
 def test_it_makes_way_for_a_verify_and_goes_on_afterwards(services: Services, shards: list[ShardManifest]) -> None:
     stop = Slept()
     scan = IntegrityScan(services, stop, clock=stop.clock)
-    verify = Turn(services, is_controller=False)
+    verify = ReadPermit(services, is_controller=False)
     assert verify.is_mine()
     with pytest.raises(Interrupted):
         scan.advance()
-    assert not Turn(services, is_controller=False).is_mine()
-    assert not Turn(services, is_controller=True).is_mine()
+    assert not ReadPermit(services, is_controller=False).is_mine()
+    assert not ReadPermit(services, is_controller=True).is_mine()
     verify.end()
     assert scan.advance()
 
 
 def test_a_verify_takes_the_turn_from_a_controller(services: Services) -> None:
-    controller = Turn(services, is_controller=True)
+    controller = ReadPermit(services, is_controller=True)
     assert controller.is_mine()
-    assert not Turn(services, is_controller=True).is_mine()
-    assert Turn(services, is_controller=False).is_mine()
+    assert not ReadPermit(services, is_controller=True).is_mine()
+    assert ReadPermit(services, is_controller=False).is_mine()
 
 
 def test_a_second_verify_is_refused(
@@ -156,7 +156,7 @@ def test_a_second_verify_is_refused(
     other = Services(
         settings, open_store(settings.resolved_store_url), empty_index(settings.resolved_index_url), MemoryQueue()
     )
-    assert Turn(other, is_controller=False).is_mine()
+    assert ReadPermit(other, is_controller=False).is_mine()
     command = ["store", "verify", "--data-dir", str(folder)]
     refused = CliRunner().invoke(app, command)
     other.close()

@@ -11,7 +11,7 @@ from graspd.service.model.domain import JobRequest
 from graspd.service.model.planning import needed_schema
 from graspd.service.model.states import Priority, Stage
 from graspd.service.model.workers import FIRST_SCHEMA, Requirements, WorkerBeat, own_ability
-from graspd.service.pipeline.routes import Place, Routes
+from graspd.service.pipeline.routes import Route, Routes
 from graspd.service.queue import entries
 from graspd.service.queue.lists import known_lists, queue_name, queue_names
 from graspd.service.queue.rq_queue import RqQueue
@@ -36,17 +36,17 @@ NEXT = beat(revision=REVISION + 1)
 @pytest.mark.parametrize(
     ("present", "need", "place"),
     [
-        ([], NEED, Place()),
-        ([beat()], NEED, Place()),
-        ([beat(), beat(stage=Stage.SCENE, revision=1)], NEED, Place()),
-        ([beat(), NEXT], NEED, Place(apart=True)),
-        ([beat(), beat(schemas=(9, 9))], NEED, Place(apart=True)),
-        ([beat(schemas=(2, 9)), beat(schemas=(2, 2))], replace(NEED, schema=3, newest=9), Place(apart=True)),
-        ([beat(schemas=(4, 9))], replace(NEED, schema=2, newest=5), Place()),
+        ([], NEED, Route()),
+        ([beat()], NEED, Route()),
+        ([beat(), beat(stage=Stage.SCENE, revision=1)], NEED, Route()),
+        ([beat(), NEXT], NEED, Route(apart=True)),
+        ([beat(), beat(schemas=(9, 9))], NEED, Route(apart=True)),
+        ([beat(schemas=(2, 9)), beat(schemas=(2, 2))], replace(NEED, schema=3, newest=9), Route(apart=True)),
+        ([beat(schemas=(4, 9))], replace(NEED, schema=2, newest=5), Route()),
     ],
 )
 def test_a_task_goes_where_those_look_who_can_do_it(
-    present: list[WorkerBeat], need: Requirements, place: Place
+    present: list[WorkerBeat], need: Requirements, place: Route
 ) -> None:
     assert Routes(present).place(need) == place
 

@@ -30,7 +30,7 @@ from graspd.worker.hands.jaws import slides
 from graspd.worker.hands.kinematics import body_poses, generalized_forces
 from graspd.worker.hands.model import HandModel
 from graspd.worker.quality.contact import choose_contacts, finger_of_body
-from graspd.worker.quality.probe import Probe, Touch
+from graspd.worker.quality.probe import NearestPoints, Probe
 from graspd.worker.quality.wrench_space import wrenches
 
 
@@ -56,7 +56,7 @@ def pregrasp(probe: Probe, grasp: Posture) -> Posture:
     return _retreat(probe, grasp.hand_pose, _without_jams(probe, grasp.hand_pose, q, opened))
 
 
-def _leaving(probe: Probe, found: Touch, finger: NDArray[np.int32]) -> Floats:
+def _leaving(probe: Probe, found: NearestPoints, finger: NDArray[np.int32]) -> Floats:
     """(B, D) directions in which fingers leave the object; the fastest dof of each finger has about 1."""
     hand = probe.hand
     out = np.tile(-np.asarray(hand.closing, float), (len(found.bodies), 1))

@@ -15,7 +15,7 @@ from graspd.worker.planners.port import PlanRequest
 FIDELITY = FIDELITIES["draft"].model_copy(update={"name": "custom", "finalists": 2, "coarse_iterations": 30})
 
 
-def parts(count: int, threads: int = 1) -> planner.Part:
+def parts(count: int, threads: int = 1) -> planner.LaunchPart:
     """The grasps of a batch as one part."""
     hand, obj = hand_from_path("allegro"), object_from_path("block", face_error_m=1e-3)
     found = planner.optimise_batch(

@@ -22,7 +22,7 @@ from graspd.worker.planners.fast_graspd.schedule import PULL
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.scenes.rollout import lift_rollout
 from graspd.worker.simulation.data import Data, HandState
-from graspd.worker.simulation.environment import Obstacle, Placed
+from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.prescreening import SLIPS, push_rollout
 from tests.worker.models import two_finger_hand
@@ -33,7 +33,7 @@ QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2, "finalists": 2
 TABLE = (Obstacle.half_space([0, 0, 1], 0.0),)
 
 
-def plain(hand, obj, state: HandState, losses: np.ndarray, placed: Placed, *, device: str) -> GraspSet:
+def plain(hand, obj, state: HandState, losses: np.ndarray, placed: PlacedGrasps, *, device: str) -> GraspSet:
     """Grasps that remember which hand they are by their loss, and their place in the batch by their scene."""
     rows = [((0.0, 0.0, 0.0), (0.0,) * hand.dofs) for _ in losses]
     return replace(grasp_set(posture(*rows)), stability_loss=losses)
@@ -72,7 +72,7 @@ def taken(
             state, flat_rows.astype(float), worth[flat_rows].astype(float), np.isin(flat_rows, infeasible)
         )
 
-    placed = Placed(TABLE, np.tile([0, 0, 0, 1.0, 0, 0, 0], (n, 1)), np.arange(n))
+    placed = PlacedGrasps(TABLE, np.tile([0, 0, 0, 1.0, 0, 0, 0], (n, 1)), np.arange(n))
     found = candidates.tried(two_finger_hand(), ball(), np.arange(n * each).reshape(n, each), seat, placed, rollout)
     rows = found.joined().stability_loss.astype(int).tolist()
     assert found.state.pivot[:, 0].tolist() == found.losses.tolist() == rows
@@ -129,7 +129,7 @@ def scene():
     return (
         hand,
         obj,
-        Placed(supports_of(spec), rest_poses(spec, obj, count=2, seed=1)["scene/object_pose"], np.arange(4) % 2),
+        PlacedGrasps(supports_of(spec), rest_poses(spec, obj, count=2, seed=1)["scene/object_pose"], np.arange(4) % 2),
     )
 
 
@@ -253,7 +253,7 @@ def test_a_grasp_that_nobody_holds_sets_out_as_often_as_it_may_and_the_least_bad
     hand, obj, wanted, _ = free
     scores: list[float] = []
 
-    def never(grasps: GraspSet, placed: Placed | None, beat: np.ndarray) -> np.ndarray:
+    def never(grasps: GraspSet, placed: PlacedGrasps | None, beat: np.ndarray) -> np.ndarray:
         assert placed is None
         scores.extend(9.0 - 0.1 * (len(scores) + np.arange(len(grasps))))
         return np.array(scores[-len(grasps) :])
@@ -317,7 +317,7 @@ def test_hands_are_drawn_to_a_free_object_when_they_first_set_out_and_not_again(
 def test_attempts_made_ahead_give_the_grasps_of_one_after_the_other(free, monkeypatch: pytest.MonkeyPatch) -> None:
     hand, obj, wanted, _ = free
 
-    def picky(grasps: GraspSet, placed: Placed | None, _: object = None) -> np.ndarray:
+    def picky(grasps: GraspSet, placed: PlacedGrasps | None, _: object = None) -> np.ndarray:
         """Takes two fifths of the hands, by where they are."""
         assert placed is None
         chance = np.modf(np.abs(grasps.grasp.hand_pose[:, 0]) * 1e4)[0]

@@ -18,7 +18,7 @@ from graspd.worker.planners import BatchRequest, PlanRequest, synthesize
 from graspd.worker.planners.fast_graspd import planner
 from graspd.worker.planners.fast_graspd.planner import plan_joined
 from graspd.worker.scenes.kinds import rest_poses, supports_of
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 
 QUICK = resolve_fidelity("draft").model_copy(
     update={"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2}
@@ -75,9 +75,9 @@ def test_a_launch_for_which_memory_does_not_suffice_is_halved_across_batches(
         assert_same(one, other)
 
 
-def on_table(obj, count: int, seed: int) -> Placed:
+def on_table(obj, count: int, seed: int) -> PlacedGrasps:
     poses = rest_poses(TABLE, obj, count=2, seed=seed)["scene/object_pose"]
-    return Placed(supports_of(TABLE), poses, np.arange(count) % 2)
+    return PlacedGrasps(supports_of(TABLE), poses, np.arange(count) % 2)
 
 
 def good_enough(grasps: GraspSet, *_: object) -> np.ndarray:

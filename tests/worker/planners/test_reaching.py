@@ -16,7 +16,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.planners.fast_graspd.pairs import pair_of
-from graspd.worker.planners.fast_graspd.reaching import Reaching
+from graspd.worker.planners.fast_graspd.reaching import ReachSampling
 from graspd.worker.planners.fast_graspd.starts import CLEAR, RETREATS, clear_starts, start_generator
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.model import Model
@@ -59,7 +59,7 @@ def test_every_second_start_has_fingers_on_both_sides_of_a_wide_box(model: Model
 
 
 def test_a_start_does_not_depend_on_those_drawn_beside_it(model: Model) -> None:
-    reaching = Reaching.of(model)
+    reaching = ReachSampling.of(model)
     assert reaching is not None
     seeds, first = np.array([5, 6, 7], np.int32), np.zeros(3, np.int32)
     together, numbers = reaching.starts(seeds, first, np.array(RETREATS))
@@ -71,7 +71,7 @@ def test_a_start_does_not_depend_on_those_drawn_beside_it(model: Model) -> None:
 
 
 def test_draws_go_on_where_the_last_one_ended(model: Model) -> None:
-    reaching = Reaching.of(model)
+    reaching = ReachSampling.of(model)
     assert reaching is not None
     seeds, retreats = np.arange(8, dtype=np.int32), np.array(RETREATS)
     found, number = reaching.starts(seeds, np.zeros(8, np.int32), retreats)
@@ -87,7 +87,7 @@ def test_draws_go_on_where_the_last_one_ended(model: Model) -> None:
 
 def test_what_is_too_wide_all_over_is_looked_at_only() -> None:
     wide = model_of((0.25, 0.25, 0.25))
-    assert Reaching.of(wide) is None
+    assert ReachSampling.of(wide) is None
     looking, _ = starts_of(wide, 2, 2)
     alone = [start_generator(3, 0, i, k) for i in range(2) for k in range(2)]
     np.testing.assert_array_equal(looking.pivot, clear_starts(wide, alone)[0].pivot)
@@ -106,7 +106,7 @@ def test_cubes_too_small_or_too_wide_for_pads_are_held_by_other_parts(side: floa
 @pytest.mark.parametrize("side", [0.01, 0.2])
 def test_all_starts_reach_around_what_pads_cannot_hold(side: float) -> None:
     model = model_of((side, side, side))
-    reaching = Reaching.of(model)
+    reaching = ReachSampling.of(model)
     assert reaching is not None
     assert reaching.only
     _, depth = starts_of(model, 16, 2)

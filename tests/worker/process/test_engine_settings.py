@@ -11,13 +11,13 @@ from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
 from graspd.worker.engines.devices import Device
 from graspd.worker.process import engine
-from graspd.worker.process.engine import Surroundings
+from graspd.worker.process.engine import TaskResources
 from tests.worker.pool import works
 
 
-def of(folder: Path, processes: int) -> Surroundings:
+def of(folder: Path, processes: int) -> TaskResources:
     settings = Settings(data_dir=folder, processes=processes)  # type: ignore[call-arg]
-    return Surroundings(settings, open_store("memory://"), Device("cpu"))
+    return TaskResources(settings, open_store("memory://"), Device("cpu"))
 
 
 def test_tasks_that_make_grasps_share_the_processes_of_their_worker(

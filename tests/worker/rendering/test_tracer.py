@@ -15,7 +15,7 @@ from newton.sensors import SensorCamera
 from graspd.service.model.transforms import pose_from_matrix, quat_from_axis_angle, quat_rotate
 from graspd.worker.rendering.cameras import intrinsics, look_at
 from graspd.worker.rendering.kernels import rays, shading
-from graspd.worker.rendering.scenery import Box, Lamp, Look, Shot, Solid
+from graspd.worker.rendering.scenery import Appearance, Box, CameraShot, Lamp, Solid
 from graspd.worker.rendering.tracer import Tracer
 
 WIDTH, HEIGHT = 96, 72
@@ -37,10 +37,10 @@ SOLIDS = [
     solid(trimesh.creation.annulus(r_min=0.03, r_max=0.05, height=0.08)),
 ]
 LOOKS = [
-    Look((0.5, 0.4, 0.3), (0.3, 0.2, 0.1), shading.TILES, 2.0, roughness=0.4),
-    Look((0.5, 0.5, 0.5), (0.2, 0.2, 0.2), shading.SPECKLE, 1.0, roughness=0.6),
-    Look((0.8, 0.2, 0.1), roughness=0.3),
-    Look((0.2, 0.3, 0.8), roughness=0.5, metalness=0.8),
+    Appearance((0.5, 0.4, 0.3), (0.3, 0.2, 0.1), shading.TILES, 2.0, roughness=0.4),
+    Appearance((0.5, 0.5, 0.5), (0.2, 0.2, 0.2), shading.SPECKLE, 1.0, roughness=0.6),
+    Appearance((0.8, 0.2, 0.1), roughness=0.3),
+    Appearance((0.2, 0.3, 0.8), roughness=0.5, metalness=0.8),
 ]
 
 
@@ -62,11 +62,11 @@ def poses() -> np.ndarray:
     return poses
 
 
-def shot(**changes: Any) -> Shot:
+def shot(**changes: Any) -> CameraShot:
     """Two cameras a world."""
     eyes = [(0.5, -0.3, 0.4), (-0.2, -0.6, 0.25)]
     cameras = np.stack([look_at(np.array(eye), np.array([0.0, 0.0, 0.05])) for eye in eyes])
-    made = Shot(
+    made = CameraShot(
         world=np.repeat(np.arange(WORLDS, dtype=np.int32), 2),
         extrinsics=np.concatenate([cameras] * WORLDS),
         intrinsics=intrinsics(WIDTH, HEIGHT),
@@ -81,15 +81,15 @@ def shot(**changes: Any) -> Shot:
     return replace(made, **changes)
 
 
-def traced(solids: list[Solid | Box], poses: np.ndarray, what: Shot) -> Any:
+def traced(solids: list[Solid | Box], poses: np.ndarray, what: CameraShot) -> Any:
     tracer = Tracer(solids, "cpu")
-    tracer.place(poses, [[*LOOKS, *[Look((1.0, 1.0, 1.0))] * (len(solids) - len(LOOKS))]] * len(poses))
+    tracer.place(poses, [[*LOOKS, *[Appearance((1.0, 1.0, 1.0))] * (len(solids) - len(LOOKS))]] * len(poses))
     return tracer.shoot(what)
 
 
 @wp.kernel(enable_backward=False)
 def _in_the_way(
-    placed_in: wp.array2d[rays.Placed],
+    placed_in: wp.array2d[rays.PlacedSolid],
     world_in: wp.array[wp.int32],
     point_in: wp.array[wp.vec3f],
     toward: wp.vec3f,
@@ -99,7 +99,7 @@ def _in_the_way(
     shadowed_out[i] = wp.int32(rays.in_the_way(placed_in, world_in[i], point_in[i], toward))
 
 
-def by_newton(poses: np.ndarray, what: Shot) -> dict[str, np.ndarray]:
+def by_newton(poses: np.ndarray, what: CameraShot) -> dict[str, np.ndarray]:
     """Shapes, depth, normals and whether the lamp's centre is seen, by Newton's camera sensor."""
     builder = newton.ModelBuilder()
     config = newton.ModelBuilder.ShapeConfig(has_shape_collision=False, has_particle_collision=False, density=0.0)
@@ -239,7 +239,7 @@ def test_turning_worlds_is_turning_the_lamp_the_other_way(poses: np.ndarray) -> 
 
 
 def test_a_pixel_on_an_outline_has_the_colours_of_both_sides() -> None:
-    red, green = Look((0.6, 0.0, 0.0), roughness=1.0), Look((0.0, 0.6, 0.0), roughness=1.0)
+    red, green = Appearance((0.6, 0.0, 0.0), roughness=1.0), Appearance((0.0, 0.6, 0.0), roughness=1.0)
     poses = np.array([[[0, 0, -0.05, 1, 0, 0, 0], [0, 0, 0.05, 1, 0, 0, 0.0]]])
     tracer = Tracer([FLOOR, SOLIDS[2]], "cpu")
     tracer.place(poses, [[red, green]])
@@ -269,7 +269,7 @@ def test_a_mesh_is_not_seen_from_inside() -> None:
 
 def test_lines_of_tiles_that_are_thinner_than_a_pixel_darken_it_a_little() -> None:
     tracer = Tracer([FLOOR], "cpu")
-    tracer.place(np.array([[[0, 0, -0.05, 1, 0, 0, 0.0]]]), [[Look((0.8,) * 3, (0.0,) * 3, shading.TILES, 2.0)]])
+    tracer.place(np.array([[[0, 0, -0.05, 1, 0, 0, 0.0]]]), [[Appearance((0.8,) * 3, (0.0,) * 3, shading.TILES, 2.0)]])
     camera = look_at(np.array([1.5, -1.0, 2.0]), np.zeros(3))
     one = shot(world=np.zeros(1, np.int32), extrinsics=camera[None], turn=np.zeros(1), lamps=[Lamp()], samples=12)
     seen = tracer.shoot(one)

@@ -22,7 +22,7 @@ from graspd.worker.planners.port import PlanRequest
 from graspd.worker.scenes.clearance import MARGIN_M, approach
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.scenes.trajectory import plan_way
-from graspd.worker.simulation.environment import STANDOFF_M, Obstacle, Placed
+from graspd.worker.simulation.environment import STANDOFF_M, Obstacle, PlacedGrasps
 from tests.worker.simulation.test_surroundings import mujoco_distances, mujoco_room, parted
 
 #: What a draft's finish may lack of a distance that it aims at exactly [m].
@@ -35,7 +35,9 @@ def planned():
     hand = hand_from_path("barrett")
     obj = object_from_path("block", face_error_m=QUICK.face_error_m)
     spec = SceneSpec(kind="table")
-    placed = Placed(supports_of(spec), rest_poses(spec, obj, count=2, seed=1)["scene/object_pose"], np.arange(8) % 2)
+    placed = PlacedGrasps(
+        supports_of(spec), rest_poses(spec, obj, count=2, seed=1)["scene/object_pose"], np.arange(8) % 2
+    )
     return hand, obj, placed, synthesize(hand, obj, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=placed))
 
 
@@ -55,7 +57,7 @@ def test_fingertips_keep_what_the_scene_says_and_no_less() -> None:
     supports = tuple(replace(one, tips_m=-0.001) for one in supports_of(SceneSpec(kind="table")))
     # A thin slice of the block sticks out of the table: what holds it must reach down to there.
     sunk = np.array([[0, 0, float(-obj.vertices[:, 2].max()) + 0.012, 1, 0, 0, 0]])
-    placed = Placed(supports, sunk, np.zeros(12, int))
+    placed = PlacedGrasps(supports, sunk, np.zeros(12, int))
     found = synthesize(hand, obj, PlanRequest(count=12, fidelity=QUICK, seed=4, placed=placed)).grasp
     tips, rest = parted(hand)
     table = placed.scenes[0].obstacles[0]
@@ -88,14 +90,14 @@ def test_the_whole_way_is_as_clear_as_it_says(planned) -> None:
 
 def test_a_grasp_does_not_depend_on_the_scenes_of_the_others(planned) -> None:
     hand, obj, placed, grasps = planned
-    alone = Placed(placed.supports, placed.object_pose, placed.index[:3])
+    alone = PlacedGrasps(placed.supports, placed.object_pose, placed.index[:3])
     found = synthesize(hand, obj, PlanRequest(count=3, fidelity=QUICK, seed=4, placed=alone))
     assert np.array_equal(found.grasp.hand_pose, grasps.grasp.hand_pose[:3])
 
 
 def test_a_scene_without_obstacles_leaves_the_hand_free_to_come_from_below() -> None:
     hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
-    nothing = Placed((), np.array([[0, 0, 0, 1.0, 0, 0, 0]]), np.zeros(8, int))
+    nothing = PlacedGrasps((), np.array([[0, 0, 0, 1.0, 0, 0, 0]]), np.zeros(8, int))
     found = synthesize(hand, obj, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=nothing))
     below = Obstacle.half_space([0, 0, 1], -0.03)
     assert (mujoco_distances(hand, found.grasp, below) < 0).any()

@@ -8,7 +8,7 @@ import pytest
 from graspd.worker.grasps import joined
 from graspd.worker.scenes import rollout as rollouts
 from graspd.worker.scenes.rollout import BEST, FALLS, TOUCHES, hold_rollout, lift_rollout
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.lift import Lift
 from graspd.worker.validation.lifting import KnownLifts, validate_lifts
 from graspd.worker.validation.prescreening import SLIPS, LiftRollouts
@@ -19,7 +19,7 @@ from tests.worker.validation.test_prescreening import LEAST
 
 SQUEEZES = (-0.005, 1.3 * LEAST, 4 * LEAST)
 MANY = joined([grasp(squeeze) for squeeze in SQUEEZES])
-WHERE = Placed(PLACED.supports, PLACED.object_pose, np.zeros(3, int))
+WHERE = PlacedGrasps(PLACED.supports, PLACED.object_pose, np.zeros(3, int))
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_a_lift_of_anything_else_is_not_known(lifts: list[int], other: str) -> N
     if other == "squeeze":
         grasps = joined([grasp(squeeze + 1e-6) for squeeze in SQUEEZES])
     if other == "scene":
-        where = Placed(PLACED.supports, PLACED.object_pose + np.array([1e-6, 0, 0, 0, 0, 0, 0]), WHERE.index)
+        where = PlacedGrasps(PLACED.supports, PLACED.object_pose + np.array([1e-6, 0, 0, 0, 0, 0, 0]), WHERE.index)
     validate_lifts(HAND, BOX, grasps, where, pieces=WHOLE, hard=other == "friction", known=known)
     assert len(lifts) == 6
 
@@ -62,7 +62,10 @@ def rollout_of(monkeypatch: pytest.MonkeyPatch, scores: list[float], outcomes: d
     """Scores of grasps that the short lift gives `scores`, and the lift test `outcomes` at half the friction (True) and
     at the whole of it."""
     count = len(scores)
-    grasps, where = MANY.take(np.zeros(count, int)), Placed(WHERE.supports, WHERE.object_pose, np.zeros(count, int))
+    grasps, where = (
+        MANY.take(np.zeros(count, int)),
+        PlacedGrasps(WHERE.supports, WHERE.object_pose, np.zeros(count, int)),
+    )
     grasps.stability_loss = np.arange(count, dtype=float)
 
     def validated(hand, obj, some, placed, *, hard=False, **_):

@@ -79,7 +79,7 @@ def forbid_the_host(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return broken
 
 
-def planned() -> planner.Part:
+def planned() -> planner.LaunchPart:
     box = object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.08)))
     (part,) = planner.optimise_batch(
         two_finger_hand(), box, PlanRequest(2, FIDELITY, seed=3), ExecutionContext("cpu", threads=1)

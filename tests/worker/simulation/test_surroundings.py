@@ -14,7 +14,7 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
-from graspd.worker.simulation.environment import CLEAR_M, Environment, Obstacle, Placed
+from graspd.worker.simulation.environment import CLEAR_M, Environment, Obstacle, PlacedGrasps
 from graspd.worker.simulation.obstacles import (
     PosedFeatures,
     body_distances,
@@ -55,7 +55,7 @@ def test_an_obstacle_seen_from_a_frame_has_the_same_distances_there() -> None:
 
 
 def test_up_is_against_gravity_in_the_object_frame() -> None:
-    placed = Placed((Obstacle.half_space([0, 0, 1], 0),), TILTED[None], np.zeros(1, int))
+    placed = PlacedGrasps((Obstacle.half_space([0, 0, 1], 0),), TILTED[None], np.zeros(1, int))
     np.testing.assert_allclose(quat_rotate(TILTED[3:], placed.scenes[0].up), [0, 0, 1], atol=1e-12)
 
 

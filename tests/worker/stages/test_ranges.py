@@ -24,7 +24,7 @@ from graspd.service.store.shards import Shard
 from graspd.service.store.store import Store, open_store
 from graspd.worker import generation
 from graspd.worker.execution_context import ExecutionContext
-from graspd.worker.planners import NoPlace
+from graspd.worker.planners import NoStartFound
 from graspd.worker.process.runner import Runner
 from graspd.worker.stages import scene, synthesize
 from graspd.worker.stages.context import StopReason, TaskContext
@@ -159,7 +159,7 @@ def test_a_batch_whose_scenes_leave_no_place_has_no_grasps_but_for_the_first_of_
 
     def some(*given: Any, batch: int, **options: Any) -> Any:
         if batch in refused:
-            raise NoPlace("no hand finds a way in")
+            raise NoStartFound("no hand finds a way in")
         return whole(*given, batch=batch, **options)
 
     monkeypatch.setattr("graspd.worker.together.certified_grasps", some)

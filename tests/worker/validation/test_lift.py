@@ -11,7 +11,7 @@ import trimesh
 from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import quat_multiply, quat_rotate
 from graspd.worker.grasps import GraspSet, Posture
-from graspd.worker.simulation.environment import Neighbour, Obstacle, Placed
+from graspd.worker.simulation.environment import Neighbour, Obstacle, PlacedGrasps
 from graspd.worker.simulation.obstacles import obstacle_distances
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import RISING, RISING_S, Lift, LiftOutcome
@@ -25,7 +25,9 @@ HAND = pad_hand()
 BOX = object_from_mesh(trimesh.creation.box((2 * HALF, 0.04, HEIGHT)))
 WHOLE = ConvexPieces((BOX.hull_vertices,), 1.0, 0.0, "box")
 #: The hand's base is at -z of the object: the box stands on its head, so that the hand comes from above.
-PLACED = Placed((Obstacle.half_space([0, 0, 1], 0.0),), np.array([[0, 0, HEIGHT / 2, 0, 1, 0, 0.0]]), np.zeros(1, int))
+PLACED = PlacedGrasps(
+    (Obstacle.half_space([0, 0, 1], 0.0),), np.array([[0, 0, HEIGHT / 2, 0, 1, 0, 0.0]]), np.zeros(1, int)
+)
 #: Joint value at which the pads touch.
 TOUCH = 0.065
 
@@ -94,7 +96,7 @@ def test_a_hand_that_comes_from_below_has_touched_the_table() -> None:
 @pytest.mark.parametrize(("tips_m", "touched"), [(None, True), (0.0, True), (-0.0005, True), (-0.001, False)])
 def test_fingertips_press_into_the_table_as_deep_as_it_says_and_no_deeper(tips_m: float | None, touched: bool) -> None:
     """A way that ends with the pads 0.8 mm in the table."""
-    placed = Placed((dataclasses.replace(PLACED.supports[0], tips_m=tips_m),), PLACED.object_pose, PLACED.index)
+    placed = PlacedGrasps((dataclasses.replace(PLACED.supports[0], tips_m=tips_m),), PLACED.object_pose, PLACED.index)
     given = grasp(0.05)
     down = obstacle_distances(HAND, given.grasp, placed.scenes[0])[0] + 0.0008
     assert given.approach is not None
@@ -121,7 +123,7 @@ def test_a_box_whose_mesh_has_its_origin_elsewhere_stands_still_and_is_lifted_al
     )
     pose = PLACED.object_pose.copy()
     pose[:, :3] -= quat_rotate(pose[:, 3:], away)
-    placed = Placed(PLACED.supports, pose, PLACED.index)
+    placed = PlacedGrasps(PLACED.supports, pose, PLACED.index)
     scene = build(HAND, box, ConvexPieces((box.hull_vertices,), 1.0, 0.0, "box"), MujocoOptions(), placed.supports)
     test, given = Lift(scene, placed), grasp(0.05)
     for part in (given.grasp, given.pregrasp, given.squeeze, given.lift):

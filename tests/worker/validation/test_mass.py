@@ -19,7 +19,7 @@ from graspd.service.store.shards import read_shard
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.objects.options import as_asked
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.simulation.environment import Obstacle, Placed
+from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.key import verdict_key
 from graspd.worker.validation.lifting import validate_lifts
@@ -35,7 +35,7 @@ TORQUE = 0.2
 HAND = replace(two_finger_hand(), effort=np.full(2, TORQUE))
 #: The object's y is up: friction alone holds it.
 UPRIGHT = np.array([[0.0, 0.0, 0.03, np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]])
-TABLE = Placed((Obstacle.half_space((0, 0, 1), 0.0),), UPRIGHT, np.zeros(1, np.intp))
+TABLE = PlacedGrasps((Obstacle.half_space((0, 0, 1), 0.0),), UPRIGHT, np.zeros(1, np.intp))
 
 
 def pinch() -> GraspSet:

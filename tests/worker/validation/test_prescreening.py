@@ -7,7 +7,7 @@ import pytest
 
 from graspd.service.model.matter import ACCELERATION
 from graspd.worker.grasps import GraspSet, joined
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.prescreening import (
     DEEP,
     GONE,
@@ -31,7 +31,7 @@ LEAST_AT_HALF = 2 * HANGS * NEWTON
 
 
 def scores(*squeezes: float, threads: int = 1) -> np.ndarray:
-    placed = Placed(PLACED.supports, PLACED.object_pose, np.zeros(len(squeezes), int))
+    placed = PlacedGrasps(PLACED.supports, PLACED.object_pose, np.zeros(len(squeezes), int))
     grasps: GraspSet = joined([grasp(squeeze) for squeeze in squeezes])
     return LiftRollouts(HAND, BOX, lambda: WHOLE, threads=threads).scores(grasps, placed)
 
@@ -57,7 +57,7 @@ def test_what_holds_at_half_the_friction_needs_twice_the_squeeze_for_its_pull() 
 
 
 def test_what_must_hold_at_half_the_friction_to_be_better_is_not_asked_of_the_whole() -> None:
-    placed = Placed(PLACED.supports, PLACED.object_pose, np.zeros(3, int))
+    placed = PlacedGrasps(PLACED.supports, PLACED.object_pose, np.zeros(3, int))
     grasps = joined([grasp(squeeze) for squeeze in (1.1 * LEAST, 2.4 * LEAST, 1.1 * LEAST)])
     found = LiftRollouts(HAND, BOX, lambda: WHOLE).scores(grasps, placed, np.array([1.5, 1.5, np.inf]))
     assert found[0] == 1.5
@@ -68,7 +68,7 @@ def test_what_must_hold_at_half_the_friction_to_be_better_is_not_asked_of_the_wh
 def test_pads_that_start_in_the_box_are_no_candidates() -> None:
     deep = grasp(0.05)
     deep.pregrasp.joint_positions[:] += 0.02
-    placed = Placed(PLACED.supports, PLACED.object_pose, np.zeros(1, int))
+    placed = PlacedGrasps(PLACED.supports, PLACED.object_pose, np.zeros(1, int))
     assert LiftRollouts(HAND, BOX, lambda: WHOLE).scores(deep, placed) == [DEEP]
 
 

@@ -11,7 +11,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.metrics import Axis
 from graspd.service.model.transforms import quat_from_axis_angle, quat_rotate
 from graspd.worker.grasps import GraspSet, joined
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.lift import LiftOutcome, LiftTest
 from graspd.worker.validation.lifting import validate_lifts
 from graspd.worker.validation.model import FRICTION, HARD, MujocoOptions
@@ -34,7 +34,7 @@ def models(friction: tuple[float, float] = FRICTION) -> Models:
 def by_luck(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lifts that succeed as a coin falls that follows from the grasp and the variant."""
 
-    def lift(self: Models, grasps: GraspSet, row: int, placed: Placed, variant: Variant, **_: object) -> LiftTest:
+    def lift(self: Models, grasps: GraspSet, row: int, placed: PlacedGrasps, variant: Variant, **_: object) -> LiftTest:
         words = np.frombuffer(repr((variant, grasps.squeeze.joint_positions[row].tolist())).encode(), np.uint8)
         lifted = np.random.default_rng(words.tolist()).random() < 0.7
         return LiftTest(LiftOutcome.LIFTED if lifted else LiftOutcome.NOT_LIFTED)

@@ -183,7 +183,7 @@ def room_beside(pairs: Crossings, scene: Environment, width: float) -> Floats:
 
 
 @dataclass(frozen=True)
-class Reaches:
+class AntipodalHands:
     """n hands that reach across the object."""
 
     known: Oppositions
@@ -212,7 +212,7 @@ class Reaches:
         return np.linalg.norm(off - np.minimum(along, 0.0)[..., None] * away, axis=-1)
 
 
-def across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, ways: Floats) -> Reaches:
+def across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, ways: Floats) -> AntipodalHands:
     """Hands that reach across the object.
 
     Args:
@@ -242,7 +242,7 @@ def across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats
     # Between holding with the fingertips and with the palm against the object.
     deep = np.maximum(np.einsum("ni,ni->n", reach, palm), 0.0) * uniform[:, 5]
     pivot = opening.pairs.middle[pair] - np.einsum("nij,nj->ni", turn, reach) - deep[:, None] * away
-    return Reaches(known, posture, pivot - obj.centre_of_mass, turn, away, deep)
+    return AntipodalHands(known, posture, pivot - obj.centre_of_mass, turn, away, deep)
 
 
 def promising(

@@ -20,8 +20,8 @@ from graspd.worker.planners.fast_graspd.scene_starts import free_ways
 from graspd.worker.planners.fast_graspd.schedule import WarmStart, in_scene, with_rollout
 from graspd.worker.planners.fast_graspd.starts import start_generator
 from graspd.worker.planners.port import BatchRequest
-from graspd.worker.planners.threads import Steps
-from graspd.worker.simulation.environment import Placed, placed_together
+from graspd.worker.planners.threads import StepCounter
+from graspd.worker.simulation.environment import PlacedGrasps, placed_together
 
 Rows = NDArray[np.intp]
 
@@ -47,15 +47,15 @@ class Batches:
         """(n,) whether hands of a row set out more open than their pre-shape: in that they had no place."""
         self.errors: dict[int, Exception] = {}
         """What became of the batches that are out."""
-        self._steps = [Steps(one.wanted.count * (hands(self.fidelity) + 1), one.run) for one in asked]
+        self._steps = [StepCounter(one.wanted.count * (hands(self.fidelity) + 1), one.run) for one in asked]
         placed = [one.placed for one in wanted if one.placed is not None]
-        self.placed: Placed | None = placed_together(placed) if placed else None
+        self.placed: PlacedGrasps | None = placed_together(placed) if placed else None
         self.ways: list[Floats] = []
         """Free ways of each scene."""
         for owner, scenes in enumerate(placed):
             self._find_ways(owner, scenes, obj)
 
-    def _find_ways(self, owner: int, scenes: Placed, obj: ObjectModel) -> None:
+    def _find_ways(self, owner: int, scenes: PlacedGrasps, obj: ObjectModel) -> None:
         try:
             # Whole or not at all: those of a scene are found by its number.
             self.ways += [free_ways(scene, obj) for scene in scenes.scenes]

@@ -15,7 +15,7 @@ from graspd.worker.grasps import GraspSet, Posture, joined
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.data import HandState
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 
 #: Hands of each grasp that are seated and tried before the next are: seating costs half of a trial.
 TOGETHER: Final = 2
@@ -33,7 +33,13 @@ HOPELESS: Final = 1e9
 
 
 def with_postures(
-    hand: HandModel, obj: ObjectModel, state: HandState, losses: Floats, placed: Placed | None, *, device: str = "cpu"
+    hand: HandModel,
+    obj: ObjectModel,
+    state: HandState,
+    losses: Floats,
+    placed: PlacedGrasps | None,
+    *,
+    device: str = "cpu",
 ) -> GraspSet:
     """Hands (n) as grasps with the postures around them, found on a device."""
     grasp = posture_of(hand, obj, state)
@@ -88,7 +94,7 @@ def tried(
     obj: ObjectModel,
     order: NDArray[np.intp],
     seat: Seat,
-    placed: Placed | None,
+    placed: PlacedGrasps | None,
     rollout: RolloutOf,
     *,
     together: int = TOGETHER,

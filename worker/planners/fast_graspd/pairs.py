@@ -36,7 +36,7 @@ KEPT: Final = 4
 
 
 @dataclass(frozen=True)
-class Side:
+class PhaseGeometry:
     """How finely a phase sees the hand and the object."""
 
     points: SurfacePoints
@@ -49,12 +49,12 @@ class Side:
 class Pair:
     """A hand and an object on a device, as each phase sees them."""
 
-    coarse: Side
-    fine: Side
+    coarse: PhaseGeometry
+    fine: PhaseGeometry
     options: LossOptions
     hand: DeviceHand
 
-    def model(self, side: Side, obstacles: DeviceObstacles | None = None, *, pulled: bool = True) -> Model:
+    def model(self, side: PhaseGeometry, obstacles: DeviceObstacles | None = None, *, pulled: bool = True) -> Model:
         """The hand and the object as a phase sees them. Among obstacles points are not pulled: fingers that could be
         drawn around the object are kept off the table."""
         options = self.options if obstacles is None and pulled else replace(self.options, pull=0.0)
@@ -83,12 +83,12 @@ def pair_of(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str, 
         samples = object_samples(obj, count)
         whole = DeviceObject.create(obj, device, samples=samples, phong_alpha=fidelity.phong_alpha, cell=FIELD_CELL)
         pair = Pair(
-            coarse=Side(
+            coarse=PhaseGeometry(
                 points=sample_surface(hand, fidelity.coarse_points),
                 own=sample_surface(hand, COARSE_SELF_POINTS),
                 obj=whole.thinned(COARSE_SAMPLES),
             ),
-            fine=Side(
+            fine=PhaseGeometry(
                 points=sample_surface(hand, fidelity.fine_points),
                 own=sample_surface(hand, FINE_SELF_POINTS),
                 obj=whole,

@@ -47,7 +47,7 @@ from graspd.worker.planners.port import BatchRequest, Method, PlanRequest
 from graspd.worker.planners.threads import cut, run_parts
 from graspd.worker.quality.gate import MAX_PENETRATION_MM, MIN_CONTACT_LINKS
 from graspd.worker.simulation.data import Data, HandState
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.obstacles import DeviceObstacles
@@ -78,7 +78,7 @@ AHEAD: Final = 4
 
 
 @dataclass
-class Part:
+class LaunchPart:
     """Grasps of a launch, worked on by one thread."""
 
     rows: Rows
@@ -99,14 +99,14 @@ class Part:
         if len(self.attempts) != len(self.rows):
             self.attempts = np.ones(len(self.rows), int)
 
-    def take(self, which: NDArray[np.intp]) -> Part:
+    def take(self, which: NDArray[np.intp]) -> LaunchPart:
         """Some of the grasps."""
         grasps = None if self.grasps is None else self.grasps.take(which)
         curve = [one[which] for one in self.curve]
         parts = (self.rows[which], self.state[which], self.loss[which], self.merit[which], curve, grasps)
-        return Part(*parts, self.attempts[which])
+        return LaunchPart(*parts, self.attempts[which])
 
-    def followed_by(self, other: Part) -> Part:
+    def followed_by(self, other: LaunchPart) -> LaunchPart:
         """All grasps of both."""
         curve = [np.concatenate(both) for both in zip(self.curve, other.curve, strict=True)]
         both = [part.grasps for part in (self, other) if part.grasps is not None]
@@ -115,7 +115,7 @@ class Part:
             for name in ("rows", "loss", "merit", "attempts")
         )
         state = _joined_states([self.state, other.state])
-        return Part(rows, state, loss, merit, curve, joined(both) if both else None, attempts)
+        return LaunchPart(rows, state, loss, merit, curve, joined(both) if both else None, attempts)
 
 
 def plan(
@@ -157,12 +157,12 @@ def _pair(hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: Execution
     return pair_of(hand, obj, wanted.fidelity, run.device, in_scenes=wanted.placed is not None)
 
 
-def optimise_batch(hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> list[Part]:
+def optimise_batch(hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> list[LaunchPart]:
     """Starts, optimisation and projection of a batch, without the postures around each grasp."""
     return optimise_pair(_pair(hand, obj, wanted, run), wanted, run)
 
 
-def optimise_pair(pair: Pair, wanted: PlanRequest, run: ExecutionContext) -> list[Part]:
+def optimise_pair(pair: Pair, wanted: PlanRequest, run: ExecutionContext) -> list[LaunchPart]:
     """The same for a pair that is on `run.device` already, and need not be as the fidelity would make it."""
     batches = Batches([BatchRequest(wanted, run)], pair.fine.obj.model)
     parts = optimise(pair, batches, run)
@@ -170,7 +170,7 @@ def optimise_pair(pair: Pair, wanted: PlanRequest, run: ExecutionContext) -> lis
     return parts
 
 
-def optimise(pair: Pair, batches: Batches, run: ExecutionContext, *, postures: bool = False) -> list[Part]:
+def optimise(pair: Pair, batches: Batches, run: ExecutionContext, *, postures: bool = False) -> list[LaunchPart]:
     """The same for several batches: the parts of those that are not out in the end, and perhaps of others; with the
     `postures` around grasps, if they are wanted.
 
@@ -182,15 +182,15 @@ def optimise(pair: Pair, batches: Batches, run: ExecutionContext, *, postures: b
     rows = _with_place(launch, begun)
     begun = begun.take(np.flatnonzero(np.isin(begun.rows, rows)), batches.fidelity.starts)
 
-    def work(which: range) -> Part:
+    def work(which: range) -> LaunchPart:
         return _work(launch, begun.take(np.arange(which.start, which.stop), batches.fidelity.starts))
 
     parts = run_parts(cut(len(rows), run, least=PART), work)
     if batches.placed is None or batches.has_rollout:
-        parts = [_tried_again(launch, reduce(Part.followed_by, parts), run)]
+        parts = [_tried_again(launch, reduce(LaunchPart.followed_by, parts), run)]
     if not postures or batches.has_rollout:
         return parts
-    whole = reduce(Part.followed_by, parts)
+    whole = reduce(LaunchPart.followed_by, parts)
     return run_parts(
         cut(len(rows), run, least=PART), lambda which: _posed(launch, whole.take(np.arange(which.start, which.stop)))
     )
@@ -212,7 +212,7 @@ class _Launch:
         object.__setattr__(self, "coarse", self.pair.model(self.pair.coarse, obstacles, pulled=self.pulled))
         object.__setattr__(self, "fine", self.pair.model(self.pair.fine, obstacles, pulled=self.pulled))
 
-    def placed(self, rows: Rows) -> Placed | None:
+    def placed(self, rows: Rows) -> PlacedGrasps | None:
         return self.batches.placed.take(rows) if self.batches.placed is not None else None
 
     def merits(self, state: HandState, losses: Floats, depths: Floats | None = None) -> Floats:
@@ -297,7 +297,7 @@ def _with_place(launch: _Launch, begun: _Begun) -> Rows:
     return batches.left()
 
 
-def _work(launch: _Launch, begun: _Begun) -> Part:
+def _work(launch: _Launch, begun: _Begun) -> LaunchPart:
     batches, pair, rows = launch.batches, launch.pair, begun.rows
     fidelity, placed, n = batches.fidelity, launch.placed(rows), len(rows)
     hand, obj, last = pair.hand.model, pair.fine.obj.model, finalists(fidelity)
@@ -329,13 +329,13 @@ def _work(launch: _Launch, begun: _Begun) -> Part:
         if placed is None:
             off = standing_off(hand, obj, found.grasp, device=pair.hand.device)
             score = np.where(off & (score < STANDS), STANDS + 1e-3 * score, score)
-        return Part(rows, taken.state, taken.losses, score, curve, found)
+        return LaunchPart(rows, taken.state, taken.losses, score, curve, found)
     seated = seats.seated(np.sort(order, axis=1), np.arange(n))
     winners = best_of_each(seated.merit, n, 1) if last > 1 else np.arange(n)
-    return Part(rows, seated.state[winners], seated.losses[winners], seated.merit[winners], curve)
+    return LaunchPart(rows, seated.state[winners], seated.losses[winners], seated.merit[winners], curve)
 
 
-def _tried_again(launch: _Launch, part: Part, run: ExecutionContext) -> Part:
+def _tried_again(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> LaunchPart:
     """Grasps that fail their trial, or of free objects balance poorly, set out again; the first good one stays, or else
     the best.
 
@@ -361,12 +361,12 @@ def _tried_again(launch: _Launch, part: Part, run: ExecutionContext) -> Part:
     return part
 
 
-def _set_out_again(launch: _Launch, rows: Rows, attempt: Rows, run: ExecutionContext) -> Part:
+def _set_out_again(launch: _Launch, rows: Rows, attempt: Rows, run: ExecutionContext) -> LaunchPart:
     """Later attempts (n,) of grasps; the merit of those without a place is inf. Their hands are not pulled: on a bowl's
     wall half as many hold that are."""
     launch = replace(launch, pulled=False)
 
-    def work(which: range) -> Part:
+    def work(which: range) -> LaunchPart:
         some = slice(which.start, which.stop)
         begun = _set_out(launch, rows[some], attempt[some])
         made = _work(launch, begun)
@@ -375,10 +375,10 @@ def _set_out_again(launch: _Launch, rows: Rows, attempt: Rows, run: ExecutionCon
         lost = (deep.max(axis=1) if launch.batches.placed is None else deep.min(axis=1)) > NO_PLACE
         return replace(made, merit=np.where(lost, np.inf, made.merit))
 
-    return reduce(Part.followed_by, run_parts(cut(len(rows), run), work))
+    return reduce(LaunchPart.followed_by, run_parts(cut(len(rows), run), work))
 
 
-def _posed(launch: _Launch, part: Part) -> Part:
+def _posed(launch: _Launch, part: LaunchPart) -> LaunchPart:
     """The part with the postures around its grasps."""
     hand, obj = launch.pair.hand.model, launch.pair.fine.obj.model
     placed, device = launch.placed(part.rows), launch.pair.hand.device
@@ -416,14 +416,14 @@ class _Seats:
         return Refinements(state, losses, merit, launch.infeasible(state, depths))
 
 
-def _obstacles(pair: Pair, placed: Placed | None) -> DeviceObstacles | None:
+def _obstacles(pair: Pair, placed: PlacedGrasps | None) -> DeviceObstacles | None:
     if placed is None:
         return None
     centre = pair.fine.obj.model.centre_of_mass
     return DeviceObstacles.create(pair.hand.model, placed.scenes, centre, pair.hand.device)
 
 
-def _in_scenes(data: Data, placed: Placed | None, each: int) -> Data:
+def _in_scenes(data: Data, placed: PlacedGrasps | None, each: int) -> Data:
     """The data with the scene of every hand, `each` hands a grasp."""
     if placed is not None:
         data.set_scenes(np.repeat(placed.index, each))
@@ -461,9 +461,9 @@ def _joined_states(states: Sequence[HandState]) -> HandState:
 def grasps_of(
     hand: HandModel,
     obj: ObjectModel,
-    parts: list[Part],
+    parts: list[LaunchPart],
     seconds: float,
-    placed: Placed | None = None,
+    placed: PlacedGrasps | None = None,
     *,
     device: str = "cpu",
 ) -> GraspSet:

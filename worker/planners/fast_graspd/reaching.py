@@ -45,7 +45,7 @@ SLACK_M: Final = 0.001
 
 
 @dataclass(frozen=True)
-class Reaching:
+class ReachSampling:
     """What draws of a hand around an object share."""
 
     model: Model
@@ -55,7 +55,7 @@ class Reaching:
     for the hand's pads."""
 
     @classmethod
-    def of(cls, model: Model) -> Reaching | None:
+    def of(cls, model: Model) -> ReachSampling | None:
         """None where the hand opposes no fingers, or where the object is too wide for it all over."""
         hand, obj = model.hand.model, model.obj.model
         width = crossings_of(obj).width

@@ -16,7 +16,7 @@ from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.planners.fast_graspd.starts import Probe
 from graspd.worker.quality.contact import finger_of_body
 from graspd.worker.simulation.data import HandState
-from graspd.worker.simulation.environment import RISE_M, Environment, Placed
+from graspd.worker.simulation.environment import RISE_M, Environment, PlacedGrasps
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.mounting import mounting_lack
 
@@ -32,7 +32,7 @@ DEEPEST_M: Final = 0.01
 UP: Final = (0.5, 1.0)
 
 
-def hindrance(model: Model, state: HandState, placed: Placed) -> Floats:
+def hindrance(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
     """(n,) merit that hands lose since they cannot move straight back, or rise, in their scenes: what of them is then
     in the object or in an obstacle, or what of their mountings is in an obstacle already."""
     hand, obj = model.hand.model, model.obj.model
@@ -71,7 +71,7 @@ def _open_above(scene: Environment) -> bool:
     return all(len(o.planes) == 1 and o.planes[0, :3] @ scene.up > 1 - 1e-6 for o in scene.obstacles)
 
 
-def _rising(model: Model, state: HandState, placed: Placed) -> Floats:
+def _rising(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
     """(n,) depth in obstacles of hands that rise as they are [m]."""
     n = len(state.pivot)
     up = np.array([scene.up for scene in placed.scenes])[placed.index]

@@ -23,12 +23,12 @@ from graspd.service.model.transforms import (
 )
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners.fast_graspd.antipodal_starts import NEAR_M, Openings, Reaches, across, promising
+from graspd.worker.planners.fast_graspd.antipodal_starts import NEAR_M, AntipodalHands, Openings, across, promising
 from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.planners.fast_graspd.starts import CLEAR, POSTURE_NOISE, TILT, Probe
-from graspd.worker.planners.port import NoPlace
+from graspd.worker.planners.port import NoStartFound
 from graspd.worker.simulation.data import HandState
-from graspd.worker.simulation.environment import STANDOFF_M, Environment, Placed
+from graspd.worker.simulation.environment import STANDOFF_M, Environment, PlacedGrasps
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.mounting import mounting_lack
 
@@ -92,17 +92,17 @@ def free_ways(scene: Environment, obj: ObjectModel) -> Floats:
     return np.asarray(ways[free])
 
 
-def no_place(model: Model) -> NoPlace:
+def no_place(model: Model) -> NoStartFound:
     """What to say of a batch none of whose starts is clear."""
     hand, obj = model.hand.model, model.obj.model
-    return NoPlace(
+    return NoStartFound(
         f"{hand.name} finds no free place around {obj.name} in this scene: the object is too large, or what stands "
         "around it leaves no room"
     )
 
 
 def clear_scene_starts(
-    model: Model, generators: list[np.random.Generator], *, each: int, placed: Placed, ways: Sequence[Floats]
+    model: Model, generators: list[np.random.Generator], *, each: int, placed: PlacedGrasps, ways: Sequence[Floats]
 ) -> tuple[HandState, Floats]:
     """A start of each generator, `each` per grasp, and how deep it is (n,) [m]: the first of its draws that is clear,
     or else the least deep; of those that reach across the object the clear one between whose pads it lies best.
@@ -172,7 +172,7 @@ def _normal(generators: list[np.random.Generator], rows: NDArray[np.intp], dofs:
 
 
 def _depths(
-    probe: Probe, states: HandState, placed: Placed, scene: NDArray[np.intp], worth: NDArray[np.bool_]
+    probe: Probe, states: HandState, placed: PlacedGrasps, scene: NDArray[np.intp], worth: NDArray[np.bool_]
 ) -> Floats:
     """(n, len(RETREATS)) depths [m] of hands and their mountings in scenes (n,), from the farthest distance that is
     `worth` it (n, len(RETREATS)) inwards for as long as it is clear; inf elsewhere.
@@ -193,14 +193,18 @@ def _depths(
     return found
 
 
-def _mounting_lack(probe: Probe, states: HandState, placed: Placed, scene: NDArray[np.intp], *, exact: bool) -> Floats:
+def _mounting_lack(
+    probe: Probe, states: HandState, placed: PlacedGrasps, scene: NDArray[np.intp], *, exact: bool
+) -> Floats:
     """(n,) what the mountings of hands in scenes (n,) lack of their distance from obstacles and of `ROOM` [m]."""
     hand, obj = probe.model.hand.model, probe.model.obj.model
     poses = posture_of(hand, obj, states).hand_pose
     return mounting_lack(hand, poses, placed.scenes, scene, room=ROOM, exact=exact)
 
 
-def _raise(drawn: _Drawn, rows: NDArray[np.intp], placed: Placed, scene: NDArray[np.intp], probe: Probe) -> Floats:
+def _raise(
+    drawn: _Drawn, rows: NDArray[np.intp], placed: PlacedGrasps, scene: NDArray[np.intp], probe: Probe
+) -> Floats:
     """Lift draws `rows` at all their distances, scenes (n,), by what the nearest and its mounting lack of their room
     from obstacles; how far their pairs are then from between their pads (n, len(RETREATS)) [m], 0 of others.
 
@@ -229,7 +233,7 @@ class _Drawn:
 
     states: HandState
     """(n * len(RETREATS)) hands, each at each distance."""
-    reaching: list[tuple[NDArray[np.intp], Reaches]]
+    reaching: list[tuple[NDArray[np.intp], AntipodalHands]]
     """Those that reach across the object, and which of the n they are."""
 
 
@@ -246,7 +250,7 @@ class _Around:
     """Of each scene."""
 
     def order(
-        self, uniform: Floats, scene: NDArray[np.intp], reaching: NDArray[np.bool_], placed: Placed
+        self, uniform: Floats, scene: NDArray[np.intp], reaching: NDArray[np.bool_], placed: PlacedGrasps
     ) -> tuple[NDArray[np.intp], Floats]:
         """See `promising`: (n, REACHES) draws of hands that reach across the object; inf of others."""
         order, least = np.zeros((len(scene), REACHES), np.intp), np.full((len(scene), REACHES), np.inf)

@@ -11,7 +11,7 @@ import numpy as np
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.transforms import Floats
 from graspd.worker.simulation.data import HandState, Schedule
-from graspd.worker.simulation.environment import Placed
+from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.simulation.model import LossOptions, Model
 from graspd.worker.simulation.projection import ProjectionOptions
 
@@ -106,6 +106,12 @@ class WarmStart(Protocol):
         starts need."""
 
     def __call__(
-        self, model: Model, generators: list[np.random.Generator], *, each: int, placed: Placed, ways: Sequence[Floats]
+        self,
+        model: Model,
+        generators: list[np.random.Generator],
+        *,
+        each: int,
+        placed: PlacedGrasps,
+        ways: Sequence[Floats],
     ) -> tuple[HandState, Floats]:
         """See `scene_starts.clear_scene_starts`."""

@@ -29,7 +29,7 @@ from graspd.service.model.transforms import (
 from graspd.worker.hands.jaws import Jaws, jaws_of
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners.fast_graspd.reaching import LOOKS, Reaching
+from graspd.worker.planners.fast_graspd.reaching import LOOKS, ReachSampling
 from graspd.worker.planners.fitting import Pairs, fitting_pairs
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.model import Model
@@ -215,7 +215,7 @@ def clear_starts(model: Model, generators: list[np.random.Generator], *, each: i
     pair = _Pair.of(hand, obj)
     best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
     deepest = np.full(count, np.inf)
-    if jaws is None and each > 1 and (reaching := Reaching.of(model)) is not None:
+    if jaws is None and each > 1 and (reaching := ReachSampling.of(model)) is not None:
         rows = np.arange(count)
         _reach(reaching, generators, rows if reaching.only else rows[rows % each % 2 == 1], probe, best, deepest)
 
@@ -288,7 +288,7 @@ def _draw_until_clear(
 
 
 def _reach(
-    reaching: Reaching,
+    reaching: ReachSampling,
     generators: list[np.random.Generator],
     rows: NDArray[np.intp],
     probe: Probe,

@@ -20,7 +20,7 @@ class LightPass:
 @wp.kernel
 def expose(
     # Worlds:
-    placed_in: wp.array2d[rays.Placed],
+    placed_in: wp.array2d[rays.PlacedSolid],
     corner_normal_in: wp.array[wp.vec3f],
     material_in: wp.array2d[shading.Material],
     # Views:
@@ -53,7 +53,7 @@ def expose(
     seen = wp.int32(-1)
     spread = 0.75 / wp.min(focal[0], focal[1])
     near = wp.uint64(0)
-    hit = rays.Hit()
+    hit = rays.RayHit()
     flat = wp.bool(False)
     offset = wp.float32(0.0)
     for k in range(pass_in.shape[0]):

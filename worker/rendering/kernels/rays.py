@@ -14,7 +14,7 @@ _TINY = wp.constant(1.0e-15)
 
 
 @wp.struct
-class Placed:
+class PlacedSolid:
     """A solid in a world."""
 
     lower: wp.vec3f
@@ -33,7 +33,7 @@ class Placed:
 
 
 @wp.struct
-class Hit:
+class RayHit:
     """What a ray meets first."""
 
     shape: wp.int32
@@ -90,7 +90,9 @@ def box_distance(half: wp.vec3f, origin: wp.vec3f, direction: wp.vec3f):
 
 
 @wp.func
-def may_meet(placed: wp.array2d[Placed], world: wp.int32, origin: wp.vec3f, direction: wp.vec3f, spread: wp.float32):
+def may_meet(
+    placed: wp.array2d[PlacedSolid], world: wp.int32, origin: wp.vec3f, direction: wp.vec3f, spread: wp.float32
+):
     """Bit k: whether a unit ray that is off another one by no more than `spread` may meet solid k. From the 64th on,
     bits are of several."""
     inverse = inverse_of(direction)
@@ -106,7 +108,7 @@ def may_meet(placed: wp.array2d[Placed], world: wp.int32, origin: wp.vec3f, dire
 
 
 @wp.func
-def on_one_face(there: Placed, hit: Hit, point: wp.vec3f, direction: wp.vec3f, spread: wp.float32):
+def on_one_face(there: PlacedSolid, hit: RayHit, point: wp.vec3f, direction: wp.vec3f, spread: wp.float32):
     """Whether all rays that are off this one by no more than `spread`, and meet no other solid, meet the same plane:
     the face of a box, away from its edges."""
     if there.mesh != wp.uint64(0):
@@ -122,7 +124,7 @@ def on_one_face(there: Placed, hit: Hit, point: wp.vec3f, direction: wp.vec3f, s
 
 @wp.func
 def first_hit(
-    placed: wp.array2d[Placed],
+    placed: wp.array2d[PlacedSolid],
     corner_normals: wp.array[wp.vec3f],
     world: wp.int32,
     near: wp.uint64,
@@ -130,7 +132,7 @@ def first_hit(
     direction: wp.vec3f,
 ):
     """What a ray meets first of those that it `may_meet`. A mesh of which it meets the inside first is not seen."""
-    hit = Hit()
+    hit = RayHit()
     hit.shape = wp.int32(-1)
     hit.distance = FAR
     face = wp.int32(-1)
@@ -170,7 +172,7 @@ def first_hit(
 
 
 @wp.func
-def in_the_way(placed: wp.array2d[Placed], world: wp.int32, origin: wp.vec3f, direction: wp.vec3f):
+def in_the_way(placed: wp.array2d[PlacedSolid], world: wp.int32, origin: wp.vec3f, direction: wp.vec3f):
     """Whether a ray meets anything at all."""
     inverse = inverse_of(direction)
     for k in range(placed.shape[1]):

@@ -33,7 +33,7 @@ class Skin:
 
 
 @wp.struct
-class Nearest:
+class NearestPoint:
     """What is nearest to a point."""
 
     distance: wp.float32
@@ -50,7 +50,7 @@ def nearest(skin: Skin, p: wp.vec3, reach: wp.float32):
     `coarse` and a point the distance changes at most by the way between them: what is beyond reach by that is looked up
     no further, no face is looked for beyond it, and no sign where it cannot change.
     """
-    out = Nearest()
+    out = NearestPoint()
     out.distance = reach
     out.closest = p
     out.normal = wp.vec3(0.0)

@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 
 @wp.struct
-class Jams:
+class FingerJams:
     """Fingers held back where they would jam: B hands, F fingers."""
 
     going: wp.array(dtype=wp.int32)  # (B,)
@@ -24,7 +24,9 @@ class Jams:
 
 
 @wp.func
-def on_way(fingers: Fingers, hands: Hands, jams: Jams, open: wp.array2d(dtype=wp.float64), b: wp.int32, d: wp.int32):
+def on_way(
+    fingers: Fingers, hands: Hands, jams: FingerJams, open: wp.array2d(dtype=wp.float64), b: wp.int32, d: wp.int32
+):
     """How far a dof goes, as a difference to the grasp."""
     move = open[b, d] - hands.q[b, d]
     finger = fingers.of_dof[d]
@@ -40,7 +42,7 @@ def place_on_way(
     fingers_in: Fingers,
     hands_in: Hands,
     # In:
-    jams_in: Jams,
+    jams_in: FingerJams,
     open_in: wp.array2d(dtype=wp.float64),
     way_in: wp.float64,
     # Out:
@@ -76,7 +78,7 @@ def finger_depth(
     piece_p_in: wp.array2d(dtype=wp.vec3),
     piece_q_in: wp.array2d(dtype=wp.quat),
     # Out:
-    jams_inout: Jams,
+    jams_inout: FingerJams,
 ):
     """Deepest that each finger is in the rest of the hand, or that in the finger. Launch over (B, L)."""
     b, body = wp.tid()
@@ -107,7 +109,7 @@ def limit_depth(
     # In:
     more_in: wp.float32,
     # Out:
-    jams_inout: Jams,
+    jams_inout: FingerJams,
 ):
     """What a finger has in the grasp and so much more is its limit; depths begin anew. Launch over B."""
     b = wp.tid()
@@ -121,7 +123,7 @@ def hold_back(
     # In:
     less_in: wp.float64,
     # Out:
-    jams_inout: Jams,
+    jams_inout: FingerJams,
 ):
     """Fingers that jam go a share `less` as far; hands of which none does are done. Depths begin anew. Over B."""
     b = wp.tid()
@@ -142,7 +144,7 @@ def take_way(
     fingers_in: Fingers,
     hands_in: Hands,
     # In:
-    jams_in: Jams,
+    jams_in: FingerJams,
     # Out:
     open_inout: wp.array2d(dtype=wp.float64),
 ):

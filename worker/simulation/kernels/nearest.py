@@ -44,7 +44,7 @@ class Cells:
 
 
 @wp.struct
-class Closest:
+class ClosestPoint:
     """A closest point of the mesh: a + v ab + w ac."""
 
     face: wp.int32  # -1: none
@@ -91,7 +91,7 @@ def on_face(face: Face, p: wp.vec3):
 @wp.func
 def closest_in_cell(cells: Cells, cell: wp.int32, centre: wp.vec3, p: wp.vec3):
     """The closest point of the mesh to p, which lies in the cell with this centre; face -1 where nothing is listed."""
-    out = Closest()
+    out = ClosestPoint()
     out.face = -1
     off = wp.length(p - centre)
     best = float(1.0e30)

@@ -36,7 +36,7 @@ class Grips:
 
 
 @wp.struct
-class Draw:
+class HandSample:
     """Where a drawn hand is."""
 
     found: wp.bool
@@ -79,7 +79,7 @@ def drawn(
     state: wp.uint32,
 ):
     """A hand around a pair of places, at the nearest distance at which it is clear."""
-    out = Draw()
+    out = HandSample()
     pair = wp.min(first_above(grips.sums, wp.randf(state)), grips.sums.shape[0] - 1)
     line = grips.axis[pair]
     if wp.randf(state) < 0.5:

@@ -24,7 +24,7 @@ ON_FACE = wp.constant(wp.float32(1.0e-5))
 
 
 @wp.struct
-class Lowest:
+class EdgeMinimum:
     """The least value of a convex function on an edge."""
 
     t: wp.float32
@@ -33,7 +33,7 @@ class Lowest:
 
 
 @wp.struct
-class Near:
+class NearestObstacle:
     """Where a link is nearest to an obstacle; `direction` is the gradient of the distance as `point` moves with it."""
 
     distance: wp.float32
@@ -67,7 +67,7 @@ def edge_in_piece(pieces: Pieces, piece: wp.int32, a: wp.vec3, b: wp.vec3, limit
     f1 = at1[3]
     t0 = float(0.0)
     t1 = float(1.0)
-    out = Lowest()
+    out = EdgeMinimum()
     if wp.dot(n0, along) >= 0.0:
         out.value = f0
         out.gradient = n0
@@ -128,7 +128,7 @@ def edge_in_obstacle(obstacles: Obstacles, k: wp.int32, a: wp.vec3, b: wp.vec3, 
     f1 = at1[3]
     t0 = float(0.0)
     t1 = float(1.0)
-    out = Lowest()
+    out = EdgeMinimum()
     if wp.dot(n0, along) >= 0.0:
         out.value = f0
         out.gradient = n0
@@ -206,7 +206,7 @@ def nearest_edge(
     body_q: wp.array2d(dtype=wp.quat),
 ):
     """Where an edge of obstacle k is nearest to a piece, or an edge of the piece deepest in the obstacle."""
-    out = Near()
+    out = NearestObstacle()
     out.distance = limit
     q = piece_rotation(pieces, piece, b, body_q)
     p = piece_centre(pieces, piece, b, body_p, body_q)

@@ -29,7 +29,7 @@ class Surface:
 
 
 @wp.struct
-class Sample:
+class SurfaceSample:
     """Distance and outward unit normal of the object at a point."""
 
     distance: wp.float32
@@ -41,7 +41,7 @@ def smoothed(
     surface: Surface, point: wp.vec3, closest: wp.vec3, face: wp.int32, u: wp.float32, v: wp.float32, sign: wp.float32
 ):
     """Distance and normal at a point whose closest point on the mesh has weights u, v, 1 - u - v of a face."""
-    out = Sample()
+    out = SurfaceSample()
     w = 1.0 - u - v
     n0 = surface.corner_normals[3 * face]
     n1 = surface.corner_normals[3 * face + 1]
@@ -73,7 +73,7 @@ def smoothed(
 @wp.func
 def mesh_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
     """Smoothed signed distance and normal; distance = reach and normal 0 where the surface is farther than `reach`."""
-    out = Sample()
+    out = SurfaceSample()
     out.distance = reach
     out.normal = wp.vec3(0.0)
     query = wp.mesh_query_point_sign_normal(surface.mesh, point, reach)
@@ -193,7 +193,7 @@ def cube_normal(cube: Cube):
 def field_distance(surface: Surface, point: wp.vec3):
     """Trilinear interpolation of the grid with its exact gradient; distance 1e3 m outside the grid."""
     cube = cube_around(surface, point)
-    out = Sample()
+    out = SurfaceSample()
     out.distance = cube_distance(cube)
     out.normal = cube_normal(cube)
     return out
@@ -207,7 +207,7 @@ def distance(surface: Surface, point: wp.vec3, reach: wp.float32, exact_below: w
         cube = cube_around(surface, point)
         coarse = cube_distance(cube)
         if coarse > exact_below + surface.field_error:
-            out = Sample()
+            out = SurfaceSample()
             out.distance = reach
             out.normal = wp.vec3(0.0)
             if coarse < keep:

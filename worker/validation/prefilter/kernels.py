@@ -37,7 +37,7 @@ PARKED = wp.constant(10.0)
 
 
 @wp.struct
-class Grasps:
+class GraspCommands:
     """What N grasps ask of their worlds."""
 
     queue: wp.array(dtype=wp.int32)
@@ -89,7 +89,7 @@ class Worlds:
 
 
 @wp.struct
-class Found:
+class WorldVerdicts:
     """What is said of N grasps."""
 
     outcome: wp.array2d(dtype=wp.int32)
@@ -101,7 +101,7 @@ class Found:
 
 
 @wp.struct
-class Terms:
+class TestConstants:
     """What is the same in all worlds."""
 
     object_qpos: wp.int32
@@ -127,7 +127,7 @@ def blend(a: wp.vec4, b: wp.vec4, share: wp.float32):
 
 
 @wp.func
-def command(w: wp.int32, g: wp.int32, ticks: wp.int32, grasps: Grasps, engine: Engine):
+def command(w: wp.int32, g: wp.int32, ticks: wp.int32, grasps: GraspCommands, engine: Engine):
     """Target posture of the stage that begins after so many ticks of closing."""
     stage = wp.min(ticks / STAGE, 2 * STAGES - 1)
     part = stage / STAGES
@@ -140,7 +140,7 @@ def command(w: wp.int32, g: wp.int32, ticks: wp.int32, grasps: Grasps, engine: E
 
 
 @wp.func
-def offset(w: wp.int32, terms: Terms, engine: Engine):
+def offset(w: wp.int32, terms: TestConstants, engine: Engine):
     """Displacement of the object's own frame since the start [m]."""
     at = terms.object_qpos
     position = wp.vec3(engine.qpos[w, at], engine.qpos[w, at + 1], engine.qpos[w, at + 2])
@@ -149,7 +149,7 @@ def offset(w: wp.int32, terms: Terms, engine: Engine):
 
 
 @wp.func
-def turned(w: wp.int32, terms: Terms, engine: Engine):
+def turned(w: wp.int32, terms: TestConstants, engine: Engine):
     """Rotation of the object since the start [rad]."""
     at = terms.object_qpos + 3
     axis = wp.vec3(engine.qpos[w, at + 1], engine.qpos[w, at + 2], engine.qpos[w, at + 3])
@@ -157,7 +157,7 @@ def turned(w: wp.int32, terms: Terms, engine: Engine):
 
 
 @wp.func
-def push(w: wp.int32, number: wp.int32, terms: Terms, worlds: Worlds, engine: Engine):
+def push(w: wp.int32, number: wp.int32, terms: TestConstants, worlds: Worlds, engine: Engine):
     """Begin a push from the closed state."""
     for k in range(engine.qpos.shape[1]):
         engine.qpos[w, k] = worlds.qpos[w, k]
@@ -175,7 +175,14 @@ def push(w: wp.int32, number: wp.int32, terms: Terms, worlds: Worlds, engine: En
 
 
 @wp.func
-def take(w: wp.int32, terms: Terms, grasps: Grasps, worlds: Worlds, engine: Engine, state: wp.array(dtype=wp.int32)):
+def take(
+    w: wp.int32,
+    terms: TestConstants,
+    grasps: GraspCommands,
+    worlds: Worlds,
+    engine: Engine,
+    state: wp.array(dtype=wp.int32),
+):
     """Begin with the next grasp of the queue, or wait for good."""
     place = wp.atomic_add(state, 0, 1)
     g = wp.int32(-1)
@@ -202,8 +209,8 @@ def take(w: wp.int32, terms: Terms, grasps: Grasps, worlds: Worlds, engine: Engi
 @wp.kernel
 def begin(
     # Model:
-    terms_in: Terms,
-    grasps_in: Grasps,
+    terms_in: TestConstants,
+    grasps_in: GraspCommands,
     # Data out:
     worlds_out: Worlds,
     engine_out: Engine,
@@ -215,12 +222,12 @@ def begin(
 @wp.kernel
 def look(
     # Model:
-    terms_in: Terms,
-    grasps_in: Grasps,
+    terms_in: TestConstants,
+    grasps_in: GraspCommands,
     # Data out:
     worlds_out: Worlds,
     engine_out: Engine,
-    found_out: Found,
+    found_out: WorldVerdicts,
     state_out: wp.array(dtype=wp.int32),
 ):
     """What a tick has brought; `state_out`: places of the queue taken, worlds with a grasp, grasps in the queue."""

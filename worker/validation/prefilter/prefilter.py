@@ -87,7 +87,7 @@ class WorldPool:
         return found
 
     def _make_terms(self) -> Any:
-        scene, terms = self.scene, kernels.Terms()
+        scene, terms = self.scene, kernels.TestConstants()
         terms.object_qpos, terms.object_body = scene.object_qpos, scene.object_body
         terms.push = scene.push
         terms.centre = wp.vec3(*(float(x) for x in scene.centre))
@@ -140,7 +140,7 @@ class WorldPool:
         if n <= self._capacity:
             return
         rows, model, self._graph = max(self.worlds, 1 << (n - 1).bit_length()), self.scene.model, None
-        asked, found = kernels.Grasps(), kernels.Found()
+        asked, found = kernels.GraspCommands(), kernels.WorldVerdicts()
         asked.queue = wp.zeros(rows, dtype=wp.int32)
         asked.start = wp.zeros((rows, model.nq), dtype=wp.float32)
         asked.position = wp.zeros((rows, 3), dtype=wp.vec3)
