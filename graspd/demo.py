@@ -13,11 +13,11 @@ from rich.console import Console
 from rich.table import Table
 
 from api.client.client import Client
-from api.client.job_options import validated
 from api.client.reports import JobDisplay, job_summary, means_of, yield_of
 from api.formatting import count, duration, metric
 from api.models import GraspQuery, JobDetail
 from service.cli import JsonFlag, emit, load_settings, plain_console, reporting_errors, write_output
+from service.command_options import validated
 from service.index.views import GraspView
 from service.model.domain import JobRequest
 from service.model.errors import TaskError

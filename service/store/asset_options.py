@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from service.model.errors import InputError
-from service.model.matter import FRICTION, MASS_KG, MOST_KG
+from service.model.matter import FRICTION, MASS_KG
 
 PalmOption = Annotated[str | None, typer.Option("--palm", help="Link that is the palm.")]
 ApproachOption = Annotated[
@@ -59,18 +59,12 @@ DensityOption = Annotated[
 MassOption = Annotated[
     float | None, typer.Option("--mass", help=f"Mass of the object in kg; {MASS_KG:g} where nothing is said.")
 ]
-_FRICTION_HELP: Final = f"Coulomb coefficient of the object's contacts in simulation; {FRICTION:g} where none is given."
-FrictionOption = Annotated[float | None, typer.Option("--friction", help=_FRICTION_HELP)]
-#: Where `--friction` is the coefficient of the metrics.
-ObjectFrictionOption = Annotated[float | None, typer.Option("--object-friction", help=_FRICTION_HELP)]
-PayloadOption = Annotated[
-    bool, typer.Option("--payload", help="Measure the heaviest mass that each valid grasp lifts.")
-]
-MinPayloadOption = Annotated[
-    float, typer.Option("--min-payload", help="Mass that a grasp must lift to count [kg]; 0: any.", min=0, max=MOST_KG)
-]
-ShakeOption = Annotated[
-    bool, typer.Option("--shake", help="Shake what each valid grasp lifts: 2 cm, 3 Hz, along x and y of its scene.")
+FrictionOption = Annotated[
+    float | None,
+    typer.Option(
+        "--friction",
+        help=f"Coulomb coefficient of the object's contacts in simulation; {FRICTION:g} where none is given.",
+    ),
 ]
 LicenceOption = Annotated[
     str | None, typer.Option("--licence", help="Terms it may be used on, for dataset cards: CC-BY-4.0.")

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from service.model.domain import JobOptions
-from service.model.errors import InputError, MeshError, TaskCancelled
+from service.model.errors import MeshError, TaskCancelled
 from service.model.fidelity import resolve_fidelity
 from worker import together
 from worker.certified import Certified, certified_grasps
-from worker.engines.joins import batches_at_once, fitting, parse_join
-from worker.files.synthesis import synthesized
+from worker.engines.joins import batches_at_once, fitting
 from worker.hands.load import hand_from_path
 from worker.meeting import Meeting
 from worker.objects.prepare import object_from_path
@@ -110,14 +107,7 @@ def test_a_job_that_is_cancelled_stops_all_its_batches(pair) -> None:
 
 
 def test_how_many_are_joined_where_nobody_says() -> None:
-    assert [parse_join(text) for text in ("auto", "1", "32")] == [None, 1, 32]
     assert batches_at_once("cpu", None) == 1
     assert batches_at_once("cpu", 4) == 4
     # Of an H100 and an H200 (132 multiprocessors), of a GPU with 20, and of one whose memory is nearly full.
     assert [fitting(132, 80 << 30), fitting(20, 8 << 30), fitting(132, 1 << 30), fitting(132, 0)] == [32, 4, 4, 1]
-
-
-@pytest.mark.parametrize("text", ["0", "-1", "many", "1.5", ""])
-def test_what_is_no_number_of_batches_is_refused(text: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--join takes a number of batches"):
-        synthesized("barrett", str(tmp_path / "none.stl"), REQUEST, join=text)

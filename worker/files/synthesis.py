@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.domain import BATCH_SIZE, SHAKE_NEEDS_A_SCENE, JobOptions
-from service.model.errors import InputError, TaskCancelled, did_you_mean, one_of
-from service.model.fidelity import FIDELITIES, Fidelity
+from service.model.errors import InputError, TaskCancelled
+from service.model.local_options import LocalOptions
 from service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits
 from service.model.planning import shortfall, totals
-from service.model.scene_spec import MOST_SCENES, SceneSpec
+from service.model.scene_spec import SceneSpec
 from service.store.columns import Attribute
 from service.store.shards import json_attribute
 from worker.certified import Certified, certified_grasps
 from worker.engines.devices import Device
-from worker.engines.joins import batches_at_once, parse_join
+from worker.engines.joins import batches_at_once
 from worker.files.provenance import (
     NEIGHBOUR_FACE_ERROR_M,
     base_attributes,
@@ -36,6 +36,7 @@ from worker.objects.model import ObjectModel
 from worker.objects.options import as_asked
 from worker.objects.prepare import object_from_path
 from worker.planners import planner
+from worker.planners.registry import of_this_machine
 from worker.pool.pool import MODULES, Pool, processes_at_once
 from worker.quality.referee.payload import Limit
 from worker.run import FirstJudge, Progress, Run
@@ -178,6 +179,29 @@ class Synthesized:
         }
 
 
+def synthesized_as(hand: str, obj: str, options: LocalOptions, **run: Any) -> Synthesized:
+    """The grasps that a user of this process asks for; see `synthesized`.
+
+    Args:
+        hand: see `synthesized`.
+        obj: see `synthesized`.
+        options: what is asked.
+        run: first_judge, processes, progress, cancelled and partial of `synthesized`.
+    """
+    return synthesized(
+        hand,
+        obj,
+        options.request(of_this_machine(options.method, options.options)),
+        place=options.place,
+        scenes=options.scenes,
+        mesh=options.mesh,
+        device=options.device,
+        threads=options.threads,
+        join=None if options.join == "auto" else options.join,
+        **run,
+    )
+
+
 def synthesized(
     hand: str,
     obj: str,
@@ -189,7 +213,7 @@ def synthesized(
     device: str = "auto",
     threads: int = 0,
     first_judge: FirstJudge = "auto",
-    join: int | str = "auto",
+    join: int | None = None,
     processes: int = 0,
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
@@ -207,7 +231,7 @@ def synthesized(
         device: cpu, cuda:0 or auto.
         threads: CPU threads; 0: one per core.
         first_judge: whether MuJoCo Warp gives the clear verdicts; auto: on a GPU, where it is installed.
-        join: batches of 32 whose grasps are planned in one launch, or auto; the grasps are the same.
+        join: batches of 32 whose grasps are planned in one launch; None: what fills a GPU. The grasps are the same.
         processes: that judge and measure; 1: this one; 0: on a GPU one for each core less one, else 1.
         progress: told of the grasps that are done, and of how many.
         cancelled: asked often; True: the work stops.
@@ -218,13 +242,8 @@ def synthesized(
         TaskCancelled: `cancelled` answered True; with `partial`, before anything was judged.
     """
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
-    if place.kind != "free" and not 1 <= scenes <= MOST_SCENES:
-        raise InputError(f"scenes: must be at least 1 and at most {MOST_SCENES}; got {scenes}")
-    if threads < 0:
-        raise InputError(f"threads: must be at least 0; got {threads}")
     if request.shake and place.kind == "free":
         raise InputError(SHAKE_NEEDS_A_SCENE)
-    wanted = parse_join(str(join))
     options = dict(mesh or {})
     model = hand_from_path(hand)
     thing = as_asked(object_from_path(obj, face_error_m=request.knobs.face_error_m, options=options), request)
@@ -238,7 +257,7 @@ def synthesized(
     run = Run(chosen, threads, first_judge=first_judge)
     run = run if progress is None else replace(run, progress=progress)
     run = run if cancelled is None else replace(run, cancelled=cancelled)
-    joined = batches_at_once(chosen, wanted)
+    joined = batches_at_once(chosen, join)
     with _pool(processes_at_once(chosen, processes, threads=threads)) as pool:
         run = replace(run, pool=pool)
         batches = certified_batches(
@@ -290,26 +309,6 @@ def _as_stored(place: SceneSpec, others: Sequence[ObjectModel]) -> dict[str, Any
     for one, other in zip(said["neighbours"], others, strict=True):
         one["object"] = other.name
     return said
-
-
-def chosen_fidelity(name: str, contact_solver: str = "") -> Fidelity:
-    """The knobs of a named fidelity, with another contact solver where one is given.
-
-    Raises:
-        InputError: unknown fidelity or solver.
-    """
-    if name not in FIDELITIES:
-        raise InputError(f"unknown fidelity {name!r}; choose one of {one_of(name, FIDELITIES)}")
-    knobs = FIDELITIES[name].model_dump()
-    if contact_solver:
-        knobs |= {"contact_solver": contact_solver, "name": f"{name}+{contact_solver}"}
-    try:
-        return Fidelity(**knobs)
-    except ValueError:
-        meant = did_you_mean(contact_solver, ("direct", "jacobi", "gauss_seidel"))
-        raise InputError(
-            f"unknown contact solver {contact_solver!r}; choose direct, jacobi or gauss_seidel{meant}"
-        ) from None
 
 
 def _attributes(

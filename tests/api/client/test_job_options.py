@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from api.client.job_options import pairs
+from service.command_options import pairs
 from service.model.errors import InputError
 
 
