@@ -66,6 +66,11 @@ _SCENES_IN_WORDS: Final = {"free": "the object alone", "table": "a table", "bin"
 SHAKE_NEEDS_A_SCENE: Final = "shake moves what was lifted out of a scene: choose one, such as table"
 
 
+def _sparse(default: Any, **facts: Any) -> Any:
+    """A field that stays out of documents at its default: ids and records of jobs without it stay what they are."""
+    return Field(default, exclude_if=lambda value: value == default, **facts)
+
+
 class JobOptions(Model):
     """What a job says besides its hand and object: how many grasps, how made, with which scenes and views."""
 
@@ -89,7 +94,6 @@ class JobOptions(Model):
     seed: Annotated[int, Option("basic", form=Form("grasps", "Seed", "same seed, same grasps"))] = Field(
         0, ge=0, lt=2**31, description="the same seed gives the same grasps"
     )
-    # What is left at its default stays out of every document, so that ids and records of jobs without it stay.
     scene: Annotated[
         SceneOption,
         Option(
@@ -97,17 +101,15 @@ class JobOptions(Model):
             typed="where the grasps are used: free, table, bin, shelf, or a JSON or YAML file",
             form=Form("scenes", "Grasps are for", choices=_SCENES_IN_WORDS, cells=True),
         ),
-    ] = Field(
+    ] = _sparse(
         "free",
-        exclude_if=lambda value: value == "free",
         description="where the grasps are used: free (around an object that floats), table, bin, shelf, or a document "
         "with supports. If not free they are planned, judged and rendered there, and `grasps` counts those valid there",
     )
     faces: Annotated[
         Literal["drawn", "all"], Option(form=Form("scenes", "It lies", choices=_FACES_IN_WORDS, cells=True))
-    ] = Field(
+    ] = _sparse(
         "drawn",
-        exclude_if=lambda value: value == "drawn",
         description="faces that the object lies on in its scenes. drawn: as often as drops end on them; all: one scene "
         "for each stable face, whatever `scenes` says",
     )
@@ -125,22 +127,20 @@ class JobOptions(Model):
                 cells=True,
             ),
         ),
-    ] = Field(
+    ] = _sparse(
         (),
         max_length=MOST_NEIGHBOURS,
-        exclude_if=lambda value: not value,
         description="names of up to eight other objects, which are dropped around this one in its scenes; a document "
         "places its own",
     )
     touch: Annotated[
         float,
         Option(form=Form("scenes", "Fingertips keep", "from supports; 0: they may touch, 2: as the hand", cells=True)),
-    ] = Field(
+    ] = _sparse(
         TOUCH,
         ge=LEAST_TOUCH,
         le=MOST_TOUCH,
         allow_inf_nan=False,
-        exclude_if=lambda value: value == TOUCH,
         description="distance that fingertips keep from the supports of their scene [mm]. 2: as the rest of the hand; "
         "0: they may touch; below: they may press into it, for what lies flat",
     )
@@ -171,20 +171,15 @@ class JobOptions(Model):
         Option(
             "basic", schema=5, form=Form("grasps", "Mass of the object", "empty: its own, 0.1 kg where it has none")
         ),
-    ] = Field(
-        None,
-        exclude_if=lambda value: value is None,
-        description=f"mass of the object [kg]; by default its own, {MASS_KG:g} kg where it has none",
-    )
-    density: Annotated[Density | None, Option(schema=5)] = Field(
-        None, exclude_if=lambda value: value is None, description="density of the object [kg/m^3], in place of the mass"
+    ] = _sparse(None, description=f"mass of the object [kg]; by default its own, {MASS_KG:g} kg where it has none")
+    density: Annotated[Density | None, Option(schema=5)] = _sparse(
+        None, description="density of the object [kg/m^3], in place of the mass"
     )
     object_friction: Annotated[
         Friction | None,
         Option(schema=5, form=Form("grasps", "Friction in simulation", "Coulomb; empty: the object's own, else 0.6")),
-    ] = Field(
+    ] = _sparse(
         None,
-        exclude_if=lambda value: value is None,
         description="Coulomb coefficient of contacts in simulation; by default the object's own, "
         f"{FRICTION:g} where it has none",
     )
@@ -200,12 +195,11 @@ class JobOptions(Model):
     )
     min_distance: Annotated[
         float, Option(form=Form("grasps", "Least distance", "between two grasps of a batch; 0: any", cells=True))
-    ] = Field(
+    ] = _sparse(
         MIN_DISTANCE_M,
         ge=0,
         le=0.1,
         allow_inf_nan=False,
-        exclude_if=lambda value: value == MIN_DISTANCE_M,
         description="a grasp that is nearer to an earlier one of its batch is not kept [m]: mean distance of the same "
         "points of the hand, in the object's frame; 0: all are. Goes with want valid",
     )
@@ -238,27 +232,23 @@ class JobOptions(Model):
                 cells=True,
             ),
         ),
-    ] = Field(
+    ] = _sparse(
         0.0,
         ge=0,
         le=1,
         allow_inf_nan=False,
-        exclude_if=lambda value: value == 0,
         description="share of models around the nominal one in which a grasp must hold to count; 0: none is wanted. "
         "Where raw grasps are wanted all are kept, whatever their share",
     )
-    robust_models: Annotated[int, Option()] = Field(
+    robust_models: Annotated[int, Option()] = _sparse(
         0,
         ge=0,
         le=MOST_ROBUST_MODELS,
-        exclude_if=lambda value: value == 0,
         description=f"models in which each valid grasp is judged too; 0: {ROBUST_MODELS} where a share is wanted, "
         "else none",
     )
-    payload: Annotated[bool, Option(schema=5)] = Field(
-        False,
-        exclude_if=lambda value: not value,
-        description="measure the heaviest mass that each valid grasp lifts",
+    payload: Annotated[bool, Option(schema=5)] = _sparse(
+        False, description="measure the heaviest mass that each valid grasp lifts"
     )
     min_payload: Annotated[
         float,
@@ -266,20 +256,15 @@ class JobOptions(Model):
             schema=5,
             form=Form("grasps", "Least payload", "mass that a grasp must lift to count; 0: not asked", cells=True),
         ),
-    ] = Field(
+    ] = _sparse(
         0.0,
         ge=0,
         le=MOST_KG,
         allow_inf_nan=False,
-        exclude_if=lambda value: value == 0,
         description="mass that a grasp must lift to count [kg]; 0: none is wanted. It is measured where one is",
     )
     shake: Annotated[bool, Option(schema=5, form=Form("scenes", "After the lift", "Shake: 2 cm, 3 Hz", cells=True))] = (
-        Field(
-            False,
-            exclude_if=lambda value: not value,
-            description="shake each valid grasp after its lift: 2 cm, 3 Hz, along x and y of its scene",
-        )
+        _sparse(False, description="shake each valid grasp after its lift: 2 cm, 3 Hz, along x and y of its scene")
     )
     options: Annotated[
         dict[
