@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import inspect
+import json
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 import graspd
 from service.command_options import validated
+from service.docs import STUB, keywords_stub
 from service.model.domain import JobOptions, JobRequest
 from service.model.errors import InputError
 from service.model.local_options import LocalOptions
 from service.model.options import rows, type_text
+from tests.conftest import REPOSITORY
+from tests.one_more_option import FLAG, MEANING, NAME
 
 
 @pytest.mark.parametrize("join", ["0", 0, -1, "many", 1.5, ""])
@@ -76,3 +83,28 @@ def test_types_lose_their_bounds_and_keep_their_choices() -> None:
     assert types["want"] == 'Literal["valid", "raw"]'
     assert types["neighbours"] == "Sequence[str | Mapping[str, Any]]"
     assert types["options"] == "Mapping[str, int | float | str]"
+
+
+def test_one_more_option_is_found_in_all_places(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tests.one_more_option", str(tmp_path / "data")]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert all(FLAG in text and MEANING.removeprefix("largest ") in text for text in found["help"])
+    assert [text.strip() for text in found["out of bounds"][:2]] == [
+        f"graspd: {FLAG}: must be at most 20; see `root {name} --help`" for name in ("synth", "submit")
+    ]
+    assert NAME in found["out of bounds"][2]
+    for page, place in zip(found["forms"], ("", "cell-"), strict=True):
+        assert f'<label for="{place}{NAME}">Finger force [N]</label>' in page
+        assert f'name="{NAME}" type="number" min="1" max="20" step="any" value="5"' in page
+    shown = {"type": "number", "maximum": 20.0, "minimum": 1.0, "title": "Finger Force", "default": 5.0}
+    assert found["http"] == [shown | {"description": MEANING}] * 2
+    assert found["python"] == [f"{NAME}: 'float' = 5.0"] * 2
+    assert found["types"].count(f"    {NAME}: float\n") == 2
+    assert f"| `{NAME}` | `{FLAG}` | both | `5.0` | at least 1 and at most 20 | {MEANING} |" in found["docs"]
+    assert not found["warp"], "help, completion and what is refused need no engine"
+
+
+def test_the_types_of_keywords_are_up_to_date() -> None:
+    assert (REPOSITORY / STUB).read_text() == keywords_stub(), "run: make docs"
