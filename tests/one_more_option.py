@@ -14,7 +14,7 @@ from pathlib import Path
 
 NAME, FLAG, MEANING = "finger_force", "--finger-force", "largest force of a finger [N]"
 ROW = f"""
-    {NAME}: Annotated[float, Option(form=Form("grasps", "Finger force", "of each finger", cells=True))] = _sparse(
+    {NAME}: Annotated[float, Option(), Form("grasps", "Finger force", "of each finger", cells=True)] = _sparse(
         5.0, ge=1, le=20, description="{MEANING}"
     )
 """

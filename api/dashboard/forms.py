@@ -68,7 +68,7 @@ class FormInput:
 
 def inputs_of(section: str = "", *, cells: bool = False) -> list[FormInput]:
     """Options that the form of a job shows, in one section or all; with `cells`, those that a dataset's form shows."""
-    shown = [(row, row.option.form) for row in rows(JobOptions, "job") if row.option.form is not None]
+    shown = [(row, row.form) for row in rows(JobOptions, "job") if row.form is not None]
     return [
         FormInput.of(row, form) for row, form in shown if section in ("", form.section) and (form.cells or not cells)
     ]

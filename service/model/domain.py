@@ -22,15 +22,14 @@ from service.model.metrics import MIN_DISTANCE_M, MOST_ROBUST_MODELS, ROBUST_MOD
 from service.model.options import JOB, Form, Option
 from service.model.projects import Project
 from service.model.scene_spec import (
-    LEAST_TOUCH,
     MOST_NEIGHBOURS,
-    MOST_TOUCH,
     TOUCH,
     BesideOption,
     NamedNeighbour,
     SceneDocument,
     SceneOption,
     SceneSpec,
+    Touch,
     has_table,
     scene_of,
 )
@@ -79,35 +78,31 @@ class JobOptions(Model):
 
     grasps: Annotated[
         int,
-        Option(
-            "basic", flags="--grasps -n", keyword="count", form=Form("grasps", "Number of grasps", "in batches of 32")
-        ),
+        Option("basic", flags="--grasps -n", keyword="count"),
+        Form("grasps", "Number of grasps", "in batches of 32"),
     ] = Field(
         32, ge=1, le=1_000_000, description="number of grasps to synthesize, in a dataset for each hand and object"
     )
     method: Annotated[Name, Option("basic")] = Field(
         "fast_graspd", description=f"planner: {', '.join(METHODS)}, or one that another package offers"
     )
-    fidelity: Annotated[str | Fidelity, Option("basic", form=Form("grasps", "Fidelity"))] = Field(
+    fidelity: Annotated[str | Fidelity, Option("basic"), Form("grasps", "Fidelity")] = Field(
         "standard", description=f"{', '.join(OFFERED)}, or auto with a target"
     )
-    seed: Annotated[int, Option("basic", form=Form("grasps", "Seed", "same seed, same grasps"))] = Field(
+    seed: Annotated[int, Option("basic"), Form("grasps", "Seed", "same seed, same grasps")] = Field(
         0, ge=0, lt=2**31, description="the same seed gives the same grasps"
     )
     scene: Annotated[
         SceneOption,
-        Option(
-            "basic",
-            typed="where the grasps are used: free, table, bin, shelf, or a JSON or YAML file",
-            form=Form("scenes", "Grasps are for", choices=_SCENES_IN_WORDS, cells=True),
-        ),
+        Option("basic", typed="where the grasps are used: free, table, bin, shelf, or a JSON or YAML file"),
+        Form("scenes", "Grasps are for", choices=_SCENES_IN_WORDS, cells=True),
     ] = _sparse(
         "free",
         description="where the grasps are used: free (around an object that floats), table, bin, shelf, or a document "
         "with supports. If not free they are planned, judged and rendered there, and `grasps` counts those valid there",
     )
     faces: Annotated[
-        Literal["drawn", "all"], Option(form=Form("scenes", "It lies", choices=_FACES_IN_WORDS, cells=True))
+        Literal["drawn", "all"], Option(), Form("scenes", "It lies", choices=_FACES_IN_WORDS, cells=True)
     ] = _sparse(
         "drawn",
         description="faces that the object lies on in its scenes. drawn: as often as drops end on them; all: one scene "
@@ -119,13 +114,13 @@ class JobOptions(Model):
             "basic",
             flags="--with",
             typed="another object in each scene: a name, for submit also a mesh to upload; up to eight",
-            form=Form(
-                "scenes",
-                "Beside it",
-                "names of up to eight other objects, with commas",
-                placeholder="block, bottle",
-                cells=True,
-            ),
+        ),
+        Form(
+            "scenes",
+            "Beside it",
+            "names of up to eight other objects, with commas",
+            placeholder="block, bottle",
+            cells=True,
         ),
     ] = _sparse(
         (),
@@ -134,67 +129,63 @@ class JobOptions(Model):
         "places its own",
     )
     touch: Annotated[
-        float,
-        Option(form=Form("scenes", "Fingertips keep", "from supports; 0: they may touch, 2: as the hand", cells=True)),
+        Touch,
+        Option(),
+        Form("scenes", "Fingertips keep", "from supports; 0: they may touch, 2: as the hand", cells=True),
     ] = _sparse(
         TOUCH,
-        ge=LEAST_TOUCH,
-        le=MOST_TOUCH,
-        allow_inf_nan=False,
         description="distance that fingertips keep from the supports of their scene [mm]. 2: as the rest of the hand; "
         "0: they may touch; below: they may press into it, for what lies flat",
     )
     scenes: Annotated[
-        int,
-        Option("basic", form=Form("scenes", "Scenes", "for each batch; 0: none, or 4 where grasps are for a scene")),
+        int, Option("basic"), Form("scenes", "Scenes", "for each batch; 0: none, or 4 where grasps are for a scene")
     ] = Field(0, ge=0, le=64, description=f"scenes per batch of grasps; {SCENES} where a scene is named")
-    views: Annotated[
-        int, Option("basic", places=JOB, form=Form("scenes", "Views", "camera placements for each scene"))
-    ] = Field(0, ge=0, le=256, description="camera placements per scene")
-    stereo: Annotated[bool, Option(places=JOB, form=Form("scenes", "Cameras", "Stereo: left and right eye"))] = Field(
+    views: Annotated[int, Option("basic", places=JOB), Form("scenes", "Views", "camera placements for each scene")] = (
+        Field(0, ge=0, le=256, description="camera placements per scene")
+    )
+    stereo: Annotated[bool, Option(places=JOB), Form("scenes", "Cameras", "Stereo: left and right eye")] = Field(
         False, description="a left and a right picture per placement instead of one"
     )
-    width: Annotated[int, Option(places=JOB, form=Form("scenes", "Width"))] = Field(
+    width: Annotated[int, Option(places=JOB), Form("scenes", "Width")] = Field(
         320, ge=16, le=4096, description="picture width [px]"
     )
-    height: Annotated[int, Option(places=JOB, form=Form("scenes", "Height"))] = Field(
+    height: Annotated[int, Option(places=JOB), Form("scenes", "Height")] = Field(
         240, ge=16, le=4096, description="picture height [px]"
     )
     channels: Annotated[tuple[Literal["distance", "normals", "occlusion"], ...], Option(places=JOB)] = Field(
         (), description="what pictures show besides colour, depth and segmentation: distance, normals or occlusion"
     )
-    friction: Annotated[float, Option(form=Form("grasps", "Friction coefficient", "Coulomb, for the metrics"))] = Field(
+    friction: Annotated[float, Option(), Form("grasps", "Friction coefficient", "Coulomb, for the metrics")] = Field(
         1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics"
     )
     mass: Annotated[
         Mass | None,
-        Option(
-            "basic", schema=5, form=Form("grasps", "Mass of the object", "empty: its own, 0.1 kg where it has none")
-        ),
+        Option("basic", schema=5),
+        Form("grasps", "Mass of the object", "empty: its own, 0.1 kg where it has none"),
     ] = _sparse(None, description=f"mass of the object [kg]; by default its own, {MASS_KG:g} kg where it has none")
     density: Annotated[Density | None, Option(schema=5)] = _sparse(
         None, description="density of the object [kg/m^3], in place of the mass"
     )
     object_friction: Annotated[
         Friction | None,
-        Option(schema=5, form=Form("grasps", "Friction in simulation", "Coulomb; empty: the object's own, else 0.6")),
+        Option(schema=5),
+        Form("grasps", "Friction in simulation", "Coulomb; empty: the object's own, else 0.6"),
     ] = _sparse(
         None,
         description="Coulomb coefficient of contacts in simulation; by default the object's own, "
         f"{FRICTION:g} where it has none",
     )
-    want: Annotated[
-        Literal["valid", "raw"], Option("basic", form=Form("grasps", "Counted", choices=_WANTS_IN_WORDS))
-    ] = Field(
-        "valid",
-        description="what `grasps` counts. valid: valid grasps (sound ones where the referee is none); raw: all that "
-        "were tried",
+    want: Annotated[Literal["valid", "raw"], Option("basic"), Form("grasps", "Counted", choices=_WANTS_IN_WORDS)] = (
+        Field(
+            "valid",
+            description="what `grasps` counts. valid: valid grasps (sound ones with referee none); raw: all tries",
+        )
     )
     budget: Annotated[float, Option()] = Field(
         4.0, ge=1, le=100, description="tries for each valid grasp wanted, at most"
     )
     min_distance: Annotated[
-        float, Option(form=Form("grasps", "Least distance", "between two grasps of a batch; 0: any", cells=True))
+        float, Option(), Form("grasps", "Least distance", "between two grasps of a batch; 0: any", cells=True)
     ] = _sparse(
         MIN_DISTANCE_M,
         ge=0,
@@ -205,7 +196,8 @@ class JobOptions(Model):
     )
     referee: Annotated[
         Literal["letter", "certificate", "screen", "none"],
-        Option("basic", form=Form("grasps", "Judged by MuJoCo", choices=_REFEREES_IN_WORDS)),
+        Option("basic"),
+        Form("grasps", "Judged by MuJoCo", choices=_REFEREES_IN_WORDS),
     ] = Field(
         "certificate",
         description="level at which MuJoCo judges the grasps (screen: on a GPU, MuJoCo Warp gives the clear verdicts); "
@@ -223,14 +215,9 @@ class JobOptions(Model):
     )
     robust: Annotated[
         float,
-        Option(
-            "basic",
-            form=Form(
-                "grasps",
-                "Robust share",
-                "of 8 models around the nominal one that a grasp must hold in; 0: any",
-                cells=True,
-            ),
+        Option("basic"),
+        Form(
+            "grasps", "Robust share", "of 8 models around the nominal one that a grasp must hold in; 0: any", cells=True
         ),
     ] = _sparse(
         0.0,
@@ -252,10 +239,8 @@ class JobOptions(Model):
     )
     min_payload: Annotated[
         float,
-        Option(
-            schema=5,
-            form=Form("grasps", "Least payload", "mass that a grasp must lift to count; 0: not asked", cells=True),
-        ),
+        Option(schema=5),
+        Form("grasps", "Least payload", "mass that a grasp must lift to count; 0: not asked", cells=True),
     ] = _sparse(
         0.0,
         ge=0,
@@ -263,7 +248,7 @@ class JobOptions(Model):
         allow_inf_nan=False,
         description="mass that a grasp must lift to count [kg]; 0: none is wanted. It is measured where one is",
     )
-    shake: Annotated[bool, Option(schema=5, form=Form("scenes", "After the lift", "Shake: 2 cm, 3 Hz", cells=True))] = (
+    shake: Annotated[bool, Option(schema=5), Form("scenes", "After the lift", "Shake: 2 cm, 3 Hz", cells=True)] = (
         _sparse(False, description="shake each valid grasp after its lift: 2 cm, 3 Hz, along x and y of its scene")
     )
     options: Annotated[
@@ -279,14 +264,7 @@ class JobOptions(Model):
         max_length=16,
         description="the method's own options, such as steps; see docs/how-to/planners.md",
     )
-    target: Annotated[
-        str,
-        Option(
-            places=JOB,
-            typed="with fidelity auto: the accuracy wanted, such as gsr>=0.6 or pd_mm<=1, in a scene lift>=0.9; the "
-            "cheapest fidelity that meets it is taken",
-        ),
-    ] = Field(
+    target: Annotated[str, Option(places=JOB)] = Field(
         "",
         max_length=40,
         description="with fidelity `auto`: the accuracy wanted, such as gsr>=0.6, letter>=0.9, epsilon>=0.2 or "

@@ -55,7 +55,6 @@ class Option:
     """Spelling in `graspd.synthesize`; empty: the name."""
     typed: str = ""
     """The description where a person types the value, if it differs from that of the HTTP document."""
-    form: Form | None = None
     schema: int = 0
     """First schema of task messages with the field; 0: all have it."""
 
@@ -67,6 +66,11 @@ class Row:
     name: str
     field: FieldInfo
     option: Option
+
+    @property
+    def form(self) -> Form | None:
+        """How forms show it, if they do."""
+        return next((one for one in self.field.metadata if isinstance(one, Form)), None)
 
     @property
     def flags(self) -> list[str]:
