@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 
@@ -16,15 +15,11 @@ from worker.engines.joins import PER_LAUNCH
 from worker.hands.model import HandModel
 from worker.meeting import Meeting
 from worker.objects.model import ObjectModel
-from worker.quality.diversity import distinct, hand_points
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.rounds import taken
 from worker.run import ALONE, Run
 from worker.side_by_side import Shares, in_threads
 from worker.simulation.surroundings import Scenes
-
-#: Times that batches are made for grasps that were too like those of another batch.
-_REFILLS: Final = 3
 
 
 def certified_batches(
@@ -119,39 +114,6 @@ def _nothing(like: Certified) -> Certified:
     grasps, columns = taken(like.grasps, like.columns, np.zeros(0, int))
     seconds, shares = (dict.fromkeys(counts, 0.0) for counts in (like.seconds, like.shares))
     return Certified(grasps, columns, 0, dict.fromkeys(like.rejected, 0), {}, like.verdict_key, 0, seconds, shares)
-
-
-def distinct_batches(
-    hand: HandModel, request: JobOptions, batches: list[Certified], more: Callable[[int, int], Certified | None]
-) -> list[Certified]:
-    """The batches without grasps too like one of an earlier batch, and further batches in their place.
-
-    A job's tasks know nothing of each other, so this is for whoever has all batches at hand.
-
-    Args:
-        hand: the hand.
-        request: `min_distance` says what is too like; raw grasps are all kept.
-        batches: the batches of a job, from the first.
-        more: makes a batch of so many grasps, of that number within the job; None: there are to be no more.
-    """
-    if request.want == "raw" or request.min_distance <= 0:
-        return batches
-    points = hand_points(hand, batches[0].grasps.grasp)
-    kept = [batches[0]]
-    waiting, missing, refills = batches[1:], 0, 0
-    while waiting:
-        batch = waiting.pop(0)
-        both = np.concatenate([points, hand_points(hand, batch.grasps.grasp)])
-        mask = distinct(both, request.min_distance, given=len(points))
-        points, mine = both[mask], mask[len(points) :]
-        kept.append(batch if mine.all() else batch.keeping(mine))
-        missing += int((~mine).sum())
-        if not waiting and missing and refills < _REFILLS:
-            if (another := more(missing, len(batches) + refills)) is None:
-                break
-            waiting.append(another)
-            missing, refills = 0, refills + 1
-    return kept
 
 
 def _together(

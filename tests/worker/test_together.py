@@ -9,14 +9,14 @@ from service.model.domain import JobOptions
 from service.model.errors import MeshError, TaskCancelled
 from service.model.fidelity import resolve_fidelity
 from worker import together
-from worker.certified import Certified, certified_grasps
 from worker.engines.joins import batches_at_once, fitting
+from worker.files.synthesis import synthesized
 from worker.hands.load import hand_from_path
 from worker.meeting import Meeting
 from worker.objects.prepare import object_from_path
 from worker.pool.pool import MODULES, Pool
 from worker.run import Run
-from worker.together import certified_batches, distinct_batches
+from worker.together import certified_batches
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), audits=0, grasps=6)
 
@@ -74,21 +74,13 @@ def test_batches_that_other_processes_judge_and_measure_are_the_same(pair, alone
     assert told[-1] == (6, 6)
 
 
-def test_grasps_alike_in_two_batches_are_replaced_by_those_of_another(pair) -> None:
-    request = REQUEST.model_copy(update={"referee": "none"})
-    first, third = (certified_batches(*pair, request, sizes=[size], run=Run(threads=2))[0] for size in (2, 3))
-    asked: list[tuple[int, int]] = []
-
-    def more(count: int, number: int) -> Certified:
-        asked.append((count, number))
-        return certified_grasps(*pair, request, count=count, batch=number, run=Run(threads=2))
-
-    found = distinct_batches(pair[0], request, [first, third], more)
-    # The second batch begins as the first one does: two of its three are there already.
-    assert asked == [(2, 2)] and [len(one.grasps) for one in found] == [2, 1, 2]
-    assert found[1].rejected["alike"] == 2 and len(found[1].columns["quality/epsilon"]) == 1
-    raw = request.model_copy(update={"want": "raw"})
-    assert distinct_batches(pair[0], raw, [first, third], more) == [first, third]
+def test_a_run_in_this_process_makes_the_batches_of_a_job(pair) -> None:
+    """Near-duplicates are dropped from a batch, whoever makes it: at this distance two batches are full of them."""
+    request = JobOptions(grasps=33, referee="none", fidelity="draft", min_distance=0.03, budget=2, audits=0)
+    batches = certified_batches(*pair, request, sizes=[32, 1], run=Run(threads=2))
+    made = synthesized("barrett", "block", request, device="cpu", threads=2)
+    assert_same(made.batches, batches)
+    assert len(made.arrays["grasp/hand_pose"]) == sum(len(one.grasps) for one in batches)
 
 
 def test_what_becomes_of_one_batch_ends_the_job(pair) -> None:

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.domain import BATCH_SIZE, SHAKE_NEEDS_A_SCENE, JobOptions
-from service.model.errors import InputError, TaskCancelled
+from service.model.errors import InputError
 from service.model.local_options import LocalOptions
 from service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits
 from service.model.planning import shortfall, totals
 from service.model.scene_spec import SceneSpec
 from service.store.columns import Attribute
 from service.store.shards import json_attribute
-from worker.certified import Certified, certified_grasps
+from worker.certified import Certified
 from worker.engines.devices import Device
 from worker.engines.joins import batches_at_once
 from worker.files.provenance import (
@@ -42,7 +42,7 @@ from worker.quality.referee.payload import Limit
 from worker.run import FirstJudge, Progress, Run
 from worker.scenes.beside import scenes_of
 from worker.scenes.rest import rolling_poses
-from worker.together import certified_batches, distinct_batches
+from worker.together import certified_batches
 
 Arrays = dict[str, NDArray[Any]]
 #: Threshold of the metrics that a summary tells [m].
@@ -263,18 +263,6 @@ def synthesized(
         batches = certified_batches(
             model, thing, request, sizes=sizes, join=joined, scenes=where, run=run, partial=partial
         )
-
-        def more(count: int, number: int) -> Certified | None:
-            try:
-                return certified_grasps(
-                    model, thing, request, count=count, batch=number, scenes=where, run=run.quiet(), partial=partial
-                )
-            except TaskCancelled:
-                if not partial:
-                    raise
-                return None
-
-        batches = distinct_batches(model, request, batches, more)
     interrupted = partial and run.cancelled()
     seconds = time.perf_counter() - began
     arrays = joined_columns([{**batch.grasps.to_columns(), **batch.columns} for batch in batches])
