@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Unpack
 
 from graspd.grasps import Grasps
+from service.model.errors import InputError
 from service.model.local_options import LocalOptions
 from service.model.options import accepted, rows, with_keywords
 
@@ -15,6 +17,8 @@ if TYPE_CHECKING:
     from graspd.keywords import SynthesizeKeywords
 
 _NAMES: Final = {row.keyword: row.name for row in rows(LocalOptions, "python")}
+_KEYWORDS: Final = {flag: row.keyword for row in rows(LocalOptions, "python") for flag in row.flags}
+_FLAG: Final = re.compile(r"--[a-z]+(?:-[a-z]+)*")
 
 
 @with_keywords(LocalOptions, "python")
@@ -55,5 +59,10 @@ def synthesize(
     given = {_NAMES[keyword]: value for keyword, value in options.items() if value is not None}
     asked = accepted(LocalOptions, given, names={name: keyword for keyword, name in _NAMES.items()})
     told = (lambda done, total, _message: progress(done / total)) if progress else None
-    made = synthesized_as(str(hand), str(object), asked, progress=told)
+    try:
+        made = synthesized_as(str(hand), str(object), asked, progress=told)
+    except InputError as error:
+        # The engine names fixes as the command line spells them.
+        error.args = (_FLAG.sub(lambda flag: _KEYWORDS.get(flag[0], flag[0]), str(error)),)
+        raise
     return Grasps(made.arrays, made.attributes)

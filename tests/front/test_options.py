@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import trimesh
 
 import graspd
 from service.command_options import validated
@@ -51,6 +52,13 @@ def test_every_message_is_in_the_words_of_the_caller(wrong: dict[str, Any], type
     with pytest.raises(InputError) as refused:
         graspd.synthesize("barrett", "block", **{names[name]: value for name, value in wrong.items()})  # type: ignore[arg-type]
     assert str(refused.value).startswith(called)
+
+
+def test_a_fix_is_in_the_words_of_the_caller(tmp_path: Path) -> None:
+    trimesh.creation.box((60, 60, 60)).export(tmp_path / "box.stl")
+    with pytest.raises(graspd.MeshError, match=r"; units mm makes it .*scale_to 0\.1") as refused:
+        graspd.synthesize("barrett", tmp_path / "box.stl")
+    assert "--" not in str(refused.value) and refused.value.facts["options_suggested"]  # type: ignore[attr-defined]
 
 
 def test_a_keyword_that_is_none_is_a_type_error() -> None:
