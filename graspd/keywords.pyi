@@ -61,7 +61,7 @@ class SynthesizeKeywords(TypedDict, total=False):
     min_payload: float
     shake: bool
     options: Mapping[str, int | float | str]
-    units: Literal["m", "mm", "cm", "in"] | None
+    units: Literal["m", "mm", "cm", "in"]
     scale_to: float | None
     device: str
     threads: int

@@ -11,6 +11,7 @@ from pydantic import Field, field_validator, model_validator
 from service.model.domain import SCENES, JobOptions
 from service.model.errors import one_of
 from service.model.fidelity import FIDELITIES, Fidelity
+from service.model.object_options import MeshOptions
 from service.model.options import Option, Place
 from service.model.scene_spec import MOST_NEIGHBOURS, MOST_SCENES, SceneSpec, Touch, parse_scene
 
@@ -18,10 +19,9 @@ _LOCAL: Final[tuple[Place, ...]] = ("synth", "python")
 _COMMAND: Final[tuple[Place, ...]] = ("synth",)
 #: Fields of a job that say where its grasps are used; in this process a `SceneSpec` does.
 _OF_PLACE: Final = {"scene", "faces", "neighbours", "touch", "scenes"}
-_OF_MESH: Final = {"units", "scale_to", "keep_largest", "compound", "allow_open"}
 
 
-class LocalOptions(JobOptions):
+class LocalOptions(MeshOptions, JobOptions):
     """What `graspd synth` and `graspd.synthesize` are told besides hand and object."""
 
     fidelity: Annotated[str, Option("basic", _LOCAL)] = Field("standard", description=f"one of {', '.join(FIDELITIES)}")
@@ -46,21 +46,6 @@ class LocalOptions(JobOptions):
         False,
         description="measure the heaviest mass that each valid grasp lifts; graspd synth does by default in scenes "
         "where a mass is said",
-    )
-    units: Annotated[Literal["m", "mm", "cm", "in"] | None, Option(places=_LOCAL)] = Field(
-        None, description="unit of the mesh; by default metres"
-    )
-    scale_to: Annotated[Annotated[float, Field(gt=0, allow_inf_nan=False)] | None, Option(places=_LOCAL)] = Field(
-        None, description="longest side of the object after scaling [m]"
-    )
-    keep_largest: Annotated[bool, Option(places=_COMMAND)] = Field(
-        False, description="of several components keep the largest"
-    )
-    compound: Annotated[bool, Option(places=_COMMAND)] = Field(
-        False, description="components that lie apart are one rigid body"
-    )
-    allow_open: Annotated[bool, Option(places=_COMMAND)] = Field(
-        False, description="take a mesh that is not watertight"
     )
     device: Annotated[str, Option(places=_LOCAL)] = Field("auto", description="device: cpu, cuda:0 or auto")
     threads: Annotated[int, Option(places=_LOCAL)] = Field(0, ge=0, description="CPU threads; 0: one per core")
@@ -106,7 +91,8 @@ class LocalOptions(JobOptions):
     @property
     def mesh(self) -> dict[str, Any]:
         """How the object's file is read, as keys of its `asset.json`."""
-        return {name: value for name in sorted(_OF_MESH) if (value := getattr(self, name))}
+        given = self.model_fields_set & MeshOptions.model_fields.keys()
+        return {name: value for name in sorted(given) if (value := getattr(self, name))}
 
     def request(self, options: dict[str, Any]) -> JobOptions:
         """The job without its place, of which a file holds no sample of second opinions.

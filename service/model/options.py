@@ -22,8 +22,8 @@ from service.model.errors import InputError
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
-#: Who takes an option: a job of the service, the command `graspd synth`, `graspd.synthesize`.
-Place = Literal["job", "synth", "python"]
+#: Who takes an option: a job of the service, the command `graspd synth`, `graspd.synthesize`; the file of an asset.
+Place = Literal["job", "synth", "python", "asset"]
 EVERYWHERE: Final[tuple[Place, ...]] = ("job", "synth", "python")
 JOB: Final[tuple[Place, ...]] = ("job",)
 _UNIT: Final = re.compile(r"\[([^\]]+)\]")

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from service.model.errors import AssetError, InputError
-from worker.objects.options import ObjectOptions, parse_options
+from service.model.object_options import ObjectOptions
+from worker.objects.options import parse_options
 from worker.objects.prepare import build, main_file, repaired_mesh, weighed
 from worker.objects.repair import Repaired
 

@@ -24,6 +24,7 @@ from service import user_cache
 from service.model.digests import digest_files, digest_json, digest_variant
 from service.model.errors import MeshError, NotFoundError, did_you_mean
 from service.model.libraries import version_of
+from service.model.object_options import ObjectOptions
 from service.model.states import AssetKind
 from service.model.transforms import Floats
 from service.store.assets import builtin_files, builtin_names, unpack_file
@@ -32,7 +33,7 @@ from worker.objects.distance import MeshDistance, deviation, surface_points
 from worker.objects.formats import READERS, read_mesh
 from worker.objects.mesh_geometry import corner_normals, mass_properties, signed_volume
 from worker.objects.model import Ints, ObjectModel
-from worker.objects.options import OF_MATTER, ObjectOptions, parse_options
+from worker.objects.options import OF_MATTER, parse_options
 from worker.objects.repair import Repaired, repair
 from worker.objects.topology import Indices
 

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from service.model.errors import MeshError
+from service.model.object_options import ObjectOptions
 from service.model.transforms import Floats
 from worker.grasps import on_grid
 from worker.objects import mesh_geometry, topology
@@ -19,7 +20,7 @@ from worker.objects.distance import MeshDistance, surface_points
 from worker.objects.formats import Soup
 from worker.objects.intersections import crossings, untangle
 from worker.objects.mesh_geometry import Centred, centred, signed_volume
-from worker.objects.options import UNITS, ObjectOptions
+from worker.objects.options import UNITS
 from worker.objects.topology import Indices
 
 MAX_EXTENT_M: Final = 3.0
