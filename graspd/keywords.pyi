@@ -60,7 +60,7 @@ class SynthesizeKeywords(TypedDict, total=False):
     payload: bool
     min_payload: float
     shake: bool
-    options: Mapping[str, int | float | str]
+    options: Mapping[str, Any]
     units: Literal["m", "mm", "cm", "in"]
     scale_to: float | None
     device: str

@@ -49,7 +49,7 @@ _BOUNDS: Final = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_e
 _NAMES: Final = "must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores"
 #: How pydantic begins: of what, not of which field.
 _SUBJECT: Final = re.compile(r"^(Value error, )|^\w+ should ")
-_CLASS: Final = re.compile(r"_[A-Z]\w*$")
+_CLASS: Final = re.compile(r"_[A-Z]\w*$|constrained-\w+$")
 #: How typer names the choices of an option; pydantic gives them as `expected`.
 _CHOICES: Final = re.compile(r"'(?P<word>.*?)' is not one of (?P<expected>'.*')")
 

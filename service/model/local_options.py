@@ -12,7 +12,7 @@ from service.model.domain import SCENES, JobOptions
 from service.model.errors import one_of
 from service.model.fidelity import FIDELITIES, Fidelity
 from service.model.object_options import MeshOptions
-from service.model.options import Option, Place
+from service.model.options import Option, Place, accepted
 from service.model.scene_spec import MOST_NEIGHBOURS, MOST_SCENES, SceneSpec, Touch, parse_scene
 
 _LOCAL: Final[tuple[Place, ...]] = ("synth", "python")
@@ -46,6 +46,10 @@ class LocalOptions(MeshOptions, JobOptions):
         False,
         description="measure the heaviest mass that each valid grasp lifts; graspd synth does by default in scenes "
         "where a mass is said",
+    )
+    # A value may be a file, whose digest a job has.
+    options: Annotated[dict[str, Any], Option("advanced", _LOCAL, "--option")] = Field(
+        default_factory=dict, description="an option of the planner, such as steps=20000 or network=net.npz"
     )
     device: Annotated[str, Option(places=_LOCAL)] = Field("auto", description="device: cpu, cuda:0 or auto")
     threads: Annotated[int, Option(places=_LOCAL)] = Field(0, ge=0, description="CPU threads; 0: one per core")
@@ -99,7 +103,10 @@ class LocalOptions(MeshOptions, JobOptions):
 
         Args:
             options: of the method, with digests for files.
+
+        Raises:
+            InputError: one of them is no number or short text.
         """
         shared = {name: getattr(self, name) for name in JobOptions.model_fields.keys() - _OF_PLACE}
         # An audit is a sample that watches over many jobs; a file can be judged by the letter whole.
-        return JobOptions(**shared | {"fidelity": self.knobs, "options": options, "audits": 0})
+        return accepted(JobOptions, shared | {"fidelity": self.knobs, "options": options, "audits": 0})
