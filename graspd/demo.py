@@ -15,9 +15,9 @@ from rich.table import Table
 from graspd.api.formatting import count, duration, metric
 from graspd.api.models import GraspQuery, JobDetail
 from graspd.client.client import Client
-from graspd.client.job_options import parsed_options
 from graspd.client.reports import JobDisplay, job_summary, means_of, yield_of
 from graspd.service.cli import JsonFlag, emit, load_settings, plain_console, reporting_errors, write_output
+from graspd.service.command_options import parsed_options
 from graspd.service.index.views import GraspView
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import TaskError

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Self
-
-from pydantic import ValidationError
+from typing import TYPE_CHECKING, Self, Unpack
 
 from graspd.grasps import Grasps, joined
-from graspd.service.model.base import refusal
-from graspd.service.model.domain import JobRequest
+from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.errors import InputError, TaskError
+from graspd.service.model.options import accepted, with_keywords
 from graspd.service.model.states import State
 from graspd.service.store.shards import read_shard
+
+if TYPE_CHECKING:
+    from graspd.keywords import JobKeywords
 
 try:
     from graspd.api.models import JobDetail
@@ -47,23 +48,21 @@ class Client:
         """Close the connection."""
         self._http.close()
 
-    def submit(self, hand: str, object: str, **options: Any) -> Job:
+    @with_keywords(JobOptions, "job")
+    def submit(self, hand: str, object: str, **options: Unpack[JobKeywords]) -> Job:
         """Submit a job; the same request is the same job.
 
         Args:
             hand: name of a hand that the service knows.
             object: name of an object that it knows.
-            options: `grasps`, `scene`, `fidelity`, `seed` and the other fields of POST /v1/jobs.
+            options: fields of POST /v1/jobs; docs/reference/options.md lists them, with units, bounds and defaults.
 
         Raises:
             InputError: an unknown option, or a value out of range.
             NotFoundError: unknown hand or object.
             UnavailableError: the service does not answer.
         """
-        try:
-            request = JobRequest.model_validate({"hand": hand, "object": object, **options})
-        except ValidationError as error:
-            raise InputError(refusal(error, JobRequest)) from None
+        request = accepted(JobRequest, {"hand": hand, "object": object, **options})
         return Job(self._http, self._http.submit(request))
 
     def job(self, job_id: str) -> Job:

@@ -1,6 +1,6 @@
-"""The parts of the documentation that follow from the code: the tables of shards and settings.
+"""What follows from the code and lies in files: tables of the documentation, types of keywords.
 
-A page holds them between `<!-- NAME -->` and `<!-- /NAME -->`; `python -m graspd.service.docs` writes them anew.
+A page holds its tables between `<!-- NAME -->` and `<!-- /NAME -->`; `python -m graspd.service.docs` writes all anew.
 """
 
 from __future__ import annotations
@@ -11,6 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.local_options import LocalOptions
+from graspd.service.model.options import Place, Row, keywords_of, rows
 from graspd.service.pipeline.metrics import series_table
 from graspd.service.settings import Settings
 from graspd.service.store.columns import ATTRIBUTES, SCHEMAS, ShardKind
@@ -46,15 +49,61 @@ def settings_table() -> str:
     return "\n".join(lines)
 
 
+def options_table() -> str:
+    """Markdown tables of the options of jobs and of runs in this process, the basic ones first."""
+    job, local = rows(JobOptions, "job"), rows(LocalOptions, "synth")
+    same = {row.name for row in local if any(_cells(row) == _cells(other) for other in job)}
+    found = [(row, "both" if row.name in same else "job") for row in job]
+    found += [(row, "here") for row in local if row.name not in same]
+    order = list(LocalOptions.model_fields)
+    found.sort(key=lambda one: order.index(one[0].name))
+    tables = []
+    for group in ("basic", "advanced"):
+        lines = [f"## {group.capitalize()}", "", "| option | command line | of | default | bounds | meaning |"]
+        lines += ["| --- | --- | --- | --- | --- | --- |"]
+        for row, where in found:
+            if row.option.group == group:
+                default, bounds, meaning = _cells(row)
+                flags = ", ".join(f"`{flag}`" for flag in row.flags)
+                lines.append(f"| `{row.name}` | {flags} | {where} | {default} | {bounds} | {meaning} |")
+        tables.append("\n".join(lines))
+    return "\n\n".join(tables)
+
+
+def _cells(row: Row) -> tuple[str, str, str]:
+    default = "" if row.default is False or row.default in (None, (), {}, "") else f"`{row.default}`"
+    return default, row.range, row.meaning
+
+
+def keywords_stub() -> str:
+    """Types of the keywords of `graspd.synthesize` and `graspd.Client.submit`, which take them as `**options`."""
+    parts = [
+        '"""Keywords that follow from the options; `python -m graspd.service.docs` writes them."""\n',
+        "from collections.abc import Mapping, Sequence",
+        "from pathlib import Path",
+        "from typing import Any, Literal, TypedDict",
+    ]
+    tables: tuple[tuple[str, type[JobOptions], Place], ...] = (
+        ("JobKeywords", JobOptions, "job"),
+        ("SynthesizeKeywords", LocalOptions, "python"),
+    )
+    for title, model, place in tables:
+        fields = [f"    {name}: {text}" for name, _, text in keywords_of(model, place)]
+        parts.append("\n".join(["", f"class {title}(TypedDict, total=False):", *fields]))
+    return "\n".join(parts) + "\n"
+
+
 PARTS: Final[dict[str, Callable[[], str]]] = {
     "attributes": attributes_table,
     "base": lambda: schema_table("base"),
     "scene": lambda: schema_table("scene"),
     "views": lambda: schema_table("views"),
+    "options": options_table,
     "settings": settings_table,
     "metrics": series_table,
 }
-PAGES: Final = ("docs/reference/settings.md", "docs/reference/dataset.md", "docs/reference/metrics.md")
+PAGES: Final = tuple(f"docs/reference/{name}.md" for name in ("settings", "dataset", "metrics", "options"))
+STUB: Final = "graspd/keywords.pyi"
 
 
 def renewed(text: str) -> str:
@@ -66,10 +115,11 @@ def renewed(text: str) -> str:
 
 
 def main(root: Path) -> None:
-    """Renew all pages under a checkout."""
+    """Renew all pages, and the types of keywords, under a checkout."""
     for page in PAGES:
         path = root / page
         path.write_text(renewed(path.read_text()))
+    (root / STUB).write_text(keywords_stub())
 
 
 if __name__ == "__main__":

@@ -63,14 +63,14 @@ def evaluate(
     Level letter has the protocol's own mass and friction, the others the object's.
 
     Keys: n, protocol, level, hard, mu, mass_kg, object_friction; gsr (share that holds), osr (1 if any holds), sgs
-    (holding grasps per second of making and validating them; of making them alone: sgs_without_referee), pd_mm and
+    (holding grasps per second of making and validating them; of making them alone: sgs_without_validation), pd_mm and
     spd_mm (penetration, self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity:
     variance explained by the first principal component; nearest_mm: distance of the two grasps that are most alike.
     verdicts, where somebody validated: see `told`. Validated in `models` models around the nominal one, by the same
     protocol: robust_share, the mean of those that hold in it, robust_n, how many, robust_axes, the share by axis;
     `tell` gets what became of each grasp.
     With protocol lift also clear_share (free of what stands in the scene, coming, closing and lifting). With another
-    model of the hand as `judge_hand` also what `ForeignVerdicts.facts` tells, and in the verdicts held_foreign and
+    model of the hand as `validation_hand` also what `ForeignVerdicts.facts` tells, and in the verdicts held_foreign and
     reason_foreign.
 
     Raises:

@@ -112,14 +112,6 @@ class ValidatedBatch:
         """The same with the grasps moved by a vector (3,) [m]."""
         return replace(self, grasps=self.grasps.moved(by))
 
-    def keeping(self, kept: NDArray[np.bool_]) -> ValidatedBatch:
-        """The same without the grasps that are not `kept` (N,): they were too like others."""
-        grasps, columns = taken(self.grasps, self.columns, np.flatnonzero(kept))
-        alike = {"alike": int((~kept).sum())}
-        rejected = {**self.rejected, "alike": self.rejected.get("alike", 0) + alike["alike"]}
-        outcomes = totals([self.outcomes, alike])
-        return replace(self, grasps=grasps, columns=columns, rejected=rejected, outcomes=outcomes)
-
 
 def validated_grasps(
     hand: HandModel,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 
@@ -17,14 +16,10 @@ from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.hands.model import HandModel
 from graspd.worker.meeting import Meeting
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.quality.diversity import distinct, hand_points
 from graspd.worker.rounds import taken
 from graspd.worker.side_by_side import Shares, in_threads
 from graspd.worker.simulation.environment import Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
-
-#: Times that batches are made for grasps that were too like those of another batch.
-_REFILLS: Final = 3
 
 
 def validated_batches(
@@ -119,42 +114,6 @@ def _nothing(like: ValidatedBatch) -> ValidatedBatch:
     grasps, columns = taken(like.grasps, like.columns, np.zeros(0, int))
     seconds, shares = (dict.fromkeys(counts, 0.0) for counts in (like.seconds, like.shares))
     return ValidatedBatch(grasps, columns, 0, dict.fromkeys(like.rejected, 0), {}, like.verdict_key, 0, seconds, shares)
-
-
-def distinct_batches(
-    hand: HandModel,
-    request: JobOptions,
-    batches: list[ValidatedBatch],
-    more: Callable[[int, int], ValidatedBatch | None],
-) -> list[ValidatedBatch]:
-    """The batches without grasps too like one of an earlier batch, and further batches in their place.
-
-    A job's tasks know nothing of each other, so this is for whoever has all batches at hand.
-
-    Args:
-        hand: the hand.
-        request: `min_distance` says what is too like; candidates are all kept.
-        batches: the batches of a job, from the first.
-        more: makes a batch of so many grasps, of that number within the job; None: there are to be no more.
-    """
-    if request.want == "candidates" or request.min_distance <= 0:
-        return batches
-    points = hand_points(hand, batches[0].grasps.grasp)
-    kept = [batches[0]]
-    waiting, missing, refills = batches[1:], 0, 0
-    while waiting:
-        batch = waiting.pop(0)
-        both = np.concatenate([points, hand_points(hand, batch.grasps.grasp)])
-        mask = distinct(both, request.min_distance, given=len(points))
-        points, mine = both[mask], mask[len(points) :]
-        kept.append(batch if mine.all() else batch.keeping(mine))
-        missing += int((~mine).sum())
-        if not waiting and missing and refills < _REFILLS:
-            if (another := more(missing, len(batches) + refills)) is None:
-                break
-            waiting.append(another)
-            missing, refills = 0, refills + 1
-    return kept
 
 
 def _together(

@@ -20,7 +20,7 @@ from graspd.api.catalog.jobs import Jobs
 from graspd.api.dashboard import figures
 from graspd.api.dashboard.figures import twins
 from graspd.api.dashboard.form_uploads import asset_choices
-from graspd.api.dashboard.forms import first_message, listed
+from graspd.api.dashboard.forms import first_message, inputs_of, listed
 from graspd.api.dashboard.grasp_pages import COLUMNS
 from graspd.api.dashboard.rendering import render
 from graspd.api.routes.dependencies import AssetsOf, ComparisonsOf, DatasetsOf, JobsOf, may_read, may_submit
@@ -39,18 +39,8 @@ _MAX_FIELDS: Final = 4000
 _DONE: Final = {"submit": "submitted", "retry": "retried", "cancel": "cancelled", "snapshot": "taken as a snapshot"}
 
 #: Fields of the form of a dataset, and what stands there at first.
-_MAKE: Final = {
-    "name": "",
-    "grasps": "320",
-    "fidelity": "standard",
-    "scene": "free",
-    "faces": "drawn",
-    "touch": "0",
-    "min_distance": "0.005",
-    "robust": "0",
-    "min_payload": "0",
-    "shake": "",
-    "neighbours": "",
+_MAKE: Final = {"name": "", "grasps": "320", "fidelity": "standard"} | {
+    one.name: one.default for one in inputs_of(cells=True)
 }
 
 router = APIRouter(prefix="/datasets", include_in_schema=False)
@@ -257,6 +247,7 @@ def _overview(
         hands=hands,
         objects=objects,
         fidelities=OFFERED,
+        inputs=inputs_of(cells=True),
         form=_MAKE | {"hands": [], "objects": []} | (form or {}),
         problem=problem,
         did=_did(request),

@@ -24,9 +24,10 @@ from graspd.api.routes.dependencies import AssetsOf, JobsOf, may_read, may_submi
 from graspd.service.index.index import Index
 from graspd.service.index.queries.overview import BatchCost, Costs
 from graspd.service.model.base import refusal, words
-from graspd.service.model.domain import JobRequest
+from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.fidelity import OFFERED
+from graspd.service.model.options import Form, Row, rows
 from graspd.service.model.projects import ProjectScope
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline.datasets.cost import estimate
@@ -34,33 +35,46 @@ from graspd.service.pipeline.datasets.spec import Matrix
 
 router = APIRouter(include_in_schema=False)
 
-DEFAULTS: Final[dict[str, Any]] = {
-    "hand": "allegro",
-    "object": "mug",
-    "grasps": 32,
-    "fidelity": "standard",
-    "seed": 0,
-    "friction": 1.0,
-    "mass": "",
-    "object_friction": "",
-    "min_payload": 0.0,
-    "shake": False,
-    "scene": "free",
-    "faces": "drawn",
-    "touch": 0.0,
-    "neighbours": "",
-    "scenes": 0,
-    "views": 0,
-    "stereo": False,
-    "width": 320,
-    "height": 240,
-    "want": "valid",
-    "validation": "standard",
-    "min_distance": 0.005,
-    "robust": 0.0,
-}
-#: Fields where a rule over several of them is told, by a word of the rule.
-_WHOLE: Final = {"robust": "robust", "payload": "min_payload", "shake": "shake", "mass": "mass"}
+
+@dataclass(frozen=True)
+class FormInput:
+    """An option of a job as a form shows it."""
+
+    name: str
+    label: str
+    hint: str
+    kind: str
+    """checkbox, select, number or text."""
+    choices: Mapping[str, str]
+    default: Any
+    attributes: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, row: Row, form: Form) -> FormInput:
+        """The field of a row of the options' table."""
+        kind = "checkbox" if row.kind is bool else "select" if form.choices else "text"
+        limits: dict[str, Any] = {}
+        if row.kind in (int, float):
+            bounds, kind = row.bounds, "number"
+            limits = {"min": bounds.get("ge", bounds.get("gt")), "max": bounds.get("le")}
+            limits = {name: f"{value:.12g}" for name, value in limits.items() if value is not None}
+            limits |= {"step": "any"} if row.kind is float else {}
+        elif form.placeholder:
+            limits = {"maxlength": 600, "placeholder": form.placeholder}
+        default = "" if row.default in (None, ()) else f"{row.default:g}" if row.kind is float else row.default
+        label = f"{form.label} [{row.unit}]" if row.unit else form.label
+        return cls(row.name, label, form.hint, kind, form.choices, default, limits)
+
+
+def inputs_of(section: str = "", *, cells: bool = False) -> list[FormInput]:
+    """Options that the form of a job shows, in one section or all; with `cells`, those that a dataset's form shows."""
+    shown = [(row, row.form) for row in rows(JobOptions, "job") if row.form is not None]
+    return [
+        FormInput.of(row, form) for row, form in shown if section in ("", form.section) and (form.cells or not cells)
+    ]
+
+
+DEFAULTS: Final = {"hand": "allegro", "object": "mug"} | {one.name: one.default for one in inputs_of()}
 
 
 @router.get("/submit", dependencies=[Depends(may_read)])
@@ -113,7 +127,7 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
         for name in DEFAULTS
         if name not in ("hand", "object") and isinstance(fields.get(name), str) and fields[name] != ""
     }
-    form |= {name: fields.get(name) == "true" for name in ("stereo", "shake")}
+    form |= {one.name: fields.get(one.name) == "true" for one in inputs_of() if one.kind == "checkbox"}
     things = {kind: chosen(request, assets, fields, kind) for kind in FILE_FIELDS}
     # Without a default: a form that names no object gets none.
     form |= {kind.value: one.name for kind, one in things.items()}
@@ -140,10 +154,11 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
 def _by_field(error: ValidationError) -> dict[str, str]:
     errors: dict[str, str] = {}
     for entry in error.errors():
-        # A rule over several fields has no place of its own: those that a form can break are of these.
-        whole = next((field for word, field in _WHOLE.items() if word in entry["msg"]), "scenes")
-        name = str(entry["loc"][0]) if entry["loc"] else whole
-        errors.setdefault(name, words(entry))
+        said = words(entry)
+        # A rule over several fields has no place of its own, and mostly begins with the word of one.
+        word = said.partition(" ")[0]
+        whole = next((name for name in DEFAULTS if word in (name, name.rpartition("_")[2])), "scenes")
+        errors.setdefault(str(entry["loc"][0]) if entry["loc"] else whole, said)
     return errors
 
 
@@ -166,6 +181,7 @@ def _form(
         form={"units": "m"} | form,
         errors=dict.fromkeys([*DEFAULTS, "file", "hand_file"], "") | (errors or {}),
         problem=problem,
+        sections={section: inputs_of(section) for section in ("grasps", "scenes")},
         hands=choices(assets, AssetKind.HAND, str(form["hand"]), things[AssetKind.HAND]),
         objects=choices(assets, AssetKind.OBJECT, str(form["object"]), things[AssetKind.OBJECT]),
         held={kind.value: one.held for kind, one in things.items()},

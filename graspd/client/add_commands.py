@@ -18,31 +18,15 @@ from graspd.api.uploads import name_of_upload
 from graspd.client.client import Client
 from graspd.client.reports import UrlOption, open_client, show_asset
 from graspd.service.cli import JsonFlag, emit, reporting_errors
+from graspd.service.command_options import with_options
 from graspd.service.model.errors import InputError
 from graspd.service.model.states import AssetKind
 from graspd.service.store.asset_options import (
-    AllowOpenOption,
-    ApproachOption,
-    ClosingOption,
-    CompoundOption,
-    DensityOption,
-    DropOption,
-    FingertipsOption,
-    FixOption,
-    FrictionOption,
-    KeepLargestOption,
+    HandWords,
     LicenceOption,
-    MassOption,
-    PalmOption,
-    PreShapeOption,
-    RootOption,
-    ScaleSweepOption,
     SourceOption,
-    UnitsOption,
-    UrdfOption,
-    XacroOption,
+    SweptOptions,
     hand_options,
-    object_options,
     provenance,
     sizes_of,
 )
@@ -61,20 +45,13 @@ _CHECK_S: Final = 120.0
 _SELF_TEST_S: Final = 900.0
 
 
+@with_options(HandWords, "asset")
 @reporting_errors
 def add_hand(
     file: Annotated[Path, typer.Argument(help="A URDF, xacro or MJCF, with its meshes; its folder; or a ZIP of that.")],
     name: NameOption = None,
-    urdf: UrdfOption = None,
-    xacro: XacroOption = None,
-    palm: PalmOption = None,
-    approach: ApproachOption = None,
-    root: RootOption = None,
-    pre_shape: PreShapeOption = None,
-    closing: ClosingOption = None,
-    fingertips: FingertipsOption = None,
-    fix: FixOption = None,
-    drop: DropOption = None,
+    *,
+    options: dict[str, Any],
     licence: LicenceOption = None,
     source: SourceOption = None,
     self_test: Annotated[
@@ -86,36 +63,19 @@ def add_hand(
     json: JsonFlag = False,
 ) -> None:
     """Upload a hand, wait for its check, say what was guessed and what it holds of plain objects."""
-    options = hand_options(
-        urdf=urdf,
-        xacro=xacro,
-        palm=palm,
-        approach=approach,
-        root=root,
-        pre_shape=pre_shape,
-        closing=closing,
-        fingertips=fingertips,
-        fix=fix,
-        drop=drop,
-    )
-    options |= provenance(licence, source)
+    options = hand_options(**options) | provenance(licence, source)
     with upload_of(file) as (upload, main):
         said = ({"file": main} if main else {}) | options
         _add(AssetKind.HAND, upload, name, said, self_test=self_test, shared=shared, wait=wait, url=url, json=json)
 
 
+@with_options(SweptOptions, "asset")
 @reporting_errors
 def add_object(
     file: Annotated[Path, typer.Argument(help="A mesh, or a ZIP with one; or a folder or ZIP of many objects.")],
     name: NameOption = None,
-    units: UnitsOption = None,
-    scale_to: ScaleSweepOption = None,
-    keep_largest: KeepLargestOption = False,
-    compound: CompoundOption = False,
-    allow_open: AllowOpenOption = False,
-    density: DensityOption = None,
-    mass: MassOption = None,
-    friction: FrictionOption = None,
+    *,
+    options: dict[str, Any],
     licence: LicenceOption = None,
     source: SourceOption = None,
     shared: SharedOption = False,
@@ -124,19 +84,8 @@ def add_object(
     json: JsonFlag = False,
 ) -> None:
     """Upload an object or a whole set of them, wait for the check, and say what was repaired."""
-    sizes = sizes_of(scale_to)
-    one_size = sizes[0] if len(sizes) == 1 else None
-    options = object_options(
-        units=units,
-        scale_to=one_size,
-        keep_largest=keep_largest,
-        compound=compound,
-        allow_open=allow_open,
-        density=density,
-        mass=mass,
-        friction=friction,
-    )
-    options |= provenance(licence, source)
+    sizes = sizes_of(options.pop("scale_to", None))
+    options |= provenance(licence, source) | ({"scale_to": sizes[0]} if len(sizes) == 1 else {})
     if len(sizes) > 1:
         swept = sweep(files_of_set(file) or one_of_set(file, name), sizes)
         add = partial(add_set, swept, name=name or name_of_set(file), prefix=None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -14,7 +14,6 @@ from graspd.api.uploads import MAIN_SUFFIXES, name_of_upload
 from graspd.client import access_commands, tag_commands
 from graspd.client.add_commands import add_hand, add_network, add_object
 from graspd.client.client import Client, path_of
-from graspd.client.job_options import pairs, parsed_options
 from graspd.client.reports import (
     UrlOption,
     YesOption,
@@ -27,19 +26,11 @@ from graspd.client.reports import (
     watch,
 )
 from graspd.service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
-from graspd.service.model.domain import NETWORK_METHODS, RECHECKS, JobRequest
+from graspd.service.command_options import pairs, parsed_options, with_options
+from graspd.service.model.domain import NETWORK_METHODS, JobOptions, JobRequest
 from graspd.service.model.errors import InputError
-from graspd.service.model.metrics import MIN_DISTANCE_M
 from graspd.service.model.scene_spec import scene_option
 from graspd.service.model.states import AssetKind, State
-from graspd.service.store.asset_options import (
-    DensityOption,
-    MassOption,
-    MinPayloadOption,
-    ObjectFrictionOption,
-    PayloadOption,
-    ShakeOption,
-)
 from graspd.service.store.asset_summary import hand_line, self_test_line
 
 app = typer.Typer(no_args_is_help=True)
@@ -48,111 +39,28 @@ JobArgument = Annotated[str, typer.Argument(help="Job id, or the beginning of on
 
 
 @app.command(epilog="graspd submit --hand allegro --object mug.stl --grasps 320 --scenes 2 --views 3 --wait")
+@with_options(JobOptions, "job")
 @reporting_errors
 def submit(
     hand: Annotated[str, typer.Option(help="Name of a hand, or a URDF or ZIP to upload.")],
     object: Annotated[str, typer.Option(help="Name of an object, or a mesh file to upload.")],
-    grasps: Annotated[int, typer.Option("--grasps", "-n", help="Number of grasps.")] = 32,
-    want: Annotated[str, typer.Option(help="valid: that many valid grasps; candidates: of any kind.")] = "valid",
-    budget: Annotated[float, typer.Option(help="Candidates for each valid grasp, at most.")] = 4.0,
-    min_distance: Annotated[
-        float, typer.Option(help="No two grasps of a batch are nearer [m], by the mean distance of the hand's points.")
-    ] = MIN_DISTANCE_M,
-    validation: Annotated[str, typer.Option(help="dexgraspbench, standard, fast or none.")] = "standard",
-    rechecks: Annotated[
-        int,
-        typer.Option(
-            help="Valid grasps validated again under the DexGraspBench protocol; 8 are spread over the job, one of 64."
-        ),
-    ] = RECHECKS,
-    robustness: Annotated[int, typer.Option(help="Verdicts under noise for each valid grasp.")] = 0,
-    robust: Annotated[
-        float, typer.Option(help="Share of models around the nominal one that a grasp must hold in.")
-    ] = 0.0,
-    robust_models: Annotated[
-        int, typer.Option(help="Models each valid grasp is validated in; 0: 8 with --robust.")
-    ] = 0,
-    method: Annotated[str, typer.Option(help="Planner.")] = "fast_graspd",
-    option: Annotated[
-        list[str] | None, typer.Option(help="An option of the planner, such as steps=20000; several times.")
-    ] = None,
-    fidelity: Annotated[str, typer.Option(help="draft, standard, fine, or auto with --target.")] = "standard",
-    target: Annotated[
-        str, typer.Option(help="With auto: gsr>=0.6 or pd_mm<=1, in a scene lift>=0.9; the cheapest that meets it.")
-    ] = "",
-    seed: Annotated[int, typer.Option(help="The same seed gives the same grasps.")] = 0,
-    scene: Annotated[
-        str, typer.Option(help="Where the grasps are used: free, table, bin, shelf, or a JSON or YAML file.")
-    ] = "free",
-    faces: Annotated[str, typer.Option(help="drawn: as drops fall; all: a scene for each stable face.")] = "drawn",
-    with_: Annotated[
-        list[str] | None,
-        typer.Option("--with", help="Another object in the scene: a name, or a mesh to upload; up to eight."),
-    ] = None,
-    touch: Annotated[
-        float, typer.Option(help="mm that fingertips keep from supports: 2 as the hand; 0: they touch; to -1: press.")
-    ] = 0.0,
-    scenes: Annotated[int, typer.Option(help="Scenes per batch of grasps; 4 where a scene is named.")] = 0,
-    views: Annotated[int, typer.Option(help="Camera placements per scene.")] = 0,
-    stereo: Annotated[bool, typer.Option("--stereo", help="A left and a right picture per placement.")] = False,
-    width: Annotated[int, typer.Option(help="Picture width [px].")] = 320,
-    height: Annotated[int, typer.Option(help="Picture height [px].")] = 240,
-    channels: Annotated[list[str] | None, typer.Option(help="distance, normals or occlusion; several times.")] = None,
-    friction: Annotated[float, typer.Option(help="Coulomb coefficient of the metrics.")] = 1.0,
-    mass: MassOption = None,
-    density: DensityOption = None,
-    object_friction: ObjectFrictionOption = None,
-    payload: PayloadOption = False,
-    min_payload: MinPayloadOption = 0.0,
-    shake: ShakeOption = False,
+    options: dict[str, Any],
     wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Submit a job: one hand on one object."""
-    options = pairs(option or [])
     with open_client(url) as client:
         as_object = partial(_uploaded, client, AssetKind.OBJECT)
-        if method in NETWORK_METHODS and "network" in options:
-            options["network"] = _uploaded(client, AssetKind.NETWORK, str(options["network"]))
-        request = parsed_options(
-            JobRequest,
-            {
-                "hand": _uploaded(client, AssetKind.HAND, hand),
-                "object": as_object(object),
-                "grasps": grasps,
-                "want": want,
-                "budget": budget,
-                "min_distance": min_distance,
-                "validation": validation,
-                "rechecks": rechecks,
-                "robustness": robustness,
-                "robust": robust,
-                "robust_models": robust_models,
-                "method": method,
-                "options": options,
-                "fidelity": fidelity,
-                "target": target,
-                "seed": seed,
-                "scene": scene_option(scene, named=as_object),
-                "faces": faces,
-                "touch": touch,
-                "neighbours": [as_object(one) for one in with_ or []],
-                "scenes": scenes,
-                "views": views,
-                "stereo": stereo,
-                "width": width,
-                "height": height,
-                "channels": channels or [],
-                "friction": friction,
-                "mass": mass,
-                "density": density,
-                "object_friction": object_friction,
-                "payload": payload,
-                "min_payload": min_payload,
-                "shake": shake,
-            },
-        )
+        pair = {"hand": _uploaded(client, AssetKind.HAND, hand), "object": as_object(object)}
+        own = pairs(options.get("options", ()))
+        if options.get("method") in NETWORK_METHODS and "network" in own:
+            own["network"] = _uploaded(client, AssetKind.NETWORK, str(own["network"]))
+        place = {
+            "scene": scene_option(options.get("scene", "free"), named=as_object),
+            "neighbours": [as_object(one) for one in options.get("neighbours", ())],
+        }
+        request = parsed_options(JobRequest, pair | options | place | {"options": own})
         job = client.submit(request)
         if wait:
             job = watch(client, job.id)

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from graspd.api.formatting import count, minute, percent, size
 from graspd.client.add_commands import name_of_set, upload_set
 from graspd.client.client import Client, path_of
-from graspd.client.job_options import PlanRequest, SpecOption, parsed_options, wanted, with_job_options
+from graspd.client.job_options import PlanRequest, SpecOption, wanted
 from graspd.client.reports import (
     UrlOption,
     YesOption,
@@ -27,7 +27,9 @@ from graspd.client.reports import (
     watch_dataset,
 )
 from graspd.service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
+from graspd.service.command_options import parsed_options, with_options
 from graspd.service.index.views import DatasetView
+from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError, TaskError, did_you_mean, one_of
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.datasets.estimate import Estimate
@@ -49,10 +51,9 @@ WaitOption = Annotated[bool, typer.Option("--wait", help="Show progress until th
 
 
 @group.command(epilog="graspd datasets create kitchen --hands allegro,shadow --objects ./ycb --grasps 1000")
-@with_job_options
+@with_options(JobOptions, "job")
 @reporting_errors
 def create(
-    options: dict[str, Any],
     name: Annotated[str | None, typer.Argument(help="Name of the dataset; a spec may say it.")] = None,
     hands: HandsOption = None,
     objects: ObjectsOption = None,
@@ -62,6 +63,8 @@ def create(
     wait: WaitOption = False,
     url: UrlOption = None,
     json: JsonFlag = False,
+    *,
+    options: dict[str, Any],
 ) -> None:
     """Make a dataset: a job for each hand and object. The same command again goes on where it was."""
     console = plain_console(stderr=json)
@@ -96,15 +99,16 @@ def create(
 
 
 @group.command(epilog="graspd datasets estimate --hands allegro --objects mug --grasps 1000000 --scenes 2 --views 3")
-@with_job_options
+@with_options(JobOptions, "job")
 @reporting_errors
 def estimate(
-    options: dict[str, Any],
     hands: HandsOption = None,
     objects: ObjectsOption = None,
     spec: SpecOption = None,
     url: UrlOption = None,
     json: JsonFlag = False,
+    *,
+    options: dict[str, Any],
 ) -> None:
     """What a dataset would cost: time for 1, 8 and 64 workers, storage, network."""
     asked = wanted(spec, name=None, hands=hands, objects=objects, options=options)

@@ -205,7 +205,7 @@ def _show(bar: Progress, task: TaskID, name: str, done: float, total: float, wha
 
 
 def _table(rows: list[dict[str, Any]], whole: dict[str, Any]) -> Table:
-    stated = f"{whole['protocol']}, {whole['level'] or 'not judged'}{', hard' if whole['hard'] else ''}"
+    stated = f"{whole['protocol']}, {whole['level'] or 'not validated'}{', hard' if whole['hard'] else ''}"
     friction = " ".join(sorted({f"{row['mu']:g}" for row in rows}))
     table = Table(
         title=f"{stated}; ε at μ = {friction}, contact at 5 mm; medians",

@@ -12,21 +12,10 @@ import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from graspd.service.cli import JsonFlag, emit, plain_console, reporting_errors
+from graspd.service.command_options import with_options
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.states import AssetKind
-from graspd.service.store.asset_options import (
-    ApproachOption,
-    ClosingOption,
-    DropOption,
-    FingertipsOption,
-    FixOption,
-    PalmOption,
-    PreShapeOption,
-    RootOption,
-    UrdfOption,
-    XacroOption,
-    hand_options,
-)
+from graspd.service.store.asset_options import HandWords, hand_options
 from graspd.service.store.asset_summary import say_check, self_test_lines
 from graspd.service.store.descriptions import described
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
@@ -39,21 +28,13 @@ app = typer.Typer(add_completion=False)
 
 
 @app.command("check", epilog="graspd hands check my_hand.urdf --palm base_link --approach 0,0,1 --picture my_hand.png")
+@with_options(HandWords, "asset")
 @reporting_errors
 def check(
     file: Annotated[
         str, typer.Argument(help="A URDF, xacro or MJCF, its folder, a ZIP of that, or the name of a built-in hand.")
     ],
-    urdf: UrdfOption = None,
-    xacro: XacroOption = None,
-    palm: PalmOption = None,
-    approach: ApproachOption = None,
-    root: RootOption = None,
-    pre_shape: PreShapeOption = None,
-    closing: ClosingOption = None,
-    fingertips: FingertipsOption = None,
-    fix: FixOption = None,
-    drop: DropOption = None,
+    options: dict[str, Any],
     picture: Annotated[
         Path | None, typer.Option(help="Draw the hand open, on approach, closing, and from three sides: a PNG.")
     ] = None,
@@ -69,18 +50,7 @@ def check(
     json: JsonFlag = False,
 ) -> None:
     """Say whether a hand can be used, what was guessed, and what it holds of plain objects. Needs no server."""
-    options = hand_options(
-        urdf=urdf,
-        xacro=xacro,
-        palm=palm,
-        approach=approach,
-        root=root,
-        pre_shape=pre_shape,
-        closing=closing,
-        fingertips=fingertips,
-        fix=fix,
-        drop=drop,
-    )
+    options = hand_options(**options)
     with _bar("reading     ", quiet=json) as run:
         report = report_hand(file, options, run)
     if picture and report["verdict"] != "refuse":

@@ -8,19 +8,10 @@ from typing import Annotated, Any
 import typer
 
 from graspd.service.cli import JsonFlag, emit, reporting_errors
+from graspd.service.command_options import with_options
 from graspd.service.model.errors import GraspdError, InputError
+from graspd.service.model.object_options import ObjectOptions
 from graspd.service.model.states import AssetKind
-from graspd.service.store.asset_options import (
-    AllowOpenOption,
-    CompoundOption,
-    DensityOption,
-    FrictionOption,
-    KeepLargestOption,
-    MassOption,
-    ScaleToOption,
-    UnitsOption,
-    object_options,
-)
 from graspd.service.store.asset_summary import say_check, verdict_line
 from graspd.service.store.assets import builtin_names
 from graspd.service.store.object_sets import Objects, files_of_set
@@ -31,33 +22,17 @@ app = typer.Typer(add_completion=False)
 
 
 @app.command("check", epilog="graspd objects check banana.stl --units mm --picture banana.png")
+@with_options(ObjectOptions, "asset")
 @reporting_errors
 def check(
     file: Annotated[
         str, typer.Argument(help="A mesh (STL, OBJ, PLY, OFF, GLB), a built-in; or a folder or ZIP of one or many.")
     ],
-    units: UnitsOption = None,
-    scale_to: ScaleToOption = None,
-    keep_largest: KeepLargestOption = False,
-    compound: CompoundOption = False,
-    allow_open: AllowOpenOption = False,
-    density: DensityOption = None,
-    mass: MassOption = None,
-    friction: FrictionOption = None,
+    options: dict[str, Any],
     picture: Annotated[Path | None, typer.Option(help="Draw the prepared mesh: a PNG.")] = None,
     json: JsonFlag = False,
 ) -> None:
     """Say whether a mesh can be used, what was repaired, and how large it is. Needs no server."""
-    options = object_options(
-        units=units,
-        scale_to=scale_to,
-        keep_largest=keep_largest,
-        compound=compound,
-        allow_open=allow_open,
-        density=density,
-        mass=mass,
-        friction=friction,
-    )
     if several := _several(file):
         if picture:
             raise InputError(f"--picture draws one object; {file} holds {len(several)}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 from pydantic.fields import FieldInfo
@@ -49,28 +49,48 @@ _BOUNDS: Final = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_e
 _NAMES: Final = "must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores"
 #: How pydantic begins: of what, not of which field.
 _SUBJECT: Final = re.compile(r"^(Value error, )|^\w+ should ")
-_CLASS: Final = re.compile(r"_[A-Z]\w*$")
+_CLASS: Final = re.compile(r"_[A-Z]\w*$|constrained-\w+$")
 #: How typer names the choices of an option; pydantic gives them as `expected`.
 _CHOICES: Final = re.compile(r"'(?P<word>.*?)' is not one of (?P<expected>'.*')")
 
 
-def refusal(error: ValidationError, model: type[BaseModel] | None = None) -> str:
+def refusal(
+    error: ValidationError, model: type[BaseModel] | None = None, names: Mapping[str, str] | None = None
+) -> str:
     """The first thing that is wrong, after its place: `scene.touch: must be at least -1`.
 
     With the model that refused, a number's whole range is named: `share: must be more than 0 and at most 1; got 3`.
+    `names` gives fields as the caller spells them: `--share: must be ...`.
     """
     first = error.errors(include_url=False)[0]
     # Of several models that would do, pydantic names the one that it tried.
-    where = ".".join(str(part) for part in first["loc"] if not _CLASS.match(str(part)))
-    field = model.model_fields.get(where) if model else None
-    said = f"{_range(field)}; got {first['input']!r}" if field and first["type"] in _BOUNDS else words(first)
-    return f"{where}: {said}" if where else said
+    place = [str(part) for part in first["loc"] if not _CLASS.match(str(part))]
+    if place and names:
+        named = names.get(place[0], place[0])
+        place = [named] if named.startswith("-") else [named, *place[1:]]
+    field = model.model_fields.get(str(first["loc"][0])) if model and len(first["loc"]) == 1 else None
+    bounded = field is not None and first["type"] in _BOUNDS
+    said = f"{range_words(bounds_of(field))}; got {first['input']!r}" if field and bounded else words(first)
+    return f"{'.'.join(place)}: {said}" if place else said
 
 
-def _range(field: FieldInfo) -> str:
-    """The bounds of a number: `must be at least 0 and at most 3`."""
-    held = ((name, getattr(one, key, None)) for one in field.metadata for name, key in _BOUNDS.items())
-    said = [_WORDS[name].format(**{_BOUNDS[name]: f"{value:.12g}"}) for name, value in held if value is not None]
+def bounds_of(field: FieldInfo) -> dict[str, float]:
+    """The bounds of a number, also of one that may be absent, by their names in pydantic: ge, gt, le, lt."""
+    found: dict[str, float] = {}
+    for one in [*(part for kind in get_args(field.annotation) for part in _metadata(kind)), *field.metadata]:
+        found |= {key: value for key in _BOUNDS.values() if (value := getattr(one, key, None)) is not None}
+    return found
+
+
+def _metadata(annotation: object) -> list[object]:
+    """What stands beside the type in an Annotated."""
+    inner = get_args(annotation)[1:] if get_origin(annotation) is Annotated else ()
+    return [part for one in inner for part in (one.metadata if isinstance(one, FieldInfo) else (one,))]
+
+
+def range_words(bounds: Mapping[str, float]) -> str:
+    """Bounds as a sentence: `must be at least 0 and at most 3`."""
+    said = [_WORDS[name].format(**{key: f"{bounds[key]:.12g}"}) for name, key in _BOUNDS.items() if key in bounds]
     return " and ".join([*said[:1], *(words.removeprefix("must be ") for words in said[1:])])
 
 

@@ -16,20 +16,20 @@ from graspd.service.model.base import DIGEST, Model
 from graspd.service.model.base import Digest as Digest
 from graspd.service.model.base import Name as Name
 from graspd.service.model.base import Word as Word
-from graspd.service.model.fidelity import AUTO, Fidelity, resolve_fidelity
+from graspd.service.model.fidelity import AUTO, OFFERED, Fidelity, resolve_fidelity
 from graspd.service.model.matter import FRICTION, MASS_KG, MOST_KG, Density, Friction, Mass
 from graspd.service.model.metrics import MIN_DISTANCE_M, MOST_ROBUST_MODELS, ROBUST_MODELS
+from graspd.service.model.options import JOB, Form, Option
 from graspd.service.model.projects import Project
 from graspd.service.model.scene_spec import (
-    LEAST_TOUCH,
     MOST_NEIGHBOURS,
-    MOST_TOUCH,
     TOUCH,
     BesideOption,
     NamedNeighbour,
     SceneDocument,
     SceneOption,
     SceneSpec,
+    Touch,
     has_table,
     scene_of,
 )
@@ -49,9 +49,25 @@ _RECHECK_EVERY: Final = 2
 FREE_ONLY_METHODS: Final = ("autograsp", "dfc", "graspd2022", "graspit")
 #: Methods that set out from what a network proposes for a thing on a table: their option `network` names it.
 NETWORK_METHODS: Final = ("learned",)
+#: graspd's own methods; other packages offer more.
+METHODS: Final = ("fast_graspd", "graspit", "graspd2022", "dfc", *NETWORK_METHODS, "autograsp")
 #: Scenes of a batch that is planned in scenes, where the request does not say how many.
 SCENES: Final = 4
+_REFEREES_IN_WORDS: Final = {
+    "standard": "standard",
+    "fast": "screen, quicker",
+    "dexgraspbench": "under the DexGraspBench protocol, slower",
+    "none": "not at all",
+}
+_FACES_IN_WORDS: Final = {"drawn": "as it falls", "all": "on each stable face"}
+_WANTS_IN_WORDS: Final = {"valid": "valid grasps", "candidates": "all that are tried"}
+_SCENES_IN_WORDS: Final = {"free": "the object alone", "table": "a table", "bin": "a bin", "shelf": "a shelf"}
 SHAKE_NEEDS_A_SCENE: Final = "shake moves what was lifted out of a scene: choose one, such as table"
+
+
+def _sparse(default: Any, **facts: Any) -> Any:
+    """A field that stays out of documents at its default: ids and records of jobs without it stay what they are."""
+    return Field(default, exclude_if=lambda value: value == default, **facts)
 
 
 class JobOptions(Model):
@@ -60,140 +76,199 @@ class JobOptions(Model):
     SUBMITTED: ClassVar[bool] = False
     """Whether it goes to a service, or is work of this process."""
 
-    grasps: int = Field(32, ge=1, le=1_000_000, description="number of grasps to synthesize")
-    method: Name = "fast_graspd"
-    fidelity: str | Fidelity = "standard"
-    seed: int = Field(0, ge=0, lt=2**31)
-    # What is left at its default stays out of every document, so that ids and records of jobs without it stay.
-    scene: SceneOption = Field(
+    grasps: Annotated[
+        int,
+        Option("basic", flags="--grasps -n", keyword="count"),
+        Form("grasps", "Number of grasps", "in batches of 32"),
+    ] = Field(
+        32, ge=1, le=1_000_000, description="number of grasps to synthesize, in a dataset for each hand and object"
+    )
+    method: Annotated[Name, Option("basic")] = Field(
+        "fast_graspd", description=f"planner: {', '.join(METHODS)}, or one that another package offers"
+    )
+    fidelity: Annotated[str | Fidelity, Option("basic"), Form("grasps", "Fidelity")] = Field(
+        "standard", description=f"{', '.join(OFFERED)}, or auto with a target"
+    )
+    seed: Annotated[int, Option("basic"), Form("grasps", "Seed", "same seed, same grasps")] = Field(
+        0, ge=0, lt=2**31, description="the same seed gives the same grasps"
+    )
+    scene: Annotated[
+        SceneOption,
+        Option("basic", typed="where the grasps are used: free, table, bin, shelf, or a JSON or YAML file"),
+        Form("scenes", "Grasps are for", choices=_SCENES_IN_WORDS, cells=True),
+    ] = _sparse(
         "free",
-        exclude_if=lambda value: value == "free",
         description="where the grasps are used: free (around an object that floats), table, bin, shelf, or a document "
         "with supports. If not free they are planned, validated and rendered there, and `grasps` counts those valid",
     )
-    faces: Literal["drawn", "all"] = Field(
+    faces: Annotated[
+        Literal["drawn", "all"], Option(), Form("scenes", "It lies", choices=_FACES_IN_WORDS, cells=True)
+    ] = _sparse(
         "drawn",
-        exclude_if=lambda value: value == "drawn",
         description="faces that the object lies on in its scenes. drawn: as often as drops end on them; all: one scene "
         "for each stable face, whatever `scenes` says",
     )
-    neighbours: tuple[BesideOption, ...] = Field(
+    neighbours: Annotated[
+        tuple[BesideOption, ...],
+        Option(
+            "basic",
+            flags="--with",
+            typed="another object in each scene: a name, for submit also a mesh to upload; up to eight",
+        ),
+        Form(
+            "scenes",
+            "Beside it",
+            "names of up to eight other objects, with commas",
+            placeholder="block, bottle",
+            cells=True,
+        ),
+    ] = _sparse(
         (),
         max_length=MOST_NEIGHBOURS,
-        exclude_if=lambda value: not value,
         description="names of up to eight other objects, which are dropped around this one in its scenes; a document "
         "places its own",
     )
-    touch: float = Field(
+    touch: Annotated[
+        Touch,
+        Option(),
+        Form("scenes", "Fingertips keep", "from supports; 0: they may touch, 2: as the hand", cells=True),
+    ] = _sparse(
         TOUCH,
-        ge=LEAST_TOUCH,
-        le=MOST_TOUCH,
-        allow_inf_nan=False,
-        exclude_if=lambda value: value == TOUCH,
         description="distance that fingertips keep from the supports of their scene [mm]. 2: as the rest of the hand; "
         "0: they may touch; below: they may press into it, for what lies flat",
     )
-    scenes: int = Field(0, ge=0, le=64, description="scenes per batch of grasps")
-    views: int = Field(0, ge=0, le=256, description="camera placements per scene")
-    stereo: bool = Field(False, description="a left and a right picture per placement instead of one")
-    width: int = Field(320, ge=16, le=4096, description="picture width [px]")
-    height: int = Field(240, ge=16, le=4096, description="picture height [px]")
-    channels: tuple[Literal["distance", "normals", "occlusion"], ...] = Field(
-        (), description="what pictures show besides colour, depth and segmentation"
+    scenes: Annotated[
+        int, Option("basic"), Form("scenes", "Scenes", "for each batch; 0: none, or 4 where grasps are for a scene")
+    ] = Field(0, ge=0, le=64, description=f"scenes per batch of grasps; {SCENES} where a scene is named")
+    views: Annotated[int, Option("basic", places=JOB), Form("scenes", "Views", "camera placements for each scene")] = (
+        Field(0, ge=0, le=256, description="camera placements per scene")
     )
-    friction: float = Field(1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics")
-    mass: Mass | None = Field(
+    stereo: Annotated[bool, Option(places=JOB), Form("scenes", "Cameras", "Stereo: left and right eye")] = Field(
+        False, description="a left and a right picture per placement instead of one"
+    )
+    width: Annotated[int, Option(places=JOB), Form("scenes", "Width")] = Field(
+        320, ge=16, le=4096, description="picture width [px]"
+    )
+    height: Annotated[int, Option(places=JOB), Form("scenes", "Height")] = Field(
+        240, ge=16, le=4096, description="picture height [px]"
+    )
+    channels: Annotated[tuple[Literal["distance", "normals", "occlusion"], ...], Option(places=JOB)] = Field(
+        (), description="what pictures show besides colour, depth and segmentation: distance, normals or occlusion"
+    )
+    friction: Annotated[float, Option(), Form("grasps", "Friction coefficient", "Coulomb, for the metrics")] = Field(
+        1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics"
+    )
+    mass: Annotated[
+        Mass | None,
+        Option("basic", schema=5),
+        Form("grasps", "Mass of the object", "empty: its own, 0.1 kg where it has none"),
+    ] = _sparse(None, description=f"mass of the object [kg]; by default its own, {MASS_KG:g} kg where it has none")
+    density: Annotated[Density | None, Option(schema=5)] = _sparse(
+        None, description="density of the object [kg/m^3], in place of the mass"
+    )
+    object_friction: Annotated[
+        Friction | None,
+        Option(schema=5),
+        Form("grasps", "Friction in simulation", "Coulomb; empty: the object's own, else 0.6"),
+    ] = _sparse(
         None,
-        exclude_if=lambda value: value is None,
-        description=f"mass of the object [kg]; by default its own, {MASS_KG:g} kg where it has none",
-    )
-    density: Density | None = Field(
-        None, exclude_if=lambda value: value is None, description="density of the object [kg/m^3], in place of the mass"
-    )
-    object_friction: Friction | None = Field(
-        None,
-        exclude_if=lambda value: value is None,
         description="Coulomb coefficient of contacts in simulation; by default the object's own, "
         f"{FRICTION:g} where it has none",
     )
-    want: Literal["valid", "candidates"] = Field(
+    want: Annotated[
+        Literal["valid", "candidates"], Option("basic"), Form("grasps", "Counted", choices=_WANTS_IN_WORDS)
+    ] = Field(
         "valid",
-        description="valid: `grasps` counts valid grasps (feasible ones without validation); candidates: it counts all "
-        "candidates",
+        description="what `grasps` counts. valid: valid grasps (feasible ones without validation); candidates: all",
     )
-    budget: float = Field(4.0, ge=1, le=100, description="candidates for each valid grasp wanted, at most")
-    min_distance: float = Field(
+    budget: Annotated[float, Option()] = Field(
+        4.0, ge=1, le=100, description="candidates for each valid grasp wanted, at most"
+    )
+    min_distance: Annotated[
+        float, Option(), Form("grasps", "Least distance", "between two grasps of a batch; 0: any", cells=True)
+    ] = _sparse(
         MIN_DISTANCE_M,
         ge=0,
         le=0.1,
         allow_inf_nan=False,
-        exclude_if=lambda value: value == MIN_DISTANCE_M,
         description="a grasp that is nearer to an earlier one of its batch is not kept [m]: mean distance of the same "
         "points of the hand, in the object's frame; 0: all are. Goes with want valid",
     )
-    validation: Literal["dexgraspbench", "standard", "fast", "none"] = Field(
+    validation: Annotated[
+        Literal["dexgraspbench", "standard", "fast", "none"],
+        Option("basic"),
+        Form("grasps", "Validated by MuJoCo", choices=_REFEREES_IN_WORDS),
+    ] = Field(
         "standard",
         description="level of validation in MuJoCo (fast: on a GPU, MuJoCo Warp gives the clear verdicts); "
         "none: grasps are feasible at best",
     )
-    rechecks: int = Field(
+    rechecks: Annotated[int, Option(places=JOB)] = Field(
         RECHECKS,
         ge=0,
         le=10_000,
         description=f"valid grasps that are validated at level dexgraspbench; the default, {RECHECKS}, are "
         "spread over the job, one of 64, and take a twentieth of its time; of any other number the first ones",
     )
-    robustness: int = Field(0, ge=0, le=20, description="verdicts under noise that each valid grasp gets")
-    robust: float = Field(
+    robustness: Annotated[int, Option(places=JOB)] = Field(
+        0, ge=0, le=20, description="verdicts under noise that each valid grasp gets"
+    )
+    robust: Annotated[
+        float,
+        Option("basic"),
+        Form(
+            "grasps", "Robust share", "of 8 models around the nominal one that a grasp must hold in; 0: any", cells=True
+        ),
+    ] = _sparse(
         0.0,
         ge=0,
         le=1,
         allow_inf_nan=False,
-        exclude_if=lambda value: value == 0,
         description="share of models around the nominal one in which a grasp must hold to count; 0: none is wanted. "
         "Where candidates are wanted all are kept, whatever their share",
     )
-    robust_models: int = Field(
+    robust_models: Annotated[int, Option()] = _sparse(
         0,
         ge=0,
         le=MOST_ROBUST_MODELS,
-        exclude_if=lambda value: value == 0,
         description=f"models in which each valid grasp is validated too; 0: {ROBUST_MODELS} where a share is wanted, "
         "else none",
     )
-    payload: bool = Field(
-        False,
-        exclude_if=lambda value: not value,
-        description="whether the heaviest mass that each valid grasp lifts is measured",
+    payload: Annotated[bool, Option(schema=5)] = _sparse(
+        False, description="measure the heaviest mass that each valid grasp lifts"
     )
-    min_payload: float = Field(
+    min_payload: Annotated[
+        float,
+        Option(schema=5),
+        Form("grasps", "Least payload", "mass that a grasp must lift to count; 0: not asked", cells=True),
+    ] = _sparse(
         0.0,
         ge=0,
         le=MOST_KG,
         allow_inf_nan=False,
-        exclude_if=lambda value: value == 0,
         description="mass that a grasp must lift to count [kg]; 0: none is wanted. It is measured where one is",
     )
-    shake: bool = Field(
-        False,
-        exclude_if=lambda value: not value,
-        description="whether each valid grasp, lifted, is shaken: 2 cm, 3 Hz, along x and y of its scene",
+    shake: Annotated[bool, Option(schema=5), Form("scenes", "After the lift", "Shake: 2 cm, 3 Hz", cells=True)] = (
+        _sparse(False, description="shake each valid grasp after its lift: 2 cm, 3 Hz, along x and y of its scene")
     )
-    options: dict[
-        Annotated[str, Field(max_length=40)],
-        Annotated[int, Field(ge=-(2**53), le=2**53)]
-        | Annotated[float, Field(allow_inf_nan=False)]
-        | Annotated[str, Field(max_length=80)],
+    options: Annotated[
+        dict[
+            Annotated[str, Field(max_length=40)],
+            Annotated[int, Field(ge=-(2**53), le=2**53)]
+            | Annotated[float, Field(allow_inf_nan=False)]
+            | Annotated[str, Field(max_length=80)],
+        ],
+        Option(flags="--option", typed="an option of the planner, such as steps=20000"),
     ] = Field(
         default_factory=dict,
         max_length=16,
         description="the method's own options, such as steps; see docs/how-to/planners.md",
     )
-    target: str = Field(
+    target: Annotated[str, Option(places=JOB)] = Field(
         "",
         max_length=40,
-        description="with fidelity `auto`: the accuracy wanted, such as gsr>=0.6, letter>=0.9, epsilon>=0.2 or "
-        "pd_mm<=1, with a scene lift>=0.9, lift_dexgraspbench, lift_hard or robust; the cheapest fidelity that meets it in "
+        description="with fidelity `auto`: the accuracy wanted, such as gsr>=0.6, dexgraspbench>=0.9 or "
+        "pd_mm<=1, in a scene lift>=0.9, lift_hard or robust; the cheapest fidelity that meets it in "
         "the stored chart of such grasps is taken when the job is submitted",
     )
 

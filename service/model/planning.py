@@ -17,11 +17,11 @@ from typing import Final, TypeVar
 from graspd.service.model.digests import digest_json, shard_id
 from graspd.service.model.domain import BATCH_SIZE, JobOptions, JobRequest, batches_of
 from graspd.service.model.messages import IngestMessage, TaskMessage
+from graspd.service.model.options import rows
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.version import (
     OLDEST_TASK_SCHEMA,
-    SCHEMA_OF_FIELD,
     SCHEMA_OF_NETWORKS,
     SCHEMA_OF_RANGES,
     TASK_SCHEMA,
@@ -130,11 +130,16 @@ def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: 
     )
 
 
-def needed_schema(request: JobRequest, since: Mapping[str, int] = SCHEMA_OF_FIELD) -> int:
-    """The oldest schema in which a request can be said: that of the newest that it uses.
+#: Options by the schema that first had them. A job that uses one needs a worker that knows it; all other jobs go to
+#: older workers too.
+_SCHEMAS: Final = {row.name: row.option.schema for row in rows(JobOptions, "job") if row.option.schema}
+
+
+def needed_schema(request: JobRequest, since: Mapping[str, int] = _SCHEMAS) -> int:
+    """The oldest schema in which a request can be said: that of the newest option that it uses.
 
     Args:
-        since: fields by the schema that first had them.
+        since: options by the schema that first had them.
     """
     fields = JobRequest.model_fields
     used = [schema for name, schema in since.items() if getattr(request, name) != fields[name].get_default()]

@@ -10,16 +10,6 @@ PACKAGE_VERSION: Final = "0.2.0"
 #: that can read it, so workers of two versions may run side by side (`service/model/workers.py`).
 TASK_SCHEMA: Final = 6
 OLDEST_TASK_SCHEMA: Final = 2
-#: Fields of a request by the schema that first had them. A job that uses one needs a worker that knows it; all other
-#: jobs go to older workers too.
-SCHEMA_OF_FIELD: Final[dict[str, int]] = {
-    "mass": 5,
-    "density": 5,
-    "object_friction": 5,
-    "payload": 5,
-    "min_payload": 5,
-    "shake": 5,
-}
 #: The first schema whose tasks may have several batches.
 SCHEMA_OF_RANGES: Final = 6
 #: The first schema whose workers fetch the network that a request's options name.

@@ -3,75 +3,52 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final
 
 import typer
+from pydantic import Field
 
+from graspd.service.model.base import Model
 from graspd.service.model.errors import InputError
-from graspd.service.model.matter import FRICTION, MASS_KG, MOST_KG
+from graspd.service.model.object_options import ASSET, ObjectOptions
+from graspd.service.model.options import Option
 
-PalmOption = Annotated[str | None, typer.Option("--palm", help="Link that is the palm.")]
-ApproachOption = Annotated[
-    str | None, typer.Option("--approach", help="Direction out of the palm, in the palm's frame: x,y,z.")
-]
-RootOption = Annotated[
-    str | None, typer.Option("--root", help="Link to begin at; a forearm and wrist above it are left out.")
-]
-PreShapeOption = Annotated[
-    list[str] | None,
-    typer.Option("--pre-shape", help="Joint values on approach (rad, m): JOINT=VALUE,...; several times."),
-]
-FixOption = Annotated[
-    list[str] | None, typer.Option("--fix", help="Freeze joints (rad, m): JOINT=VALUE,...; several times.")
-]
-DropOption = Annotated[
-    list[str] | None, typer.Option("--drop", help="Leave out a link and all that hangs on it; several times.")
-]
-UrdfOption = Annotated[
-    str | None, typer.Option("--urdf", help="Which URDF, xacro or MJCF of the folder or ZIP is the hand: NAME.")
-]
-XacroOption = Annotated[
-    list[str] | None, typer.Option("--xacro", help="Arguments of a xacro file: NAME=VALUE; several times.")
-]
-ClosingOption = Annotated[
-    list[str] | None,
-    typer.Option("--closing", help="How joints close the hand, -1, 0 (spreads) or 1: JOINT=-1,...; several times."),
-]
-FingertipsOption = Annotated[str | None, typer.Option("--fingertips", help="Links at the ends of the fingers: A,B,C.")]
-UnitsOption = Annotated[
-    Literal["m", "mm", "cm", "in"] | None, typer.Option("--units", help="Unit of the file; default: metres.")
-]
-ScaleToOption = Annotated[
-    float | None, typer.Option("--scale-to", help="Scale the longest extent to this many metres.")
-]
-ScaleSweepOption = Annotated[
-    str | None,
-    typer.Option(
-        "--scale-to", help="Scale the longest extent to this many metres; 0.06,0.08,0.1: an object of each size."
-    ),
-]
-CompoundOption = Annotated[bool, typer.Option("--compound", help="Components that lie apart are one rigid body.")]
-KeepLargestOption = Annotated[bool, typer.Option("--keep-largest", help="Of several components keep the largest.")]
-AllowOpenOption = Annotated[bool, typer.Option("--allow-open", help="Take a mesh that is not watertight.")]
-DensityOption = Annotated[
-    float | None, typer.Option("--density", help="Density of the object in kg/m3, in place of the mass.")
-]
-MassOption = Annotated[
-    float | None, typer.Option("--mass", help=f"Mass of the object in kg; {MASS_KG:g} where nothing is said.")
-]
-_FRICTION_HELP: Final = f"Coulomb coefficient of the object's contacts in simulation; {FRICTION:g} where none is given."
-FrictionOption = Annotated[float | None, typer.Option("--friction", help=_FRICTION_HELP)]
-#: Where `--friction` is the coefficient of the metrics.
-ObjectFrictionOption = Annotated[float | None, typer.Option("--object-friction", help=_FRICTION_HELP)]
-PayloadOption = Annotated[
-    bool, typer.Option("--payload", help="Measure the heaviest mass that each valid grasp lifts.")
-]
-MinPayloadOption = Annotated[
-    float, typer.Option("--min-payload", help="Mass that a grasp must lift to count [kg]; 0: any.", min=0, max=MOST_KG)
-]
-ShakeOption = Annotated[
-    bool, typer.Option("--shake", help="Shake what each valid grasp lifts: 2 cm, 3 Hz, along x and y of its scene.")
-]
+_TYPED: Final = Option(places=ASSET)
+
+
+class HandWords(Model):
+    """What of a hand's `asset.json` can be typed; see `hand_options`."""
+
+    urdf: Annotated[str | None, _TYPED] = Field(
+        None, description="which URDF, xacro or MJCF of the folder or ZIP is the hand: NAME"
+    )
+    xacro: Annotated[tuple[str, ...], _TYPED] = Field((), description="arguments of a xacro file: NAME=VALUE")
+    palm: Annotated[str | None, _TYPED] = Field(None, description="link that is the palm")
+    approach: Annotated[str | None, _TYPED] = Field(
+        None, description="direction out of the palm, in the palm's frame: x,y,z"
+    )
+    root: Annotated[str | None, _TYPED] = Field(
+        None, description="link to begin at; a forearm and wrist above it are left out"
+    )
+    pre_shape: Annotated[tuple[str, ...], _TYPED] = Field(
+        (), description="joint values on approach (rad, m): JOINT=VALUE,..."
+    )
+    closing: Annotated[tuple[str, ...], _TYPED] = Field(
+        (), description="how joints close the hand, -1, 0 (spreads) or 1: JOINT=-1,..."
+    )
+    fingertips: Annotated[str | None, _TYPED] = Field(None, description="links at the ends of the fingers: A,B,C")
+    fix: Annotated[tuple[str, ...], _TYPED] = Field((), description="joints to freeze (rad, m): JOINT=VALUE,...")
+    drop: Annotated[tuple[str, ...], _TYPED] = Field((), description="a link to leave out with all that hangs on it")
+
+
+class SweptOptions(ObjectOptions):
+    """Those of an object, of which one of several sizes may be made."""
+
+    scale_to: Annotated[str | None, _TYPED] = Field(  # type: ignore[assignment]
+        None, description="longest extent after scaling [m]; 0.06,0.08,0.1: an object of each size"
+    )
+
+
 LicenceOption = Annotated[
     str | None, typer.Option("--licence", help="Terms it may be used on, for dataset cards: CC-BY-4.0.")
 ]
@@ -114,31 +91,6 @@ def hand_options(
         "drop": drop,
     }
     return {key: value for key, value in options.items() if value}
-
-
-def object_options(
-    *,
-    units: str | None = None,
-    scale_to: float | None = None,
-    keep_largest: bool = False,
-    compound: bool = False,
-    allow_open: bool = False,
-    density: float | None = None,
-    mass: float | None = None,
-    friction: float | None = None,
-) -> dict[str, Any]:
-    """Keys of an object's `asset.json`; those not given are left out."""
-    options = {
-        "units": units,
-        "scale_to": scale_to,
-        "keep_largest": keep_largest or None,
-        "compound": compound or None,
-        "allow_open": allow_open or None,
-        "density": density,
-        "mass": mass,
-        "friction": friction,
-    }
-    return {key: value for key, value in options.items() if value is not None}
 
 
 def sizes_of(text: str | None) -> tuple[float, ...]:

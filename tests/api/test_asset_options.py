@@ -13,7 +13,7 @@ from graspd.api.uploads import files_of_upload
 from graspd.service.model.messages import IngestMessage
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline.backends import Services
-from graspd.service.store.asset_options import hand_options, object_options
+from graspd.service.store.asset_options import hand_options
 from graspd.service.store.assets import builtin_files
 from graspd.service.store.library import load_asset, load_asset_files, load_check
 from graspd.worker.stages import ingest
@@ -63,7 +63,7 @@ TWO = stl(BALL, trimesh.creation.box((0.01, 0.01, 0.01)).apply_translation((0.1,
 def test_an_option_of_an_object_decides_its_check(
     http: TestClient, services: Services, data: bytes, options: dict[str, Any], verdict: str, volume: float | None
 ) -> None:
-    found = check(http, services, AssetKind.OBJECT, ("thing.stl", data), object_options(**options))
+    found = check(http, services, AssetKind.OBJECT, ("thing.stl", data), options)
     assert found["verdict"] == verdict, found["message"]
     facts = found["facts"]
     if volume is not None:

@@ -74,11 +74,14 @@ def test_contributing_is_short() -> None:
 
 def test_the_documentation_stays_short() -> None:
     pages = [page for page in REPOSITORY.rglob("*.md") if not {".venv", "build", "node_modules"} & set(page.parts)]
+    # Tables that follow from the code are not prose.
     words = {
-        page: len(page.read_text().split()) for page in pages if REPOSITORY / "docs" / "results" not in page.parents
+        page: len(re.sub(r"<!-- (\w+) -->\n.*?<!-- /\1 -->", "", page.read_text(), flags=re.DOTALL).split())
+        for page in pages
+        if REPOSITORY / "docs" / "results" not in page.parents
     }
     assert words[REPOSITORY / "README.md"] <= 900
-    assert sum(words.values()) <= 45_000
+    assert sum(words.values()) <= 41_000
     assert len((REPOSITORY / "ARCHITECTURE.md").read_text().splitlines()) <= 300
 
 

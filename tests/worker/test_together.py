@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from graspd.service.model.domain import JobOptions
-from graspd.service.model.errors import InputError, MeshError, TaskCancelled
+from graspd.service.model.errors import MeshError, TaskCancelled
 from graspd.service.model.fidelity import resolve_fidelity
 from graspd.worker import together
-from graspd.worker.engines.joins import batches_at_once, fitting, parse_join
+from graspd.worker.engines.joins import batches_at_once, fitting
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.synthesis import synthesized
-from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.meeting import Meeting
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.pool.pool import MODULES, Pool
-from graspd.worker.together import distinct_batches, validated_batches
+from graspd.worker.together import validated_batches
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), rechecks=0, grasps=6)
 
@@ -77,23 +74,13 @@ def test_batches_that_other_processes_judge_and_measure_are_the_same(pair, alone
     assert told[-1] == (6, 6)
 
 
-def test_grasps_alike_in_two_batches_are_replaced_by_those_of_another(pair) -> None:
-    request = REQUEST.model_copy(update={"validation": "none"})
-    first, third = (
-        validated_batches(*pair, request, sizes=[size], run=ExecutionContext(threads=2))[0] for size in (2, 3)
-    )
-    asked: list[tuple[int, int]] = []
-
-    def more(count: int, number: int) -> ValidatedBatch:
-        asked.append((count, number))
-        return validated_grasps(*pair, request, count=count, batch=number, run=ExecutionContext(threads=2))
-
-    found = distinct_batches(pair[0], request, [first, third], more)
-    # The second batch begins as the first one does: two of its three are there already.
-    assert asked == [(2, 2)] and [len(one.grasps) for one in found] == [2, 1, 2]
-    assert found[1].rejected["alike"] == 2 and len(found[1].columns["quality/epsilon"]) == 1
-    raw = request.model_copy(update={"want": "candidates"})
-    assert distinct_batches(pair[0], raw, [first, third], more) == [first, third]
+def test_a_run_in_this_process_makes_the_batches_of_a_job(pair) -> None:
+    """Near-duplicates are dropped from a batch, whoever makes it: at this distance two batches are full of them."""
+    request = JobOptions(grasps=33, validation="none", fidelity="draft", min_distance=0.03, budget=2, rechecks=0)
+    batches = validated_batches(*pair, request, sizes=[32, 1], run=ExecutionContext(threads=2))
+    made = synthesized("barrett", "block", request, device="cpu", threads=2)
+    assert_same(made.batches, batches)
+    assert len(made.arrays["grasp/hand_pose"]) == sum(len(one.grasps) for one in batches)
 
 
 def test_what_becomes_of_one_batch_ends_the_job(pair) -> None:
@@ -114,14 +101,7 @@ def test_a_job_that_is_cancelled_stops_all_its_batches(pair) -> None:
 
 
 def test_how_many_are_joined_where_nobody_says() -> None:
-    assert [parse_join(text) for text in ("auto", "1", "32")] == [None, 1, 32]
     assert batches_at_once("cpu", None) == 1
     assert batches_at_once("cpu", 4) == 4
     # Of an H100 and an H200 (132 multiprocessors), of a GPU with 20, and of one whose memory is nearly full.
     assert [fitting(132, 80 << 30), fitting(20, 8 << 30), fitting(132, 1 << 30), fitting(132, 0)] == [32, 4, 4, 1]
-
-
-@pytest.mark.parametrize("text", ["0", "-1", "many", "1.5", ""])
-def test_what_is_no_number_of_batches_is_refused(text: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--join takes a number of batches"):
-        synthesized("barrett", str(tmp_path / "none.stl"), REQUEST, join=text)

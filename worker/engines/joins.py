@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from typing import Final
 
 from graspd.service.model.domain import BATCH_SIZE
-from graspd.service.model.errors import InputError
 
 #: Grasps for each multiprocessor of a GPU: their 7 simulations for each of 2 finalists are four warps, one for each of
 #: its schedulers. The kernels of a hand's points fill it long before.
@@ -18,19 +16,6 @@ MEMORY_SHARE: Final = 0.5
 MOST: Final = 64
 #: Batches at work for each one in a launch: while one half is on the device, the other is validated and measured.
 PER_LAUNCH: Final = 2
-
-
-def parse_join(text: str) -> int | None:
-    """Batches in one launch; None: auto.
-
-    Raises:
-        InputError: neither a number from 1 on nor auto.
-    """
-    if text == "auto":
-        return None
-    if not re.fullmatch(r"[1-9][0-9]{0,3}", text):
-        raise InputError(f"--join takes a number of batches from 1 to 9999, or auto; got {text!r}")
-    return int(text)
 
 
 def batches_at_once(device: str, join: int | None) -> int:

@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.domain import BATCH_SIZE, SHAKE_NEEDS_A_SCENE, JobOptions
-from graspd.service.model.errors import InputError, TaskCancelled, did_you_mean, one_of
-from graspd.service.model.fidelity import FIDELITIES, Fidelity
+from graspd.service.model.errors import InputError
+from graspd.service.model.local_options import LocalOptions
 from graspd.service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits
 from graspd.service.model.planning import shortfall, totals
-from graspd.service.model.scene_spec import MOST_SCENES, SceneSpec
+from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.store.columns import Attribute
 from graspd.service.store.shards import json_attribute
 from graspd.worker.engines.devices import Device
-from graspd.worker.engines.joins import batches_at_once, parse_join
+from graspd.worker.engines.joins import batches_at_once
 from graspd.worker.execution_context import ExecutionContext, PrefilterMode, Progress
 from graspd.worker.files.provenance import (
     NEIGHBOUR_FACE_ERROR_M,
@@ -29,7 +29,7 @@ from graspd.worker.files.provenance import (
     remembered,
     wrist_attributes,
 )
-from graspd.worker.generation import ValidatedBatch, validated_grasps
+from graspd.worker.generation import ValidatedBatch
 from graspd.worker.grasps import joined_columns
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
@@ -37,10 +37,11 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.options import as_asked
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import planner
+from graspd.worker.planners.registry import of_this_machine
 from graspd.worker.pool.pool import MODULES, Pool, processes_at_once
 from graspd.worker.scenes.placement import scenes_of
 from graspd.worker.scenes.rest import rolling_poses
-from graspd.worker.together import distinct_batches, validated_batches
+from graspd.worker.together import validated_batches
 from graspd.worker.validation.payload import Limit
 
 Arrays = dict[str, NDArray[Any]]
@@ -178,6 +179,29 @@ class SynthesisResult:
         }
 
 
+def synthesized_as(hand: str, obj: str, options: LocalOptions, **run: Any) -> SynthesisResult:
+    """The grasps that a user of this process asks for; see `synthesized`.
+
+    Args:
+        hand: see `synthesized`.
+        obj: see `synthesized`.
+        options: what is asked.
+        run: prefilter, processes, progress, cancelled and partial of `synthesized`.
+    """
+    return synthesized(
+        hand,
+        obj,
+        options.request(of_this_machine(options.method, options.options)),
+        place=options.place,
+        scenes=options.scenes,
+        mesh=options.mesh,
+        device=options.device,
+        threads=options.threads,
+        join=None if options.join == "auto" else options.join,
+        **run,
+    )
+
+
 def synthesized(
     hand: str,
     obj: str,
@@ -189,7 +213,7 @@ def synthesized(
     device: str = "auto",
     threads: int = 0,
     prefilter: PrefilterMode = "auto",
-    join: int | str = "auto",
+    join: int | None = None,
     processes: int = 0,
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
@@ -206,8 +230,8 @@ def synthesized(
         mesh: how the object's file is read: units, scale_to, keep_largest, allow_open.
         device: cpu, cuda:0 or auto.
         threads: CPU threads; 0: one per core.
-        first_judge: whether MuJoCo Warp gives the clear verdicts; auto: on a GPU, where it is installed.
-        join: batches of 32 whose grasps are planned in one launch, or auto; the grasps are the same.
+        prefilter: whether MuJoCo Warp gives the clear verdicts; auto: on a GPU, where it is installed.
+        join: batches of 32 whose grasps are planned in one launch; None: what fills a GPU. The grasps are the same.
         processes: that validate and measure; 1: this one; 0: on a GPU one for each core less one, else 1.
         progress: told of the grasps that are done, and of how many.
         cancelled: asked often; True: the work stops.
@@ -218,13 +242,8 @@ def synthesized(
         TaskCancelled: `cancelled` answered True; with `partial`, before anything was validated.
     """
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
-    if place.kind != "free" and not 1 <= scenes <= MOST_SCENES:
-        raise InputError(f"scenes: must be at least 1 and at most {MOST_SCENES}; got {scenes}")
-    if threads < 0:
-        raise InputError(f"threads: must be at least 0; got {threads}")
     if request.shake and place.kind == "free":
         raise InputError(SHAKE_NEEDS_A_SCENE)
-    wanted = parse_join(str(join))
     options = dict(mesh or {})
     model = hand_from_path(hand)
     thing = as_asked(object_from_path(obj, face_error_m=request.knobs.face_error_m, options=options), request)
@@ -238,24 +257,12 @@ def synthesized(
     run = ExecutionContext(chosen, threads, prefilter=prefilter)
     run = run if progress is None else replace(run, progress=progress)
     run = run if cancelled is None else replace(run, cancelled=cancelled)
-    joined = batches_at_once(chosen, wanted)
+    joined = batches_at_once(chosen, join)
     with _pool(processes_at_once(chosen, processes, threads=threads)) as pool:
         run = replace(run, pool=pool)
         batches = validated_batches(
             model, thing, request, sizes=sizes, join=joined, scenes=where, run=run, partial=partial
         )
-
-        def more(count: int, number: int) -> ValidatedBatch | None:
-            try:
-                return validated_grasps(
-                    model, thing, request, count=count, batch=number, scenes=where, run=run.quiet(), partial=partial
-                )
-            except TaskCancelled:
-                if not partial:
-                    raise
-                return None
-
-        batches = distinct_batches(model, request, batches, more)
     interrupted = partial and run.cancelled()
     seconds = time.perf_counter() - began
     arrays = joined_columns([{**batch.grasps.to_columns(), **batch.columns} for batch in batches])
@@ -290,26 +297,6 @@ def _as_stored(place: SceneSpec, others: Sequence[ObjectModel]) -> dict[str, Any
     for one, other in zip(said["neighbours"], others, strict=True):
         one["object"] = other.name
     return said
-
-
-def chosen_fidelity(name: str, contact_solver: str = "") -> Fidelity:
-    """The knobs of a named fidelity, with another contact solver where one is given.
-
-    Raises:
-        InputError: unknown fidelity or solver.
-    """
-    if name not in FIDELITIES:
-        raise InputError(f"unknown fidelity {name!r}; choose one of {one_of(name, FIDELITIES)}")
-    knobs = FIDELITIES[name].model_dump()
-    if contact_solver:
-        knobs |= {"contact_solver": contact_solver, "name": f"{name}+{contact_solver}"}
-    try:
-        return Fidelity(**knobs)
-    except ValueError:
-        meant = did_you_mean(contact_solver, ("direct", "jacobi", "gauss_seidel"))
-        raise InputError(
-            f"unknown contact solver {contact_solver!r}; choose direct, jacobi or gauss_seidel{meant}"
-        ) from None
 
 
 def _attributes(

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from graspd.service.model.errors import AssetError, InputError
-from graspd.worker.objects.options import ObjectOptions, parse_options
+from graspd.service.model.object_options import ObjectOptions
+from graspd.worker.objects.options import parse_options
 from graspd.worker.objects.prepare import build, main_file, repaired_mesh, weighed
 from graspd.worker.objects.repair import RepairedMesh
 

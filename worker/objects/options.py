@@ -4,48 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Any, Final
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ValidationError
 
 from graspd.service.model.base import refusal
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import MeshError
-from graspd.service.model.matter import Density, Friction, Mass
+from graspd.service.model.object_options import ObjectOptions
 from graspd.worker.objects.model import ObjectModel
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 #: Keys that decide how heavy and how slippery the object is, and not its shape.
 OF_MATTER: Final = ("density", "mass", "friction")
 
 #: Metres per unit.
 UNITS: Final = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
-
-
-class ObjectOptions(BaseModel):
-    """The keys of an object's `asset.json`; units are SI."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    file: str = ""
-    description: str = ""
-    licence: str = ""
-    source: str = ""
-    facts: dict[str, Any] = Field(default_factory=dict)
-    units: Literal["m", "mm", "cm", "in"] = "m"
-    scale_to: Positive | None = Field(None, description="longest extent after scaling [m]")
-    keep_largest: bool = Field(False, description="of several components keep the largest")
-    compound: bool = Field(False, description="components that lie apart are one rigid body")
-    allow_open: bool = Field(False, description="take a mesh that encloses no volume")
-    density: Density | None = Field(None, description="[kg/m^3]")
-    mass: Mass | None = Field(None, description="[kg]; instead of the density")
-    friction: Friction | None = Field(None, description="Coulomb coefficient of its contacts in simulation")
-
-    @model_validator(mode="after")
-    def _one_of_mass_and_density(self) -> Self:
-        if self.mass is not None and self.density is not None:
-            raise ValueError("mass and density both: give one of them")
-        return self
 
 
 def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = None) -> ObjectOptions:

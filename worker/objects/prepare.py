@@ -24,6 +24,7 @@ from graspd.service import user_cache
 from graspd.service.model.digests import digest_files, digest_json, digest_variant
 from graspd.service.model.errors import MeshError, NotFoundError, did_you_mean
 from graspd.service.model.libraries import version_of
+from graspd.service.model.object_options import ObjectOptions
 from graspd.service.model.states import AssetKind
 from graspd.service.model.transforms import Floats
 from graspd.service.store.assets import builtin_files, builtin_names, unpack_file
@@ -32,7 +33,7 @@ from graspd.worker.objects.distance import MeshDistance, deviation, surface_poin
 from graspd.worker.objects.formats import READERS, read_mesh
 from graspd.worker.objects.mesh_geometry import corner_normals, mass_properties, signed_volume
 from graspd.worker.objects.model import Ints, ObjectModel
-from graspd.worker.objects.options import OF_MATTER, ObjectOptions, parse_options
+from graspd.worker.objects.options import OF_MATTER, parse_options
 from graspd.worker.objects.repair import RepairedMesh, repair
 from graspd.worker.objects.topology import Indices
 

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from graspd.service.model.errors import MeshError
+from graspd.service.model.object_options import ObjectOptions
 from graspd.service.model.transforms import Floats
 from graspd.worker.grasps import on_grid
 from graspd.worker.objects import mesh_geometry, topology
@@ -19,7 +20,7 @@ from graspd.worker.objects.distance import MeshDistance, surface_points
 from graspd.worker.objects.formats import Soup
 from graspd.worker.objects.intersections import crossings, untangle
 from graspd.worker.objects.mesh_geometry import CentredMesh, centred, signed_volume
-from graspd.worker.objects.options import UNITS, ObjectOptions
+from graspd.worker.objects.options import UNITS
 from graspd.worker.objects.topology import Indices
 
 MAX_EXTENT_M: Final = 3.0

@@ -99,17 +99,6 @@ def of_this_machine(name: str, options: Mapping[str, Any] | None) -> dict[str, A
     return given | {key: files[key](Path(str(value))) for key, value in given.items() if key in files}
 
 
-def parsed_options(pairs: list[str]) -> dict[str, str]:
-    """`["steps=20000"]` as `{"steps": "20000"}`.
-
-    Raises:
-        InputError: a text without `=`.
-    """
-    if wrong := [pair for pair in pairs if "=" not in pair]:
-        raise InputError(f"{wrong[0]!r} is no option; write it as name=value, for example steps=20000")
-    return dict(pair.split("=", 1) for pair in pairs)
-
-
 def entry_points(group: str) -> EntryPoints:
     """Entry points of the packages that are installed; the library that finds them is loaded for it."""
     from importlib.metadata import entry_points as found

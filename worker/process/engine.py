@@ -32,7 +32,7 @@ from graspd.service.pipeline.identity import check_service
 from graspd.service.queue.port import Report
 from graspd.service.store.store import Store, open_store
 from graspd.worker.engines.devices import Device
-from graspd.worker.engines.joins import batches_at_once, parse_join
+from graspd.worker.engines.joins import batches_at_once
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.pool.pool import MODULES, Pool, processes_at_once
 from graspd.worker.process.fitness import Check, Fitness
@@ -201,7 +201,8 @@ class TaskResources:
     @cached_property
     def _join(self) -> int:
         """Batches that one launch plans on the device; waits until that is known."""
-        return batches_at_once(self._device.resolve(), parse_join(self.settings.join))
+        join = self.settings.join
+        return batches_at_once(self._device.resolve(), None if join == "auto" else int(join))
 
     def pool(self, stage: str) -> Pool | None:
         """The processes that validate and measure, if a task of this stage has work for them; waits until it is known

@@ -187,7 +187,7 @@ def scene_verdicts(
         scenes: the scenes.
         level: of the lift test.
         pieces: the object's convex pieces; None: nothing is validated, and grasps are only told clear or not.
-        known: see `judge_lifts`.
+        known: see `validate_lifts`.
         run: told of grasps validated; asked between grasps whether to stop.
 
     Returns:

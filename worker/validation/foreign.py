@@ -34,7 +34,7 @@ class ForeignVerdicts:
     same: SameHand
 
     def facts(self) -> dict[str, Any]:
-        """judge_hand: name of the other model; fingertips_mm: how far it is from ours; foreign_key: terms of its
+        """validation_hand: name of the other model; fingertips_mm: how far it is from ours; foreign_key: terms of its
         verdicts; and `share_counts`."""
         a, b = self.nominal.success == 1, self.foreign.success == 1
         return {

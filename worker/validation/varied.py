@@ -62,7 +62,7 @@ class Models:
     def lift(
         self, grasps: GraspSet, row: int, placed: PlacedGrasps, variant: Variant, *, dexgraspbench: bool = False
     ) -> LiftTest:
-        """What the lift test says of a grasp in a variant; the nominal one has that of `judge_lifts` bit for bit.
+        """What the lift test says of a grasp in a variant; the nominal one has that of `validate_lifts` bit for bit.
 
         Args:
             grasps: with, except at level dexgraspbench, their way.

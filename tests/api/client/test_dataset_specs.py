@@ -34,7 +34,7 @@ def asked(file: Path | None, *, hands: str | None = None, objects: str | None = 
 
 
 def test_a_spec_says_it_all(tmp_path: Path) -> None:
-    found = asked(spec(tmp_path, TOML), stereo=False)  # a flag that was not set
+    found = asked(spec(tmp_path, TOML))
     assert (found.name, found.hands, found.objects) == ("kitchen", "allegro,barrett", "mug,block")
     assert found.options == {"scenes": 2, "stereo": True, "fidelity": "draft"}
     assert found.shared_out({"hands": ["a", "b"]}, 3)["grasps"] == 167  # a sixth of 1000, rounded up

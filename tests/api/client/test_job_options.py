@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from graspd.client.job_options import pairs
+from graspd.service.command_options import pairs
 from graspd.service.model.errors import InputError
 
 

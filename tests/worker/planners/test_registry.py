@@ -15,7 +15,6 @@ from graspd.service.model.domain import FREE_ONLY_METHODS
 from graspd.service.model.errors import InputError
 from graspd.worker.planners import PLANNERS, method, method_names, planner, registry
 from graspd.worker.planners.port import Method
-from graspd.worker.planners.registry import parsed_options
 
 
 @pytest.mark.parametrize("name", sorted(PLANNERS))
@@ -41,11 +40,6 @@ def test_options_of_a_method_are_read_from_text() -> None:
 def test_a_wrong_option_is_refused_with_those_there_are(options: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         planner("autograsp", options)
-
-
-def test_an_option_without_a_value_is_refused() -> None:
-    with pytest.raises(InputError, match="name=value"):
-        parsed_options(["steps"])
 
 
 def offer(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:

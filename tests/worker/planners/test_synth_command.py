@@ -14,12 +14,12 @@ from typer.testing import CliRunner
 
 import graspd
 from graspd.cli import build
-from graspd.commands import synth as synth_command
 from graspd.service.cli import write_output
 from graspd.service.model.errors import ConflictError, NotFoundError
 from graspd.service.readers import Grasps, open_shards
 from graspd.service.store.shards import Shard, read_shard
 from graspd.worker import generation
+from graspd.worker.files import synthesis
 from graspd.worker.files.provenance import object_of_shard
 
 
@@ -157,7 +157,7 @@ def test_the_line_for_people_says_that_nobody_validated(tmp_path: Path) -> None:
 def test_a_word_that_is_none_is_refused_before_the_files_are_read(words: tuple[str, str], tmp_path: Path) -> None:
     done = run("synth", "--hand", "absent.urdf", "--object", "block", "-o", tmp_path / "g.h5", *words)
     assert done.exit_code == 2
-    assert words[1] in done.output and "choose" in done.output
+    assert f"{words[0]}: must be one of" in done.output
 
 
 def test_an_object_is_named_after_its_folder_where_the_file_says_nothing(of_own_mesh: Path) -> None:
@@ -252,7 +252,7 @@ def test_all_that_were_asked_need_no_reason(validated: tuple[Path, dict[str, Any
 def test_who_stops_it_keeps_what_was_validated(
     folder: Path, monkeypatch: pytest.MonkeyPatch, asked: signal.Signals
 ) -> None:
-    real, out = synth_command.synthesized, folder / f"stopped-{asked}.h5"
+    real, out = synthesis.synthesized, folder / f"stopped-{asked}.h5"
 
     def stopped(*given: Any, progress: Any, **named: Any) -> Any:
         def tell(done: float, total: float, message: str) -> None:
@@ -262,7 +262,7 @@ def test_who_stops_it_keeps_what_was_validated(
         return real(*given, progress=tell, **named)
 
     before = signal.getsignal(asked)
-    monkeypatch.setattr(synth_command, "synthesized", stopped)
+    monkeypatch.setattr(synthesis, "synthesized", stopped)
     words = ["--hand", "barrett", "--object", "block", "-n", 64, "--budget", 1, "--validation", "none", "--json"]
     done = run("synth", *words, "--fidelity", "draft", "--device", "cpu", "-o", out)  # type: ignore[arg-type]
     shard = read_shard(out, kind="base")

@@ -1,0 +1,77 @@
+"""Options of commands from the one table: each row of `service.model.options.rows` with its type, default and words."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import math
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any
+
+import typer
+from pydantic import BaseModel
+
+from graspd.service.model.errors import InputError
+from graspd.service.model.options import EVERYWHERE, ModelT, Place, Row, accepted, rows
+
+
+def with_options(model: type[BaseModel], place: Place) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command an option for each row, where its parameter `options` stands: it gets those that were given."""
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def wrapper(**given: Any) -> None:
+            options = {row.name: given.pop(row.name) for row in added}
+            command(**given, options={name: value for name, value in options.items() if value is not None})
+
+        added = rows(model, place)
+        own = list(inspect.signature(command, eval_str=True).parameters.values())
+        at = [parameter.name for parameter in own].index("options")
+        parameters = [*own[:at], *map(_parameter, added), *own[at + 1 :]]
+        parameters = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in parameters]
+        del wrapper.__wrapped__  # its signature is not this one's
+        wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        wrapper.__annotations__ = {one.name: one.annotation for one in parameters}
+        return wrapper
+
+    return decorate
+
+
+def _parameter(row: Row) -> inspect.Parameter:
+    words = row.meaning[:1].upper() + row.meaning[1:]
+    if row.kind == list[str]:
+        words += "; several times"
+    elif row.default not in (None, "") and row.kind is not bool:
+        words += f". Default: {row.default}"
+    least, most = (row.bounds.get(key) if row.kind in (int, float) else None for key in ("ge", "le"))
+    option = typer.Option(*row.flags, help=f"{words}.", show_default=False, min=least, max=most)
+    annotation: Any = Annotated[row.kind | None, option]
+    return inspect.Parameter(row.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+
+
+def parsed_options(model: type[ModelT], values: dict[str, Any]) -> ModelT:
+    """A model of what was given; InputError names the first option that cannot be used, as it is typed."""
+    options = {row.name: row.flags[0].partition("/")[0] for place in EVERYWHERE for row in rows(model, place)}
+    names = {name: f"--{name.replace('_', '-')}" for name in model.model_fields}
+    # The name of a dataset is an argument.
+    return accepted(model, values, names={**names, "name": "NAME", **options})
+
+
+def pairs(texts: Iterable[str]) -> dict[str, str | int | float]:
+    """`name=value` of each `--option`, numbers as numbers: the same job as by HTTP. InputError for another form."""
+    split = [text.partition("=") for text in texts]
+    for name, equals, value in split:
+        if not equals:
+            raise InputError(f"--option {name + value!r}: write it as name=value, for example steps=20000")
+    return {name: _number(value) for name, _, value in split}
+
+
+def _number(text: str) -> str | int | float:
+    for kind in (int, float):
+        try:
+            number = kind(text)
+        except ValueError:
+            continue
+        # Only what is written as a number is: 007 and nan stay what they are.
+        return number if str(number) == text and math.isfinite(number) else text
+    return text

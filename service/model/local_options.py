@@ -1,0 +1,113 @@
+"""Options of grasps that are made in this process: those of a job, with files for names, and those of a run."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from graspd.service.model.domain import SCENES, JobOptions
+from graspd.service.model.errors import one_of
+from graspd.service.model.fidelity import FIDELITIES, Fidelity
+from graspd.service.model.object_options import MeshOptions
+from graspd.service.model.options import Option, Place, accepted
+from graspd.service.model.scene_spec import MOST_NEIGHBOURS, MOST_SCENES, SceneSpec, Touch, parse_scene
+
+_LOCAL: Final[tuple[Place, ...]] = ("synth", "python")
+_COMMAND: Final[tuple[Place, ...]] = ("synth",)
+#: Fields of a job that say where its grasps are used; in this process a `SceneSpec` does.
+_OF_PLACE: Final = {"scene", "faces", "neighbours", "touch", "scenes"}
+
+
+class LocalOptions(MeshOptions, JobOptions):
+    """What `graspd synth` and `graspd.synthesize` are told besides hand and object."""
+
+    fidelity: Annotated[str, Option("basic", _LOCAL)] = Field("standard", description=f"one of {', '.join(FIDELITIES)}")
+    contact_solver: Annotated[Literal["direct", "jacobi", "gauss_seidel"] | None, Option(places=_COMMAND)] = Field(
+        None, description="contact solver in place of the fidelity's"
+    )
+    scene: Annotated[str | Path, Option("basic", _LOCAL)] = Field(  # type: ignore[assignment]
+        "free", description="where the grasps are used: free, table, bin, shelf, or a JSON or YAML file"
+    )
+    scenes: Annotated[int, Option("basic", _LOCAL)] = Field(
+        SCENES, ge=1, le=MOST_SCENES, description="scenes over which the grasps are distributed"
+    )
+    neighbours: Annotated[tuple[str | Path, ...], Option("basic", _LOCAL, "--with", "beside")] = Field(  # type: ignore[assignment]
+        (), max_length=MOST_NEIGHBOURS, description="another object in the scene, a file or built-in; up to eight"
+    )
+    touch: Annotated[Touch | None, Option(places=_LOCAL)] = Field(  # type: ignore[assignment]
+        None,
+        description="distance that fingertips keep from supports [mm], by default as the scene's file says, else 0. "
+        "2: as the rest of the hand; 0: they may touch; below: they may press into it",
+    )
+    payload: Annotated[bool, Option("advanced", _LOCAL, "--payload/--no-payload")] = Field(
+        False,
+        description="measure the heaviest mass that each valid grasp lifts; graspd synth does by default in scenes "
+        "where a mass is said",
+    )
+    # A value may be a file, whose digest a job has.
+    options: Annotated[dict[str, Any], Option("advanced", _LOCAL, "--option")] = Field(
+        default_factory=dict, description="an option of the planner, such as steps=20000 or network=net.npz"
+    )
+    device: Annotated[str, Option(places=_LOCAL)] = Field("auto", description="device: cpu, cuda:0 or auto")
+    threads: Annotated[int, Option(places=_LOCAL)] = Field(0, ge=0, description="CPU threads; 0: one per core")
+    join: Annotated[int | Literal["auto"], Option(places=_LOCAL)] = Field(
+        "auto",
+        description="batches of 32 that are planned in one launch; auto: as many as fill a GPU, 1 on a CPU. Grasps do "
+        "not depend on it",
+    )
+
+    @field_validator("fidelity")
+    @classmethod
+    def _known(cls, value: str | Fidelity) -> str | Fidelity:
+        if not isinstance(value, str) or value not in FIDELITIES:
+            raise ValueError(f"unknown fidelity {value!r}; choose one of {one_of(str(value), FIDELITIES)}")
+        return value
+
+    @field_validator("join", mode="before")
+    @classmethod
+    def _batches(cls, value: object) -> object:
+        if not re.fullmatch(r"auto|[1-9][0-9]{0,3}", str(value)):
+            raise ValueError(f"must be a number of batches from 1 to 9999, or auto; got {value!r}")
+        return value
+
+    @model_validator(mode="before")
+    @classmethod
+    def _some_scenes(cls, data: Any) -> Any:
+        return data
+
+    @property
+    def knobs(self) -> Fidelity:
+        """The knobs of the fidelity, with another contact solver where one is given."""
+        knobs, solver = FIDELITIES[self.fidelity], self.contact_solver
+        if solver is None:
+            return knobs
+        return knobs.model_copy(update={"contact_solver": solver, "name": f"{knobs.name}+{solver}"})
+
+    @property
+    def place(self) -> SceneSpec:
+        """The scene; InputError for a file that cannot be used."""
+        beside = [str(one) for one in self.neighbours]
+        return parse_scene(str(self.scene), faces=self.faces, touch=self.touch, beside=beside)
+
+    @property
+    def mesh(self) -> dict[str, Any]:
+        """How the object's file is read, as keys of its `asset.json`."""
+        given = self.model_fields_set & MeshOptions.model_fields.keys()
+        return {name: value for name in sorted(given) if (value := getattr(self, name))}
+
+    def request(self, options: dict[str, Any]) -> JobOptions:
+        """The job without its place, of which a file holds no sample of second opinions.
+
+        Args:
+            options: of the method, with digests for files.
+
+        Raises:
+            InputError: one of them is no number or short text.
+        """
+        shared = {name: getattr(self, name) for name in JobOptions.model_fields.keys() - _OF_PLACE}
+        # A recheck is a sample that watches over many jobs; a file can be validated under the DexGraspBench protocol
+        # whole.
+        return accepted(JobOptions, shared | {"fidelity": self.knobs, "options": options, "rechecks": 0})

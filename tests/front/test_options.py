@@ -1,0 +1,126 @@
+"""Options are declared once; messages name them as the caller spells them."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import trimesh
+
+import graspd
+from graspd.service.command_options import parsed_options
+from graspd.service.docs import STUB, keywords_stub
+from graspd.service.model.domain import JobOptions, JobRequest
+from graspd.service.model.errors import InputError
+from graspd.service.model.local_options import LocalOptions
+from graspd.service.model.options import rows, type_text
+from tests.conftest import REPOSITORY
+from tests.one_more_option import FLAG, MEANING, NAME
+
+
+@pytest.mark.parametrize("join", ["0", 0, -1, "many", 1.5, ""])
+def test_join_is_named_as_the_caller_spells_it(join: Any) -> None:
+    line = f"join: must be a number of batches from 1 to 9999, or auto; got {join!r}"
+    with pytest.raises(InputError) as typed:
+        parsed_options(LocalOptions, {"join": join})
+    assert str(typed.value) == f"--{line}"
+    with pytest.raises(InputError) as called:
+        graspd.synthesize("barrett", "block", join=join)
+    assert str(called.value) == line
+
+
+@pytest.mark.parametrize(
+    ("wrong", "typed", "called"),
+    [
+        ({"grasps": 0}, "--grasps: ", "count: "),
+        ({"neighbours": ["mug"] * 9}, "--with: ", "beside: "),
+        ({"options": "steps"}, "--option: ", "options: "),
+        ({"min_payload": -1}, "--min-payload: ", "min_payload: "),
+        ({"payload": "perhaps"}, "--payload: ", "payload: "),
+    ],
+)
+def test_every_message_is_in_the_words_of_the_caller(wrong: dict[str, Any], typed: str, called: str) -> None:
+    with pytest.raises(InputError) as refused:
+        parsed_options(LocalOptions, wrong)
+    assert str(refused.value).startswith(typed)
+    names = {row.name: row.keyword for row in rows(LocalOptions, "python")}
+    with pytest.raises(InputError) as refused:
+        graspd.synthesize("barrett", "block", **{names[name]: value for name, value in wrong.items()})  # type: ignore[arg-type]
+    assert str(refused.value).startswith(called)
+
+
+def test_a_fix_is_in_the_words_of_the_caller(tmp_path: Path) -> None:
+    trimesh.creation.box((60, 60, 60)).export(tmp_path / "box.stl")
+    with pytest.raises(graspd.MeshError, match=r"; units mm makes it .*scale_to 0\.1") as refused:
+        graspd.synthesize("barrett", tmp_path / "box.stl")
+    assert "--" not in str(refused.value) and refused.value.facts["options_suggested"]  # type: ignore[attr-defined]
+
+
+def test_a_keyword_that_is_none_is_a_type_error() -> None:
+    with pytest.raises(TypeError, match=r"^synthesize\(\) got an unexpected keyword argument 'views'$"):
+        graspd.synthesize("barrett", "block", views=3)  # type: ignore[call-arg]
+
+
+def test_a_field_without_an_option_is_no_option_of_anybody() -> None:
+    assert {row.name for row in rows(JobRequest, "job")} == set(JobOptions.model_fields)
+
+
+def test_the_command_and_python_take_as_many_grasps() -> None:
+    bounds = [{row.name: row.bounds for row in rows(LocalOptions, place)}["grasps"] for place in ("synth", "python")]
+    assert bounds == [{"ge": 1, "le": 1_000_000}] * 2
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_an_option_of_the_planner_may_be_a_file_with_a_long_path(kind: type, tmp_path: Path) -> None:
+    file = kind(tmp_path / f"{'x' * 100}.npz")
+    with pytest.raises(InputError, match=r"xxx\.npz"):
+        graspd.synthesize("barrett", "mug", scene="table", method="learned", options={"network": file})
+    with pytest.raises(InputError, match=r"^options\.steps: must"):
+        graspd.synthesize("barrett", "mug", method="graspit", options={"steps": "x" * 100})
+
+
+def test_the_signature_has_defaults_and_plain_types() -> None:
+    shown = inspect.signature(graspd.synthesize).parameters
+    assert (shown["count"].default, shown["count"].annotation) == (32, "int")
+    assert (shown["scene"].default, shown["scene"].annotation) == ("free", "str | Path")
+    assert (shown["touch"].default, shown["touch"].annotation) == (None, "float | None")
+    assert all(one.kind is one.KEYWORD_ONLY for name, one in shown.items() if name not in ("hand", "object"))
+    assert "views" in inspect.signature(graspd.Client.submit).parameters
+
+
+def test_types_lose_their_bounds_and_keep_their_choices() -> None:
+    types = {name: type_text(field.annotation) for name, field in JobOptions.model_fields.items()}
+    assert types["mass"] == "float | None"
+    assert types["want"] == 'Literal["valid", "raw"]'
+    assert types["neighbours"] == "Sequence[str | Mapping[str, Any]]"
+    assert types["options"] == "Mapping[str, int | float | str]"
+
+
+def test_one_more_option_is_found_in_all_places(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tests.one_more_option", str(tmp_path / "data")]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert all(FLAG in text and MEANING.removeprefix("largest ") in text for text in found["help"])
+    assert [text.strip() for text in found["out of bounds"][:2]] == [
+        f"graspd: {FLAG}: must be at most 20; see `root {name} --help`" for name in ("synth", "submit")
+    ]
+    assert NAME in found["out of bounds"][2]
+    for page, place in zip(found["forms"], ("", "cell-"), strict=True):
+        assert f'<label for="{place}{NAME}">Finger force [N]</label>' in page
+        assert f'name="{NAME}" type="number" min="1" max="20" step="any" value="5"' in page
+    shown = {"type": "number", "maximum": 20.0, "minimum": 1.0, "title": "Finger Force", "default": 5.0}
+    assert found["http"] == [shown | {"description": MEANING}] * 2
+    assert found["python"] == [f"{NAME}: 'float' = 5.0"] * 2
+    assert found["types"].count(f"    {NAME}: float\n") == 2
+    assert f"| `{NAME}` | `{FLAG}` | both | `5.0` | at least 1 and at most 20 | {MEANING} |" in found["docs"]
+    assert not found["warp"], "help, completion and what is refused need no engine"
+
+
+def test_the_types_of_keywords_are_up_to_date() -> None:
+    assert (REPOSITORY / STUB).read_text() == keywords_stub(), "run: make docs"
