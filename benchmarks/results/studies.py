@@ -178,10 +178,8 @@ STUDIES: Final = (
             "--out OUT/results/validation-levels.json",
         ),
         (
-            (
-                f"python -m benchmarks.validation_levels DATA --work WORK/cells {_LITTLE} "
-                "--out OUT/results/validation-levels.json",
-            ),
+            f"python -m benchmarks.validation_levels DATA --work WORK/cells {_LITTLE} "
+            "--out OUT/results/validation-levels.json",
         ),
         seeds=(7001,),
         prints="results/validation-levels.md",

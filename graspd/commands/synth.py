@@ -21,7 +21,7 @@ from graspd.service.cli import (
     told_to_stop,
     write_output,
 )
-from graspd.service.command_options import pairs, validated, with_options
+from graspd.service.command_options import pairs, parsed_options, with_options
 from graspd.service.model.errors import InputError, TaskCancelled
 from graspd.service.model.local_options import LocalOptions
 from graspd.service.model.metrics import DIRECTION_CELLS
@@ -58,7 +58,7 @@ def synth(
     if out.is_dir():
         raise InputError(f"{out} is a folder; name a file in it, such as --out {out / 'grasps.h5'}")
     options["options"] = pairs(options.get("options", ()))
-    asked = validated(LocalOptions, options)
+    asked = parsed_options(LocalOptions, options)
     if "payload" not in options and asked.place.kind != "free" and asked.validation != "none":
         asked = asked.model_copy(update={"payload": asked.mass is not None or asked.density is not None})
     settings = engine_settings()

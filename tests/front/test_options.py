@@ -96,7 +96,7 @@ def test_the_signature_has_defaults_and_plain_types() -> None:
 def test_types_lose_their_bounds_and_keep_their_choices() -> None:
     types = {name: type_text(field.annotation) for name, field in JobOptions.model_fields.items()}
     assert types["mass"] == "float | None"
-    assert types["want"] == 'Literal["valid", "raw"]'
+    assert types["want"] == 'Literal["valid", "candidates"]'
     assert types["neighbours"] == "Sequence[str | Mapping[str, Any]]"
     assert types["options"] == "Mapping[str, int | float | str]"
 

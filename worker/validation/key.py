@@ -81,7 +81,7 @@ def verdict_key(
     """Digest of the terms of a verdict: all that it follows from but the grasp's own postures.
 
     In it: level, friction, masses, gains and torque limits, the rules of pregrasp and squeeze, shapes of the hand,
-    convex pieces of the object, the constants of `MOVES` and of the level, version of the engine; and `first_judge`,
+    convex pieces of the object, the constants of `MOVES` and of the level, version of the engine; and `prefilter`,
     the prefilter's terms where it takes part.
 
     Raises:

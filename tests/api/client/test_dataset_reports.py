@@ -32,7 +32,7 @@ def test_a_report_names_the_standing_of_what_it_counts(services: Services, valid
     print_cells(dataset, services.index.datasets.cells("k").items, console)
     made = 32 if validation == "none" else dataset.valid
     word, other = ("feasible", "valid") if validation == "none" else ("valid", "feasible")
-    assert f"grasps: {made} {word} of 32 tried" in out.getvalue()
+    assert f"grasps: {made} {word} of 32 candidates" in out.getvalue()
     validated = "not validated" if validation == "none" else "at"
     assert f"per {word} grasp" in out.getvalue() and f"{made}/32 {validated}" in out.getvalue()
     assert other not in out.getvalue()
