@@ -103,16 +103,17 @@ def test_what_the_referee_saw_of_each_try_is_counted(
 def test_a_batch_that_is_stopped_is_what_was_judged_before(
     hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch, after: int
 ) -> None:
-    rounds, real = [], certified._Work._round
+    rounds, real = [], certified.Batch.made
 
     def counted(*given: Any) -> Any:
         if len(rounds) == after:
             raise TaskCancelled("stopped")
         rounds.append(real(*given))
         rounds[-1].grasps, rounds[-1].columns = taken(rounds[-1].grasps, rounds[-1].columns, np.arange(1))
+        rounds[-1].rows = rounds[-1].rows[:1]
         return rounds[-1]
 
-    monkeypatch.setattr(certified._Work, "_round", counted)
+    monkeypatch.setattr(certified.Batch, "made", counted)
     if not after:
         with pytest.raises(TaskCancelled):
             certified_grasps(hand, block, wish(audits=0), count=COUNT, partial=True)

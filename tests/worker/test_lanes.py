@@ -97,7 +97,7 @@ def test_a_round_ends_as_soon_as_enough_are_found(pair, monkeypatch: pytest.Monk
     calls = noted(monkeypatch)
     parts = certified_grasps(*pair, wish, count=6, run=Run(threads=1))
     assert any(first > 0 or count < 8 for number, first, count in calls if number > 0)
-    monkeypatch.setattr(certified._Work, "_in_parts", False)
+    monkeypatch.setattr(certified.Batch, "_in_parts", False)
     rounds = certified_grasps(*pair, wish, count=6, run=Run(threads=1))
     assert parts.planned <= rounds.planned
     assert_same(parts, rounds)
@@ -138,20 +138,20 @@ def test_grasps_from_one_of_a_batch_on_are_those_of_the_whole(pair, first: int) 
 
 def test_the_first_valid_grasps_are_audited_whoever_finds_them(pair, one_lane, monkeypatch: pytest.MonkeyPatch) -> None:
     begun: list[int] = []
-    whole = certified._Work._begin_audits
+    whole = certified.Batch._begin_audits
     monkeypatch.setattr(
-        certified._Work, "_begin_audits", lambda work, first: (begun.append(len(first.grasps)), whole(work, first))
+        certified.Batch, "_begin_audits", lambda work, first: (begun.append(len(first.grasps)), whole(work, first))
     )
     audited: list[GraspSet] = []
-    audit = certified._Work._audited
-    monkeypatch.setattr(certified._Work, "_audited", lambda work, some: (audited.append(some), audit(work, some))[1])
+    audit = certified.Batch._audited
+    monkeypatch.setattr(certified.Batch, "_audited", lambda work, some: (audited.append(some), audit(work, some))[1])
     found = certified_grasps(*pair, REQUEST, count=COUNT, run=Run(threads=2))
     assert len(begun) == len(audited) == 1
     first = audited[0].moved(pair[1].centre)  # the engine works about the middle of the object
     np.testing.assert_array_equal(first.grasp.hand_pose, found.grasps.grasp.hand_pose[:2])
     np.testing.assert_array_equal(found.columns["quality/audit"] >= 0, np.arange(COUNT) < 2)
     np.testing.assert_array_equal(found.columns["quality/audit"], one_lane.columns["quality/audit"])
-    monkeypatch.setattr(certified._Work, "_begin_audits", lambda work, first: None)
+    monkeypatch.setattr(certified.Batch, "_begin_audits", lambda work, first: None)
     late = certified_grasps(*pair, REQUEST, count=COUNT, run=Run(threads=2))
     np.testing.assert_array_equal(found.columns["quality/audit"], late.columns["quality/audit"])
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,15 +12,18 @@ import pytest
 from service.model.domain import JobOptions
 from service.model.errors import InputError, MeshError, TaskCancelled
 from service.model.fidelity import resolve_fidelity
+from service.model.scene_spec import SceneSpec
 from worker import together
 from worker.certified import Certified, certified_grasps
 from worker.engines.joins import batches_at_once, fitting, parse_join
 from worker.files.synthesis import synthesized
 from worker.hands.load import hand_from_path
-from worker.meeting import Meeting
 from worker.objects.prepare import object_from_path
+from worker.planners import Asked, NoPlace
 from worker.pool.pool import MODULES, Pool
 from worker.run import Run
+from worker.scenes.kinds import rest_poses, supports_of
+from worker.simulation.surroundings import Scenes
 from worker.together import certified_batches, distinct_batches
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), audits=0, grasps=6)
@@ -51,18 +56,17 @@ def assert_same(batches, others) -> None:
 def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(
     pair, alone, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    launches: list[Meeting] = []
+    launches, whole = list[list[int]](), together.synthesize_batches
 
-    class Noted(Meeting):
-        def __init__(self, *given: int) -> None:
-            super().__init__(*given)
-            launches.append(self)
+    def noted(hand: Any, obj: Any, asked: Sequence[Asked], **named: Any) -> Any:
+        launches.append([one.wanted.batch for one in asked])
+        return whole(hand, obj, asked, **named)
 
-    monkeypatch.setattr(together, "Meeting", Noted)
+    monkeypatch.setattr(together, "synthesize_batches", noted)
     told: list[tuple[float, float]] = []
     run = Run(threads=2, progress=lambda done, total, message: told.append((done, total)))
     joined = certified_batches(*pair, REQUEST, sizes=[2, 2, 2], join=3, run=run)
-    assert launches[0].served[0] == 3, "the first launch has all three"
+    assert launches[0] == [0, 1, 2], "the first launch has all three"
     assert_same(joined, alone)
     assert told[-1] == (6, 6)
     assert all(done <= total for done, total in told)
@@ -75,6 +79,64 @@ def test_batches_that_other_processes_judge_and_measure_are_the_same(pair, alone
         assert_same(certified_batches(*pair, REQUEST, sizes=[2, 2, 2], join=2, run=run), alone)
         assert len(pool.pids) == 2
     assert told[-1] == (6, 6)
+
+
+@pytest.fixture(scope="module")
+def scenes(pair) -> list[Scenes]:
+    """Of each of three batches its own."""
+    table = SceneSpec(kind="table")
+    poses = rest_poses(table, pair[1], count=6, seed=1)["scene/object_pose"]
+    return [Scenes(supports_of(table), poses[first : first + 2]) for first in (0, 2, 4)]
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_waves_of_batches_in_scenes_are_the_same(pair, scenes: list[Scenes], apart: bool) -> None:
+    wish = REQUEST.model_copy(update={"budget": 3.0, "audits": 1})
+    where, sizes = scenes if apart else scenes[0], [2, 2, 3]
+    one_by_one, waves = (
+        certified_batches(*pair, wish, sizes=sizes, scenes=where, join=join, run=Run(threads=2)) for join in (1, 2)
+    )
+    assert_same(waves, one_by_one)
+    assert [one.shares for one in waves] == [one.shares for one in one_by_one]
+    assert set(np.concatenate([one.grasps.scene for one in waves])) <= {0, 1}, "numbered as the batch has them"
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_batch_of_a_wave_without_a_place_has_no_grasps_but_for_the_first_of_a_job(
+    pair, scenes: list[Scenes], monkeypatch: pytest.MonkeyPatch, first: int
+) -> None:
+    whole = together.synthesize_batches
+
+    def narrow(hand: Any, obj: Any, asked: Sequence[Asked], **named: Any) -> Any:
+        made = whole(hand, obj, asked, **named)
+        return [
+            NoPlace("no way in") if one.wanted.batch == 1 - first else g for one, g in zip(asked, made, strict=True)
+        ]
+
+    monkeypatch.setattr(together, "synthesize_batches", narrow)
+    wish = REQUEST.model_copy(update={"referee": "none", "want": "raw"})
+
+    def made() -> list[Certified]:
+        asked = {"sizes": [2, 2], "scenes": scenes[:2], "join": 2, "run": Run(threads=2), "empty_on": (NoPlace,)}
+        return certified_batches(*pair, wish, **asked)
+
+    if first:
+        with pytest.raises(NoPlace, match="no way in"):
+            made()
+    else:
+        assert [len(one.grasps) for one in made()] == [2, 0]
+
+
+def test_what_was_judged_before_a_stop_is_kept(pair, alone) -> None:
+    stopped: list[bool] = []
+
+    def one_is_made(number: int, made: Certified) -> None:
+        stopped.append(True)
+
+    run = Run(threads=2, cancelled=lambda: bool(stopped))
+    found = certified_batches(*pair, REQUEST, sizes=[2, 32, 32], join=2, run=run, partial=True, checked=one_is_made)
+    assert_same(found[:1], alone[:1])
+    assert sum(len(one.grasps) for one in found) < 66
 
 
 def test_grasps_alike_in_two_batches_are_replaced_by_those_of_another(pair) -> None:

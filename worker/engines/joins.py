@@ -1,4 +1,4 @@
-"""How many batches go into one launch where nobody says, and how many are at work for each of them."""
+"""How many batches go into one launch where nobody says."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ BYTES_PER_GRASP: Final = 2.5 * 2**20
 MEMORY_SHARE: Final = 0.5
 #: More batches of one pair than this seldom wait.
 MOST: Final = 64
-#: Batches at work for each one in a launch: while one half is on the device, the other is judged and measured.
-PER_LAUNCH: Final = 2
 
 
 def parse_join(text: str) -> int | None:

@@ -95,6 +95,7 @@ def judge(
     pieces: ConvexPieces | None = None,
     cache: Path | None = None,
     known: KnownTrials | None = None,
+    prefilter: Screened | None = None,
     run: Run = ALONE,
 ) -> Verdicts:
     """Test grasps by the DexGraspBench force-closure protocol; see `worker.quality.referee.protocol` for the levels.
@@ -111,6 +112,7 @@ def judge(
         pieces: convex pieces of the object; by default its CoACD pieces.
         cache: folder of the pieces, see `decompose`.
         known: trials of the CPU on these terms that are not done again; others are added.
+        prefilter: what `prefiltered` says of these grasps on these terms; None: it is asked.
         run: told of grasps done; asked between grasps whether to stop.
 
     Raises:
@@ -127,7 +129,7 @@ def judge(
     of_the_cpu: Level = "certificate" if first_judge else level
     case = _Case(hand, obj, pieces, of_the_cpu, hard)
     terms = verdict_key(hand, obj, level, hard, pieces=pieces, first_judge=first_judge)
-    first = screened(case.scene, terms, grasps, level=level, run=run) if first_judge else Screened({}, {})
+    first = prefilter or _screened(case, terms, grasps, level, run if first_judge else None)
     trials = dict(first.stands)
     left = [row for row in range(len(grasps)) if row not in trials]
     keys = {} if known is None else {row: postures_key(terms, grasps.take(slice(row, row + 1))) for row in left}
@@ -143,6 +145,19 @@ def judge(
     ordered = [trials[row] for row in range(len(grasps))]
     found = _verdicts(ordered, case, terms, postures_key(terms, grasps), time.perf_counter() - began)
     return replace(found, level=level, audited=len(first.audited), contradicted=contradicted)
+
+
+def prefiltered(
+    hand: HandModel, obj: ObjectModel, grasps: GraspSet, *, level: Level, pieces: ConvexPieces, run: Run
+) -> Screened:
+    """What `judge` asks of the GPU prefilter, for whoever has the device before."""
+    first_judge = first_terms(hand, level, run)
+    terms = verdict_key(hand, obj, level, False, pieces=pieces, first_judge=first_judge)
+    return _screened(_Case(hand, obj, pieces, "certificate", False), terms, grasps, level, run if first_judge else None)
+
+
+def _screened(case: _Case, terms: str, grasps: GraspSet, level: Level, run: Run | None) -> Screened:
+    return Screened({}, {}) if run is None else screened(case.scene, terms, grasps, level=level, run=run)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -19,10 +18,9 @@ from tests.worker.quality.first.test_worlds import every_kind
 from tests.worker.quality.test_referee import BOX, PADS, WHOLE
 from worker.certified import scored
 from worker.grasps import GraspSet
-from worker.meeting import Meeting
 from worker.quality.referee.first import screening, trials
 from worker.quality.referee.first.trials import FirstTrials
-from worker.quality.referee.judge import Verdicts, judge
+from worker.quality.referee.judge import Verdicts, judge, prefiltered
 from worker.quality.referee.key import Level
 from worker.quality.referee.protocol import JudgedBy
 from worker.run import Run
@@ -153,22 +151,11 @@ def test_a_shard_tells_of_each_grasp_who_judged_it(mode: Any) -> None:
         assert columns.keys() <= SCHEMAS["base"].keys()
 
 
-def test_members_of_a_meeting_are_judged_in_one_launch() -> None:
-    grasps = every_kind()
-    halves = [grasps.take(np.arange(0, 6)), grasps.take(np.arange(6, len(grasps)))]
-    alone = [verdicts(ON, "screen", half) for half in halves]
-    with Meeting(2, 64) as meeting:
-        run = dataclasses.replace(ON, meeting=meeting)
-
-        def member(half: GraspSet) -> Any:
-            try:
-                return verdicts(run, "screen", half)
-            finally:
-                meeting.leave()
-
-        with ThreadPoolExecutor(2) as pool:
-            together = list(pool.map(member, halves))
-    assert meeting.served == [2]
-    for one, other in zip(alone, together, strict=True):
-        np.testing.assert_array_equal(one.outcome, other.outcome)
-        np.testing.assert_array_equal(one.judged_by, other.judged_by)
+def test_verdicts_of_the_gpu_prefilter_that_were_asked_before_are_those_of_the_judge(stand_in: Stand) -> None:
+    run, made = ON.quiet(), verdicts(ON, "screen")
+    known = prefiltered(PADS, BOX, every_kind(), level="screen", pieces=WHOLE, run=run)
+    launched = stand_in.steps
+    again = judge(PADS, BOX, every_kind(), level="screen", pieces=WHOLE, prefilter=known, run=run)
+    assert stand_in.steps == launched > 0, "it is not asked twice"
+    np.testing.assert_array_equal(again.outcome, made.outcome)
+    np.testing.assert_array_equal(again.judged_by, made.judged_by)

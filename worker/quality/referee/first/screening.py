@@ -14,9 +14,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import logging
-import threading
 from collections import OrderedDict
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
@@ -29,8 +27,8 @@ from numpy.typing import NDArray
 from service.model.errors import InputError
 from service.model.transforms import Floats
 from worker.engines import backend
-from worker.engines.devices import check_device, is_out_of_memory
-from worker.grasps import GraspSet, Posture, joined
+from worker.engines.devices import check_device, exclusive, is_out_of_memory
+from worker.grasps import GraspSet, Posture
 from worker.hands.jaws import jaws_of
 from worker.hands.model import HandModel
 from worker.quality.referee import protocol
@@ -239,7 +237,6 @@ class WorldPool:
 
 
 _pools: OrderedDict[tuple[str, str, int], WorldPool] = OrderedDict()
-_lock = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -279,7 +276,7 @@ def first_terms(hand: HandModel, level: str, run: Run) -> list[Any]:
 
 
 def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: Run) -> Screened:
-    """What the first judge says of grasps in a scene; in one launch with those of the others in `run.meeting`.
+    """What the first judge says of grasps in a scene.
 
     Args:
         scene: the referee's own.
@@ -292,22 +289,13 @@ def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: Run
         TaskCancelled: when `run.cancelled()` answers True.
     """
 
-    def work(asked: Sequence[GraspSet]) -> list[FirstTrials]:
-        with _lock:
-            every = joined(asked)
-            found = _pool(scene, terms, run.device, len(every)).judge(every, run if run.meeting is None else ALONE)
-        check_device(run.device)
-        return found.parts([len(one) for one in asked])
-
     postures = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
     if not len(grasps):
         return Screened({}, {})
     try:
-        if run.meeting is None:
-            found = work([postures])[0]
-        else:
-            key = ("first judge", terms, run.device)
-            found = run.meeting.ask(key, postures, work, size=len(grasps), cancelled=run.cancelled)
+        with exclusive:
+            found = _pool(scene, terms, run.device, len(grasps)).judge(postures, run)
+            check_device(run.device)
     except RuntimeError as error:
         if not is_out_of_memory(error):
             raise
