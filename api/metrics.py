@@ -10,7 +10,7 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, generate_la
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 
 from service.index.queries.overview import IndexNow
-from service.pipeline.metrics import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S, parse_field
+from service.model.series import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S, parse_field
 from service.queue.port import QueueNow
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"

@@ -86,7 +86,7 @@ def _of_api(settings: Settings) -> list[Check]:
 def _of_worker(settings: Settings) -> list[Check]:
     if missing_extra("worker"):
         return [_absent("gpu", "worker"), _absent("kernels", "worker")]
-    from worker.process.doctor import checks_of as of_worker
+    from worker.commands.doctor import checks_of as of_worker
 
     return of_worker(settings)
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from service.pipeline.metrics import series_table
+from service.model.series import series_table
 from service.settings import Settings
 from service.store.columns import ATTRIBUTES, SCHEMAS, ShardKind
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from api.metrics import Metrics, Snapshot
+from service.model.series import SERIES
 from service.model.states import Stage
 from service.model.workers import WorkerBeat
-from service.pipeline.metrics import SERIES
 from service.queue.port import QueueNow
 
 STATES = ("checking", "idle", "busy", "stopping", "quarantined")

@@ -15,10 +15,11 @@ from api.metrics import Metrics, Snapshot
 from service.index.notes import Damage
 from service.index.queries import overview
 from service.model.messages import TaskMessage
+from service.model.series import SERIES, parse_field
 from service.model.states import Lane, Stage, State
 from service.pipeline.backends import Services
 from service.pipeline.job_actions import submit
-from service.pipeline.metrics import MOST_KINDS, OTHER_KIND, SERIES, Tally, parse_field
+from service.pipeline.metrics import MOST_KINDS, OTHER_KIND, Tally
 from service.queue.rq_queue import WORKERS, RqQueue, worker_key
 from tests.conftest import REPOSITORY
 from tests.fakes import make_shard, message_for, request

@@ -13,7 +13,7 @@ import pytest
 
 from service.run.doctor.checks import Condition
 from service.settings import Settings
-from worker.process import doctor
+from worker.commands import doctor
 from worker.process.selfcheck import EngineError
 
 GIB = 2**30

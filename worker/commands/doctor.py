@@ -15,7 +15,7 @@ from service.model.states import Stage
 from service.run.doctor.checks import Check, Finding, bad, good, warning
 from service.settings import Settings
 
-_MODULE: Final = "worker.process.doctor"
+_MODULE: Final = "worker.commands.doctor"
 _GPU_S: Final = 120.0
 #: All kernels compiled from nothing on a slow machine.
 _KERNELS_S: Final = 900.0
