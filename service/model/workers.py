@@ -6,16 +6,19 @@ knew. A worker reads a range too, and makes one revision of each stage.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+import socket
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Final
+from typing import Annotated, Final, Self
 
 from pydantic import Field
 
+from service.model.clock import timestamp
 from service.model.domain import Word
 from service.model.messages import IngestMessage, TaskMessage
 from service.model.states import Stage
-from service.model.version import OLDEST_TASK_SCHEMA, STAGE_REVISIONS, TASK_SCHEMA
+from service.model.version import OLDEST_TASK_SCHEMA, PACKAGE_VERSION, STAGE_REVISIONS, TASK_SCHEMA
 
 #: Anybody who writes to Redis may say anything: what is read from there is as long and as large as ours can be.
 HostWord = Annotated[str, Field(max_length=300)]
@@ -44,6 +47,24 @@ class WorkerBeat:
     """Oldest and newest task message that it reads; graspd 0.1 does not say it, and its workers are given no task."""
     revisions: Annotated[dict[HostWord, Count], Field(max_length=16)] = field(default_factory=dict)
     """Revision that it makes of each stage."""
+
+    @classmethod
+    def of_this_process(cls, name: str, device: str, stages: Iterable[Stage]) -> Self:
+        """What a worker says before its first check."""
+        now, own = timestamp(), own_ability()
+        facts = (
+            socket.gethostname(),
+            os.getpid(),
+            device,
+            "",
+            tuple(stages),
+            PACKAGE_VERSION,
+            "checking",
+            "",
+            now,
+            now,
+        )
+        return cls(name, *facts, schemas=own.schemas, revisions=dict(own.revisions))
 
     @property
     def ability(self) -> Ability:

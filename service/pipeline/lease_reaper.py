@@ -151,15 +151,11 @@ class LeaseReaper:
     def _lose_task(self, worker: str, message: TaskMessage) -> None:
         if self._find(message.task_id, message.stage, message.output):
             return
-        attempt = AttemptRecord(
-            task_id=message.task_id,
-            job_id=message.job_id,
-            stage=message.stage,
-            number=message.attempt,
+        attempt = AttemptRecord.of(
+            message,
             kind="WorkerLost",
             reason=f"worker {worker} was lost: no sign of life for {self._services.settings.lease_s:g} s",
             worker=worker,
-            ended=timestamp(),
             last=message.attempt >= message.max_attempt,
         )
         key = names.attempt(message.task_id, message.attempt)

@@ -14,8 +14,7 @@ from typing import Any, Final, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from service.model.messages import IngestMessage, TaskMessage
-from service.model.states import Stage
+from service.model.messages import message_type
 from service.model.workers import WorkerBeat
 from service.queue.port import Event, Message, Report
 
@@ -50,7 +49,7 @@ def message(data: bytes | None) -> Message | None:
         return None
     try:
         raw = json.loads(zlib.decompressobj().decompress(data, _MESSAGE_BYTES))[2][0]
-        return (IngestMessage if raw.get("stage") == Stage.INGEST else TaskMessage).model_validate(raw)
+        return message_type(raw).model_validate(raw)
     except Exception:  # forged data may fail anywhere
         return None
 

@@ -65,7 +65,7 @@ def known_lists(connection: Any) -> list[str]:
         if not entries.is_wrong_type(error):
             raise
         found = set()
-    named = (list_name(raw.decode(errors="replace")) for raw in found)
+    named = (entries.text(raw).removeprefix(Queue.redis_queue_namespace_prefix) for raw in found)
     return [*_COMMON, *sorted(name for name in named if is_apart(name))[:_MOST_APART]]
 
 
@@ -101,11 +101,6 @@ def _needs(stage: Stage, ability: Ability | None) -> list[Need]:
 def list_key(name: str) -> str:
     """List of waiting tasks."""
     return f"{Queue.redis_queue_namespace_prefix}{name}"
-
-
-def list_name(key: str) -> str:
-    """Name of a list by its key."""
-    return key.removeprefix(Queue.redis_queue_namespace_prefix)
 
 
 def held_key(name: str) -> str:

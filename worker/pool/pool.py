@@ -19,7 +19,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from multiprocessing import Pipe
@@ -71,7 +71,7 @@ class _Request:
         return pickle.dumps(self.shared)
 
 
-class Pool:
+class Pool(AbstractContextManager["Pool"]):
     """So many processes, started when they are first needed. Any thread may ask for work; a context manager."""
 
     def __init__(self, processes: int, modules: Sequence[str] = ()) -> None:
@@ -82,9 +82,6 @@ class Pool:
         self._threads = ThreadPoolExecutor(processes, thread_name_prefix="pool")
         self._changing = threading.Lock()
         self._started = self._closed = False
-
-    def __enter__(self) -> Pool:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

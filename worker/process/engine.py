@@ -185,15 +185,13 @@ class Surroundings:
         self._device = device
         self._memory_mb = settings.worker_max_memory_mb or available_memory() / 2 / 2**20
         self.tasks_done = 0
-        self._pool: Pool | None = None
-        self._processes = 0
 
     def outgrown(self) -> str:
         """Why this process should make room for a fresh one, "" if it need not."""
         most = self.settings.worker_max_tasks
         if most and self.tasks_done >= most:
             return f"it has done {self.tasks_done} tasks (GRASPD_WORKER_MAX_TASKS)"
-        beside = sum(resident_mb(pid) for pid in self._pool.pids) if self._pool is not None else 0.0
+        beside = sum(resident_mb(pid) for pid in pool.pids) if (pool := vars(self).get("_pool")) is not None else 0.0
         if (held := resident_mb() + beside) > self._memory_mb:
             return f"it holds {held:.0f} MiB, over {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"
         return ""
@@ -208,20 +206,20 @@ class Surroundings:
         many they are."""
         if stage != Stage.SYNTHESIZE:
             return None
-        if not self._processes:
-            chosen = self.settings
-            self._processes = processes_at_once(
-                self._device.resolve(), chosen.processes, threads=chosen.threads, workers=chosen.workers_here
-            )
-            self._pool = Pool(self._processes, MODULES) if self._processes > 1 else None
         if self._pool is not None:
             self._pool.start()
         return self._pool
 
+    @cached_property
+    def _pool(self) -> Pool | None:
+        chosen, device = self.settings, self._device.resolve()
+        count = processes_at_once(device, chosen.processes, threads=chosen.threads, workers=chosen.workers_here)
+        return Pool(count, MODULES) if count > 1 else None
+
     def close(self) -> None:
         """End what was started for tasks."""
-        if self._pool is not None:
-            self._pool.close()
+        if (pool := vars(self).get("_pool")) is not None:
+            pool.close()
 
     def context(self, raw: Mapping[str, Any], report: Callable[[str, Report], None]) -> TaskContext:
         """The context of a task, whose progress goes to `report`."""

@@ -27,10 +27,8 @@ from rq.job import JobStatus
 from rq.serializers import JSONSerializer
 from rq.worker import WorkerStatus
 
-from service.model.clock import timestamp
 from service.model.errors import QueueUnavailable, TaskRefused
 from service.model.states import Stage
-from service.model.version import PACKAGE_VERSION
 from service.model.workers import WorkerBeat, own_ability
 from service.queue import allowed
 from service.queue.connection import redis_url
@@ -269,7 +267,7 @@ def run_worker(
     queue = open_queue(settings, patience=_PATIENCE)
     heart = Heartbeat(
         redis_url(settings),
-        _first_beat(name, settings.device, stages),
+        WorkerBeat.of_this_process(name, settings.device, stages),
         lease_s=settings.lease_s,
         alive=settings.heartbeat_file,
         is_stopped=lambda: engine.is_stopped,
@@ -303,22 +301,3 @@ def run_worker(
     # RQ's loop ends in the same way where an error that nobody foresaw broke it off.
     is_done = not does_all and (worker.found_none or worker.tasks_done >= (max_tasks or math.inf))
     return worker.engine_is == "outgrown" or (worker.engine_is == "fit" and (is_done or worker.told_to_stop))
-
-
-def _first_beat(name: str, device: str, stages: Collection[Stage]) -> WorkerBeat:
-    now = timestamp()
-    return WorkerBeat(
-        name=name,
-        host=socket.gethostname(),
-        pid=os.getpid(),
-        device=device,
-        device_name="",
-        stages=tuple(stages),
-        version=PACKAGE_VERSION,
-        state="checking",
-        task_id="",
-        started=now,
-        seen=now,
-        schemas=own_ability().schemas,
-        revisions=dict(own_ability().revisions),
-    )
