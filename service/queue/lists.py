@@ -17,7 +17,7 @@ from redis.exceptions import ResponseError
 from rq import Queue, Worker
 from rq.executions import Execution, ExecutionRegistry
 from rq.job import Job
-from rq.registry import FailedJobRegistry, StartedJobRegistry
+from rq.registry import StartedJobRegistry
 from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
 from service.model.states import Lane, Stage
@@ -108,11 +108,6 @@ def held_key(name: str) -> str:
     return str(StartedJobRegistry.key_template.format(name))
 
 
-def failed_key(name: str) -> str:
-    """Tasks of a list that RQ calls failed."""
-    return str(FailedJobRegistry.key_template.format(name))
-
-
 def job_key(job: str) -> str:
     """What is known of a task and attempt."""
     return f"{Job.redis_job_namespace_prefix}{job}"
@@ -139,5 +134,4 @@ def kinds(lists: list[str]) -> Iterator[tuple[str, str]]:
     for name in lists:
         yield list_key(name), "list"
         yield held_key(name), "zset"
-        yield failed_key(name), "zset"
         yield workers_key(name), "set"

@@ -27,13 +27,12 @@ from service.model.errors import QueueUnavailable
 from service.model.states import Lane, Stage
 from service.model.workers import WorkerBeat, need_of
 from service.queue import entries
-from service.queue.allowed import TASK_FUNCTION, new_job
+from service.queue.allowed import new_job
 from service.queue.connection import connect, redis_url
 from service.queue.lists import (
     LISTS,
     RQ_WORKERS,
     execution_keys,
-    failed_key,
     held_key,
     job_key,
     kinds,
@@ -346,7 +345,7 @@ class RqQueue:
 
     def tidy(self) -> None:
         """Throw away what dead workers and refused entries left behind."""
-        # RQ's registries of workers and failures are emptied by its own maintenance, which is off.
+        # RQ's registries of workers are emptied by its own maintenance, which is off.
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             entries.sweep(self.connection, _KINDS, (EVENTS,))
             lists = known_lists(self.connection)
@@ -361,8 +360,6 @@ class RqQueue:
                     for registry in (RQ_WORKERS, *map(workers_key, lists)):
                         pipe.srem(registry, key)
                     pipe.srem(WORKERS, name)
-            for queue in lists:
-                pipe.zremrangebyscore(failed_key(queue), 0, time.time())
             pipe.execute()
 
     def close(self) -> None:
@@ -390,7 +387,6 @@ class RqQueue:
 
     def _job(self, message: Message) -> Job:
         return new_job(
-            TASK_FUNCTION,
             message.model_dump(mode="json", by_alias=True),
             id=rq_id(message.task_id, message.attempt),
             connection=self.connection,

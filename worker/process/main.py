@@ -18,16 +18,16 @@ import time
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any, Final
 
 from redis.exceptions import RedisError, ResponseError
 from rq import SimpleWorker
 from rq.exceptions import StopRequested
-from rq.job import JobStatus
 from rq.serializers import JSONSerializer
 from rq.worker import WorkerStatus
 
-from service.model.errors import QueueUnavailable, TaskRefused
+from service.model.errors import GraspdError, QueueUnavailable, TaskRefused
 from service.model.states import Stage
 from service.model.workers import WorkerBeat, own_ability
 from service.queue import allowed
@@ -59,6 +59,8 @@ STUCK_AFTER_S: Final = 60.0
 class GraspWorker(SimpleWorker):  # type: ignore[misc]
     """RQ's in-process worker, whose tasks an engine does. What of RQ it does without, and why, is in docs/adr."""
 
+    execution: Any
+
     def __init__(
         self, queue: RqQueue, engine: Link, heart: Heartbeat, *, stages: Collection[Stage], name: str, limit_s: float
     ) -> None:
@@ -83,10 +85,6 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         """Whether it ended because no task waits."""
         self.engine_is: Condition = "fit"
         """How the engine was after the last task."""
-        self._job: Any = None
-        self._outcome: Event | None = None
-        self._asked = False
-        allowed.task_function = self._run_task
 
     def check_service(self) -> None:
         """Raises BusyError if Redis belongs to another service than the store, and InputError if there is no such
@@ -100,34 +98,30 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         return bool(self._await("ready"))
 
     def execute_job(self, job: Any, queue: Any) -> None:
-        """One task under a lease. Its outcome is told after RQ has closed its books on it."""
-        self._job = job
+        """One task under a lease. Its outcome is told after the lease is given back."""
         self.prepare_execution(job)
+        self.prepare_job_execution(job)
         self._heart.update(task_id=job.id.rpartition("-")[0], state="busy")
-        self.perform_job(job, queue)
-        self._heart.update(task_id="", state="stopping" if self.told_to_stop else "idle")
-        self.tasks_done += 1
-        outcome, self._outcome = self._outcome, None
-        if outcome is not None:
-            self._publish(outcome)
-        asked, self._asked = self._asked, False
-        if asked:
-            self.engine_is = self._await("idle")
-        if self.engine_is != "fit":
-            self._heart.update(state="stopping")
-            raise StopRequested
-        self.set_state(WorkerStatus.IDLE)
-
-    def _run_task(self, message: dict[str, Any]) -> None:
-        self._engine.say("task", message)
-        self._asked = True
+        outcome: Event | None = None
+        self._engine.say("task", job.args[0])
         try:
-            self._outcome = self._await("done", self._keep_lease)
+            outcome = self._await("done", partial(self._keep_lease, job))
+        except GraspdError as error:
+            log.warning("the engine refuses a task: %s", error)
         except EngineLost as error:
             # As if this process had been killed: the lease stays, and the controller finds that nobody keeps it.
             log.error("this worker ends: %s", error)
             os._exit(1)
-        self._prepare_end()
+        self._give_back(job)
+        self._heart.update(task_id="", state="stopping" if self.told_to_stop else "idle")
+        self.tasks_done += 1
+        if outcome is not None:
+            self._publish(outcome)
+        self.engine_is = self._await("idle")
+        if self.engine_is != "fit":
+            self._heart.update(state="stopping")
+            raise StopRequested
+        self.set_state(WorkerStatus.IDLE)
 
     def _await(self, word: str, beat: Callable[[], None] = lambda: None) -> Any:
         """What the engine answers, within the time that a task may take. What else it says is passed on meanwhile."""
@@ -171,16 +165,16 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         except QueueUnavailable as error:
             log.warning("what became of task %s is for the controller to find: %s", event.task_id, error)
 
-    def _keep_lease(self) -> None:
+    def _keep_lease(self, job: Any) -> None:
         """A sign of life for the task in hand, which hears if it is not wanted any more."""
         if self._engine.is_stopped:
             return
         try:
-            is_held, is_cancelled = lease_state(self.connection, self._job, self.execution)
+            is_held, is_cancelled = lease_state(self.connection, job, self.execution)
             if is_held:
                 with self.connection.pipeline() as pipe:
                     self.heartbeat(pipeline=pipe)
-                    renew_lease(pipe, self._job, self.execution, self.get_heartbeat_ttl(self._job))
+                    renew_lease(pipe, job, self.execution, self.get_heartbeat_ttl(job))
                     pipe.execute()
         except RedisError as error:
             log.warning("the lease of a task could not be renewed: %s", error)
@@ -188,17 +182,17 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         if is_cancelled or not is_held:
             self._engine.say("stop", StopReason.CANCELLED if is_cancelled else StopReason.LEASE_LOST)
 
-    def _prepare_end(self) -> None:
-        """See to it that RQ can close its books: Redis refuses writes on a full disk, and a task that was taken away
-        has no books any more."""
-        if not self.job_class.exists(self._job.id, self.connection):
-            log.info("task %s was taken from this worker meanwhile: it was slow", self._job.id.rpartition("-")[0])
-        told = False
+    def _give_back(self, job: Any) -> None:
+        """Nothing is left of the task in Redis, which refuses writes while its disk is full: then this waits."""
+        if not job.exists(job.id, self.connection):
+            log.info("task %s was taken from this worker meanwhile: it was slow", job.id.rpartition("-")[0])
+        execution, told = self.execution, False
         while True:
             try:
                 with self.connection.pipeline() as pipe:
-                    self._job.set_status(JobStatus.STARTED, pipe)
-                    pipe.expire(self._job.key, allowed.FAILURE_TTL_S)
+                    self.execution = execution
+                    self.cleanup_execution(job, pipe)
+                    pipe.delete(job.key)
                     pipe.execute()
                 return
             except ResponseError as error:
@@ -294,7 +288,6 @@ def run_worker(
         log.error("this worker ends: %s", error)
         return False
     finally:
-        allowed.task_function = None
         engine.close()
         heart.stop()
         queue.close()
