@@ -23,6 +23,7 @@ from service.model.version import OLDEST_TASK_SCHEMA, PACKAGE_VERSION, STAGE_REV
 #: Anybody who writes to Redis may say anything: what is read from there is as long and as large as ours can be.
 HostWord = Annotated[str, Field(max_length=300)]
 Count = Annotated[int, Field(ge=0, lt=2**31)]
+Amount = Annotated[float, Field(ge=0, le=1e15, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,10 @@ class WorkerBeat:
     """Oldest and newest task message that it reads; graspd 0.1 does not say it, and its workers are given no task."""
     revisions: Annotated[dict[HostWord, Count], Field(max_length=16)] = field(default_factory=dict)
     """Revision that it makes of each stage."""
+    done: Amount = 0.0
+    total: Amount = 0.0
+    """How far its task is; 0 where the end is not known."""
+    message: Annotated[str, Field(max_length=300)] = ""
 
     @classmethod
     def of_this_process(cls, name: str, device: str, stages: Iterable[Stage]) -> Self:

@@ -35,7 +35,7 @@ from service.pipeline.leading import PART
 from service.pipeline.lease_reaper import LeaseReaper
 from service.pipeline.routes import Routes
 from service.pipeline.webhook_dispatcher import WebhookDispatcher
-from service.queue.port import Event, EventKind, Report
+from service.queue.port import Event, EventKind
 from service.store.library import publish_builtins, stored_assets
 from service.store.packs import take_apart
 from service.store.records import newest_mark, next_mark, read_record, set_mark
@@ -51,7 +51,7 @@ _WORKERS_EVERY_S: Final = 2.0
 #: How long what a worker can do counts after it was last seen.
 _REMEMBERED_S: Final = 60.0
 #: How often the progress of tasks is passed on: as often as pages ask for it.
-_REPORTS_EVERY_S: Final = 0.5
+_PROGRESS_EVERY_S: Final = 0.5
 _LONGEST_PAUSE_S: Final = 5.0
 _COLLECT_EVERY_S: Final = 5.0
 #: How often it looks whether store and index are still its service's.
@@ -89,7 +89,7 @@ class Controller:
         self._workers = 0
         """Workers that were there when they were last counted."""
         self._clock = clock
-        self._reports: dict[str, Report] = {}
+        self._progress: dict[str, tuple[float, float, str]] = {}
         """How far tasks were when it was last passed on."""
         interval_s = services.settings.controller_interval_s
         self._entered = ""
@@ -103,7 +103,7 @@ class Controller:
             # Each lease is seen three times before it can be called lost.
             Duty(clock, self._look_after_queue, interval_s, longest_s=services.settings.lease_s / 3),
             Duty(clock, self._feed_news, 0.0),
-            Duty(clock, self._pass_on_reports, min(_REPORTS_EVERY_S, interval_s), share=0.1),
+            Duty(clock, self._pass_on_progress, min(_PROGRESS_EVERY_S, interval_s), share=0.1),
             # The index is free for at least as long as it was held.
             Duty(clock, self._enter_large_job, _ENTERING_GAP_S, share=0.5),
             Duty(clock, self._plan, interval_s),
@@ -164,7 +164,7 @@ class Controller:
         self._see_to_the_index()
         away: list[UnavailableError] = []
         with _noted(away):
-            self._index_events(0.0 if self._has_plans else min(wait_s, _REPORTS_EVERY_S))
+            self._index_events(0.0 if self._has_plans else min(wait_s, _PROGRESS_EVERY_S))
         for duty in self._duties:
             with _noted(away):
                 duty()
@@ -183,13 +183,13 @@ class Controller:
             notes.set_marked(Marked(fresh, fresh, changes))
             self._known, self._made = fresh, False
 
-    def _pass_on_reports(self) -> None:
-        """What changed in the workers' reports to the progress that the index shows."""
-        found = self._services.queue.reports()
-        changed = {task: report for task, report in found.items() if self._reports.get(task) != report}
-        if changed:
-            self._services.index.live.set_progress({task: (r.done, r.total, r.message) for task, r in changed.items()})
-        self._reports = found
+    def _pass_on_progress(self) -> None:
+        """What changed in how far tasks are, as their workers say."""
+        busy = (beat for beat in self._services.queue.workers() if beat.task_id)
+        found = {beat.task_id: (beat.done, beat.total, beat.message) for beat in busy}
+        if changed := {task: one for task, one in found.items() if self._progress.get(task) != one}:
+            self._services.index.live.set_progress(changed)
+        self._progress = found
 
     def _plan(self) -> bool:
         self._has_plans = self._planner.advance()
@@ -297,11 +297,6 @@ class Controller:
         # Waiting tasks are read before leases: one that a worker takes in between is then seen as held.
         waiting = self._services.queue.waiting()
         leases = self._services.queue.leases()
-        # Reports that were read before the leases were, and whose tasks nobody held then.
-        gone = self._reports.keys() - {lease.task_id for lease in leases}
-        self._services.queue.forget_reports(gone)
-        for task in gone:
-            del self._reports[task]
         lost = self._reaper.reap(leases)
         present = waiting | {lease.task_id for lease in leases if lease not in lost}
         if stray := self._services.index.feed.cancelled(present):

@@ -16,10 +16,10 @@ from pydantic import TypeAdapter, ValidationError
 
 from service.model.messages import message_type
 from service.model.workers import WorkerBeat
-from service.queue.port import Event, Message, Report
+from service.queue.port import Event, Message
 
-Entry = TypeVar("Entry", WorkerBeat, Event, Report)
-_ADAPTERS: Final[dict[type, TypeAdapter[Any]]] = {kind: TypeAdapter(kind) for kind in (WorkerBeat, Event, Report)}
+Entry = TypeVar("Entry", WorkerBeat, Event)
+_ADAPTERS: Final[dict[type, TypeAdapter[Any]]] = {kind: TypeAdapter(kind) for kind in (WorkerBeat, Event)}
 _ATTEMPT: Final = re.compile(r"(.+)-([0-9]{1,9})")
 #: A message has a few kilobytes, whatever its few compressed bytes would unpack to.
 _MESSAGE_BYTES: Final = 1 << 20
@@ -55,7 +55,7 @@ def message(data: bytes | None) -> Message | None:
 
 
 def read(kind: type[Entry], data: bytes | None) -> Entry | None:
-    """What a worker says of itself, an event or a report; None if it is forged, or of a version much newer or older."""
+    """What a worker says of itself, or an event; None if it is forged, or of a version much newer or older."""
     try:
         found: Entry = _ADAPTERS[kind].validate_json(data or b"")
         return found

@@ -44,7 +44,7 @@ from service.queue.lists import (
     without_takers,
     workers_key,
 )
-from service.queue.port import Event, Lease, Message, Place, QueueNow, Report
+from service.queue.port import Event, Lease, Message, Place, QueueNow
 from service.settings import Settings
 
 EVENTS: Final = "graspd:events"
@@ -56,8 +56,6 @@ _GROUP: Final = "keeper"
 WORKERS: Final = "graspd:workers"
 #: Lease of the controller that leads. A graspd of 0.2 takes and keeps the same one: so the two give way to each other.
 LEAD: Final = "graspd:lead:keeper"
-#: How far running tasks are: one field of a hash for each, so that what is late replaces what was not yet read.
-REPORTS: Final = "graspd:reports"
 #: Sums for Prometheus, a few hundred fields.
 METRICS: Final = "graspd:metrics"
 _SERVICE: Final = "graspd:service"
@@ -192,7 +190,6 @@ class RqQueue:
         with _mapped(), self.connection.pipeline(transaction=True) as pipe:
             pipe.zrem(key, entry)
             pipe.delete(*execution_keys(name), job_key(name.partition(":")[0]))
-            pipe.hdel(REPORTS, lease.task_id)
             pipe.execute()
 
     def workers(self) -> list[WorkerBeat]:
@@ -207,26 +204,7 @@ class RqQueue:
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for event in events:
                 put_event(pipe, event)
-                if event.kind.ends_attempt:
-                    pipe.hdel(REPORTS, event.task_id)
             pipe.execute()
-
-    def report(self, task_id: str, report: Report) -> None:
-        """Say how far a task is, in place of what was said before; gone with the event that ends the attempt."""
-        with _mapped():
-            self.connection.hset(REPORTS, task_id, report.model_dump_json())
-
-    def reports(self) -> dict[str, Report]:
-        """The last report on each task."""
-        with _mapped():
-            found = self.connection.hgetall(REPORTS)
-        return {entries.text(task): entries.read(Report, data) or Report() for task, data in found.items()}
-
-    def forget_reports(self, task_ids: Collection[str]) -> None:
-        """Take reports away whose tasks nobody holds."""
-        if task_ids:
-            with _mapped():
-                self.connection.hdel(REPORTS, *task_ids)
 
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         """Next events for the controller, the oldest first; those never acknowledged come again to the next one."""
@@ -469,7 +447,6 @@ _KINDS: Final = (
     (LEAD, "string"),
     (WORKERS, "set"),
     (METRICS, "hash"),
-    (REPORTS, "hash"),
     (_SERVICE, "string"),
     (RQ_WORKERS, "set"),
     (LISTS, "set"),

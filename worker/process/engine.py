@@ -3,7 +3,7 @@
 Its worker (`worker.process.main`) sends pairs of a word and what it is about over a pipe, after the `Setup`. Orders are
 `service` (does the store belong to it?), `check` (answer: `ready`), `task` (`done`, then `idle`), `end`; an error may
 come as `refused` in place of an answer. `stop` with a reason is heard at any time. On its own the engine sends `facts`
-for the list of workers, `event` and `report`. It knows nothing of Redis.
+for the list of workers (how far a task is, too) and `event`. It knows nothing of Redis.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ from service.model.errors import BusyError, InputError, TaskRefused, Unavailable
 from service.model.libraries import own_process
 from service.model.states import Stage
 from service.pipeline.identity import check_service
-from service.queue.port import Report
 from service.store.store import Store, open_store
 from worker.engines.devices import Device
 from worker.engines.joins import batches_at_once, parse_join
@@ -90,7 +89,7 @@ class Engine:
         else:
             self._do(about)
 
-    def update(self, **facts: str) -> None:
+    def update(self, **facts: str | float) -> None:
         """Facts for the list of workers."""
         self._say("facts", facts)
 
@@ -123,7 +122,7 @@ class Engine:
         return self._fitness.sit_out(stages, self.update, lambda: self._reason is not None)
 
     def _do(self, raw: dict[str, Any]) -> None:
-        context = self._surroundings.context(raw, lambda *report: self._say("report", report))
+        context = self._surroundings.context(raw, self.update)
         with self._changing:
             self._context = context
             if self._reason is not None:
@@ -221,11 +220,11 @@ class Surroundings:
         if (pool := vars(self).get("_pool")) is not None:
             pool.close()
 
-    def context(self, raw: Mapping[str, Any], report: Callable[[str, Report], None]) -> TaskContext:
-        """The context of a task, whose progress goes to `report`."""
+    def context(self, raw: Mapping[str, Any], update: Callable[..., None]) -> TaskContext:
+        """The context of a task, whose progress goes to `update`."""
 
         def tell(done: float, total: float, message: str) -> None:
-            report(raw["task_id"], Report(attempt=raw["attempt"], done=done, total=total, message=message[:200]))
+            update(done=done, total=total, message=message[:200])
 
         stage, chosen = raw.get("stage", ""), self.settings
         device = "cpu" if stage == Stage.INGEST else self._device.resolve()

@@ -60,8 +60,8 @@ class Heartbeat:
     def start(self) -> None:
         self._thread.start()
 
-    def update(self, **facts: str) -> None:
-        """Facts that changed, such as the state, or the name of the device."""
+    def update(self, **facts: str | float) -> None:
+        """Facts that changed, such as the state, the name of the device, or how far the task is."""
         self._beat.update(facts)
         self._news.set()
 

@@ -16,7 +16,6 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Collection
-from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
 from typing import Any, Final
@@ -101,7 +100,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         """One task under a lease. Its outcome is told after the lease is given back."""
         self.prepare_execution(job)
         self.prepare_job_execution(job)
-        self._heart.update(task_id=job.id.rpartition("-")[0], state="busy")
+        self._heart.update(task_id=job.id.rpartition("-")[0], state="busy", done=0.0, total=0.0, message="")
         outcome: Event | None = None
         self._engine.say("task", job.args[0])
         try:
@@ -153,11 +152,8 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             raise about
         if word == "facts":
             self._heart.update(**about)
-        elif word == "event":
-            self._publish(about)
         else:
-            with suppress(QueueUnavailable):
-                self._queue.report(*about)
+            self._publish(about)
 
     def _publish(self, event: Event) -> None:
         try:
