@@ -15,7 +15,6 @@ from contextlib import contextmanager
 from typing import Final
 
 from service.index.notes import Marked
-from service.index.queries.feed import ReadyTask
 from service.index.rebuild import complete_if_new, rebuild
 from service.model import names
 from service.model.clock import timestamp
@@ -322,7 +321,7 @@ class Controller:
         held: set[str] = set()
         for lane in Lane:
             room = window - sum(n for (of, _), n in depths.items() if of is lane)
-            ready = self._ready(lane, now, room) if room > 0 else []
+            ready = self._services.index.feed.ready_tasks(lane, self._turns, now=now, limit=room) if room > 0 else []
             if present is None:
                 held |= queue_tasks(self._services, ready, routes=self._routes)
                 continue
@@ -336,9 +335,6 @@ class Controller:
             log.warning("tasks are %s", why)
         self._held = held
         self._feed_checks(present, missing, now)
-
-    def _ready(self, lane: Lane, now: float, room: int) -> list[ReadyTask]:
-        return self._services.index.feed.ready_tasks(lane, self._turns, now=now, limit=room)
 
     def _feed_checks(self, present: set[str] | None, missing: Collection[str], now: float) -> None:
         for check in self._services.index.feed.ready_checks(now=now, limit=self._services.settings.queue_window):

@@ -64,11 +64,10 @@ class LeaseReaper:
         now = self._clock()
         self._missing = {task: self._missing.get(task, now) for task in believed - set(present)}
         missing = [task for task, since in self._missing.items() if now - since >= LOST_AFTER_S]
-        of_checks = {ingest_id(kind, digest): (kind, digest) for kind, digest in checks}
-        self._recover([task for task in missing if task not in of_checks])
-        for task in missing:
-            if task in of_checks:
-                self._recover_check(*of_checks[task])
+        self._recover([task for task in missing if task in tasks])
+        for kind, digest in checks:
+            if ingest_id(kind, digest) in missing:
+                self._recover_check(kind, digest)
         return missing
 
     def _recover(self, missing: list[str]) -> None:
@@ -110,17 +109,9 @@ class LeaseReaper:
     def _fail(self, task_id: str, stage: Stage, error: DamagedError) -> None:
         """End a task that a damaged record stands in the way of."""
         task = self._services.index.jobs.task(task_id)
-        attempt = AttemptRecord(
-            task_id=task_id,
-            job_id=task.job_id,
-            stage=stage,
-            number=task.attempt,
-            kind=type(error).__name__,
-            reason=str(error),
-            worker="controller",
-            ended=timestamp(),
-            last=True,
-        )
+        about = {"task_id": task_id, "job_id": task.job_id, "stage": stage, "number": task.attempt}
+        why = {"kind": type(error).__name__, "reason": str(error), "worker": "controller"}
+        attempt = AttemptRecord.model_validate({**about, **why, "ended": timestamp(), "last": True})
         put_record(self._services.store, names.attempt(task_id, attempt.number), attempt)
         self._indexer.failed(attempt)
 

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Final
 
 from service.model.series import SERIES, STAGE_BUCKETS_S, field
-from service.model.states import State
 from service.store.manifests import ShardManifest
 
 #: Names of errors that get a series of their own; more than an engine raises, and a bound if somebody forges them.
@@ -32,13 +31,13 @@ class Tally:
         """Shards that were indexed."""
         for manifest in manifests:
             stage = manifest.stage.value
-            self._add("graspd_shards_total", stage)
-            self._add("graspd_shard_bytes_total", stage, amount=manifest.size_bytes)
+            self.add("graspd_shards_total", stage)
+            self.add("graspd_shard_bytes_total", stage, amount=manifest.size_bytes)
             self._observe("graspd_stage_seconds", stage, seconds=manifest.seconds)
             if manifest.kind == "base":
-                self._add("graspd_grasps_total", "all", amount=manifest.count)
-                self._add("graspd_grasps_total", "valid", amount=manifest.valid)
-                self._add("graspd_grasps_total", "judged", amount=manifest.judged)
+                self.add("graspd_grasps_total", "all", amount=manifest.count)
+                self.add("graspd_grasps_total", "valid", amount=manifest.valid)
+                self.add("graspd_grasps_total", "judged", amount=manifest.judged)
 
     def failed(self, stage: str, kind: str) -> None:
         """An attempt of a task failed."""
@@ -46,15 +45,7 @@ class Tally:
             if len(self._kinds) >= MOST_KINDS:
                 kind = OTHER_KIND
             self._kinds.add((stage, kind))
-        self._add("graspd_task_failures_total", stage, kind)
-
-    def handed_back(self, stage: str, kind: str) -> None:
-        """A task was deferred, returned or cancelled."""
-        self._add("graspd_task_handbacks_total", stage, kind)
-
-    def ended(self, state: State) -> None:
-        """A job came to its end."""
-        self._add("graspd_jobs_ended_total", state.value)
+        self.add("graspd_task_failures_total", stage, kind)
 
     def flush(self) -> None:
         """Add what was counted to the sums; QueueUnavailable keeps it for the next time."""
@@ -67,6 +58,7 @@ class Tally:
         self._amounts[field(f"{name}_bucket", *labels, "+Inf" if bound is None else str(bound))] += 1
         self._amounts[field(f"{name}_sum", *labels)] += seconds
 
-    def _add(self, name: str, *labels: str, amount: float = 1) -> None:
+    def add(self, name: str, *labels: str, amount: float = 1) -> None:
+        """Count in a series."""
         assert len(SERIES[name].labels) == len(labels)
         self._amounts[field(name, *labels)] += amount

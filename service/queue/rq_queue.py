@@ -225,7 +225,9 @@ class RqQueue:
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         """Events after an id, for any number of readers. `"$"`: only what comes from now on; `"0"`: all kept."""
         with _mapped():
-            found = entries.events(self.connection.xread({EVENTS: after}, count=limit, block=_block_ms(wait_s)))
+            found = entries.events(
+                self.connection.xread({EVENTS: after}, count=limit, block=int(wait_s * 1000) or None)
+            )
         return [(event_id, event) for event_id, event in found if event is not None]
 
     def announce(self, part: str, seconds: float) -> None:
@@ -319,15 +321,18 @@ class RqQueue:
         """All those sums."""
         with _mapped():
             found = self.connection.hgetall(METRICS)
-        return {entries.text(name): amount for name, raw in found.items() if (amount := _amount(raw)) is not None}
+        sums: dict[str, float] = {}
+        for name, raw in found.items():
+            with suppress(ValueError):  # forged
+                sums[entries.text(name)] = float(raw)
+        return sums
 
     def tidy(self) -> None:
         """Throw away what dead workers and refused entries left behind."""
         # RQ's registries of workers are emptied by its own maintenance, which is off.
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
-            entries.sweep(self.connection, _KINDS, (EVENTS,))
             lists = known_lists(self.connection)
-            entries.sweep(self.connection, kinds(lists))
+            entries.sweep(self.connection, (*_KINDS, *kinds(lists)), (EVENTS,))
             known = list(self.connection.smembers(WORKERS))
             for name in known:
                 pipe.exists(_WORKER + name)
@@ -347,7 +352,7 @@ class RqQueue:
     def _of_group(self, after: str, limit: int, wait_s: float) -> list[tuple[str, Event | None]]:
         """Events of the group of controllers, which is made where there is none."""
         read = partial(
-            self.connection.xreadgroup, _GROUP, _GROUP, {EVENTS: after}, count=limit, block=_block_ms(wait_s)
+            self.connection.xreadgroup, _GROUP, _GROUP, {EVENTS: after}, count=limit, block=int(wait_s * 1000) or None
         )
         try:
             return entries.events(read())
@@ -383,10 +388,6 @@ def open_queue(settings: Settings, *, patience: int = 3) -> RqQueue:
 def put_event(pipe: Any, event: Event) -> None:
     """Append an event to the bounded stream."""
     pipe.xadd(EVENTS, {"e": event.model_dump_json(exclude_defaults=True)}, maxlen=EVENTS_KEPT, approximate=True)
-
-
-def _block_ms(wait_s: float) -> int | None:
-    return max(1, int(wait_s * 1000)) if wait_s > 0 else None
 
 
 def rq_id(task_id: str, attempt: int) -> str:
@@ -451,13 +452,6 @@ _KINDS: Final = (
     (RQ_WORKERS, "set"),
     (LISTS, "set"),
 )
-
-
-def _amount(raw: bytes) -> float | None:
-    try:
-        return float(raw)
-    except ValueError:
-        return None
 
 
 @contextmanager

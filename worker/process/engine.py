@@ -134,7 +134,6 @@ class Engine:
         finally:
             with self._changing:
                 self._context = None
-        self._surroundings.tasks_done += 1
         self._say("idle", self._look_after_itself())
 
     def _look_after_itself(self) -> Condition:
@@ -173,23 +172,16 @@ class Engine:
 
 
 class Surroundings:
-    """What a task gets besides its message, and what its worker counts.
-
-    Engines and drivers leak: a worker that grew makes room for a new one.
-    """
+    """What a task gets besides its message. Engines and drivers leak: a worker that grew makes room for a new one."""
 
     def __init__(self, settings: Settings, store: Store, device: Device) -> None:
         self.settings = settings
         self.store = store
         self._device = device
         self._memory_mb = settings.worker_max_memory_mb or available_memory() / 2 / 2**20
-        self.tasks_done = 0
 
     def outgrown(self) -> str:
         """Why this process should make room for a fresh one, "" if it need not."""
-        most = self.settings.worker_max_tasks
-        if most and self.tasks_done >= most:
-            return f"it has done {self.tasks_done} tasks (GRASPD_WORKER_MAX_TASKS)"
         beside = sum(resident_mb(pid) for pid in pool.pids) if (pool := vars(self).get("_pool")) is not None else 0.0
         if (held := resident_mb() + beside) > self._memory_mb:
             return f"it holds {held:.0f} MiB, over {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"

@@ -89,11 +89,10 @@ class Heartbeat:
             self._news.wait(self.interval_s - _SHORTEST_INTERVAL_S)
 
     def _tick(self) -> None:
+        away, self._away = self._away, True
         try:
             list_worker(self._connection, self._beat | {"seen": timestamp()}, self._lease_s)
-        except (RedisError, OSError) as error:
-            if not self._away:
-                log.warning("no sign of life could be given: %s", error)
-            self._away = True
-        else:
             self._away = False
+        except (RedisError, OSError) as error:
+            if not away:
+                log.warning("no sign of life could be given: %s", error)

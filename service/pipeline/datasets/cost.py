@@ -4,7 +4,7 @@
     seconds of a cell  = tries x seconds per try + batches x scenes x seconds per scene + pictures x seconds per picture
     time of W workers  = the larger of seconds / W and rounds of batches x seconds of a batch
 
-The rates, each with an interval, come from `service.pipeline.rates`; intervals add, as if all were off
+The rates, each with an interval, come from `service.index.queries.rates`; intervals add, as if all were off
 together. A worker is one process of `graspd worker` on a device like those that were measured.
 """
 
@@ -19,6 +19,7 @@ from typing import Final
 
 from service.index.index import Index
 from service.index.queries.overview import BatchCost
+from service.index.queries.rates import Machine, Rate, Rates, StageRate, picture_rate, scene_rate, tries
 from service.model.domain import BATCH_SIZE, JobOptions, JobRequest
 from service.model.errors import LimitError
 from service.model.planning import stages_of
@@ -27,7 +28,6 @@ from service.model.records import request_of
 from service.model.states import AssetKind, Stage
 from service.pipeline.datasets.estimate import Estimate, RateUsed, WorkersPlan
 from service.pipeline.datasets.spec import MAX_CELLS, Matrix
-from service.pipeline.rates import Machine, Rate, Rates, StageRate, picture_rate, scene_rate, tries
 
 WORKERS: Final = (1, 8, 64)
 #: A task in the queue and the events it sends back, both ways (docs/explanation/scaling.md) [bytes].

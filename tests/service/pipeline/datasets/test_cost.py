@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 
 from service.index.queries.overview import BatchCost
+from service.index.queries.rates import ORIGIN, STORED, STORED_METHODS, STORED_MODEL_S, STORED_PLACE, machine_of
 from service.model.domain import JobRequest
 from service.model.errors import LimitError, NotFoundError
 from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.cost import estimate
 from service.pipeline.datasets.estimate import Estimate
-from service.pipeline.rates import ORIGIN, STORED, STORED_METHODS, STORED_MODEL_S, STORED_PLACE, machine_of
 from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import finish, jobs_of, wanted
 
