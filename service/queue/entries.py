@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 import zlib
-from collections.abc import Iterable
+from collections.abc import Mapping
 from typing import Any, Final, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
@@ -74,22 +74,20 @@ def events(reply: Any) -> list[tuple[str, Event | None]]:
     ]
 
 
-def sweep(connection: Any, kinds: Iterable[tuple[str, str]], streams: Iterable[str] = ()) -> None:
-    """Remove what is not of the kind that its name says, and streams that take no more entries.
+def sweep(connection: Any, kinds: Mapping[str, str], stream: str) -> None:
+    """Remove what is not of the kind that its name says, and the stream of events where it takes no more entries.
 
     Args:
         kinds: names with the type that Redis should tell of each.
-        streams: those of them that are streams of events.
+        stream: one of them.
     """
-    expected = dict(kinds)
     with connection.pipeline(transaction=False) as pipe:
-        for name in expected:
+        for name in kinds:
             pipe.type(name)
-        found = dict(zip(expected, map(text, pipe.execute()), strict=True))
-    wrong = [name for name, kind in found.items() if kind not in ("none", expected[name])]
-    for stream in (name for name in streams if found.get(name) == "stream"):
+        found = dict(zip(kinds, map(text, pipe.execute()), strict=True))
+    wrong = [name for name, kind in found.items() if kind not in ("none", kinds[name])]
+    if found[stream] == "stream":
         newest = int(text(connection.xinfo_stream(stream)["last-generated-id"]).partition("-")[0])
-        if newest > connection.time()[0] * 1000 + _FUTURE_MS:
-            wrong.append(stream)
+        wrong += [stream] if newest > connection.time()[0] * 1000 + _FUTURE_MS else []
     if wrong:
         connection.delete(*wrong)

@@ -9,7 +9,7 @@ Where RQ keeps what, RQ itself says. Its own readers clean up as they read, so w
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable
 from itertools import product
 from typing import Any, Final
 
@@ -129,9 +129,7 @@ def execution_keys(entry: str) -> tuple[str, str]:
     return Execution(execution, job, connection=None).key, str(ExecutionRegistry.key_template.format(job))
 
 
-def kinds(lists: list[str]) -> Iterator[tuple[str, str]]:
+def kinds(lists: list[str]) -> dict[str, str]:
     """Keys of lists, each with its type in Redis."""
-    for name in lists:
-        yield list_key(name), "list"
-        yield held_key(name), "zset"
-        yield workers_key(name), "set"
+    of_each = ((list_key, "list"), (held_key, "zset"), (workers_key, "set"))
+    return {key(name): kind for name in lists for key, kind in of_each}

@@ -225,10 +225,8 @@ class RqQueue:
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         """Events after an id, for any number of readers. `"$"`: only what comes from now on; `"0"`: all kept."""
         with _mapped():
-            found = entries.events(
-                self.connection.xread({EVENTS: after}, count=limit, block=int(wait_s * 1000) or None)
-            )
-        return [(event_id, event) for event_id, event in found if event is not None]
+            found = self.connection.xread({EVENTS: after}, count=limit, block=int(wait_s * 1000) or None)
+        return [(event_id, event) for event_id, event in entries.events(found) if event is not None]
 
     def announce(self, part: str, seconds: float) -> None:
         """Say that a part of the service (the controller) lives, for that long."""
@@ -332,7 +330,7 @@ class RqQueue:
         # RQ's registries of workers are emptied by its own maintenance, which is off.
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             lists = known_lists(self.connection)
-            entries.sweep(self.connection, (*_KINDS, *kinds(lists)), (EVENTS,))
+            entries.sweep(self.connection, {**_KINDS, **kinds(lists)}, EVENTS)
             known = list(self.connection.smembers(WORKERS))
             for name in known:
                 pipe.exists(_WORKER + name)
@@ -443,15 +441,12 @@ def _part_key(part: str) -> str:
 
 
 #: Names of a fixed number, each with its type in Redis.
-_KINDS: Final = (
-    (EVENTS, "stream"),
-    (LEAD, "string"),
-    (WORKERS, "set"),
-    (METRICS, "hash"),
-    (_SERVICE, "string"),
-    (RQ_WORKERS, "set"),
-    (LISTS, "set"),
-)
+_KINDS: Final = {
+    **dict.fromkeys((LEAD, _SERVICE), "string"),
+    **dict.fromkeys((WORKERS, RQ_WORKERS, LISTS), "set"),
+    EVENTS: "stream",
+    METRICS: "hash",
+}
 
 
 @contextmanager

@@ -21,7 +21,7 @@ from service.store.columns import Attribute
 from service.store.shards import json_attribute
 from worker.certified import Certified, certified_grasps
 from worker.engines.devices import Device
-from worker.engines.joins import batches_at_once, parse_join
+from worker.engines.joins import batches_at_once, parse_join, processes_at_once
 from worker.files.provenance import (
     NEIGHBOUR_FACE_ERROR_M,
     base_attributes,
@@ -36,7 +36,7 @@ from worker.objects.model import ObjectModel
 from worker.objects.options import as_asked
 from worker.objects.prepare import object_from_path
 from worker.planners import planner
-from worker.pool.pool import MODULES, Pool, processes_at_once
+from worker.pool.pool import MODULES, Pool
 from worker.quality.referee.payload import Limit
 from worker.run import FirstJudge, Progress, Run
 from worker.scenes.beside import scenes_of

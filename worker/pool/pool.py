@@ -24,10 +24,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any, Final
 
-from service.model.cores import ROOT, available_cores, available_memory
 from service.model.errors import GraspdError, TaskCancelled
 from worker.pool.child import Order
 
@@ -36,11 +34,6 @@ log = logging.getLogger(__name__)
 MODULES: Final = ("worker.quality.referee.judge", "worker.quality.table")
 #: What each process keeps of things that pieces of work share: two for a pair that is judged and measured.
 KEPT: Final = 8
-#: Memory that a process takes at the most, with the models of the pairs that it keeps [bytes]; see
-#: docs/explanation/performance.md.
-BYTES_PER_PROCESS: Final = 400 * 2**20
-#: Share of the machine's memory for them.
-MEMORY_SHARE: Final = 0.25
 #: Pause between two looks at whether to stop [s].
 _LOOK_S: Final = 0.1
 #: A process that goes on for so long with what nobody wants any more is ended [s].
@@ -256,23 +249,3 @@ def end_child(process: subprocess.Popen[bytes], patience_s: float) -> str:
     process.kill()
     code = process.wait()
     return f"signal {-code}" if code < 0 else f"exit code {code}"
-
-
-def processes_at_once(device: str, wanted: int, *, threads: int = 0, workers: int = 1, root: Path = ROOT) -> int:
-    """Processes that judge and measure; 1: the worker's own, with threads.
-
-    Where nobody says, a worker on a GPU has one for each core but its own, as far as a quarter of the memory goes. On a
-    CPU the planner takes the same cores at other times, and threads do.
-
-    Args:
-        device: Warp device of the planner.
-        wanted: so many; 0: nobody says.
-        threads: CPU threads of the worker; 0: one for each core.
-        workers: of this machine, which share its cores and its memory.
-        root: the folder that holds `proc` and `sys`.
-    """
-    if wanted or not device.startswith("cuda"):
-        return wanted or 1
-    room = int(MEMORY_SHARE * available_memory(root) / workers / BYTES_PER_PROCESS)
-    cores = min(threads or available_cores(root), max(1, available_cores(root) // workers))
-    return max(1, min(cores - 1, room))

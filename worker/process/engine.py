@@ -31,8 +31,8 @@ from service.model.states import Stage
 from service.pipeline.identity import check_service
 from service.store.store import Store, open_store
 from worker.engines.devices import Device
-from worker.engines.joins import batches_at_once, parse_join
-from worker.pool.pool import MODULES, Pool, processes_at_once
+from worker.engines.joins import batches_at_once, parse_join, processes_at_once
+from worker.pool.pool import MODULES, Pool
 from worker.process.fitness import Check, Fitness
 from worker.process.link import Condition, Setup
 from worker.process.runner import Runner
