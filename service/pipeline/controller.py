@@ -79,7 +79,7 @@ class Controller:
         self._seen: dict[str, tuple[float, WorkerBeat]] = {}
         self._held: set[str] = set()
         """Why tasks were held back when the queue was last filled."""
-        self._news = False
+        self._has_news = False
         """Whether anything came in since the queue was filled."""
         self._made = False
         """Whether anything came in since store and index got their mark."""
@@ -101,7 +101,7 @@ class Controller:
             Duty(clock, self._look_after_workers, _WORKERS_EVERY_S, share=0.1),
             # Each lease is seen three times before it can be called lost.
             Duty(clock, self._look_after_queue, interval_s, longest_s=services.settings.lease_s / 3),
-            Duty(clock, self._feed_news, 0.0),
+            Duty(clock, self._feed_new, 0.0),
             Duty(clock, self._pass_on_progress, min(_PROGRESS_EVERY_S, interval_s), share=0.1),
             # The index is free for at least as long as it was held.
             Duty(clock, self._enter_large_job, _ENTERING_GAP_S, share=0.5),
@@ -281,7 +281,7 @@ class Controller:
         done = [entry for place, entry in enumerate(self._backlog) if place not in waiting]
         self._backlog = [entry for place, entry in enumerate(self._backlog) if place in waiting]
         self._services.queue.acknowledge([event_id for event_id, _ in done])
-        self._news |= (made := any(event.kind is not EventKind.JOB for _, event in done))
+        self._has_news |= (made := any(event.kind is not EventKind.JOB for _, event in done))
         self._made |= made
         if waiting:
             raise StoreUnavailable(f"the store does not answer, and {len(waiting)} events wait for it")
@@ -302,13 +302,13 @@ class Controller:
             self._services.queue.discard(stray)
         missing = {*self._reaper.find_missing(present), *(lease.task_id for lease in lost)}
         self._feed(present, missing)
-        self._news = False
+        self._has_news = False
 
-    def _feed_news(self) -> None:
+    def _feed_new(self) -> None:
         """What became ready by what came in, without a wait."""
-        if self._news:
+        if self._has_news:
             self._feed()
-            self._news = False
+            self._has_news = False
 
     def _feed(self, present: set[str] | None = None, missing: Collection[str] = ()) -> None:
         """Queue what is ready. Where nobody knows what is in the queue (`present`), the index's own marks say so, and

@@ -34,7 +34,7 @@ class LeaseReaper:
         self._services = services
         self._indexer = indexer
         self._clock = clock
-        self._beats: dict[Any, tuple[str, float]] = {}
+        self._heartbeats: dict[Any, tuple[str, float]] = {}
         self._looked = clock()
         self._missing: dict[str, float] = {}
 
@@ -44,17 +44,17 @@ class LeaseReaper:
         lease_s = self._services.settings.lease_s
         # Time in which nobody looked, because Redis was away or this process was stopped, is no worker's silence.
         looked, self._looked = min(now - self._looked, lease_s / 3), now
-        beats: dict[Any, tuple[str, float]] = {}
+        heartbeats: dict[Any, tuple[str, float]] = {}
         lost = []
         for lease in leases:
-            beat, silence = self._beats.get(lease.key, (None, 0.0))
+            beat, silence = self._heartbeats.get(lease.key, (None, 0.0))
             silence = silence + looked if beat == lease.beat else 0.0
             if silence <= lease_s:
-                beats[lease.key] = (lease.beat, silence)
+                heartbeats[lease.key] = (lease.beat, silence)
             else:
                 self._lose(lease)
                 lost.append(lease)
-        self._beats = beats
+        self._heartbeats = heartbeats
         return lost
 
     def find_missing(self, present: Collection[str]) -> list[str]:

@@ -69,7 +69,7 @@ class Engine:
     def serve(self) -> None:
         """Until told to end."""
         with self._connection:
-            threading.Thread(target=self._listen, name="engine-ears", daemon=True).start()
+            threading.Thread(target=self._listen, name="engine-orders", daemon=True).start()
             try:
                 self._start()
                 word, about = self._orders.get()

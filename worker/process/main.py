@@ -75,7 +75,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         )
         self.last_cleaned_at = datetime.now(UTC)
         self.max_connection_wait_time = _LONGEST_RETRY_S
-        self._queue, self._engine, self._heart = queue, engine, heart
+        self._queue, self._engine, self._heartbeat = queue, engine, heart
         self._stages, self._taken, self._limit_s = stages, 0, limit_s
         self.tasks_done = 0
         self.told_to_stop = False
@@ -100,7 +100,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         """One task under a lease. Its outcome is told after the lease is given back."""
         self.prepare_execution(job)
         self.prepare_job_execution(job)
-        self._heart.update(task_id=job.id.rpartition("-")[0], state="busy", done=0.0, total=0.0, message="")
+        self._heartbeat.update(task_id=job.id.rpartition("-")[0], state="busy", done=0.0, total=0.0, message="")
         outcome: Event | None = None
         self._engine.say("task", job.args[0])
         try:
@@ -112,20 +112,20 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             log.error("this worker ends: %s", error)
             os._exit(1)
         self._give_back(job)
-        self._heart.update(task_id="", state="stopping" if self.told_to_stop else "idle")
+        self._heartbeat.update(task_id="", state="stopping" if self.told_to_stop else "idle")
         self.tasks_done += 1
         if outcome is not None:
             self._publish(outcome)
         self.engine_is = self._await("idle")
         if self.engine_is != "fit":
-            self._heart.update(state="stopping")
+            self._heartbeat.update(state="stopping")
             raise StopRequested
         self.set_state(WorkerStatus.IDLE)
 
     def _await(self, word: str, beat: Callable[[], None] = lambda: None) -> Any:
         """What the engine answers, within the time that a task may take. What else it says is passed on meanwhile."""
         began = time.monotonic()
-        due = began + self._heart.interval_s
+        due = began + self._heartbeat.interval_s
         told: StopReason | None = None
         while True:
             if (news := self._engine.hear(_LOOK_S)) is not None:
@@ -144,14 +144,14 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                 self._engine.kill()
             if time.monotonic() >= due:
                 beat()
-                due = time.monotonic() + self._heart.interval_s
+                due = time.monotonic() + self._heartbeat.interval_s
 
     def _pass_on(self, word: str, about: Any) -> None:
         """News of the engine."""
         if word == "refused":
             raise about
         if word == "facts":
-            self._heart.update(**about)
+            self._heartbeat.update(**about)
         else:
             self._publish(about)
 
@@ -223,7 +223,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
     def handle_warm_shutdown_request(self) -> None:
         """SIGTERM: the task in hand stops at its next launch and goes back to the queue."""
         self.told_to_stop = True
-        self._heart.update(state="stopping")
+        self._heartbeat.update(state="stopping")
 
     def subscribe(self) -> None:
         """No command channel: it is deaf after a reconnect, and lets anybody in Redis stop workers."""
