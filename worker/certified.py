@@ -158,10 +158,10 @@ def certified_grasps(
     """
     require_graspable(hand, obj)
     with Scoring.begun(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
-        work = Batch(scoring, batch, count)
+        work = Batch(scoring, batch, count, run)
         try:
-            for asked in work.requests():
-                work.add(work.made(asked, run.part(*asked.progress)))
+            while work.needed is not None:
+                work.add(work.made(work.needed))
         except TaskCancelled:
             if not partial or not work.rounds:
                 raise
@@ -199,9 +199,8 @@ def scored(
     """
     request = request.model_copy(update={"want": "raw"})
     with Scoring.begun(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
-        work = Batch(scoring, 0, len(grasps))
-        made = scoring.scored(grasps.moved(np.negative(obj.centre)), run)
-        work.add(made)
+        work = Batch(scoring, 0, len(grasps), run)
+        work.add(scoring.scored(grasps.moved(np.negative(obj.centre)), run))
         return work.finish()
 
 
@@ -450,9 +449,9 @@ class Needed:
 class Batch:
     """One batch in the making: what it needs next, and what came of it."""
 
-    def __init__(self, scoring: Scoring, number: int, count: int, scenes: range | None = None) -> None:
-        """`scenes` are those of the job that are the batch's; None: all of them."""
-        self.scoring, self.number, self.count = scoring, number, count
+    def __init__(self, scoring: Scoring, number: int, count: int, run: Run, scenes: range | None = None) -> None:
+        """`run` is told of the batch alone; `scenes` are those of the job that are the batch's, None: all of them."""
+        self.scoring, self.number, self.count, self.run = scoring, number, count, run
         self.request = scoring.request
         self.rounds: list[Round] = []
         self.tried = self.repeated = 0
@@ -462,10 +461,12 @@ class Batch:
         self._scenes = every if scenes is None else scenes
         self._audits: Future[NDArray[np.int8]] | None = None
         self._kept = np.zeros((0, POINTS, 3))
+        self._needs = self._all_needed()
+        self.needed = next(self._needs, None)
+        """What is to be made and added next; None: the batch can be finished."""
 
-    def requests(self) -> Iterator[Needed]:
-        """What is needed until `count` grasps are there or the budget is used up; each is to be added before the next
-        is asked for."""
+    def _all_needed(self) -> Iterator[Needed]:
+        """What is needed until `count` grasps are there or the budget is used up, one after the other is added."""
         wish, count = self.request, self.count
         if wish.want == "raw":
             yield Needed(0, range(count), self.tried, (0.0, 1.0))
@@ -486,7 +487,7 @@ class Batch:
             number += 1
 
     def add(self, made: Round) -> None:
-        """What came of the grasps that were asked for; those too near to one that is kept are not."""
+        """Add what was needed, without grasps too near to one that is kept."""
         self.tried += len(made.fates)
         self.repeated += made.repeated
         for name in self.seconds:
@@ -498,6 +499,7 @@ class Batch:
             made.fates[made.rows[~wanted]] = "alike"
             made.grasps, made.columns = taken(made.grasps, made.columns, np.flatnonzero(wanted))
         self.rounds.append(made)
+        self.needed = next(self._needs, None)
 
     def _hopeless(self) -> bool:
         """Whether the latest grasps, none of which is kept, show that the hand lifts far less than is wanted."""
@@ -524,9 +526,10 @@ class Batch:
         several lanes. A GPU makes all of it at once, in the time of a few."""
         return not self.scoring.run.device.startswith("cuda") and method(self.request.method).in_parts
 
-    def made(self, asked: Needed, run: Run) -> Round:
-        """The grasps that were asked for, planned, judged and measured: on the CPU in lanes."""
+    def made(self, asked: Needed) -> Round:
+        """What is needed, planned, judged and measured: on the CPU in lanes."""
         known: Known = {}
+        run = self.run.part(*asked.progress)
         trial = self.scoring.trial(known)  # one for all lanes
         parts = lanes_of(asked.rows, run.cores if self._in_parts and run.pool is None else 1)
 
@@ -583,6 +586,7 @@ class Batch:
     def noted(self, asked: Needed, made: Round, told: GraspSet) -> Round:
         """The round with what the planner said; the audits of the batch's first grasps begin."""
         made.planned = [told]
+        made.grasps = replace(made.grasps, info=told.info, seconds=told.seconds)
         made.seconds["planner"] += told.seconds
         made.repeated = max(0, told.attempts - len(asked.rows)) if self.scoring.scenes is not None else 0
         if asked.number == 0 and asked.rows.start == 0:

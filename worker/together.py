@@ -7,9 +7,9 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -24,8 +24,8 @@ from worker.planners import Asked, NoPlace, synthesize_batches
 from worker.quality.diversity import distinct, hand_points
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.first.screening import Screened
-from worker.rounds import taken
-from worker.run import ALONE, Progress, Run
+from worker.rounds import Round, taken
+from worker.run import ALONE, Run
 from worker.side_by_side import Shares
 from worker.simulation.surroundings import Scenes, scenes_together
 
@@ -78,15 +78,14 @@ def certified_batches(
     job = _Job(hand, obj, request, sizes, first, given, pieces_once, run, partial)
     found: dict[int, Certified | None] = {}
     refused: list[Exception] = []
-    waves = join > 1 and len(sizes) > 1
     try:
-        with closing(job.in_waves(join) if waves else job.one_by_one()) as batches:
+        with closing(job.one_by_one() if join == 1 or len(sizes) == 1 else job.in_waves(join)) as batches:
             for number, one in batches:
                 if isinstance(one, Certified):
                     if checked is not None:
-                        checked(first + number, one)
+                        checked(number, one)
                     found[number] = one
-                elif isinstance(one, empty_on) and first + number > 0:
+                elif isinstance(one, empty_on) and number > 0:
                     refused.append(one)
                     found[number] = None
                 else:
@@ -98,6 +97,10 @@ def certified_batches(
     if (like := next(filter(None, ordered), None)) is None:
         raise refused[0]
     return [one or _nothing(like) for one in ordered]
+
+
+#: The number of a batch within its job, with what came of it.
+Made = tuple[int, Certified | Exception]
 
 
 @dataclass(frozen=True)
@@ -114,165 +117,124 @@ class _Job:
     run: Run
     partial: bool
 
-    def one_by_one(self) -> Generator[tuple[int, Certified | Exception]]:
-        """Each batch by its number here, or what became of it."""
+    def one_by_one(self) -> Generator[Made]:
+        """One batch after the other."""
         shares = Shares(self.sizes, self.run.progress)
-        for number, count in enumerate(self.sizes):
-            own = replace(self.run, progress=shares.of(number))
+        for k, (count, scenes) in enumerate(zip(self.sizes, self.scenes, strict=True)):
+            own, number = replace(self.run, progress=shares.of(k)), self.first + k
+            how: dict[str, Any] = {"scenes": scenes, "pieces": self.pieces, "run": own, "partial": self.partial}
             try:
-                yield (
-                    number,
-                    certified_grasps(
-                        self.hand,
-                        self.obj,
-                        self.request,
-                        count=count,
-                        batch=self.first + number,
-                        scenes=self.scenes[number],
-                        pieces=self.pieces,
-                        run=own,
-                        partial=self.partial,
-                    ),
-                )
-                own.progress(1.0, 1.0, "done")
+                made = certified_grasps(self.hand, self.obj, self.request, count=count, batch=number, **how)
             except InputError as error:
                 yield number, error
+            else:
+                yield number, made
+                own.progress(1.0, 1.0, "done")
 
-    def in_waves(self, join: int) -> Generator[tuple[int, Certified | Exception]]:
-        """The same, with what `join` batches need next planned in one launch. While the device plans a wave, the one
-        before it is judged and measured."""
+    def in_waves(self, join: int) -> Generator[Made]:
+        """What `join` batches need next is planned in one launch; meanwhile the wave before is judged and measured."""
         require_graspable(self.hand, self.obj)
         stop, shares = threading.Event(), Shares(self.sizes, self.run.progress)
         run = replace(self.run, cancelled=lambda: stop.is_set() or self.run.cancelled())
-        apart = len({id(one) for one in self.scenes}) > 1
-        scenes = scenes_together([one for one in self.scenes if one is not None]) if apart else self.scenes[0]
-        ends = accumulate((0 if one is None else len(one.object_pose) for one in self.scenes), initial=0)
-        own = [range(*both) for both in pairwise(ends)] if apart else [None] * len(self.sizes)
+        several = [one for one in self.scenes if one is not None] if len({*map(id, self.scenes)}) > 1 else []
+        ends = accumulate((len(one.object_pose) for one in several), initial=0)
+        own = [range(*both) for both in pairwise(ends)] if several else [None] * len(self.sizes)
+        scenes = scenes_together(several) if several else self.scenes[0]
+        going, waiting = dict[int, Batch](), deque[Batch]()
         with (
             Scoring.begun(self.hand, self.obj, self.request, scenes=scenes, pieces=self.pieces, run=run) as scoring,
             ThreadPoolExecutor(1, thread_name_prefix="device") as device,
         ):
-            waves = _Waves(scoring, join * BATCH_SIZE)
             fresh = (
-                _Open(number, Batch(scoring, self.first + number, count, own[number]), shares.of(number))
-                for number, count in enumerate(self.sizes)
+                Batch(scoring, self.first + k, count, replace(run, progress=shares.of(k)), own[k])
+                for k, count in enumerate(self.sizes)
             )
-            going: dict[int, _Open] = {}
             ahead: Future[_Wave] | None = None
             try:
-                while (members := waves.next(fresh)) or ahead is not None:
-                    planned, ahead = ahead, device.submit(waves.planned, members) if members else None
-                    going |= {one.number: one for one in members}
-                    for number, made in waves.scored(planned.result()) if planned is not None else ():
-                        del going[number]
-                        yield number, made
+                while (wave := _next_wave(waiting, fresh, join * BATCH_SIZE)) or ahead is not None:
+                    planned, ahead = ahead, device.submit(_planned, scoring, wave) if wave else None
+                    going |= {batch.number: batch for batch in wave}
+                    for batch, error in _scored(scoring, planned.result()) if planned is not None else ():
+                        if error is None and batch.needed is not None:
+                            waiting.append(batch)
+                            continue
+                        del going[batch.number]
+                        yield batch.number, error or batch.finish()
+                        batch.run.progress(1.0, 1.0, "done")
             except TaskCancelled:
                 stop.set()
                 if self.partial:
                     scoring.goes_on()
-                    yield from ((one.number, one.batch.finish()) for one in going.values() if one.batch.rounds)
+                    yield from ((number, batch.finish()) for number, batch in going.items() if batch.rounds)
                 raise
             finally:
                 stop.set()
-
-
-@dataclass
-class _Open:
-    """A batch that is being made."""
-
-    number: int
-    batch: Batch
-    progress: Progress
-
-    def __post_init__(self) -> None:
-        self.requests = self.batch.requests()
-        self.needed = next(self.requests, None)
 
 
 @dataclass(frozen=True)
 class _Wave:
     """Grasps of several batches that were planned in one launch."""
 
-    members: list[_Open]
-    planned: list[GraspSet]
-    """Of each of them."""
-    refused: list[tuple[int, Exception]]
-    """Batches that could not be planned."""
+    batches: Sequence[Batch]
+    made: Sequence[GraspSet | Exception]
+    """Of each batch."""
     whole: GraspSet | None
+    """All of them."""
     known: Known
     prefilter: Screened | None
 
 
-@dataclass
-class _Waves:
-    """Waves of batches; what comes after the first round of a batch goes before batches that have not begun."""
+def _next_wave(waiting: deque[Batch], fresh: Iterator[Batch], most: int) -> list[Batch]:
+    """Batches that need as many grasps as one launch takes; those that have begun go first."""
+    found, size = list[Batch](), 0
+    while (batch := waiting.popleft() if waiting else next(fresh, None)) is not None:
+        assert batch.needed is not None
+        size += len(batch.needed.rows)
+        if found and size > most:
+            waiting.appendleft(batch)
+            break
+        found.append(batch)
+    return found
 
-    scoring: Scoring
-    most: int
-    """Grasps in a wave."""
-    waiting: deque[_Open] = field(default_factory=deque)
 
-    def next(self, fresh: Iterator[_Open]) -> list[_Open]:
-        """The batches of the next wave."""
-        found, size = list[_Open](), 0
-        while (one := self.waiting.popleft() if self.waiting else next(fresh, None)) is not None:
-            assert one.needed is not None
-            size += len(one.needed.rows)
-            if found and size > self.most:
-                self.waiting.appendleft(one)
-                break
-            found.append(one)
-        return found
+def _planned(scoring: Scoring, batches: Sequence[Batch]) -> _Wave:
+    """Plan what the batches need; by the one thread that has the device.
 
-    def planned(self, members: Sequence[_Open]) -> _Wave:
-        """Plan what they need; by the one thread that has the device."""
-        known: Known = {}
-        trial, request, asked = self.scoring.trial(known), self.scoring.request, []
-        for one in members:
-            assert one.needed is not None
-            wanted = one.batch.wanted(one.needed, trial, others_have_place=one.batch.tried > 0)
-            run = replace(self.scoring.run, progress=one.progress).part(*one.needed.progress)
-            asked.append(Asked(wanted, run.part(0.0, PARTS[0])))
-        with exclusive:
-            made = synthesize_batches(
-                self.scoring.hand, self.scoring.obj, asked, method=request.method, options=request.options
-            )
-            check_device(self.scoring.run.device)
-            wave = _Wave([], [], [], None, known, None)
-            told: list[GraspSet] = []
-            for one, each, grasps in zip(members, asked, made, strict=True):
-                if isinstance(grasps, TaskCancelled):
-                    raise grasps
-                if isinstance(grasps, Exception):
-                    refused = one.batch.refused(grasps) if isinstance(grasps, NoPlace) else grasps
-                    wave.refused.append((one.number, refused))
-                    continue
-                told.append(one.batch.told(each.wanted, grasps))
-                wave.members.append(one)
-                wave.planned.append(told[-1])
-            if not told:
-                return wave
-            whole = joined(told)
-            return replace(wave, whole=whole, prefilter=self.scoring.prefiltered(whole))
+    Raises:
+        TaskCancelled: it was stopped.
+    """
+    known: Known = {}
+    trial, request, asked = scoring.trial(known), scoring.request, list[Asked]()
+    for batch in batches:
+        assert batch.needed is not None
+        wanted = batch.wanted(batch.needed, trial, others_have_place=batch.tried > 0)
+        asked.append(Asked(wanted, batch.run.part(*batch.needed.progress).part(0.0, PARTS[0])))
+    with exclusive:
+        made = synthesize_batches(scoring.hand, scoring.obj, asked, method=request.method, options=request.options)
+        check_device(scoring.run.device)
+        told: list[GraspSet | Exception] = []
+        for batch, one, grasps in zip(batches, asked, made, strict=True):
+            if isinstance(grasps, TaskCancelled):
+                raise grasps
+            told.append(batch.told(one.wanted, grasps) if isinstance(grasps, GraspSet) else grasps)
+        good = [grasps for grasps in told if isinstance(grasps, GraspSet)]
+        whole = joined(good) if good else None
+        return _Wave(batches, told, whole, known, scoring.prefiltered(whole) if whole is not None else None)
 
-    def scored(self, wave: _Wave) -> Iterator[tuple[int, Certified | Exception]]:
-        """Judge and measure a wave; batches that need nothing more are made."""
-        yield from wave.refused
-        if wave.whole is None:
-            return
-        made = self.scoring.scored(wave.whole, self.scoring.run.quiet(), wave.known, wave.prefilter)
-        parts = made.split([len(planned) for planned in wave.planned])
-        done: list[_Open] = []
-        for one, planned, part in zip(wave.members, wave.planned, parts, strict=True):
-            assert one.needed is not None
-            part.grasps = replace(part.grasps, info=planned.info, seconds=planned.seconds)
-            one.batch.add(one.batch.noted(one.needed, part, planned))
-            one.progress(one.needed.progress[1], 1.0, "judged")
-            one.needed = next(one.requests, None)
-            (done if one.needed is None else self.waiting).append(one)
-        for one in done:
-            yield one.number, one.batch.finish()
-            one.progress(1.0, 1.0, "done")
+
+def _scored(scoring: Scoring, wave: _Wave) -> Iterator[tuple[Batch, Exception | None]]:
+    """Judge and measure a wave at once; each of its batches, or why it could not be planned."""
+    parts: Iterator[Round] = iter(())
+    if wave.whole is not None:
+        scored = scoring.scored(wave.whole, scoring.run.quiet(), wave.known, wave.prefilter)
+        parts = iter(scored.split([len(made) for made in wave.made if isinstance(made, GraspSet)]))
+    for batch, made in zip(wave.batches, wave.made, strict=True):
+        if isinstance(made, Exception):
+            yield batch, batch.refused(made) if isinstance(made, NoPlace) else made
+            continue
+        assert batch.needed is not None
+        batch.add(batch.noted(batch.needed, next(parts), made))
+        yield batch, None
 
 
 def _nothing(like: Certified) -> Certified:
