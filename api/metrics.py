@@ -10,7 +10,7 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, generate_la
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 
 from graspd.service.index.queries.overview import IndexStatus
-from graspd.service.pipeline.metrics import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S, parse_field
+from graspd.service.model.series import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S, parse_field
 from graspd.service.queue.port import QueueStatus
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"

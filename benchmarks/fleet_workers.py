@@ -32,12 +32,11 @@ from graspd.service.model.states import Priority, Stage
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.model.workers import own_ability
 from graspd.service.queue.lists import execution_keys, held_key, job_key, list_key, queue_name, rq_worker_key
-from graspd.service.queue.port import Event, EventKind, Report
-from graspd.service.queue.rq_queue import REPORTS, WORKERS, RqQueue, cancel_key, open_queue, put_event, worker_key
+from graspd.service.queue.port import Event, EventKind
+from graspd.service.queue.rq_queue import WORKERS, RqQueue, cancel_key, open_queue, put_event, worker_key
 from graspd.service.settings import Settings
 from graspd.service.store.store import Store, open_store
 from graspd.worker.process.heartbeat import BEAT_S
-from graspd.worker.stages.context import REPORT_EVERY_S
 from tests.fakes import make_shard
 
 _TICK_S: Final = 0.02
@@ -73,7 +72,6 @@ class Fleet:
         now = time.monotonic()
         self._beats = [(now + random.random() * self._beat_s, name) for name in self._idle]
         heapq.heapify(self._beats)
-        self._news: list[tuple[float, str]] = []
         self._template = ""
         self._names: tuple[str, ...] = ()
         self._pool = ThreadPoolExecutor(8)
@@ -87,7 +85,6 @@ class Fleet:
             pipe.execute()
             self._take(pipe, now)
             self._beat_due(pipe, now)
-            self._tell_due(pipe, now)
             pipe.execute()
 
     def _end_due(self, pipe: Any, now: float) -> None:
@@ -120,7 +117,6 @@ class Fleet:
         held = Held(self._idle.popleft(), message, queue, f"{job}:{uuid.uuid4().hex}", now, now + length)
         self._held[held.worker] = held
         heapq.heappush(self._ends, (held.ends, held.worker))
-        heapq.heappush(self._news, (now + random.random() * REPORT_EVERY_S, held.worker))
         execution, executions = execution_keys(held.entry)
         pipe.hset(execution, mapping={"id": held.entry, "last_heartbeat": time.time(), "worker_name": held.worker})
         pipe.expire(execution, LEASE_KEPT_S)
@@ -150,14 +146,6 @@ class Fleet:
                 for _ in range(2):
                     pipe.zadd(held_key(held.queue), kept_until, xx=True)
 
-    def _tell_due(self, pipe: Any, now: float) -> None:
-        while self._news and self._news[0][0] <= now:
-            name = heapq.heappop(self._news)[1]
-            if (held := self._held.get(name)) is not None:
-                report = Report(attempt=1, done=now - held.begun, total=self._task_s, message="pretending")
-                pipe.hset(REPORTS, held.message["task_id"], report.model_dump_json())
-                heapq.heappush(self._news, (now + REPORT_EVERY_S, name))
-
     def _say(self, pipe: Any, held: Held, kind: EventKind, **facts: Any) -> None:
         message = held.message
         event = Event(
@@ -172,8 +160,6 @@ class Fleet:
             **facts,
         )
         put_event(pipe, event)
-        if kind.ends_attempt:
-            pipe.hdel(REPORTS, held.message["task_id"])
 
     def _publish(self, message: dict[str, Any]) -> None:
         """Put the manifest of a task's shard."""
@@ -207,6 +193,8 @@ def _beat(name: str, held: Held | None) -> dict[str, Any]:
         "seen": now,
         "schemas": own_ability().schemas,
         "revisions": dict(own_ability().revisions),
+        "done": time.monotonic() - held.begun if held else 0.0,
+        "message": "pretending" if held else "",
     }
 
 

@@ -86,7 +86,7 @@ def _of_api(settings: Settings) -> list[Check]:
 def _of_worker(settings: Settings) -> list[Check]:
     if missing_extra("graspd.commands"):
         return [_absent("gpu", "worker"), _absent("kernels", "worker")]
-    from graspd.worker.process.doctor import checks_of as of_worker
+    from graspd.commands.doctor import checks_of as of_worker
 
     return of_worker(settings)
 

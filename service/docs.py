@@ -14,7 +14,7 @@ from typing import Final
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.local_options import LocalOptions
 from graspd.service.model.options import Place, Row, keywords_of, rows
-from graspd.service.pipeline.metrics import series_table
+from graspd.service.model.series import series_table
 from graspd.service.settings import Settings
 from graspd.service.store.columns import ATTRIBUTES, SCHEMAS, ShardKind
 

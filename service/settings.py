@@ -108,11 +108,10 @@ class Settings(BaseSettings):
         60.0, ge=0, description="how long a task of a larger job should last by what was measured [s]; 0: one batch"
     )
     task_timeout_s: float = Field(1800.0, gt=0, description="longest run of one task [s]")
-    worker_max_tasks: int = Field(
-        0, ge=0, description="tasks after which a worker makes room for a fresh one; 0: never"
-    )
     worker_max_memory_mb: int = Field(
-        0, ge=0, description="resident memory after which it does so [MiB]; 0: half of the machine's"
+        0,
+        ge=0,
+        description="resident memory after which a worker makes room for a fresh one [MiB]; 0: half of the machine's",
     )
     retry_backoff_s: float = Field(2.0, ge=0, description="wait before the second attempt; doubles with each [s]")
     max_upload_bytes: int = Field(

@@ -16,7 +16,6 @@ from graspd.service.queue.port import (
     Lease,
     Message,
     QueueStatus,
-    Report,
     priority_order,
 )
 from graspd.service.queue.rq_queue import RqQueue
@@ -45,7 +44,6 @@ class MemoryQueue(RqQueue):
     _announced: dict[str, float] = field(default_factory=dict)
     _service: str | None = None
     _lease: tuple[str, float] = ("", 0.0)
-    _reports: dict[str, Report] = field(default_factory=dict)
     _sums: dict[str, float] = field(default_factory=dict)
     _taken: Counter[str] = field(default_factory=Counter)
     _read: int = 0
@@ -97,7 +95,6 @@ class MemoryQueue(RqQueue):
 
     def release(self, lease: Lease) -> None:
         self._held.pop(lease.key, None)
-        self._reports.pop(lease.task_id, None)
 
     def workers(self) -> list[WorkerBeat]:
         return list(self._workers.values())
@@ -106,18 +103,7 @@ class MemoryQueue(RqQueue):
         with self._changed:
             for event in events:
                 self._stream.append(event)
-            self.forget_reports([event.task_id for event in events if event.kind.ends_attempt])
             self._changed.notify_all()
-
-    def report(self, task_id: str, report: Report) -> None:
-        self._reports[task_id] = report
-
-    def reports(self) -> dict[str, Report]:
-        return dict(self._reports)
-
-    def forget_reports(self, task_ids: Collection[str]) -> None:
-        for task in task_ids:
-            self._reports.pop(task, None)
 
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         with self._changed:

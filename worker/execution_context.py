@@ -9,7 +9,6 @@ from typing import Final, Literal
 
 from graspd.service.model.cores import available_cores
 from graspd.service.model.errors import TaskCancelled
-from graspd.worker.meeting import Meeting
 from graspd.worker.pool.pool import Pool
 
 PrefilterMode = Literal["auto", "on", "off"]
@@ -54,8 +53,6 @@ class ExecutionContext:
     """CPU threads; 0: one per core this process may use."""
     progress: Progress = _silent
     cancelled: Cancelled = _never
-    meeting: Meeting | None = None
-    """Where it meets others like it, to be done with them in one launch; None: it is done by itself."""
     prefilter: PrefilterMode = "auto"
     """Whether MuJoCo Warp gives the clear verdicts; auto: on a GPU, where it is installed."""
     pool: Pool | None = None
@@ -67,13 +64,7 @@ class ExecutionContext:
     def cores(self) -> int:
         """CPU threads, the default counted: a fair share of them where others work beside it."""
         every = self.threads or available_cores()
-        for others in (self.meeting, self.lanes):
-            every = max(1, every // max(1, others.members)) if others is not None else every
-        return every
-
-    def apart(self) -> ExecutionContext:
-        """The same without the others: for what is done for all of them."""
-        return replace(self, meeting=None)
+        return every if self.lanes is None else max(1, every // max(1, self.lanes.members))
 
     def part(self, start: float, end: float) -> ExecutionContext:
         """The same for a part of the work, whose progress goes from share `start` to share `end` of the whole."""

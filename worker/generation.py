@@ -11,8 +11,9 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -33,7 +34,7 @@ from graspd.worker.quality.diversity import POINTS, distinct, hand_points
 from graspd.worker.quality.gate import GATES, failed_gate, passes
 from graspd.worker.quality.table import measure
 from graspd.worker.rounds import ROUND_STRIDE, Arrays, Round, enough, lanes_of, next_round, taken
-from graspd.worker.scenes.rollout import lift_level, rollout_on, scene_verdicts
+from graspd.worker.scenes.rollout import lift_level, outcomes_in_scenes, rollout_on, scene_verdicts
 from graspd.worker.side_by_side import side_by_side
 from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
@@ -42,10 +43,10 @@ from graspd.worker.validation.key import verdict_key
 from graspd.worker.validation.lift import LiftOutcome
 from graspd.worker.validation.lifting import lift_key, validate_lifts
 from graspd.worker.validation.payload import ENOUGH, Limit, limit_of, payloads, shake_margins
-from graspd.worker.validation.prefilter.prefilter import first_terms
+from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts, first_terms
 from graspd.worker.validation.protocol import DIRECTIONS, Outcome
 from graspd.worker.validation.robust import reaches, robust, robustness
-from graspd.worker.validation.validator import validate
+from graspd.worker.validation.validator import prefiltered, validate
 
 #: Why a grasp is not kept: its hand is no number, something of its scene is in its way, the validator dropped it, it
 #: failed the geometric gate, holds in too few models around the nominal one, lifts too little, or is as good as the
@@ -77,8 +78,10 @@ _LIFTED: Final = {
     LiftOutcome.DIVERGED: "unstable",
     LiftOutcome.NEIGHBOUR_MOVED: "neighbour_moved",
 }
+#: Verdicts on candidates from the planner's trial, of lifts or of pushes.
+Known = dict[str, Any]
 #: Shares of a round's progress: planned, validated, measured.
-_PARTS: Final = (0.6, 0.8, 1.0)
+PARTS: Final = (0.6, 0.8, 1.0)
 
 
 @dataclass(frozen=True)
@@ -145,20 +148,27 @@ def validated_grasps(
         MeshError: the object has no usable convex pieces.
         TaskCancelled: when `run.cancelled()` answers True; with `partial`, before anything was validated.
     """
-    require_opposing(hand)
-    work = _Work(hand, obj.centred, request, batch, run)
-    fitting_pairs(hand, work.obj)
-    work.scenes = None if scenes is None else scenes.centred(obj)
-    with ThreadPoolExecutor(1, thread_name_prefix="beside") as work.beside:
-        work.pieces = work.beside.submit(pieces, work.obj) if request.validation != "none" else None
-        rounds: list[Round] = []
+    require_graspable(hand, obj)
+    with Scoring.begun(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
+        work = Batch(scoring, batch, count, run)
         try:
-            work.until(count, rounds)
+            while work.needed is not None:
+                work.add(work.made(work.needed))
         except TaskCancelled:
-            if not partial or not rounds:
+            if not partial or not work.rounds:
                 raise
-            work.goes_on()
-        return work.finish(rounds, count).moved(obj.centre)
+            scoring.goes_on()
+        return work.finish()
+
+
+def require_graspable(hand: HandModel, obj: ObjectModel) -> None:
+    """
+    Raises:
+        HandError: no two digits of the hand oppose each other.
+        InputError: the object does not fit into the gripper.
+    """
+    require_opposing(hand)
+    fitting_pairs(hand, obj.centred)
 
 
 def scored(
@@ -179,244 +189,110 @@ def scored(
         MeshError: the object has no usable convex pieces.
         TaskCancelled: when `run.cancelled()` answers True.
     """
-    work = _Work(hand, obj.centred, request.model_copy(update={"want": "candidates"}), 0, run)
-    work.scenes = None if scenes is None else scenes.centred(obj)
-    with ThreadPoolExecutor(1, thread_name_prefix="beside") as work.beside:
-        work.pieces = work.beside.submit(pieces, work.obj) if request.validation != "none" else None
-        work.candidates = len(grasps)
-        return work.finish([work.score(grasps.moved(np.negative(obj.centre)))], len(grasps)).moved(obj.centre)
+    request = request.model_copy(update={"want": "candidates"})
+    with Scoring.begun(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
+        work = Batch(scoring, 0, len(grasps), run)
+        work.add(scoring.scored(grasps.moved(np.negative(obj.centre)), run))
+        return work.finish()
 
 
-class _Work:
-    """One batch in the making."""
+class Scoring:
+    """Verdicts and metrics of grasps of one job, whichever of its batches they are of; a grasp's do not depend on what
+    is scored with it."""
 
     def __init__(
-        self, hand: HandModel, obj: ObjectModel, request: JobOptions, batch: int, run: ExecutionContext
+        self, hand: HandModel, obj: ObjectModel, request: JobOptions, scenes: Scenes | None, run: ExecutionContext
     ) -> None:
-        self.hand, self.obj, self.request, self.batch = hand, obj, request, batch
+        self.hand, self.obj, self.request, self.run = hand, obj.centred, request, run
+        self.centre = obj.centre
+        self.scenes = None if scenes is None else scenes.centred(obj)
+        self.pieces: Future[ConvexPieces] | None = None
         self.beside: ThreadPoolExecutor
         """A thread for what need not be waited for."""
-        self.pieces: Future[ConvexPieces] | None = None
-        self.scenes: Scenes | None = None
-        self.candidates = self.repeated = 0
-        self.limit: Limit | None = None
-        self._rollouts: Rollout | None = None
-        self._known: dict[str, Any] = {}
-        """Verdicts on candidates from the planner's trial, of lifts or of pushes."""
-        self._rechecks: Future[NDArray[np.int8]] | None = None
-        self._kept = np.zeros((0, POINTS, 3))
-        self.seconds: dict[str, float] = {"planner": 0.0, "validation": 0.0, "quality": 0.0}
-        self._run = run
+
+    @classmethod
+    @contextmanager
+    def begun(
+        cls,
+        hand: HandModel,
+        obj: ObjectModel,
+        request: JobOptions,
+        *,
+        scenes: Scenes | None,
+        pieces: Callable[[ObjectModel], ConvexPieces],
+        run: ExecutionContext,
+    ) -> Iterator[Scoring]:
+        """With the object's convex pieces on their way, where somebody validates."""
+        made = cls(hand, obj, request, scenes, run)
+        with ThreadPoolExecutor(1, thread_name_prefix="beside") as made.beside:
+            made.pieces = made.beside.submit(pieces, made.obj) if request.validation != "none" else None
+            yield made
 
     def goes_on(self) -> None:
         """From here on nobody stops it."""
-        self._run = replace(self._run, cancelled=DEFAULT_CONTEXT.cancelled)
+        self.run = replace(self.run, cancelled=DEFAULT_CONTEXT.cancelled)
 
-    def until(self, count: int, parts: list[Round]) -> None:
-        """Adds rounds until `count` grasps are there or the budget is used up."""
-        wish = self.request
-        if wish.want == "candidates":
-            parts.append(self._round(0, range(count), self._run))
-            return
-        budget, number, valid = math.ceil(wish.budget * count), 0, 0
-        # In scenes a grasp that sets out again costs as much as another grasp.
-        while size := next_round(count, valid, self.candidates, budget - self.repeated):
-            first = 0
-            while first < size and valid < count:
-                share = min(size - first, enough(count, valid, self.candidates) if self._in_parts else size)
-                # It brings the batch as far as the rate so far lets hope.
-                begun = valid / count
-                run = self._run.part(begun, begun + (1 - begun) * min(1.0, share / (count - valid)) * 0.9)
-                parts.append(self._round(number, range(first, first + share), run))
-                first, valid = first + share, valid + len(parts[-1].grasps)
-            if not valid and self._hopeless(parts):
-                return
-            number += 1
-
-    def _hopeless(self, made: Sequence[Round]) -> bool:
-        """Whether the latest grasps of these rounds, none of which is kept, show that the hand lifts far less than is
-        wanted."""
-        if self.pieces is None or (self.limit is not None and self.limit.grasps >= ENOUGH):
-            return False
-        planned = joined([grasps for one in made for grasps in one.planned])
-        latest = max(ENOUGH, sum(map(len, made[-1].planned)))
-        planned = planned.take(slice(max(0, len(planned) - latest), None))
-        self.limit = limit_of(
+    def rollout(self, known: Known) -> Rollout | None:
+        """What candidates go through, where there is a validator; verdicts of the validator's own level become
+        `known`."""
+        if self.pieces is None:
+            return None
+        return rollout_on(
+            self.run,
             self.hand,
             self.obj,
-            planned,
-            wanted=max(self.obj.mass, self.request.min_payload),
-            pieces=self.pieces.result(),
-            placed=self._placed(planned),
-            run=self._run.quiet(),
+            self.pieces.result,
+            in_scenes=self.scenes is not None,
+            known=known,
+            level=self._level,
         )
-        return self.limit is not None and self.limit.hopeless
 
-    @property
-    def _in_parts(self) -> bool:
-        """Whether the grasps of a round may be made apart from each other: it ends as soon as enough are found, and has
-        several lanes. A GPU makes all of it at once, in the time of a few."""
-        return not self._run.device.startswith("cuda") and method(self.request.method).in_parts
-
-    def _round(self, number: int, rows: range, run: ExecutionContext) -> Round:
-        """Some grasps of a round, planned, validated and measured."""
-        begun = self.candidates - rows.start
-        apart = self._in_parts and run.meeting is None and run.pool is None
-        parts = lanes_of(rows, run.cores if apart else 1)
-        self._rollout()  # once, and not by every lane
-        known = self.candidates > 0
-
-        def lane(part: range, own: ExecutionContext) -> Round | NoStartFound:
-            try:
-                return self._lane(number, part, begun, known, own)
-            except NoStartFound as error:
-                return error
-
-        found = side_by_side(parts, lane, run, size=len)
-        if len(refused := [one for one in found if isinstance(one, NoStartFound)]) == len(found):
-            why = self._narrow()
-            raise NoStartFound(f"{refused[0]}: {why}") if why else refused[0]
-        made = [
-            self._lane(number, part, begun, True, run.quiet()) if isinstance(one, NoStartFound) else one
-            for part, one in zip(parts, found, strict=True)
-        ]
-        self.candidates += len(rows)
-        self.repeated += sum(lane.repeated for lane in made)
-        for name in self.seconds:
-            self.seconds[name] += sum(lane.seconds[name] for lane in made) / len(made)
-        return self._without_alike(Round.joined(made))
-
-    def _lane(self, number: int, rows: range, begun: int, known: bool, run: ExecutionContext) -> Round:
-        """The same by one lane: `begun` grasps were tried before the round; `known`: others have a place to start.
-
-        Raises:
-            NoPlace: in scenes, none of its grasps has.
-        """
-        request = self.request
-        index = None if self.scenes is None else (begun + np.array(rows)) % len(self.scenes.object_pose)
-        placed = self.scenes.placed(index) if self.scenes is not None and index is not None else None
-        number_of_batch = self.batch + number * ROUND_STRIDE
-        wanted = PlanRequest(
-            len(rows), request.knobs, request.seed, number_of_batch, placed, self._rollout(), rows.start, known
-        )
-        planned = synthesize(
-            self.hand, self.obj, wanted, run.part(0.0, _PARTS[0]), method=request.method, options=request.options
-        )
-        # Verdicts and metrics are many short pieces of work: all cores may take them, whatever other priorities are at.
-        # What is validated is what is told: positions are on the grid before.
-        planned = replace(planned, scene=index).moved(np.zeros(3))
-        made = self._scored(planned, replace(run, lanes=None))
-        made.seconds["planner"] += planned.seconds
-        made.repeated = max(0, planned.attempts - len(rows)) if placed is not None else 0
-        made.planned = [planned]
-        if number == 0 and rows.start == 0:
-            self._begin_rechecks(made)
-        return made
-
-    def finish(self, rounds: list[Round], count: int) -> ValidatedBatch:
-        """The rounds as one batch, cut to `count`, with rechecks and robustness."""
-        grasps = joined([part.grasps for part in rounds])
-        columns = joined_columns([part.columns for part in rounds])
-        fates = np.concatenate([part.fates for part in rounds])
-        # The last round may find more than were missing: its tries count up to the last grasp that is kept, or else
-        # the share of valid ones would look worse than it is.
-        places = np.flatnonzero(fates == "kept")
-        candidates = int(places[count - 1]) + 1 if len(places) >= count else len(fates)
-        absent = {"blocked"} if self.scenes is None else set()
-        absent |= set() if self.request.robust else {"not_robust"}
-        absent |= set() if self.request.min_payload else {"weak"}
-        reasons = [name for name in REJECTIONS if name not in absent]
-        outcomes = totals([Counter(fate for fate in fates[:candidates].tolist() if fate != "kept")])
-        rejected = dict.fromkeys(reasons, 0)
-        for name, number in outcomes.items():
-            rejected[_REJECTION_OF.get(name, "dropped")] += number
-        grasps, columns = taken(grasps, columns, np.arange(min(count, len(grasps))))
-        if self.repeated:
-            outcomes["repeated"] = self.repeated
-        found = ValidatedBatch(
-            grasps,
-            columns,
-            candidates,
-            rejected,
-            outcomes,
-            None,
-            len(fates),
-            self.seconds,
-            self._shares(rounds),
-            limit=None if len(grasps) else self.limit,
-        )
-        if self.pieces is None:
-            return found
-        columns |= self._second_opinions(grasps, columns["quality/valid"])
-        narrow = None if columns["quality/valid"].any() else self._narrow()
-        return replace(found, columns=columns, verdict_key=self._key(self.pieces.result()), narrow=narrow)
-
-    def _narrow(self) -> str | None:
+    def key(self) -> str:
+        """Digest of the terms of the verdicts."""
+        assert self.pieces is not None
+        pieces = self.pieces.result()
         if self.scenes is None:
-            return None
-        return why_narrow(self.hand, self.obj, self.scenes.placed(np.zeros(0, int)).scenes)
-
-    def _key(self, pieces: ConvexPieces) -> str:
-        if self.scenes is None:
-            return verdict_key(
-                self.hand,
-                self.obj,
-                self._level,
-                False,
-                pieces=pieces,
-                prefilter=first_terms(self.hand, self._level, self._run),
-            )
+            prefilter = first_terms(self.hand, self._level, self.run)
+            return verdict_key(self.hand, self.obj, self._level, False, pieces=pieces, prefilter=prefilter)
         placed = self.scenes.placed(np.zeros(0, int))
         return lift_key(self.hand, self.obj, placed, lift_level(self.request.validation), False, pieces=pieces)
-
-    def _shares(self, rounds: list[Round]) -> dict[str, float]:
-        if self.scenes is None:
-            return {}
-        planned = max(1, sum(len(part.fates) for part in rounds))
-        return {
-            f"{name}_share": sum(part.in_scene.get(name, 0) for part in rounds) / planned
-            for name in ("clear", "lift", "lift_hard")
-        }
 
     @property
     def _level(self) -> Any:
         return self.request.validation
 
-    def _rollout(self) -> Rollout | None:
-        """What candidates go through, where there is a validator; the same one in all rounds."""
-        if self._rollouts is None and self.pieces is not None:
-            in_scenes = self.scenes is not None
-            self._rollouts = rollout_on(
-                self._run,
-                self.hand,
-                self.obj,
-                self.pieces.result,
-                in_scenes=in_scenes,
-                known=self._known,
-                level=self._level,
-            )
-        return self._rollouts
+    def prefiltered(self, planned: GraspSet) -> PrefilterVerdicts | None:
+        """What the GPU prefilter says of those of the grasps that are numbers; None: it has no part in this."""
+        if self.pieces is None or self.scenes is not None or not first_terms(self.hand, self._level, self.run):
+            return None
+        finite = planned.take(np.flatnonzero(planned.finite))
+        return prefiltered(
+            self.hand, self.obj, finite, level=self._level, pieces=self.pieces.result(), run=self.run.quiet()
+        )
 
-    def score(self, planned: GraspSet) -> Round:
-        """Validate and measure grasps, and keep those that are wanted."""
-        made = self._scored(planned, self._run)
-        for name in self.seconds:
-            self.seconds[name] += made.seconds[name]
-        return self._without_alike(made)
-
-    def _scored(self, planned: GraspSet, run: ExecutionContext) -> Round:
+    def scored(
+        self,
+        planned: GraspSet,
+        run: ExecutionContext,
+        known: Known | None = None,
+        prefilter: PrefilterVerdicts | None = None,
+    ) -> Round:
         """Validate and measure grasps, and keep those that are wanted or like others; a hand that is no number is never
-        one of them."""
+        one of them. `known` are verdicts on candidates, `prefilter` what the GPU prefilter said of them before."""
         fates = np.where(planned.finite, "kept", "diverged").astype(object)
-        seconds = dict.fromkeys(self.seconds, 0.0)
+        seconds = {"planner": 0.0, "validation": 0.0, "quality": 0.0}
         finite = np.flatnonzero(fates == "kept")
         planned = planned.take(finite)
         size, every = len(planned), self.request.want == "candidates"
+        in_scene: dict[str, NDArray[np.bool_]] = {}
         if self.scenes is None:
-            columns, in_scene = self._validated(planned, run, seconds), dict[str, int]()
+            columns = self._validated(planned, run, seconds, known, prefilter)
         else:
-            planned, columns, in_scene = self._validated_in_scenes(planned, self.scenes, run, seconds)
+            planned, columns = self._validated_in_scenes(planned, self.scenes, run, seconds, known)
             fates[finite[columns["quality/success"] < 0]] = "no_place"
+            for name, those in outcomes_in_scenes(columns).items():
+                in_scene[name] = np.zeros(len(fates), bool)
+                in_scene[name][finite] = those
         why = _why(columns, size)
         rows = np.arange(size) if every or not columns else np.flatnonzero(columns["quality/success"] == 1)
         grasps = planned.take(rows)
@@ -446,40 +322,35 @@ class _Work:
                 fates[finite[rows[wanted & ~enough]]] = "weak"
                 wanted &= enough
             grasps, columns = taken(grasps, columns, np.flatnonzero(wanted))
-        return Round(grasps, columns, fates, in_scene, seconds)
-
-    def _without_alike(self, made: Round) -> Round:
-        """Without grasps that are too near to one of the batch that is kept."""
-        if self.request.want == "candidates":
-            return made
-        points = np.concatenate([self._kept, hand_points(self.hand, made.grasps.grasp)])
-        kept = distinct(points, self.request.min_distance, given=len(self._kept))
-        wanted, self._kept = kept[len(self._kept) :], points[kept]
-        made.fates[np.flatnonzero(made.fates == "kept")[~wanted]] = "alike"
-        made.grasps, made.columns = taken(made.grasps, made.columns, np.flatnonzero(wanted))
-        return made
+            rows = rows[wanted]
+        return Round(grasps, columns, finite[rows], fates, in_scene, seconds)
 
     def _validated_in_scenes(
-        self, grasps: GraspSet, scenes: Scenes, run: ExecutionContext, seconds: dict[str, float]
-    ) -> tuple[GraspSet, Arrays, dict[str, int]]:
-        """The grasps with their ways, their verdicts, and how many were clear and lifted."""
-        assert grasps.scene is not None
-        pieces = None if self.pieces is None else self.pieces.result()
+        self, grasps: GraspSet, scenes: Scenes, run: ExecutionContext, seconds: dict[str, float], known: Known | None
+    ) -> tuple[GraspSet, Arrays]:
+        """The grasps with their ways, and their verdicts."""
         began = time.perf_counter()
-        grasps, columns, counts = scene_verdicts(
+        found = scene_verdicts(
             self.hand,
             self.obj,
             grasps,
             scenes,
             level=lift_level(self.request.validation),
-            pieces=pieces,
-            known=self._known,
-            run=run.part(*_PARTS[:2]),
+            pieces=None if self.pieces is None else self.pieces.result(),
+            known=known,
+            run=run.part(*PARTS[:2]),
         )
         seconds["validation"] += time.perf_counter() - began
-        return grasps, columns, counts
+        return found
 
-    def _validated(self, grasps: GraspSet, run: ExecutionContext, seconds: dict[str, float]) -> Arrays:
+    def _validated(
+        self,
+        grasps: GraspSet,
+        run: ExecutionContext,
+        seconds: dict[str, float],
+        known: Known | None,
+        prefilter: PrefilterVerdicts | None,
+    ) -> Arrays:
         if self.pieces is None:
             return {}
         verdicts = validate(
@@ -488,8 +359,9 @@ class _Work:
             grasps,
             level=self._level,
             pieces=self.pieces.result(),
-            known=self._known,
-            run=run.part(*_PARTS[:2]),
+            known=known,
+            prefilter=prefilter,
+            run=run.part(*PARTS[:2]),
         )
         seconds["validation"] += verdicts.seconds
         return {
@@ -497,9 +369,7 @@ class _Work:
             "quality/verdict_outcome": verdicts.outcome.reshape(-1, len(DIRECTIONS)),
             "quality/verdict_margin": verdicts.margin,
             **(
-                {"quality/validated_by": verdicts.validated_by}
-                if first_terms(self.hand, self._level, self._run)
-                else {}
+                {"quality/validated_by": verdicts.validated_by} if first_terms(self.hand, self._level, self.run) else {}
             ),
         }
 
@@ -514,7 +384,7 @@ class _Work:
             self.obj,
             grasps,
             held=held,
-            placed=self._placed(grasps),
+            placed=self.placed(grasps),
             level=lift_level(wish.validation),
             models=wish.models,
             seed=wish.seed,
@@ -525,7 +395,7 @@ class _Work:
         seconds["validation"] += found.seconds
         return found.columns
 
-    def _placed(self, grasps: GraspSet) -> PlacedGrasps | None:
+    def placed(self, grasps: GraspSet) -> PlacedGrasps | None:
         """The grasps' scenes; None: the object is free."""
         if self.scenes is None:
             return None
@@ -543,7 +413,7 @@ class _Work:
             self.obj,
             grasps,
             pieces=self.pieces.result(),
-            placed=self._placed(grasps),
+            placed=self.placed(grasps),
             held=held,
             run=run.quiet(),
         )
@@ -555,7 +425,7 @@ class _Work:
     ) -> NDArray[np.float64]:
         """(N,) margins of those that are `held`, shaken after the lift."""
         assert self.pieces is not None
-        began, placed = time.perf_counter(), self._placed(grasps)
+        began, placed = time.perf_counter(), self.placed(grasps)
         assert placed is not None, "shake goes with a scene"
         found = shake_margins(
             self.hand, self.obj, grasps, placed, pieces=self.pieces.result(), held=held, run=run.quiet()
@@ -565,21 +435,246 @@ class _Work:
 
     def _measured(self, grasps: GraspSet, run: ExecutionContext, seconds: dict[str, float]) -> Arrays:
         began = time.perf_counter()
-        columns = measure(self.hand, self.obj, grasps, friction=self.request.friction, run=run.part(*_PARTS[1:]))
+        columns = measure(self.hand, self.obj, grasps, friction=self.request.friction, run=run.part(*PARTS[1:]))
         seconds["quality"] += time.perf_counter() - began
         return dict(columns)
+
+
+@dataclass(frozen=True)
+class Needed:
+    """Grasps that a batch needs next."""
+
+    number: int
+    """Of the round."""
+    rows: range
+    """Of the round."""
+    begun: int
+    """Grasps of the batch that were planned before the round."""
+    progress: tuple[float, float]
+    """Share of the batch before them, and as far as they bring it as the rate so far lets hope."""
+
+
+class Batch:
+    """One batch in the making: what it needs next, and what came of it."""
+
+    def __init__(
+        self, scoring: Scoring, number: int, count: int, run: ExecutionContext, scenes: range | None = None
+    ) -> None:
+        """`run` is told of the batch alone; `scenes` are those of the job that are the batch's, None: all of them."""
+        self.scoring, self.number, self.count, self.run = scoring, number, count, run
+        self.request = scoring.request
+        self.rounds: list[Round] = []
+        self.candidates = self.repeated = 0
+        self.limit: Limit | None = None
+        self.seconds: dict[str, float] = {"planner": 0.0, "validation": 0.0, "quality": 0.0}
+        every = range(0 if scoring.scenes is None else len(scoring.scenes.object_pose))
+        self._scenes = every if scenes is None else scenes
+        self._rechecks: Future[NDArray[np.int8]] | None = None
+        self._kept = np.zeros((0, POINTS, 3))
+        self._needs = self._all_needed()
+        self.needed = next(self._needs, None)
+        """What is to be made and added next; None: the batch can be finished."""
+
+    def _all_needed(self) -> Iterator[Needed]:
+        """What is needed until `count` grasps are there or the budget is used up, one after the other is added."""
+        wish, count = self.request, self.count
+        if wish.want == "candidates":
+            yield Needed(0, range(count), self.candidates, (0.0, 1.0))
+            return
+        budget, number, valid = math.ceil(wish.budget * count), 0, 0
+        # In scenes a grasp that sets out again costs as much as another grasp.
+        while size := next_round(count, valid, self.candidates, budget - self.repeated):
+            first = 0
+            while first < size and valid < count:
+                share = min(size - first, enough(count, valid, self.candidates) if self._in_parts else size)
+                done = valid / count
+                hoped = done + (1 - done) * min(1.0, share / (count - valid)) * 0.9
+                yield Needed(number, range(first, first + share), self.candidates - first, (done, hoped))
+                first += share
+                valid = sum(len(one.grasps) for one in self.rounds)
+            if not valid and self._hopeless():
+                return
+            number += 1
+
+    def add(self, made: Round) -> None:
+        """Add what was needed, without grasps too near to one that is kept."""
+        self.candidates += len(made.fates)
+        self.repeated += made.repeated
+        for name in self.seconds:
+            self.seconds[name] += made.seconds[name]
+        if self.request.want != "candidates":
+            points = np.concatenate([self._kept, hand_points(self.scoring.hand, made.grasps.grasp)])
+            kept = distinct(points, self.request.min_distance, given=len(self._kept))
+            wanted, self._kept = kept[len(self._kept) :], points[kept]
+            made.fates[made.rows[~wanted]] = "alike"
+            made.grasps, made.columns = taken(made.grasps, made.columns, np.flatnonzero(wanted))
+        self.rounds.append(made)
+        self.needed = next(self._needs, None)
+
+    def _hopeless(self) -> bool:
+        """Whether the latest grasps, none of which is kept, show that the hand lifts far less than is wanted."""
+        scoring = self.scoring
+        if scoring.pieces is None or (self.limit is not None and self.limit.grasps >= ENOUGH):
+            return False
+        planned = joined([grasps for one in self.rounds for grasps in one.planned])
+        latest = max(ENOUGH, sum(map(len, self.rounds[-1].planned)))
+        planned = planned.take(slice(max(0, len(planned) - latest), None))
+        self.limit = limit_of(
+            scoring.hand,
+            scoring.obj,
+            planned,
+            wanted=max(scoring.obj.mass, self.request.min_payload),
+            pieces=scoring.pieces.result(),
+            placed=scoring.placed(planned),
+            run=scoring.run.quiet(),
+        )
+        return self.limit is not None and self.limit.hopeless
+
+    @property
+    def _in_parts(self) -> bool:
+        """Whether the grasps of a round may be made apart from each other: it ends as soon as enough are found, and has
+        several lanes. A GPU makes all of it at once, in the time of a few."""
+        return not self.scoring.run.device.startswith("cuda") and method(self.request.method).in_parts
+
+    def made(self, asked: Needed) -> Round:
+        """What is needed, planned, validated and measured: on the CPU in lanes."""
+        known: Known = {}
+        run = self.run.part(*asked.progress)
+        rollout = self.scoring.rollout(known)  # one for all lanes
+        parts = lanes_of(asked.rows, run.cores if self._in_parts and run.pool is None else 1)
+
+        def planned(part: range, own: ExecutionContext, others: bool) -> Round:
+            wanted = self.wanted(replace(asked, rows=part), rollout, others_have_place=others)
+            request = self.request
+            found = synthesize(
+                self.scoring.hand,
+                self.scoring.obj,
+                wanted,
+                own.part(0.0, PARTS[0]),
+                method=request.method,
+                options=request.options,
+            )
+            told = self.told(wanted, found)
+            # Verdicts and metrics are many short pieces of work: all cores may take them, whatever other priorities are
+            # at.
+            made = self.scoring.scored(told, replace(own, lanes=None), known)
+            return self.noted(replace(asked, rows=part), made, told)
+
+        def lane(part: range, own: ExecutionContext) -> Round | NoStartFound:
+            try:
+                return planned(part, own, self.candidates > 0)
+            except NoStartFound as error:
+                return error
+
+        found = side_by_side(parts, lane, run, size=len)
+        if len(refused := [one for one in found if isinstance(one, NoStartFound)]) == len(found):
+            raise self.refused(refused[0])
+        made = [
+            planned(part, run.quiet(), True) if isinstance(one, NoStartFound) else one
+            for part, one in zip(parts, found, strict=True)
+        ]
+        whole = Round.joined(made)
+        whole.seconds = {name: value / len(made) for name, value in whole.seconds.items()}
+        return whole
+
+    def wanted(self, asked: Needed, rollout: Rollout | None, *, others_have_place: bool) -> PlanRequest:
+        """The grasps that are asked for, as a planner takes it."""
+        number = self.number + asked.number * ROUND_STRIDE
+        rows, scenes, placed = asked.rows, self.scoring.scenes, None
+        if scenes is not None:
+            poses, own = scenes, slice(self._scenes.start, self._scenes.stop)
+            beside = poses.neighbour_pose[own] if poses.neighbours else poses.neighbour_pose
+            mine = replace(poses, object_pose=poses.object_pose[own], neighbour_pose=beside)
+            placed = mine.placed((asked.begun + np.array(rows)) % len(self._scenes))
+        knobs, seed = self.request.knobs, self.request.seed
+        return PlanRequest(len(rows), knobs, seed, number, placed, rollout, rows.start, others_have_place)
+
+    def told(self, wanted: PlanRequest, planned: GraspSet) -> GraspSet:
+        """What is validated, which is what is told: positions are on the grid before; scenes are numbered as the
+        job's."""
+        index = None if wanted.placed is None else self._scenes.start + wanted.placed.index
+        return replace(planned, scene=index).moved(np.zeros(3))
+
+    def noted(self, asked: Needed, made: Round, told: GraspSet) -> Round:
+        """The round with what the planner said; the rechecks of the batch's first grasps begin."""
+        made.planned = [told]
+        made.grasps = replace(made.grasps, info=told.info, seconds=told.seconds)
+        made.seconds["planner"] += told.seconds
+        made.repeated = max(0, told.attempts - len(asked.rows)) if self.scoring.scenes is not None else 0
+        if asked.number == 0 and asked.rows.start == 0:
+            self._begin_rechecks(made)
+        return made
+
+    def refused(self, error: NoStartFound) -> NoStartFound:
+        """The same with the geometric reason, where there is one."""
+        why = self._narrow()
+        return NoStartFound(f"{error}: {why}") if why else error
+
+    def finish(self) -> ValidatedBatch:
+        """The rounds as one batch, cut to `count`, with rechecks and robustness."""
+        scoring, rounds, count = self.scoring, self.rounds, self.count
+        grasps = joined([part.grasps for part in rounds])
+        columns = joined_columns([part.columns for part in rounds])
+        fates = np.concatenate([part.fates for part in rounds])
+        # The last round may find more than were missing: its tries count up to the last grasp that is kept, or else
+        # the share of valid ones would look worse than it is.
+        places = np.flatnonzero(fates == "kept")
+        candidates = int(places[count - 1]) + 1 if len(places) >= count else len(fates)
+        absent = {"blocked"} if scoring.scenes is None else set()
+        absent |= set() if self.request.robust else {"not_robust"}
+        absent |= set() if self.request.min_payload else {"weak"}
+        reasons = [name for name in REJECTIONS if name not in absent]
+        outcomes = totals([Counter(fate for fate in fates[:candidates].tolist() if fate != "kept")])
+        rejected = dict.fromkeys(reasons, 0)
+        for name, number in outcomes.items():
+            rejected[_REJECTION_OF.get(name, "dropped")] += number
+        grasps, columns = taken(grasps, columns, np.arange(min(count, len(grasps))))
+        if self.repeated:
+            outcomes["repeated"] = self.repeated
+        found = ValidatedBatch(
+            grasps,
+            columns,
+            candidates,
+            rejected,
+            outcomes,
+            None,
+            len(fates),
+            self.seconds,
+            self._shares(),
+            limit=None if len(grasps) else self.limit,
+        )
+        if scoring.pieces is not None:
+            columns |= self._second_opinions(grasps, columns["quality/valid"])
+            narrow = None if columns["quality/valid"].any() else self._narrow()
+            found = replace(found, columns=columns, verdict_key=scoring.key(), narrow=narrow)
+        scene = None if grasps.scene is None else grasps.scene - self._scenes.start
+        return replace(found, grasps=replace(grasps, scene=scene)).moved(scoring.centre)
+
+    def _narrow(self) -> str | None:
+        if self.scoring.scenes is None:
+            return None
+        around = self.scoring.scenes.placed(np.zeros(0, int)).scenes
+        return why_narrow(self.scoring.hand, self.scoring.obj, around[self._scenes.start : self._scenes.stop])
+
+    def _shares(self) -> dict[str, float]:
+        planned = max(1, sum(len(part.fates) for part in self.rounds))
+        return {
+            f"{name}_share": float(sum(int(part.in_scene[name].sum()) for part in self.rounds)) / planned
+            for name in self.rounds[0].in_scene
+        }
 
     def _second_opinions(self, grasps: GraspSet, valid: NDArray[np.uint8]) -> Arrays:
         """Displacement of all grasps; as far as wished rechecks of the first valid ones under the DexGraspBench
         protocol, and robustness."""
-        assert self.pieces is not None
+        scoring = self.scoring
+        assert scoring.pieces is not None
         columns: Arrays = {
             "quality/simulated_displacement_cm": simulated_displacement_cm(
-                self.hand, self.obj, grasps.grasp, pieces=self.pieces.result(), run=self._run
+                scoring.hand, scoring.obj, grasps.grasp, pieces=scoring.pieces.result(), run=scoring.run
             )
         }
         began = time.perf_counter()
-        if count := self.request.rechecks_of(self.batch):
+        if count := self.request.rechecks_of(self.number):
             rechecked, recheck = np.flatnonzero(valid)[:count], np.full(len(grasps), -1, np.int8)
             if len(rechecked):
                 known = (
@@ -589,14 +684,14 @@ class _Work:
             columns["quality/recheck"] = recheck
         if repeats := self.request.robustness:
             columns["quality/robustness"] = robustness(
-                self.hand,
-                self.obj,
+                scoring.hand,
+                scoring.obj,
                 grasps,
                 held=valid,
                 repeats=repeats,
                 seed=self.request.seed,
-                pieces=self.pieces.result(),
-                run=self._run.quiet(),
+                pieces=scoring.pieces.result(),
+                run=scoring.run.quiet(),
             )
         self.seconds["validation"] += time.perf_counter() - began
         return columns
@@ -604,24 +699,25 @@ class _Work:
     def _begin_rechecks(self, first: Round) -> None:
         """Rechecks of the first grasps of a batch, which are its first ones whatever comes after them: they take one
         thread, and the others wait for them at its end."""
-        count = self.request.rechecks_of(self.batch)
-        if self.pieces is None or not count:
+        count = self.request.rechecks_of(self.number)
+        if self.scoring.pieces is None or not count:
             return
         valid = np.flatnonzero(first.columns["quality/valid"])
         if self.request.want != "candidates":
-            points = hand_points(self.hand, first.grasps.grasp.take(valid))
+            points = hand_points(self.scoring.hand, first.grasps.grasp.take(valid))
             valid = valid[distinct(points, self.request.min_distance)]
         if len(valid) >= count:
-            self._rechecks = self.beside.submit(self._rechecked, first.grasps.take(valid[:count]))
+            self._rechecks = self.scoring.beside.submit(self._rechecked, first.grasps.take(valid[:count]))
 
     def _rechecked(self, grasps: GraspSet) -> NDArray[np.int8]:
         """What the DexGraspBench protocol says of grasps."""
-        assert self.pieces is not None
-        run, pieces = self._run.quiet(), self.pieces.result()
-        if (placed := self._placed(grasps)) is None:
-            return validate(self.hand, self.obj, grasps, level="dexgraspbench", pieces=pieces, run=run).success
+        scoring = self.scoring
+        assert scoring.pieces is not None
+        run, pieces = scoring.run.quiet(), scoring.pieces.result()
+        if (placed := scoring.placed(grasps)) is None:
+            return validate(scoring.hand, scoring.obj, grasps, level="dexgraspbench", pieces=pieces, run=run).success
         return validate_lifts(
-            self.hand, self.obj, grasps, placed, level="dexgraspbench", pieces=pieces, run=run
+            scoring.hand, scoring.obj, grasps, placed, level="dexgraspbench", pieces=pieces, run=run
         ).success
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -31,10 +31,12 @@ class Round:
 
     grasps: GraspSet
     columns: Arrays
+    rows: NDArray[np.intp]
+    """Which of those that were planned they are."""
     fates: NDArray[np.object_]
     """What became of each grasp that was planned: kept, or one of `service.model.planning.OUTCOMES`."""
-    in_scene: dict[str, int]
-    """In scenes: how many were clear, lifted, lifted_hard."""
+    in_scene: dict[str, NDArray[np.bool_]]
+    """In scenes: which of those that were planned were clear, lifted, lifted hard."""
     seconds: dict[str, float]
     """Wall time of planning, validating and measuring [s]."""
     repeated: int = 0
@@ -45,17 +47,30 @@ class Round:
     @classmethod
     def joined(cls, parts: Sequence[Round]) -> Round:
         """All grasps of several."""
-        in_scene = {name: sum(part.in_scene[name] for part in parts) for name in parts[0].in_scene}
+        in_scene = {name: np.concatenate([part.in_scene[name] for part in parts]) for name in parts[0].in_scene}
+        firsts = accumulate((len(part.fates) for part in parts), initial=0)
         seconds = {name: sum(part.seconds[name] for part in parts) for name in parts[0].seconds}
         return cls(
             joined([part.grasps for part in parts]),
             joined_columns([part.columns for part in parts]),
+            np.concatenate([part.rows + first for part, first in zip(parts, firsts, strict=False)]),
             np.concatenate([part.fates for part in parts]),
             in_scene,
             seconds,
             sum(part.repeated for part in parts),
             [grasps for part in parts for grasps in part.planned],
         )
+
+    def split(self, sizes: Sequence[int]) -> list[Round]:
+        """The parts of so many planned grasps each; of the seconds each has its share."""
+        found, ends = [], list(accumulate(sizes, initial=0))
+        for first, end in pairwise(ends):
+            mine = np.flatnonzero((first <= self.rows) & (self.rows < end))
+            grasps, columns = taken(self.grasps, self.columns, mine)
+            in_scene = {name: rows[first:end] for name, rows in self.in_scene.items()}
+            seconds = {name: value * (end - first) / max(1, ends[-1]) for name, value in self.seconds.items()}
+            found.append(Round(grasps, columns, self.rows[mine] - first, self.fates[first:end], in_scene, seconds))
+        return found
 
 
 def next_round(wanted: int, valid: int, candidates: int, budget: int) -> int:

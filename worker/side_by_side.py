@@ -6,7 +6,6 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import TypeVar
 
 from graspd.worker.execution_context import ExecutionContext, Lanes, Progress
@@ -42,7 +41,7 @@ def side_by_side(
     `size`; the first that fails stops the others.
 
     Raises:
-        Exception: what became of the first part that failed.
+        Exception: what became of the first part that failed, when all have ended.
     """
     if len(parts) == 1:
         return [work(parts[0], run)]
@@ -55,17 +54,8 @@ def side_by_side(
         finally:
             lanes.leave()
 
-    return in_threads([partial(lane, number) for number in range(len(parts))], stop, "lane")
-
-
-def in_threads(works: Sequence[Callable[[], R]], stop: threading.Event, name: str) -> list[R]:
-    """What all works give, in order, each in a thread of its own; `stop` is set as soon as one fails, and at the end.
-
-    Raises:
-        Exception: what became of the first that failed, when all threads have ended.
-    """
-    with ThreadPoolExecutor(len(works), thread_name_prefix=name) as pool:
-        futures = [pool.submit(work) for work in works]
+    with ThreadPoolExecutor(len(parts), thread_name_prefix="lane") as pool:
+        futures = [pool.submit(lane, number) for number in range(len(parts))]
         try:
             done, _ = wait(futures, return_when=FIRST_EXCEPTION)
         finally:

@@ -1,25 +1,32 @@
-"""Several batches of a job at once: each in a thread of its own, with their planning done in common launches."""
+"""Several batches of a job: one after the other, or in waves that are planned in one launch each."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
+from typing import Any
 
 import numpy as np
 
 from graspd.service.model.domain import BATCH_SIZE, JobOptions
-from graspd.service.model.errors import TaskCancelled
-from graspd.worker.engines.joins import PER_LAUNCH
+from graspd.service.model.errors import InputError, TaskCancelled
+from graspd.worker.engines.devices import check_device, exclusive
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
-from graspd.worker.generation import ValidatedBatch, validated_grasps
+from graspd.worker.generation import PARTS, Batch, Known, Scoring, ValidatedBatch, require_graspable, validated_grasps
+from graspd.worker.grasps import GraspSet, joined
 from graspd.worker.hands.model import HandModel
-from graspd.worker.meeting import Meeting
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.rounds import taken
-from graspd.worker.side_by_side import Shares, in_threads
-from graspd.worker.simulation.environment import Scenes
+from graspd.worker.planners import BatchRequest, NoStartFound, synthesize_batches
+from graspd.worker.rounds import Round, taken
+from graspd.worker.side_by_side import Shares
+from graspd.worker.simulation.environment import Scenes, scenes_together
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
+from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts
 
 
 def validated_batches(
@@ -56,7 +63,6 @@ def validated_batches(
     Raises:
         Exception: what became of the first batch that failed; the others are stopped.
     """
-    shares = Shares(sizes, run.progress)
     known: list[ConvexPieces] = []
 
     def pieces_once(prepared: ObjectModel) -> ConvexPieces:
@@ -64,49 +70,168 @@ def validated_batches(
             known.append(pieces(prepared))
         return known[0]
 
-    refused: list[Exception] = []
-
-    def batch(number: int, own: ExecutionContext) -> ValidatedBatch | None:
-        own = replace(own, progress=shares.of(number))
-        where = scenes if scenes is None or isinstance(scenes, Scenes) else scenes[number]
-        try:
-            made = validated_grasps(
-                hand,
-                obj,
-                request,
-                count=sizes[number],
-                batch=first + number,
-                scenes=where,
-                pieces=pieces_once,
-                run=own,
-                partial=partial,
-            )
-        except empty_on as error:
-            if first + number == 0:
-                raise
-            refused.append(error)
-            return None
-        if checked is not None:
-            checked(first + number, made)
-        own.progress(1.0, 1.0, "done")
-        return made
-
+    given = [scenes] * len(sizes) if scenes is None or isinstance(scenes, Scenes) else list(scenes)
+    job = _Job(hand, obj, request, sizes, first, given, pieces_once, run, partial)
     found: dict[int, ValidatedBatch | None] = {}
+    refused: list[Exception] = []
     try:
-        if join == 1 or len(sizes) == 1:
-            for number in range(len(sizes)):
-                found[number] = batch(number, run)
-        else:
-            if request.validation != "none":
-                pieces_once(obj.centred)  # not by every batch at the same time
-            _together(batch, len(sizes), join, run, found)
+        with closing(job.one_by_one() if join == 1 or len(sizes) == 1 else job.in_waves(join)) as batches:
+            for number, one in batches:
+                if isinstance(one, ValidatedBatch):
+                    if checked is not None:
+                        checked(number, one)
+                    found[number] = one
+                elif isinstance(one, empty_on) and number > 0:
+                    refused.append(one)
+                    found[number] = None
+                else:
+                    raise one
     except TaskCancelled:
         if not partial or not found:
             raise
-    made = [one for number in sorted(found) if (one := found[number]) is not None]
-    if not made:
+    ordered = [found[number] for number in sorted(found)]
+    if (like := next(filter(None, ordered), None)) is None:
         raise refused[0]
-    return [one or _nothing(made[0]) for _, one in sorted(found.items())]
+    return [one or _nothing(like) for one in ordered]
+
+
+#: The number of a batch within its job, with what came of it.
+Made = tuple[int, ValidatedBatch | Exception]
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Batches of a job, and both ways to make them."""
+
+    hand: HandModel
+    obj: ObjectModel
+    request: JobOptions
+    sizes: Sequence[int]
+    first: int
+    scenes: Sequence[Scenes | None]
+    pieces: Callable[[ObjectModel], ConvexPieces]
+    run: ExecutionContext
+    partial: bool
+
+    def one_by_one(self) -> Generator[Made]:
+        """One batch after the other."""
+        shares = Shares(self.sizes, self.run.progress)
+        for k, (count, scenes) in enumerate(zip(self.sizes, self.scenes, strict=True)):
+            own, number = replace(self.run, progress=shares.of(k)), self.first + k
+            how: dict[str, Any] = {"scenes": scenes, "pieces": self.pieces, "run": own, "partial": self.partial}
+            try:
+                made = validated_grasps(self.hand, self.obj, self.request, count=count, batch=number, **how)
+            except InputError as error:
+                yield number, error
+            else:
+                yield number, made
+                own.progress(1.0, 1.0, "done")
+
+    def in_waves(self, join: int) -> Generator[Made]:
+        """What `join` batches need next is planned in one launch; meanwhile the wave before is validated and
+        measured."""
+        require_graspable(self.hand, self.obj)
+        stop, shares = threading.Event(), Shares(self.sizes, self.run.progress)
+        run = replace(self.run, cancelled=lambda: stop.is_set() or self.run.cancelled())
+        several = [one for one in self.scenes if one is not None] if len({*map(id, self.scenes)}) > 1 else []
+        ends = accumulate((len(one.object_pose) for one in several), initial=0)
+        own = [range(*both) for both in pairwise(ends)] if several else [None] * len(self.sizes)
+        scenes = scenes_together(several) if several else self.scenes[0]
+        going, waiting = dict[int, Batch](), deque[Batch]()
+        with (
+            Scoring.begun(self.hand, self.obj, self.request, scenes=scenes, pieces=self.pieces, run=run) as scoring,
+            ThreadPoolExecutor(1, thread_name_prefix="device") as device,
+        ):
+            fresh = (
+                Batch(scoring, self.first + k, count, replace(run, progress=shares.of(k)), own[k])
+                for k, count in enumerate(self.sizes)
+            )
+            ahead: Future[_Wave] | None = None
+            try:
+                while (wave := _next_wave(waiting, fresh, join * BATCH_SIZE)) or ahead is not None:
+                    planned, ahead = ahead, device.submit(_planned, scoring, wave) if wave else None
+                    going |= {batch.number: batch for batch in wave}
+                    for batch, error in _scored(scoring, planned.result()) if planned is not None else ():
+                        if error is None and batch.needed is not None:
+                            waiting.append(batch)
+                            continue
+                        del going[batch.number]
+                        yield batch.number, error or batch.finish()
+                        batch.run.progress(1.0, 1.0, "done")
+            except TaskCancelled:
+                stop.set()
+                if self.partial:
+                    scoring.goes_on()
+                    yield from ((number, batch.finish()) for number, batch in going.items() if batch.rounds)
+                raise
+            finally:
+                stop.set()
+
+
+@dataclass(frozen=True)
+class _Wave:
+    """Grasps of several batches that were planned in one launch."""
+
+    batches: Sequence[Batch]
+    made: Sequence[GraspSet | Exception]
+    """Of each batch."""
+    whole: GraspSet | None
+    """All of them."""
+    known: Known
+    prefilter: PrefilterVerdicts | None
+
+
+def _next_wave(waiting: deque[Batch], fresh: Iterator[Batch], most: int) -> list[Batch]:
+    """Batches that need as many grasps as one launch takes; those that have begun go first."""
+    found, size = list[Batch](), 0
+    while (batch := waiting.popleft() if waiting else next(fresh, None)) is not None:
+        assert batch.needed is not None
+        size += len(batch.needed.rows)
+        if found and size > most:
+            waiting.appendleft(batch)
+            break
+        found.append(batch)
+    return found
+
+
+def _planned(scoring: Scoring, batches: Sequence[Batch]) -> _Wave:
+    """Plan what the batches need; by the one thread that has the device.
+
+    Raises:
+        TaskCancelled: it was stopped.
+    """
+    known: Known = {}
+    rollout, request, asked = scoring.rollout(known), scoring.request, list[BatchRequest]()
+    for batch in batches:
+        assert batch.needed is not None
+        wanted = batch.wanted(batch.needed, rollout, others_have_place=batch.candidates > 0)
+        asked.append(BatchRequest(wanted, batch.run.part(*batch.needed.progress).part(0.0, PARTS[0])))
+    with exclusive:
+        made = synthesize_batches(scoring.hand, scoring.obj, asked, method=request.method, options=request.options)
+        check_device(scoring.run.device)
+        told: list[GraspSet | Exception] = []
+        for batch, one, grasps in zip(batches, asked, made, strict=True):
+            if isinstance(grasps, TaskCancelled):
+                raise grasps
+            told.append(batch.told(one.wanted, grasps) if isinstance(grasps, GraspSet) else grasps)
+        good = [grasps for grasps in told if isinstance(grasps, GraspSet)]
+        whole = joined(good) if good else None
+        return _Wave(batches, told, whole, known, scoring.prefiltered(whole) if whole is not None else None)
+
+
+def _scored(scoring: Scoring, wave: _Wave) -> Iterator[tuple[Batch, Exception | None]]:
+    """Validate and measure a wave at once; each of its batches, or why it could not be planned."""
+    parts: Iterator[Round] = iter(())
+    if wave.whole is not None:
+        scored = scoring.scored(wave.whole, scoring.run.quiet(), wave.known, wave.prefilter)
+        parts = iter(scored.split([len(made) for made in wave.made if isinstance(made, GraspSet)]))
+    for batch, made in zip(wave.batches, wave.made, strict=True):
+        if isinstance(made, Exception):
+            yield batch, batch.refused(made) if isinstance(made, NoStartFound) else made
+            continue
+        assert batch.needed is not None
+        batch.add(batch.noted(batch.needed, next(parts), made))
+        yield batch, None
 
 
 def _nothing(like: ValidatedBatch) -> ValidatedBatch:
@@ -114,26 +239,3 @@ def _nothing(like: ValidatedBatch) -> ValidatedBatch:
     grasps, columns = taken(like.grasps, like.columns, np.zeros(0, int))
     seconds, shares = (dict.fromkeys(counts, 0.0) for counts in (like.seconds, like.shares))
     return ValidatedBatch(grasps, columns, 0, dict.fromkeys(like.rejected, 0), {}, like.verdict_key, 0, seconds, shares)
-
-
-def _together(
-    work: Callable[[int, ExecutionContext], ValidatedBatch | None],
-    count: int,
-    join: int,
-    run: ExecutionContext,
-    found: dict[int, ValidatedBatch | None],
-) -> None:
-    """Puts each batch under its number as soon as it is made."""
-    members = min(count, PER_LAUNCH * join)
-    stop, left = threading.Event(), iter(range(count))
-    with Meeting(members, join * BATCH_SIZE) as meeting:
-        own = replace(run, meeting=meeting, cancelled=lambda: stop.is_set() or run.cancelled())
-
-        def member() -> None:
-            try:
-                while not stop.is_set() and (number := next(left, None)) is not None:
-                    found[number] = work(number, own)
-            finally:
-                meeting.leave()
-
-        in_threads([member] * members, stop, "batch")

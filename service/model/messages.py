@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from collections.abc import Mapping
+from typing import Any, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
@@ -65,3 +66,8 @@ class IngestMessage(Model):
     max_attempt: int = Field(3, ge=1)
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+
+def message_type(raw: Mapping[str, Any]) -> type[TaskMessage | IngestMessage]:
+    """The type of a message by its stage."""
+    return IngestMessage if raw.get("stage") == Stage.INGEST else TaskMessage

@@ -18,7 +18,7 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json
 from graspd.service.model.domain import Digest, JobOptions, JobRequest, Name, check_known
 from graspd.service.model.fidelity import AUTO
-from graspd.service.model.messages import Origin
+from graspd.service.model.messages import IngestMessage, Origin, TaskMessage
 from graspd.service.model.projects import Project
 from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.model.version import STAGE_REVISIONS
@@ -118,6 +118,14 @@ class AttemptRecord(Record):
     started: str | None = None
     ended: str
     last: bool
+
+    @classmethod
+    def of(cls, message: TaskMessage | IngestMessage, **facts: Any) -> Self:
+        """A failure of what was asked for, as of now."""
+        job = message.job_id if isinstance(message, TaskMessage) else ""
+        return cls(
+            task_id=message.task_id, job_id=job, stage=message.stage, number=message.attempt, ended=timestamp(), **facts
+        )
 
 
 class Member(Record):

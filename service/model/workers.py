@@ -6,20 +6,24 @@ knew. A worker reads a range too, and makes one revision of each stage.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+import socket
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Final
+from typing import Annotated, Final, Self
 
 from pydantic import Field
 
+from graspd.service.model.clock import timestamp
 from graspd.service.model.domain import Word
 from graspd.service.model.messages import IngestMessage, TaskMessage
 from graspd.service.model.states import Stage
-from graspd.service.model.version import OLDEST_TASK_SCHEMA, STAGE_REVISIONS, TASK_SCHEMA
+from graspd.service.model.version import OLDEST_TASK_SCHEMA, PACKAGE_VERSION, STAGE_REVISIONS, TASK_SCHEMA
 
 #: Anybody who writes to Redis may say anything: what is read from there is as long and as large as ours can be.
 HostWord = Annotated[str, Field(max_length=300)]
 Count = Annotated[int, Field(ge=0, lt=2**31)]
+Amount = Annotated[float, Field(ge=0, le=1e15, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,28 @@ class WorkerBeat:
     """Oldest and newest task message that it reads; graspd 0.1 does not say it, and its workers are given no task."""
     revisions: Annotated[dict[HostWord, Count], Field(max_length=16)] = field(default_factory=dict)
     """Revision that it makes of each stage."""
+    done: Amount = 0.0
+    total: Amount = 0.0
+    """How far its task is; 0 where the end is not known."""
+    message: Annotated[str, Field(max_length=300)] = ""
+
+    @classmethod
+    def of_this_process(cls, name: str, device: str, stages: Iterable[Stage]) -> Self:
+        """What a worker says before its first check."""
+        now, own = timestamp(), own_ability()
+        facts = (
+            socket.gethostname(),
+            os.getpid(),
+            device,
+            "",
+            tuple(stages),
+            PACKAGE_VERSION,
+            "checking",
+            "",
+            now,
+            now,
+        )
+        return cls(name, *facts, schemas=own.schemas, revisions=dict(own.revisions))
 
     @property
     def ability(self) -> Capabilities:

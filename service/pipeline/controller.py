@@ -15,7 +15,6 @@ from contextlib import contextmanager
 from typing import Final
 
 from graspd.service.index.notes import StoreMark
-from graspd.service.index.queries.feed import ReadyTask
 from graspd.service.index.rebuild import complete_if_new, rebuild
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
@@ -35,7 +34,7 @@ from graspd.service.pipeline.leading import PART
 from graspd.service.pipeline.lease_reaper import LeaseReaper
 from graspd.service.pipeline.routes import Routes
 from graspd.service.pipeline.webhook_dispatcher import WebhookDispatcher
-from graspd.service.queue.port import Event, EventKind, Report
+from graspd.service.queue.port import Event, EventKind
 from graspd.service.store.library import publish_builtins, stored_assets
 from graspd.service.store.packs import take_apart
 from graspd.service.store.records import newest_mark, next_mark, read_record, set_mark
@@ -51,7 +50,7 @@ _WORKERS_EVERY_S: Final = 2.0
 #: How long what a worker can do counts after it was last seen.
 _REMEMBERED_S: Final = 60.0
 #: How often the progress of tasks is passed on: as often as pages ask for it.
-_REPORTS_EVERY_S: Final = 0.5
+_PROGRESS_EVERY_S: Final = 0.5
 _LONGEST_PAUSE_S: Final = 5.0
 _COLLECT_EVERY_S: Final = 5.0
 #: How often it looks whether store and index are still its service's.
@@ -80,7 +79,7 @@ class Controller:
         self._seen: dict[str, tuple[float, WorkerBeat]] = {}
         self._held: set[str] = set()
         """Why tasks were held back when the queue was last filled."""
-        self._news = False
+        self._has_news = False
         """Whether anything came in since the queue was filled."""
         self._made = False
         """Whether anything came in since store and index got their mark."""
@@ -89,7 +88,7 @@ class Controller:
         self._workers = 0
         """Workers that were there when they were last counted."""
         self._clock = clock
-        self._reports: dict[str, Report] = {}
+        self._progress: dict[str, tuple[float, float, str]] = {}
         """How far tasks were when it was last passed on."""
         interval_s = services.settings.controller_interval_s
         self._entered = ""
@@ -102,8 +101,8 @@ class Controller:
             PeriodicDuty(clock, self._look_after_workers, _WORKERS_EVERY_S, share=0.1),
             # Each lease is seen three times before it can be called lost.
             PeriodicDuty(clock, self._look_after_queue, interval_s, longest_s=services.settings.lease_s / 3),
-            PeriodicDuty(clock, self._feed_news, 0.0),
-            PeriodicDuty(clock, self._pass_on_reports, min(_REPORTS_EVERY_S, interval_s), share=0.1),
+            PeriodicDuty(clock, self._feed_new, 0.0),
+            PeriodicDuty(clock, self._pass_on_progress, min(_PROGRESS_EVERY_S, interval_s), share=0.1),
             # The index is free for at least as long as it was held.
             PeriodicDuty(clock, self._enter_large_job, _ENTERING_GAP_S, share=0.5),
             PeriodicDuty(clock, self._plan, interval_s),
@@ -164,7 +163,7 @@ class Controller:
         self._see_to_the_index()
         away: list[UnavailableError] = []
         with _noted(away):
-            self._index_events(0.0 if self._has_plans else min(wait_s, _REPORTS_EVERY_S))
+            self._index_events(0.0 if self._has_plans else min(wait_s, _PROGRESS_EVERY_S))
         for duty in self._duties:
             with _noted(away):
                 duty()
@@ -183,13 +182,13 @@ class Controller:
             notes.set_marked(StoreMark(fresh, fresh, changes))
             self._known, self._made = fresh, False
 
-    def _pass_on_reports(self) -> None:
-        """What changed in the workers' reports to the progress that the index shows."""
-        found = self._services.queue.reports()
-        changed = {task: report for task, report in found.items() if self._reports.get(task) != report}
-        if changed:
-            self._services.index.live.set_progress({task: (r.done, r.total, r.message) for task, r in changed.items()})
-        self._reports = found
+    def _pass_on_progress(self) -> None:
+        """What changed in how far tasks are, as their workers say."""
+        busy = (beat for beat in self._services.queue.workers() if beat.task_id)
+        found = {beat.task_id: (beat.done, beat.total, beat.message) for beat in busy}
+        if changed := {task: one for task, one in found.items() if self._progress.get(task) != one}:
+            self._services.index.live.set_progress(changed)
+        self._progress = found
 
     def _plan(self) -> bool:
         self._has_plans = self._planner.advance()
@@ -282,7 +281,7 @@ class Controller:
         done = [entry for place, entry in enumerate(self._backlog) if place not in waiting]
         self._backlog = [entry for place, entry in enumerate(self._backlog) if place in waiting]
         self._services.queue.acknowledge([event_id for event_id, _ in done])
-        self._news |= (made := any(event.kind is not EventKind.JOB for _, event in done))
+        self._has_news |= (made := any(event.kind is not EventKind.JOB for _, event in done))
         self._made |= made
         if waiting:
             raise StoreUnavailable(f"the store does not answer, and {len(waiting)} events wait for it")
@@ -297,24 +296,19 @@ class Controller:
         # Waiting tasks are read before leases: one that a worker takes in between is then seen as held.
         waiting = self._services.queue.waiting()
         leases = self._services.queue.leases()
-        # Reports that were read before the leases were, and whose tasks nobody held then.
-        gone = self._reports.keys() - {lease.task_id for lease in leases}
-        self._services.queue.forget_reports(gone)
-        for task in gone:
-            del self._reports[task]
         lost = self._reaper.reap(leases)
         present = waiting | {lease.task_id for lease in leases if lease not in lost}
         if stray := self._services.index.feed.cancelled(present):
             self._services.queue.discard(stray)
         missing = {*self._reaper.find_missing(present), *(lease.task_id for lease in lost)}
         self._feed(present, missing)
-        self._news = False
+        self._has_news = False
 
-    def _feed_news(self) -> None:
+    def _feed_new(self) -> None:
         """What became ready by what came in, without a wait."""
-        if self._news:
+        if self._has_news:
             self._feed()
-            self._news = False
+            self._has_news = False
 
     def _feed(self, present: set[str] | None = None, missing: Collection[str] = ()) -> None:
         """Queue what is ready. Where nobody knows what is in the queue (`present`), the index's own marks say so, and
@@ -327,7 +321,9 @@ class Controller:
         held: set[str] = set()
         for priority in Priority:
             room = window - sum(n for (of, _), n in depths.items() if of is priority)
-            ready = self._ready(priority, now, room) if room > 0 else []
+            ready = (
+                self._services.index.feed.ready_tasks(priority, self._turns, now=now, limit=room) if room > 0 else []
+            )
             if present is None:
                 held |= queue_tasks(self._services, ready, routes=self._routes)
                 continue
@@ -341,9 +337,6 @@ class Controller:
             log.warning("tasks are %s", why)
         self._held = held
         self._feed_checks(present, missing, now)
-
-    def _ready(self, priority: Priority, now: float, room: int) -> list[ReadyTask]:
-        return self._services.index.feed.ready_tasks(priority, self._turns, now=now, limit=room)
 
     def _feed_checks(self, present: set[str] | None, missing: Collection[str], now: float) -> None:
         for check in self._services.index.feed.ready_checks(now=now, limit=self._services.settings.queue_window):

@@ -143,7 +143,7 @@ class Indexer:
         for job, state in changed.items():
             log.info("job is %s", state, extra={"job": job})
             if state.is_final:
-                self._tally.ended(state)
+                self._tally.add("graspd_jobs_ended_total", state.value)
             self._told[job] = state
         for job in states:
             self._told.move_to_end(job)
@@ -199,12 +199,12 @@ class Indexer:
             self._defer(event)
         elif event.kind is EventKind.FAILED:
             self.failed(read_record(AttemptRecord, self._services.store, attempt_key(event.task_id, event.attempt)))
-        elif event.kind is EventKind.DEFERRED:
-            self._tally.handed_back(event.stage or "", event.kind.value)
-            self._defer(event)
-        elif event.kind in (EventKind.RETURNED, EventKind.CANCELLED):
-            self._tally.handed_back(event.stage or "", event.kind.value)
-            self._wait_again(event, 0.0, None)
+        else:  # deferred, returned or cancelled
+            self._tally.add("graspd_task_handbacks_total", event.stage or "", event.kind.value)
+            if event.kind is EventKind.DEFERRED:
+                self._defer(event)
+            else:
+                self._wait_again(event, 0.0, None)
 
     def _defer(self, event: Event) -> None:
         if len(self._deferrals) >= _REMEMBERED_TASKS:

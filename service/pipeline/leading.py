@@ -8,13 +8,14 @@ index take turns.
 from __future__ import annotations
 
 import logging
+import math
 import os
 import secrets
 import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Final
 
 from graspd.service.model.errors import QueueUnavailable
@@ -51,15 +52,12 @@ class Leadership:
         told = False
         while not stop.is_set():
             self._alive.touch()
-            try:
-                if self._queue.lead(self.holder, self._lease_s):
-                    log.info("this controller leads")
-                    return True
-                if not told:
-                    log.info("another controller leads; this one waits to take over")
+            if (leads := self._leads()) is True:
+                log.info("this controller leads")
+                return True
+            if leads is False and not told:
+                log.info("another controller leads; this one waits to take over")
                 told = True
-            except QueueUnavailable as error:
-                log.warning("%s", error)
             stop.wait(self._lease_s / _RENEWALS)
         return False
 
@@ -79,23 +77,25 @@ class Leadership:
             done.set()
             thread.join(self._lease_s)
             if stop.is_set():
-                try:
+                with suppress(QueueUnavailable):  # the lease runs out by itself
                     self._queue.resign(self.holder)
-                except QueueUnavailable:
-                    log.debug("the lease of the controller runs out by itself")
 
     def _renew(self, stop: threading.Event, over: threading.Event, done: threading.Event) -> None:
-        # Also while the work is laid down.
-        while not done.is_set():
-            try:
-                if not self._queue.lead(self.holder, self._lease_s) and not over.is_set():
-                    log.warning("this controller was silent for too long, and another leads now")
-                    over.set()
-            except QueueUnavailable:
-                log.debug("the lease of the controller cannot be renewed now")
-            end = time.monotonic() + self._lease_s / _RENEWALS
-            while not (stop.is_set() or done.wait(_LOOK_S)) and time.monotonic() < end:
-                pass
-            if stop.is_set():
+        due = -math.inf  # also while the work is laid down
+        while not done.wait(_LOOK_S) and not stop.is_set():
+            if time.monotonic() < due:
+                continue
+            if self._leads() is False and not over.is_set():
+                log.warning("this controller was silent for too long, and another leads now")
                 over.set()
-                return
+            due = time.monotonic() + self._lease_s / _RENEWALS
+        if stop.is_set():
+            over.set()
+
+    def _leads(self) -> bool | None:
+        """Whether this process leads, for as long as a lease lasts; None: Redis is away."""
+        try:
+            return self._queue.lead(self.holder, self._lease_s)
+        except QueueUnavailable as error:
+            log.debug("nobody knows which controller leads: %s", error)
+            return None

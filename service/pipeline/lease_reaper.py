@@ -34,7 +34,7 @@ class LeaseReaper:
         self._services = services
         self._indexer = indexer
         self._clock = clock
-        self._beats: dict[Any, tuple[str, float]] = {}
+        self._heartbeats: dict[Any, tuple[str, float]] = {}
         self._looked = clock()
         self._missing: dict[str, float] = {}
 
@@ -44,17 +44,17 @@ class LeaseReaper:
         lease_s = self._services.settings.lease_s
         # Time in which nobody looked, because Redis was away or this process was stopped, is no worker's silence.
         looked, self._looked = min(now - self._looked, lease_s / 3), now
-        beats: dict[Any, tuple[str, float]] = {}
+        heartbeats: dict[Any, tuple[str, float]] = {}
         lost = []
         for lease in leases:
-            beat, silence = self._beats.get(lease.key, (None, 0.0))
+            beat, silence = self._heartbeats.get(lease.key, (None, 0.0))
             silence = silence + looked if beat == lease.beat else 0.0
             if silence <= lease_s:
-                beats[lease.key] = (lease.beat, silence)
+                heartbeats[lease.key] = (lease.beat, silence)
             else:
                 self._lose(lease)
                 lost.append(lease)
-        self._beats = beats
+        self._heartbeats = heartbeats
         return lost
 
     def find_missing(self, present: Collection[str]) -> list[str]:
@@ -64,11 +64,10 @@ class LeaseReaper:
         now = self._clock()
         self._missing = {task: self._missing.get(task, now) for task in believed - set(present)}
         missing = [task for task, since in self._missing.items() if now - since >= LOST_AFTER_S]
-        of_checks = {ingest_id(kind, digest): (kind, digest) for kind, digest in checks}
-        self._recover([task for task in missing if task not in of_checks])
-        for task in missing:
-            if task in of_checks:
-                self._recover_check(*of_checks[task])
+        self._recover([task for task in missing if task in tasks])
+        for kind, digest in checks:
+            if ingest_id(kind, digest) in missing:
+                self._recover_check(kind, digest)
         return missing
 
     def _recover(self, missing: list[str]) -> None:
@@ -110,17 +109,9 @@ class LeaseReaper:
     def _fail(self, task_id: str, stage: Stage, error: DamagedError) -> None:
         """End a task that a damaged record stands in the way of."""
         task = self._services.index.jobs.task(task_id)
-        attempt = AttemptRecord(
-            task_id=task_id,
-            job_id=task.job_id,
-            stage=stage,
-            number=task.attempt,
-            kind=type(error).__name__,
-            reason=str(error),
-            worker="controller",
-            ended=timestamp(),
-            last=True,
-        )
+        about = {"task_id": task_id, "job_id": task.job_id, "stage": stage, "number": task.attempt}
+        why = {"kind": type(error).__name__, "reason": str(error), "worker": "controller"}
+        attempt = AttemptRecord.model_validate({**about, **why, "ended": timestamp(), "last": True})
         put_record(self._services.store, names.attempt(task_id, attempt.number), attempt)
         self._indexer.failed(attempt)
 
@@ -151,15 +142,11 @@ class LeaseReaper:
     def _lose_task(self, worker: str, message: TaskMessage) -> None:
         if self._find(message.task_id, message.stage, message.output):
             return
-        attempt = AttemptRecord(
-            task_id=message.task_id,
-            job_id=message.job_id,
-            stage=message.stage,
-            number=message.attempt,
+        attempt = AttemptRecord.of(
+            message,
             kind="WorkerLost",
             reason=f"worker {worker} was lost: no sign of life for {self._services.settings.lease_s:g} s",
             worker=worker,
-            ended=timestamp(),
             last=message.attempt >= message.max_attempt,
         )
         key = names.attempt(message.task_id, message.attempt)

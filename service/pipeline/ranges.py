@@ -8,14 +8,14 @@ from collections.abc import Callable
 from typing import Final
 
 from graspd.service.index.queries.overview import BatchCost
-from graspd.service.model.domain import JobRequest, batches_of
+from graspd.service.index.queries.rates import Rates, tries
+from graspd.service.model.domain import batches_of
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import MOST_BATCHES, JobRecord
 from graspd.service.model.states import Priority, Stage
 from graspd.service.model.version import SCHEMA_OF_RANGES
 from graspd.service.model.workers import WorkerBeat
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.rates import Rates, tries
 
 #: Finished tasks that tell how long a batch takes.
 _LOOKED_AT: Final = 64
@@ -61,14 +61,11 @@ class TaskRanges:
         # Somebody who watches a small job sees its grasps batch by batch; a GPU makes them all in one launch.
         if job.priority is Priority.INTERACTIVE and not (able and all(one.device.startswith("cuda") for one in able)):
             return job
-        by_time = int(wanted_s / max(1e-3, self._batch_s(job.request, {one.device for one in able}) or wanted_s))
+        rate = Rates(self._costs, job.request, {one.device for one in able}).of(job.request.hand, job.request.object)
+        batch_s = rate.seconds_per_try * tries(rate, job.request) / batches
+        by_time = int(wanted_s / max(1e-3, batch_s or wanted_s))
         workers = -(-(len(able) or _EXPECTED) // among)
         return job.model_copy(update={"span": span_of(batches, by_time, workers)})
-
-    def _batch_s(self, request: JobRequest, devices: set[str]) -> float:
-        """How long one of its batches takes [s]."""
-        rate = Rates(self._costs, request, devices).of(request.hand, request.object)
-        return rate.seconds_per_try * tries(rate, request) / batches_of(request.grasps)
 
 
 def span_of(batches: int, by_time: int, workers: int) -> int:

@@ -1,12 +1,12 @@
 """What a worker runs of a job in the queue: graspd's own task, whatever a Redis writer puts there.
 
 RQ imports and calls any function that a job's hash names, JSON serializer or not; it does the same with callbacks, and
-it posts to any webhook URL. A worker therefore runs a job made anew of two facts: its id and its message.
+it posts to any webhook URL. A worker therefore makes a job anew of two facts, its id and its message, and calls nothing
+of it: the message goes to its engine.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Final
 
 from redis.exceptions import RedisError
@@ -23,23 +23,12 @@ TASK_FUNCTION: Final = "graspd.task"
 #: How long Redis keeps what is left of a broken job [s]. Results are not kept: events tell them.
 FAILURE_TTL_S: Final = 3600
 
-TaskFunction = Callable[[dict[str, Any]], None]
-#: What `TASK_FUNCTION` stands for; set in worker processes only.
-task_function: TaskFunction | None = None
 
-
-def run_task(message: dict[str, Any]) -> None:
-    """The task function of this process; TaskRefused where it has none."""
-    if task_function is None:
-        raise TaskRefused("this process runs no tasks; start `graspd worker`")
-    task_function(message)
-
-
-def new_job(function: str | TaskFunction, message: dict[str, Any], **options: Any) -> Job:
+def new_job(message: dict[str, Any], **options: Any) -> Job:
     """A job without end by time, results, retries, callbacks or webhooks: `worker.process.main` and the controller see
     to what is needed of these."""
     return Job.create(
-        function,
+        TASK_FUNCTION,
         args=(message,),
         timeout=-1,
         result_ttl=0,
@@ -57,9 +46,7 @@ def allowed_job(job: Job, queue: Queue) -> Job:
         name, message = "what cannot be read", None
     if name != TASK_FUNCTION or job.instance is not None or not isinstance(message, dict):
         raise TaskRefused(f"the queue asks for {name[:80]!r}, which is no task of graspd")
-    return new_job(
-        run_task, message, id=job.id, origin=queue.name, connection=job.connection, description=job.description
-    )
+    return new_job(message, id=job.id, origin=queue.name, connection=job.connection, description=job.description)
 
 
 def is_of_an_entry(error: Exception) -> bool:

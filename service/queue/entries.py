@@ -9,19 +9,18 @@ from __future__ import annotations
 import json
 import re
 import zlib
-from collections.abc import Iterable
+from collections.abc import Mapping
 from typing import Any, Final, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from graspd.service.model.messages import IngestMessage, TaskMessage
+from graspd.service.model.messages import message_type
 from graspd.service.model.renamed import renamed
-from graspd.service.model.states import Stage
 from graspd.service.model.workers import WorkerBeat
-from graspd.service.queue.port import Event, Message, Report
+from graspd.service.queue.port import Event, Message
 
-Entry = TypeVar("Entry", WorkerBeat, Event, Report)
-_ADAPTERS: Final[dict[type, TypeAdapter[Any]]] = {kind: TypeAdapter(kind) for kind in (WorkerBeat, Event, Report)}
+Entry = TypeVar("Entry", WorkerBeat, Event)
+_ADAPTERS: Final[dict[type, TypeAdapter[Any]]] = {kind: TypeAdapter(kind) for kind in (WorkerBeat, Event)}
 _ATTEMPT: Final = re.compile(r"(.+)-([0-9]{1,9})")
 #: A message has a few kilobytes, whatever its few compressed bytes would unpack to.
 _MESSAGE_BYTES: Final = 1 << 20
@@ -51,13 +50,13 @@ def message(data: bytes | None) -> Message | None:
         return None
     try:
         raw = renamed(json.loads(zlib.decompressobj().decompress(data, _MESSAGE_BYTES))[2][0])
-        return (IngestMessage if raw.get("stage") == Stage.INGEST else TaskMessage).model_validate(raw)
+        return message_type(raw).model_validate(raw)
     except Exception:  # forged data may fail anywhere
         return None
 
 
 def read(kind: type[Entry], data: bytes | None) -> Entry | None:
-    """What a worker says of itself, an event or a report; None if it is forged, or of a version much newer or older."""
+    """What a worker says of itself, or an event; None if it is forged, or of a version much newer or older."""
     try:
         found: Entry = _ADAPTERS[kind].validate_json(data or b"")
         return found
@@ -76,22 +75,20 @@ def events(reply: Any) -> list[tuple[str, Event | None]]:
     ]
 
 
-def sweep(connection: Any, kinds: Iterable[tuple[str, str]], streams: Iterable[str] = ()) -> None:
-    """Remove what is not of the kind that its name says, and streams that take no more entries.
+def sweep(connection: Any, kinds: Mapping[str, str], stream: str) -> None:
+    """Remove what is not of the kind that its name says, and the stream of events where it takes no more entries.
 
     Args:
         kinds: names with the type that Redis should tell of each.
-        streams: those of them that are streams of events.
+        stream: one of them.
     """
-    expected = dict(kinds)
     with connection.pipeline(transaction=False) as pipe:
-        for name in expected:
+        for name in kinds:
             pipe.type(name)
-        found = dict(zip(expected, map(text, pipe.execute()), strict=True))
-    wrong = [name for name, kind in found.items() if kind not in ("none", expected[name])]
-    for stream in (name for name in streams if found.get(name) == "stream"):
+        found = dict(zip(kinds, map(text, pipe.execute()), strict=True))
+    wrong = [name for name, kind in found.items() if kind not in ("none", kinds[name])]
+    if found[stream] == "stream":
         newest = int(text(connection.xinfo_stream(stream)["last-generated-id"]).partition("-")[0])
-        if newest > connection.time()[0] * 1000 + _FUTURE_MS:
-            wrong.append(stream)
+        wrong += [stream] if newest > connection.time()[0] * 1000 + _FUTURE_MS else []
     if wrong:
         connection.delete(*wrong)

@@ -9,7 +9,7 @@ Where RQ keeps what, RQ itself says. Its own readers clean up as they read, so w
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable
 from itertools import product
 from typing import Any, Final
 
@@ -17,7 +17,7 @@ from redis.exceptions import ResponseError
 from rq import Queue, Worker
 from rq.executions import Execution, ExecutionRegistry
 from rq.job import Job
-from rq.registry import FailedJobRegistry, StartedJobRegistry
+from rq.registry import StartedJobRegistry
 from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
 from graspd.service.model.states import Priority, Stage
@@ -65,7 +65,7 @@ def known_lists(connection: Any) -> list[str]:
         if not entries.is_wrong_type(error):
             raise
         found = set()
-    named = (list_name(raw.decode(errors="replace")) for raw in found)
+    named = (entries.text(raw).removeprefix(Queue.redis_queue_namespace_prefix) for raw in found)
     return [*_COMMON, *sorted(name for name in named if is_apart(name))[:_MOST_APART]]
 
 
@@ -103,19 +103,9 @@ def list_key(name: str) -> str:
     return f"{Queue.redis_queue_namespace_prefix}{name}"
 
 
-def list_name(key: str) -> str:
-    """Name of a list by its key."""
-    return key.removeprefix(Queue.redis_queue_namespace_prefix)
-
-
 def held_key(name: str) -> str:
     """Leases of the tasks that were taken from a list."""
     return str(StartedJobRegistry.key_template.format(name))
-
-
-def failed_key(name: str) -> str:
-    """Tasks of a list that RQ calls failed."""
-    return str(FailedJobRegistry.key_template.format(name))
 
 
 def job_key(job: str) -> str:
@@ -139,10 +129,7 @@ def execution_keys(entry: str) -> tuple[str, str]:
     return Execution(execution, job, connection=None).key, str(ExecutionRegistry.key_template.format(job))
 
 
-def kinds(lists: list[str]) -> Iterator[tuple[str, str]]:
+def kinds(lists: list[str]) -> dict[str, str]:
     """Keys of lists, each with its type in Redis."""
-    for name in lists:
-        yield list_key(name), "list"
-        yield held_key(name), "zset"
-        yield failed_key(name), "zset"
-        yield workers_key(name), "set"
+    of_each = ((list_key, "list"), (held_key, "zset"), (workers_key, "set"))
+    return {key(name): kind for name in lists for key, kind in of_each}

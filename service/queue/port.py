@@ -1,4 +1,4 @@
-"""What goes into the queue and comes out of it: tasks, leases, events, reports. `rq_queue` carries them."""
+"""What goes into the queue and comes out of it: tasks, leases, events. `rq_queue` carries them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from graspd.service.model.base import Model
 from graspd.service.model.domain import Word
 from graspd.service.model.messages import IngestMessage, TaskMessage
 from graspd.service.model.states import Priority, Stage
-from graspd.service.model.workers import Count, HostWord, WorkerBeat
+from graspd.service.model.workers import Amount, Count, HostWord, WorkerBeat
 
 Message = TaskMessage | IngestMessage
 
@@ -45,17 +45,11 @@ class EventKind(StrEnum):
     JOB = "job"
     """The job's state changed; `message` is the new state."""
 
-    @property
-    def ends_attempt(self) -> bool:
-        """Whether nobody works on the task after it."""
-        return self not in (EventKind.STARTED, EventKind.LEFT, EventKind.JOB)
-
 
 def _cut(value: object) -> object:
     return value[:_LONGEST_MESSAGE] if isinstance(value, str) else value
 
 
-Amount = Annotated[float, Field(ge=0, le=1e15, allow_inf_nan=False)]
 _LONGEST_MESSAGE: Final = 2000
 
 
@@ -77,17 +71,6 @@ class Event(Model):
     """Shard id of a finished stage; kind and digest (`hand/...`) of a finished check."""
 
     # A newer worker may say more than an older controller knows.
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-
-class Report(Model):
-    """How far a running task is. `total` is 0 where that is unknown."""
-
-    attempt: Count = 0
-    done: Amount = 0.0
-    total: Amount = 0.0
-    message: Annotated[str, BeforeValidator(_cut)] = ""
-
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 

@@ -28,13 +28,12 @@ from graspd.service.model.renamed import for_worker_of
 from graspd.service.model.states import Priority, Stage
 from graspd.service.model.workers import WorkerBeat, need_of
 from graspd.service.queue import entries
-from graspd.service.queue.allowed import TASK_FUNCTION, new_job
+from graspd.service.queue.allowed import new_job
 from graspd.service.queue.connection import connect, redis_url
 from graspd.service.queue.lists import (
     LISTS,
     RQ_WORKERS,
     execution_keys,
-    failed_key,
     held_key,
     job_key,
     kinds,
@@ -46,7 +45,7 @@ from graspd.service.queue.lists import (
     without_takers,
     workers_key,
 )
-from graspd.service.queue.port import Event, Lease, Message, Place, QueueStatus, Report
+from graspd.service.queue.port import Event, Lease, Message, Place, QueueStatus
 from graspd.service.settings import Settings
 
 EVENTS: Final = "graspd:events"
@@ -58,8 +57,6 @@ _GROUP: Final = "keeper"
 WORKERS: Final = "graspd:workers"
 #: Lease of the controller that leads. A graspd of 0.2 takes and keeps the same one: so the two give way to each other.
 LEAD: Final = "graspd:lead:keeper"
-#: How far running tasks are: one field of a hash for each, so that what is late replaces what was not yet read.
-REPORTS: Final = "graspd:reports"
 #: Sums for Prometheus, a few hundred fields.
 METRICS: Final = "graspd:metrics"
 _SERVICE: Final = "graspd:service"
@@ -196,7 +193,6 @@ class RqQueue:
         with _mapped(), self.connection.pipeline(transaction=True) as pipe:
             pipe.zrem(key, entry)
             pipe.delete(*execution_keys(name), job_key(name.partition(":")[0]))
-            pipe.hdel(REPORTS, lease.task_id)
             pipe.execute()
 
     def workers(self) -> list[WorkerBeat]:
@@ -211,26 +207,7 @@ class RqQueue:
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for event in events:
                 put_event(pipe, event)
-                if event.kind.ends_attempt:
-                    pipe.hdel(REPORTS, event.task_id)
             pipe.execute()
-
-    def report(self, task_id: str, report: Report) -> None:
-        """Say how far a task is, in place of what was said before; gone with the event that ends the attempt."""
-        with _mapped():
-            self.connection.hset(REPORTS, task_id, report.model_dump_json())
-
-    def reports(self) -> dict[str, Report]:
-        """The last report on each task."""
-        with _mapped():
-            found = self.connection.hgetall(REPORTS)
-        return {entries.text(task): entries.read(Report, data) or Report() for task, data in found.items()}
-
-    def forget_reports(self, task_ids: Collection[str]) -> None:
-        """Take reports away whose tasks nobody holds."""
-        if task_ids:
-            with _mapped():
-                self.connection.hdel(REPORTS, *task_ids)
 
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         """Next events for the controller, the oldest first; those never acknowledged come again to the next one."""
@@ -251,8 +228,8 @@ class RqQueue:
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         """Events after an id, for any number of readers. `"$"`: only what comes from now on; `"0"`: all kept."""
         with _mapped():
-            found = entries.events(self.connection.xread({EVENTS: after}, count=limit, block=_block_ms(wait_s)))
-        return [(event_id, event) for event_id, event in found if event is not None]
+            found = self.connection.xread({EVENTS: after}, count=limit, block=int(wait_s * 1000) or None)
+        return [(event_id, event) for event_id, event in entries.events(found) if event is not None]
 
     def announce(self, part: str, seconds: float) -> None:
         """Say that a part of the service (the controller) lives, for that long."""
@@ -345,15 +322,18 @@ class RqQueue:
         """All those sums."""
         with _mapped():
             found = self.connection.hgetall(METRICS)
-        return {entries.text(name): amount for name, raw in found.items() if (amount := _amount(raw)) is not None}
+        sums: dict[str, float] = {}
+        for name, raw in found.items():
+            with suppress(ValueError):  # forged
+                sums[entries.text(name)] = float(raw)
+        return sums
 
     def tidy(self) -> None:
         """Throw away what dead workers and refused entries left behind."""
-        # RQ's registries of workers and failures are emptied by its own maintenance, which is off.
+        # RQ's registries of workers are emptied by its own maintenance, which is off.
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
-            entries.sweep(self.connection, _KINDS, (EVENTS,))
             lists = known_lists(self.connection)
-            entries.sweep(self.connection, kinds(lists))
+            entries.sweep(self.connection, {**_KINDS, **kinds(lists)}, EVENTS)
             known = list(self.connection.smembers(WORKERS))
             for name in known:
                 pipe.exists(_WORKER + name)
@@ -364,8 +344,6 @@ class RqQueue:
                     for registry in (RQ_WORKERS, *map(workers_key, lists)):
                         pipe.srem(registry, key)
                     pipe.srem(WORKERS, name)
-            for queue in lists:
-                pipe.zremrangebyscore(failed_key(queue), 0, time.time())
             pipe.execute()
 
     def close(self) -> None:
@@ -375,7 +353,7 @@ class RqQueue:
     def _of_group(self, after: str, limit: int, wait_s: float) -> list[tuple[str, Event | None]]:
         """Events of the group of controllers, which is made where there is none."""
         read = partial(
-            self.connection.xreadgroup, _GROUP, _GROUP, {EVENTS: after}, count=limit, block=_block_ms(wait_s)
+            self.connection.xreadgroup, _GROUP, _GROUP, {EVENTS: after}, count=limit, block=int(wait_s * 1000) or None
         )
         try:
             return entries.events(read())
@@ -393,7 +371,6 @@ class RqQueue:
 
     def _job(self, message: Message) -> Job:
         return new_job(
-            TASK_FUNCTION,
             for_worker_of(
                 getattr(message, "revision", 0), message.stage, message.model_dump(mode="json", by_alias=True)
             ),
@@ -414,10 +391,6 @@ def open_queue(settings: Settings, *, patience: int = 3) -> RqQueue:
 def put_event(pipe: Any, event: Event) -> None:
     """Append an event to the bounded stream."""
     pipe.xadd(EVENTS, {"e": event.model_dump_json(exclude_defaults=True)}, maxlen=EVENTS_KEPT, approximate=True)
-
-
-def _block_ms(wait_s: float) -> int | None:
-    return max(1, int(wait_s * 1000)) if wait_s > 0 else None
 
 
 def rq_id(task_id: str, attempt: int) -> str:
@@ -473,23 +446,12 @@ def _part_key(part: str) -> str:
 
 
 #: Names of a fixed number, each with its type in Redis.
-_KINDS: Final = (
-    (EVENTS, "stream"),
-    (LEAD, "string"),
-    (WORKERS, "set"),
-    (METRICS, "hash"),
-    (REPORTS, "hash"),
-    (_SERVICE, "string"),
-    (RQ_WORKERS, "set"),
-    (LISTS, "set"),
-)
-
-
-def _amount(raw: bytes) -> float | None:
-    try:
-        return float(raw)
-    except ValueError:
-        return None
+_KINDS: Final = {
+    **dict.fromkeys((LEAD, _SERVICE), "string"),
+    **dict.fromkeys((WORKERS, RQ_WORKERS, LISTS), "set"),
+    EVENTS: "stream",
+    METRICS: "hash",
+}
 
 
 @contextmanager

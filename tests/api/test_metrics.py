@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from graspd.api.metrics import Metrics, Snapshot
+from graspd.service.model.series import SERIES
 from graspd.service.model.states import Stage
 from graspd.service.model.workers import WorkerBeat
-from graspd.service.pipeline.metrics import SERIES
 from graspd.service.queue.port import QueueStatus
 
 STATES = ("checking", "idle", "busy", "stopping", "quarantined")

@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from graspd.doctor import all_checks
-from graspd.service.pipeline.metrics import SERIES
+from graspd.service.model.series import SERIES
 from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.docs_commands import Line

@@ -40,3 +40,23 @@ def test_the_files_to_open_for_a_change_are_there_and_as_many_as_it_says() -> No
         assert len(named) == int(number), wish
         missing = [name for name in named if not (REPOSITORY / name).exists()]
         assert not missing, f"{wish}: {missing}"
+
+
+#: The task engine of our own: what carries tasks from the controller to a worker's result and back. Rates of batches
+#: (`service.index`), the series of `/metrics` and the checks of `graspd doctor` are none of it.
+TASK_ENGINE = (
+    "service/queue",
+    "worker/process",
+    "worker/pool",
+    *(
+        f"service/pipeline/{name}.py"
+        for name in ("controller", "leading", "lease_reaper", "ranges", "metrics", "tagging", "recording")
+    ),
+)
+
+
+def test_the_task_engine_stays_within_its_budget_of_lines() -> None:
+    places = [REPOSITORY / place for place in TASK_ENGINE]
+    files = [file for place in places for file in ([place] if place.suffix else sorted(place.glob("*.py")))]
+    assert all(place.exists() for place in places) and len(files) >= 22
+    assert sum(len(file.read_text().splitlines()) for file in files) <= 3_500

@@ -7,7 +7,7 @@ from pathlib import Path
 from benchmarks.large_index import fill
 from graspd.service.model.clock import timestamp
 from graspd.service.model.states import Priority
-from graspd.service.queue.port import Event, EventKind, Report
+from graspd.service.queue.port import Event, EventKind
 from graspd.service.queue.rq_queue import EVENTS, EVENTS_KEPT, RqQueue, cancel_key
 from graspd.service.store.store import open_store
 from tests.fakes import message_for
@@ -77,7 +77,6 @@ def test_everything_in_redis_that_is_not_of_a_fixed_number_has_an_end(rq_queue: 
     rq_queue.announce("controller", 5)
     rq_queue.lead("a", 5)
     rq_queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), task_id="a"))
-    rq_queue.report("a", Report(done=1.0, total=2.0))
     rq_queue.publish(Event(kind=EventKind.FINISHED, at=timestamp(), task_id="a"))
     fixed = ("rq:queue", "rq:job", "rq:unique", EVENTS, "graspd:workers", "graspd:tally")
     without_end = [key.decode() for key in rq_queue.connection.keys("*") if rq_queue.connection.ttl(key) < 0]

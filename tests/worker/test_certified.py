@@ -105,16 +105,17 @@ def test_what_the_validator_saw_of_each_try_is_counted(
 def test_a_batch_that_is_stopped_is_what_was_validated_before(
     hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch, after: int
 ) -> None:
-    rounds, real = [], generation._Work._round
+    rounds, real = [], generation.Batch.made
 
     def counted(*given: Any) -> Any:
         if len(rounds) == after:
             raise TaskCancelled("stopped")
         rounds.append(real(*given))
         rounds[-1].grasps, rounds[-1].columns = taken(rounds[-1].grasps, rounds[-1].columns, np.arange(1))
+        rounds[-1].rows = rounds[-1].rows[:1]
         return rounds[-1]
 
-    monkeypatch.setattr(generation._Work, "_round", counted)
+    monkeypatch.setattr(generation.Batch, "made", counted)
     if not after:
         with pytest.raises(TaskCancelled):
             validated_grasps(hand, block, wish(rechecks=0), count=COUNT, partial=True)

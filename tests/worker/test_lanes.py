@@ -103,7 +103,7 @@ def test_a_round_ends_as_soon_as_enough_are_found(pair, monkeypatch: pytest.Monk
     calls = noted(monkeypatch)
     parts = validated_grasps(*pair, wish, count=6, run=ExecutionContext(threads=1))
     assert any(first > 0 or count < 8 for number, first, count in calls if number > 0)
-    monkeypatch.setattr(generation._Work, "_in_parts", False)
+    monkeypatch.setattr(generation.Batch, "_in_parts", False)
     rounds = validated_grasps(*pair, wish, count=6, run=ExecutionContext(threads=1))
     assert parts.planned <= rounds.planned
     assert_same(parts, rounds)
@@ -144,14 +144,14 @@ def test_grasps_from_one_of_a_batch_on_are_those_of_the_whole(pair, first: int) 
 
 def test_the_first_valid_grasps_are_audited_whoever_finds_them(pair, one_lane, monkeypatch: pytest.MonkeyPatch) -> None:
     begun: list[int] = []
-    whole = generation._Work._begin_rechecks
+    whole = generation.Batch._begin_rechecks
     monkeypatch.setattr(
-        generation._Work, "_begin_rechecks", lambda work, first: (begun.append(len(first.grasps)), whole(work, first))
+        generation.Batch, "_begin_rechecks", lambda work, first: (begun.append(len(first.grasps)), whole(work, first))
     )
     rechecked: list[GraspSet] = []
-    recheck = generation._Work._rechecked
+    recheck = generation.Batch._rechecked
     monkeypatch.setattr(
-        generation._Work, "_rechecked", lambda work, some: (rechecked.append(some), recheck(work, some))[1]
+        generation.Batch, "_rechecked", lambda work, some: (rechecked.append(some), recheck(work, some))[1]
     )
     found = validated_grasps(*pair, REQUEST, count=COUNT, run=ExecutionContext(threads=2))
     assert len(begun) == len(rechecked) == 1
@@ -159,7 +159,7 @@ def test_the_first_valid_grasps_are_audited_whoever_finds_them(pair, one_lane, m
     np.testing.assert_array_equal(first.grasp.hand_pose, found.grasps.grasp.hand_pose[:2])
     np.testing.assert_array_equal(found.columns["quality/recheck"] >= 0, np.arange(COUNT) < 2)
     np.testing.assert_array_equal(found.columns["quality/recheck"], one_lane.columns["quality/recheck"])
-    monkeypatch.setattr(generation._Work, "_begin_rechecks", lambda work, first: None)
+    monkeypatch.setattr(generation.Batch, "_begin_rechecks", lambda work, first: None)
     late = validated_grasps(*pair, REQUEST, count=COUNT, run=ExecutionContext(threads=2))
     np.testing.assert_array_equal(found.columns["quality/recheck"], late.columns["quality/recheck"])
 

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import pytest
 
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import MeshError, TaskCancelled
 from graspd.service.model.fidelity import resolve_fidelity
+from graspd.service.model.scene_spec import SceneSpec
 from graspd.worker import together
 from graspd.worker.engines.joins import batches_at_once, fitting
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.synthesis import synthesized
+from graspd.worker.generation import ValidatedBatch
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.meeting import Meeting
 from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import BatchRequest, NoStartFound
 from graspd.worker.pool.pool import MODULES, Pool
+from graspd.worker.scenes.kinds import rest_poses, supports_of
+from graspd.worker.simulation.environment import Scenes
 from graspd.worker.together import validated_batches
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), rechecks=0, grasps=6)
@@ -48,18 +55,17 @@ def assert_same(batches, others) -> None:
 def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(
     pair, alone, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    launches: list[Meeting] = []
+    launches, whole = list[list[int]](), together.synthesize_batches
 
-    class Noted(Meeting):
-        def __init__(self, *given: int) -> None:
-            super().__init__(*given)
-            launches.append(self)
+    def noted(hand: Any, obj: Any, asked: Sequence[BatchRequest], **named: Any) -> Any:
+        launches.append([one.wanted.batch for one in asked])
+        return whole(hand, obj, asked, **named)
 
-    monkeypatch.setattr(together, "Meeting", Noted)
+    monkeypatch.setattr(together, "synthesize_batches", noted)
     told: list[tuple[float, float]] = []
     run = ExecutionContext(threads=2, progress=lambda done, total, message: told.append((done, total)))
     joined = validated_batches(*pair, REQUEST, sizes=[2, 2, 2], join=3, run=run)
-    assert launches[0].served[0] == 3, "the first launch has all three"
+    assert launches[0] == [0, 1, 2], "the first launch has all three"
     assert_same(joined, alone)
     assert told[-1] == (6, 6)
     assert all(done <= total for done, total in told)
@@ -81,6 +87,72 @@ def test_a_run_in_this_process_makes_the_batches_of_a_job(pair) -> None:
     made = synthesized("barrett", "block", request, device="cpu", threads=2)
     assert_same(made.batches, batches)
     assert len(made.arrays["grasp/hand_pose"]) == sum(len(one.grasps) for one in batches)
+
+
+@pytest.fixture(scope="module")
+def scenes(pair) -> list[Scenes]:
+    """Of each of three batches its own."""
+    table = SceneSpec(kind="table")
+    poses = rest_poses(table, pair[1], count=6, seed=1)["scene/object_pose"]
+    return [Scenes(supports_of(table), poses[first : first + 2]) for first in (0, 2, 4)]
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_waves_of_batches_in_scenes_are_the_same(pair, scenes: list[Scenes], apart: bool) -> None:
+    wish = REQUEST.model_copy(update={"budget": 3.0, "rechecks": 1})
+    where, sizes = scenes if apart else scenes[0], [2, 2, 3]
+    one_by_one, waves = (
+        validated_batches(*pair, wish, sizes=sizes, scenes=where, join=join, run=ExecutionContext(threads=2))
+        for join in (1, 2)
+    )
+    assert_same(waves, one_by_one)
+    assert [one.shares for one in waves] == [one.shares for one in one_by_one]
+    assert set(np.concatenate([one.grasps.scene for one in waves])) <= {0, 1}, "numbered as the batch has them"
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_batch_of_a_wave_without_a_place_has_no_grasps_but_for_the_first_of_a_job(
+    pair, scenes: list[Scenes], monkeypatch: pytest.MonkeyPatch, first: int
+) -> None:
+    whole = together.synthesize_batches
+
+    def narrow(hand: Any, obj: Any, asked: Sequence[BatchRequest], **named: Any) -> Any:
+        made = whole(hand, obj, asked, **named)
+        return [
+            NoStartFound("no way in") if one.wanted.batch == 1 - first else g
+            for one, g in zip(asked, made, strict=True)
+        ]
+
+    monkeypatch.setattr(together, "synthesize_batches", narrow)
+    wish = REQUEST.model_copy(update={"validation": "none", "want": "candidates"})
+
+    def made() -> list[ValidatedBatch]:
+        asked = {
+            "sizes": [2, 2],
+            "scenes": scenes[:2],
+            "join": 2,
+            "run": ExecutionContext(threads=2),
+            "empty_on": (NoStartFound,),
+        }
+        return validated_batches(*pair, wish, **asked)
+
+    if first:
+        with pytest.raises(NoStartFound, match="no way in"):
+            made()
+    else:
+        assert [len(one.grasps) for one in made()] == [2, 0]
+
+
+def test_what_was_validated_before_a_stop_is_kept(pair, alone) -> None:
+    stopped: list[bool] = []
+
+    def one_is_made(number: int, made: ValidatedBatch) -> None:
+        stopped.append(True)
+
+    run = ExecutionContext(threads=2, cancelled=lambda: bool(stopped))
+    found = validated_batches(*pair, REQUEST, sizes=[2, 32, 32], join=2, run=run, partial=True, checked=one_is_made)
+    assert_same(found[:1], alone[:1])
+    assert sum(len(one.grasps) for one in found) < 66
 
 
 def test_what_becomes_of_one_batch_ends_the_job(pair) -> None:

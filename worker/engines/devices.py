@@ -147,6 +147,11 @@ def _lock(file: Path) -> bool:
 _NO_MEMORY: Final = re.compile(r"Failed to allocate \d+ bytes.*'cuda:\d+'|CUDA error 2\b|out of memory", re.DOTALL)
 
 
+#: Held by whoever launches on a GPU that another thread may use too: a graph that one captures must not have launches
+#: of another.
+exclusive: Final = threading.RLock()
+
+
 class DeviceLost(GraspdError):
     """A GPU does not work in this process any more; a fresh process may find it well."""
 

@@ -20,7 +20,7 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.store.columns import Attribute
 from graspd.service.store.shards import json_attribute
 from graspd.worker.engines.devices import Device
-from graspd.worker.engines.joins import batches_at_once
+from graspd.worker.engines.joins import batches_at_once, processes_at_once
 from graspd.worker.execution_context import ExecutionContext, PrefilterMode, Progress
 from graspd.worker.files.provenance import (
     NEIGHBOUR_FACE_ERROR_M,
@@ -38,7 +38,7 @@ from graspd.worker.objects.options import as_asked
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import planner
 from graspd.worker.planners.registry import of_this_machine
-from graspd.worker.pool.pool import MODULES, Pool, processes_at_once
+from graspd.worker.pool.pool import MODULES, Pool
 from graspd.worker.scenes.placement import scenes_of
 from graspd.worker.scenes.rest import rolling_poses
 from graspd.worker.together import validated_batches

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from graspd.worker.engines.devices import check_device
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
@@ -40,6 +39,7 @@ __all__ = [
     "method_names",
     "planner",
     "synthesize",
+    "synthesize_batches",
 ]
 
 
@@ -52,25 +52,30 @@ def synthesize(
     method: str = "fast_graspd",
     options: Mapping[str, Any] | None = None,
 ) -> GraspSet:
-    """Grasps by the named method with its own `options`; see `Planner`. Where others ask for grasps of the same pair in
-    `run.meeting`, they are made in one launch with theirs, if the method knows how.
+    """Grasps by the named method with its own `options`; see `Planner`.
 
     Raises:
         InputError: the object does not fit into the gripper; see `fitting_pairs`.
     """
     fitting_pairs(hand, obj)
-    alone = planner(method, options, in_scenes=wanted.placed is not None)
-    together = joined(method, options) if run.meeting is not None else None
-    if run.meeting is None or together is None:
-        return alone(hand, obj, wanted, run)
-    around = (wanted.rollout is not None, wanted.placed.fixed if wanted.placed is not None else None)
-    key = (hand.content, obj.content, method, repr(options), wanted.fidelity.model_dump_json(), run.device, *around)
+    return planner(method, options, in_scenes=wanted.placed is not None)(hand, obj, wanted, run)
 
-    def work(asked: Sequence[BatchRequest]) -> list[GraspSet | Exception]:
+
+def synthesize_batches(
+    hand: HandModel,
+    obj: ObjectModel,
+    asked: Sequence[BatchRequest],
+    *,
+    method: str = "fast_graspd",
+    options: Mapping[str, Any] | None = None,
+) -> list[GraspSet | Exception]:
+    """Batches of one job in one launch, if the method knows how, else one after the other; see `BatchPlanner`."""
+    if (together := joined(method, options)) is not None:
+        return together(hand, obj, asked)
+    found: list[GraspSet | Exception] = []
+    for one in asked:
         try:
-            return together(hand, obj, asked)
-        finally:
-            check_device(run.device)  # here, where nobody else has work on it
-
-    found: GraspSet = run.meeting.ask(key, BatchRequest(wanted, run), work, size=wanted.count, cancelled=run.cancelled)
+            found.append(synthesize(hand, obj, one.wanted, one.run, method=method, options=options))
+        except Exception as error:
+            found.append(error)
     return found

@@ -19,15 +19,13 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any, Final
 
-from graspd.service.model.cores import ROOT, available_cores, available_memory
 from graspd.service.model.errors import GraspdError, TaskCancelled
 from graspd.worker.pool.child import WorkItem
 
@@ -36,11 +34,6 @@ log = logging.getLogger(__name__)
 MODULES: Final = ("graspd.worker.validation.validator", "graspd.worker.quality.table")
 #: What each process keeps of things that pieces of work share: two for a pair that is validated and measured.
 KEPT: Final = 8
-#: Memory that a process takes at the most, with the models of the pairs that it keeps [bytes]; see
-#: docs/explanation/performance.md.
-BYTES_PER_PROCESS: Final = 400 * 2**20
-#: Share of the machine's memory for them.
-MEMORY_SHARE: Final = 0.25
 #: Pause between two looks at whether to stop [s].
 _LOOK_S: Final = 0.1
 #: A process that goes on for so long with what nobody wants any more is ended [s].
@@ -71,7 +64,7 @@ class _Request:
         return pickle.dumps(self.shared)
 
 
-class Pool:
+class Pool(AbstractContextManager["Pool"]):
     """So many processes, started when they are first needed. Any thread may ask for work; a context manager."""
 
     def __init__(self, processes: int, modules: Sequence[str] = ()) -> None:
@@ -82,9 +75,6 @@ class Pool:
         self._threads = ThreadPoolExecutor(processes, thread_name_prefix="pool")
         self._changing = threading.Lock()
         self._started = self._closed = False
-
-    def __enter__(self) -> Pool:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -259,23 +249,3 @@ def end_child(process: subprocess.Popen[bytes], patience_s: float) -> str:
     process.kill()
     code = process.wait()
     return f"signal {-code}" if code < 0 else f"exit code {code}"
-
-
-def processes_at_once(device: str, wanted: int, *, threads: int = 0, workers: int = 1, root: Path = ROOT) -> int:
-    """Processes that validate and measure; 1: the worker's own, with threads.
-
-    Where nobody says, a worker on a GPU has one for each core but its own, as far as a quarter of the memory goes. On a
-    CPU the planner takes the same cores at other times, and threads do.
-
-    Args:
-        device: Warp device of the planner.
-        wanted: so many; 0: nobody says.
-        threads: CPU threads of the worker; 0: one for each core.
-        workers: of this machine, which share its cores and its memory.
-        root: the folder that holds `proc` and `sys`.
-    """
-    if wanted or not device.startswith("cuda"):
-        return wanted or 1
-    room = int(MEMORY_SHARE * available_memory(root) / workers / BYTES_PER_PROCESS)
-    cores = min(threads or available_cores(root), max(1, available_cores(root) // workers))
-    return max(1, min(cores - 1, room))

@@ -3,7 +3,7 @@
 Its worker (`worker.process.main`) sends pairs of a word and what it is about over a pipe, after the `Setup`. Orders are
 `service` (does the store belong to it?), `check` (answer: `ready`), `task` (`done`, then `idle`), `end`; an error may
 come as `refused` in place of an answer. `stop` with a reason is heard at any time. On its own the engine sends `facts`
-for the list of workers, `event` and `report`. It knows nothing of Redis.
+for the list of workers (how far a task is, too) and `event`. It knows nothing of Redis.
 """
 
 from __future__ import annotations
@@ -29,12 +29,11 @@ from graspd.service.model.errors import BusyError, InputError, TaskRefused, Unav
 from graspd.service.model.libraries import own_process
 from graspd.service.model.states import Stage
 from graspd.service.pipeline.identity import check_service
-from graspd.service.queue.port import Report
 from graspd.service.store.store import Store, open_store
 from graspd.worker.engines.devices import Device
-from graspd.worker.engines.joins import batches_at_once
+from graspd.worker.engines.joins import batches_at_once, processes_at_once
 from graspd.worker.execution_context import ExecutionContext
-from graspd.worker.pool.pool import MODULES, Pool, processes_at_once
+from graspd.worker.pool.pool import MODULES, Pool
 from graspd.worker.process.fitness import Check, Fitness
 from graspd.worker.process.link import Condition, Setup
 from graspd.worker.process.runner import Runner
@@ -70,7 +69,7 @@ class Engine:
     def serve(self) -> None:
         """Until told to end."""
         with self._connection:
-            threading.Thread(target=self._listen, name="engine-ears", daemon=True).start()
+            threading.Thread(target=self._listen, name="engine-orders", daemon=True).start()
             try:
                 self._start()
                 word, about = self._orders.get()
@@ -90,7 +89,7 @@ class Engine:
         else:
             self._do(about)
 
-    def update(self, **facts: str) -> None:
+    def update(self, **facts: str | float) -> None:
         """Facts for the list of workers."""
         self._say("facts", facts)
 
@@ -123,7 +122,7 @@ class Engine:
         return self._fitness.sit_out(stages, self.update, lambda: self._reason is not None)
 
     def _do(self, raw: dict[str, Any]) -> None:
-        context = self._surroundings.context(raw, lambda *report: self._say("report", report))
+        context = self._surroundings.context(raw, self.update)
         with self._changing:
             self._context = context
             if self._reason is not None:
@@ -135,7 +134,6 @@ class Engine:
         finally:
             with self._changing:
                 self._context = None
-        self._surroundings.tasks_done += 1
         self._say("idle", self._look_after_itself())
 
     def _look_after_itself(self) -> Condition:
@@ -174,26 +172,17 @@ class Engine:
 
 
 class TaskResources:
-    """What a task gets besides its message, and what its worker counts.
-
-    Engines and drivers leak: a worker that grew makes room for a new one.
-    """
+    """What a task gets besides its message. Engines and drivers leak: a worker that grew makes room for a new one."""
 
     def __init__(self, settings: Settings, store: Store, device: Device) -> None:
         self.settings = settings
         self.store = store
         self._device = device
         self._memory_mb = settings.worker_max_memory_mb or available_memory() / 2 / 2**20
-        self.tasks_done = 0
-        self._pool: Pool | None = None
-        self._processes = 0
 
     def outgrown(self) -> str:
         """Why this process should make room for a fresh one, "" if it need not."""
-        most = self.settings.worker_max_tasks
-        if most and self.tasks_done >= most:
-            return f"it has done {self.tasks_done} tasks (GRASPD_WORKER_MAX_TASKS)"
-        beside = sum(resident_mb(pid) for pid in self._pool.pids) if self._pool is not None else 0.0
+        beside = sum(resident_mb(pid) for pid in pool.pids) if (pool := vars(self).get("_pool")) is not None else 0.0
         if (held := resident_mb() + beside) > self._memory_mb:
             return f"it holds {held:.0f} MiB, over {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"
         return ""
@@ -209,26 +198,26 @@ class TaskResources:
         how many they are."""
         if stage != Stage.SYNTHESIZE:
             return None
-        if not self._processes:
-            chosen = self.settings
-            self._processes = processes_at_once(
-                self._device.resolve(), chosen.processes, threads=chosen.threads, workers=chosen.workers_here
-            )
-            self._pool = Pool(self._processes, MODULES) if self._processes > 1 else None
         if self._pool is not None:
             self._pool.start()
         return self._pool
 
+    @cached_property
+    def _pool(self) -> Pool | None:
+        chosen, device = self.settings, self._device.resolve()
+        count = processes_at_once(device, chosen.processes, threads=chosen.threads, workers=chosen.workers_here)
+        return Pool(count, MODULES) if count > 1 else None
+
     def close(self) -> None:
         """End what was started for tasks."""
-        if self._pool is not None:
-            self._pool.close()
+        if (pool := vars(self).get("_pool")) is not None:
+            pool.close()
 
-    def context(self, raw: Mapping[str, Any], report: Callable[[str, Report], None]) -> TaskContext:
-        """The context of a task, whose progress goes to `report`."""
+    def context(self, raw: Mapping[str, Any], update: Callable[..., None]) -> TaskContext:
+        """The context of a task, whose progress goes to `update`."""
 
         def tell(done: float, total: float, message: str) -> None:
-            report(raw["task_id"], Report(attempt=raw["attempt"], done=done, total=total, message=message[:200]))
+            update(done=done, total=total, message=message[:200])
 
         stage, chosen = raw.get("stage", ""), self.settings
         device = "cpu" if stage == Stage.INGEST else self._device.resolve()

@@ -49,9 +49,9 @@ class Heartbeat:
             is_stopped: whether the worker does not go on, though this thread does: then there is no beat.
         """
         self._connection: Any = connect(url, patience=0, timeout_s=_ANSWER_S)
-        self._beat, self._lease_s = asdict(beat), lease_s
+        self._facts, self._lease_s = asdict(beat), lease_s
         self._alive, self._is_stopped = HeartbeatFile(alive), is_stopped
-        self._news, self._over = threading.Event(), threading.Event()
+        self._changed, self._over = threading.Event(), threading.Event()
         self._away = False
         self.interval_s = min(BEAT_S, lease_s / 3)
         """Time between two signs of life [s]."""
@@ -60,20 +60,20 @@ class Heartbeat:
     def start(self) -> None:
         self._thread.start()
 
-    def update(self, **facts: str) -> None:
-        """Facts that changed, such as the state, or the name of the device."""
-        self._beat.update(facts)
-        self._news.set()
+    def update(self, **facts: str | float) -> None:
+        """Facts that changed, such as the state, the name of the device, or how far the task is."""
+        self._facts.update(facts)
+        self._changed.set()
 
     def stop(self) -> None:
         """End the registration, and say that this worker is not lost. Nothing is said of one that never began."""
         if self._thread.ident is None:
             return
         self._over.set()
-        self._news.set()
+        self._changed.set()
         self._thread.join(2 * _ANSWER_S)
         try:
-            left = Event(kind=EventKind.LEFT, at=timestamp(), worker=self._beat["name"])
+            left = Event(kind=EventKind.LEFT, at=timestamp(), worker=self._facts["name"])
             unlist_worker(self._connection, left)
         except (RedisError, OSError) as error:
             log.warning("Redis was away when the worker left: %s", error)
@@ -81,19 +81,18 @@ class Heartbeat:
 
     def _run(self) -> None:
         while not self._over.is_set():
-            self._news.clear()
+            self._changed.clear()
             if not self._is_stopped():
-                self._tick()
+                self._send()
                 self._alive.touch()
             self._over.wait(_SHORTEST_INTERVAL_S)
-            self._news.wait(self.interval_s - _SHORTEST_INTERVAL_S)
+            self._changed.wait(self.interval_s - _SHORTEST_INTERVAL_S)
 
-    def _tick(self) -> None:
+    def _send(self) -> None:
+        away, self._away = self._away, True
         try:
-            list_worker(self._connection, self._beat | {"seen": timestamp()}, self._lease_s)
-        except (RedisError, OSError) as error:
-            if not self._away:
-                log.warning("no sign of life could be given: %s", error)
-            self._away = True
-        else:
+            list_worker(self._connection, self._facts | {"seen": timestamp()}, self._lease_s)
             self._away = False
+        except (RedisError, OSError) as error:
+            if not away:
+                log.warning("no sign of life could be given: %s", error)

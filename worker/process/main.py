@@ -16,21 +16,18 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Collection
-from contextlib import suppress
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any, Final
 
 from redis.exceptions import RedisError, ResponseError
 from rq import SimpleWorker
 from rq.exceptions import StopRequested
-from rq.job import JobStatus
 from rq.serializers import JSONSerializer
 from rq.worker import WorkerStatus
 
-from graspd.service.model.clock import timestamp
-from graspd.service.model.errors import QueueUnavailable, TaskRefused
+from graspd.service.model.errors import GraspdError, QueueUnavailable, TaskRefused
 from graspd.service.model.states import Stage
-from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.model.workers import WorkerBeat, own_ability
 from graspd.service.queue import allowed
 from graspd.service.queue.connection import redis_url
@@ -61,6 +58,8 @@ STUCK_AFTER_S: Final = 60.0
 class GraspWorker(SimpleWorker):  # type: ignore[misc]
     """RQ's in-process worker, whose tasks an engine does. What of RQ it does without, and why, is in docs/adr."""
 
+    execution: Any
+
     def __init__(
         self, queue: RqQueue, engine: Link, heart: Heartbeat, *, stages: Collection[Stage], name: str, limit_s: float
     ) -> None:
@@ -76,7 +75,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         )
         self.last_cleaned_at = datetime.now(UTC)
         self.max_connection_wait_time = _LONGEST_RETRY_S
-        self._queue, self._engine, self._heart = queue, engine, heart
+        self._queue, self._engine, self._heartbeat = queue, engine, heart
         self._stages, self._taken, self._limit_s = stages, 0, limit_s
         self.tasks_done = 0
         self.told_to_stop = False
@@ -85,10 +84,6 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         """Whether it ended because no task waits."""
         self.engine_is: Condition = "fit"
         """How the engine was after the last task."""
-        self._job: Any = None
-        self._outcome: Event | None = None
-        self._asked = False
-        allowed.task_function = self._run_task
 
     def check_service(self) -> None:
         """Raises BusyError if Redis belongs to another service than the store, and InputError if there is no such
@@ -102,39 +97,35 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         return bool(self._await("ready"))
 
     def execute_job(self, job: Any, queue: Any) -> None:
-        """One task under a lease. Its outcome is told after RQ has closed its books on it."""
-        self._job = job
+        """One task under a lease. Its outcome is told after the lease is given back."""
         self.prepare_execution(job)
-        self._heart.update(task_id=job.id.rpartition("-")[0], state="busy")
-        self.perform_job(job, queue)
-        self._heart.update(task_id="", state="stopping" if self.told_to_stop else "idle")
-        self.tasks_done += 1
-        outcome, self._outcome = self._outcome, None
-        if outcome is not None:
-            self._publish(outcome)
-        asked, self._asked = self._asked, False
-        if asked:
-            self.engine_is = self._await("idle")
-        if self.engine_is != "fit":
-            self._heart.update(state="stopping")
-            raise StopRequested
-        self.set_state(WorkerStatus.IDLE)
-
-    def _run_task(self, message: dict[str, Any]) -> None:
-        self._engine.say("task", message)
-        self._asked = True
+        self.prepare_job_execution(job)
+        self._heartbeat.update(task_id=job.id.rpartition("-")[0], state="busy", done=0.0, total=0.0, message="")
+        outcome: Event | None = None
+        self._engine.say("task", job.args[0])
         try:
-            self._outcome = self._await("done", self._keep_lease)
+            outcome = self._await("done", partial(self._keep_lease, job))
+        except GraspdError as error:
+            log.warning("the engine refuses a task: %s", error)
         except EngineLost as error:
             # As if this process had been killed: the lease stays, and the controller finds that nobody keeps it.
             log.error("this worker ends: %s", error)
             os._exit(1)
-        self._prepare_end()
+        self._give_back(job)
+        self._heartbeat.update(task_id="", state="stopping" if self.told_to_stop else "idle")
+        self.tasks_done += 1
+        if outcome is not None:
+            self._publish(outcome)
+        self.engine_is = self._await("idle")
+        if self.engine_is != "fit":
+            self._heartbeat.update(state="stopping")
+            raise StopRequested
+        self.set_state(WorkerStatus.IDLE)
 
     def _await(self, word: str, beat: Callable[[], None] = lambda: None) -> Any:
         """What the engine answers, within the time that a task may take. What else it says is passed on meanwhile."""
         began = time.monotonic()
-        due = began + self._heart.interval_s
+        due = began + self._heartbeat.interval_s
         told: StopReason | None = None
         while True:
             if (news := self._engine.hear(_LOOK_S)) is not None:
@@ -153,19 +144,16 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                 self._engine.kill()
             if time.monotonic() >= due:
                 beat()
-                due = time.monotonic() + self._heart.interval_s
+                due = time.monotonic() + self._heartbeat.interval_s
 
     def _pass_on(self, word: str, about: Any) -> None:
         """News of the engine."""
         if word == "refused":
             raise about
         if word == "facts":
-            self._heart.update(**about)
-        elif word == "event":
-            self._publish(about)
+            self._heartbeat.update(**about)
         else:
-            with suppress(QueueUnavailable):
-                self._queue.report(*about)
+            self._publish(about)
 
     def _publish(self, event: Event) -> None:
         try:
@@ -173,16 +161,16 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         except QueueUnavailable as error:
             log.warning("what became of task %s is for the controller to find: %s", event.task_id, error)
 
-    def _keep_lease(self) -> None:
+    def _keep_lease(self, job: Any) -> None:
         """A sign of life for the task in hand, which hears if it is not wanted any more."""
         if self._engine.is_stopped:
             return
         try:
-            is_held, is_cancelled = lease_state(self.connection, self._job, self.execution)
+            is_held, is_cancelled = lease_state(self.connection, job, self.execution)
             if is_held:
                 with self.connection.pipeline() as pipe:
                     self.heartbeat(pipeline=pipe)
-                    renew_lease(pipe, self._job, self.execution, self.get_heartbeat_ttl(self._job))
+                    renew_lease(pipe, job, self.execution, self.get_heartbeat_ttl(job))
                     pipe.execute()
         except RedisError as error:
             log.warning("the lease of a task could not be renewed: %s", error)
@@ -190,17 +178,17 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         if is_cancelled or not is_held:
             self._engine.say("stop", StopReason.CANCELLED if is_cancelled else StopReason.LEASE_LOST)
 
-    def _prepare_end(self) -> None:
-        """See to it that RQ can close its books: Redis refuses writes on a full disk, and a task that was taken away
-        has no books any more."""
-        if not self.job_class.exists(self._job.id, self.connection):
-            log.info("task %s was taken from this worker meanwhile: it was slow", self._job.id.rpartition("-")[0])
-        told = False
+    def _give_back(self, job: Any) -> None:
+        """Nothing is left of the task in Redis, which refuses writes while its disk is full: then this waits."""
+        if not job.exists(job.id, self.connection):
+            log.info("task %s was taken from this worker meanwhile: it was slow", job.id.rpartition("-")[0])
+        execution, told = self.execution, False
         while True:
             try:
                 with self.connection.pipeline() as pipe:
-                    self._job.set_status(JobStatus.STARTED, pipe)
-                    pipe.expire(self._job.key, allowed.FAILURE_TTL_S)
+                    self.execution = execution
+                    self.cleanup_execution(job, pipe)
+                    pipe.delete(job.key)
                     pipe.execute()
                 return
             except ResponseError as error:
@@ -235,7 +223,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
     def handle_warm_shutdown_request(self) -> None:
         """SIGTERM: the task in hand stops at its next launch and goes back to the queue."""
         self.told_to_stop = True
-        self._heart.update(state="stopping")
+        self._heartbeat.update(state="stopping")
 
     def subscribe(self) -> None:
         """No command channel: it is deaf after a reconnect, and lets anybody in Redis stop workers."""
@@ -269,7 +257,7 @@ def run_worker(
     queue = open_queue(settings, patience=_PATIENCE)
     heart = Heartbeat(
         redis_url(settings),
-        _first_beat(name, settings.device, stages),
+        WorkerBeat.of_this_process(name, settings.device, stages),
         lease_s=settings.lease_s,
         alive=settings.heartbeat_file,
         is_stopped=lambda: engine.is_stopped,
@@ -296,29 +284,9 @@ def run_worker(
         log.error("this worker ends: %s", error)
         return False
     finally:
-        allowed.task_function = None
         engine.close()
         heart.stop()
         queue.close()
     # RQ's loop ends in the same way where an error that nobody foresaw broke it off.
     is_done = not does_all and (worker.found_none or worker.tasks_done >= (max_tasks or math.inf))
     return worker.engine_is == "outgrown" or (worker.engine_is == "fit" and (is_done or worker.told_to_stop))
-
-
-def _first_beat(name: str, device: str, stages: Collection[Stage]) -> WorkerBeat:
-    now = timestamp()
-    return WorkerBeat(
-        name=name,
-        host=socket.gethostname(),
-        pid=os.getpid(),
-        device=device,
-        device_name="",
-        stages=tuple(stages),
-        version=PACKAGE_VERSION,
-        state="checking",
-        task_id="",
-        started=now,
-        seen=now,
-        schemas=own_ability().schemas,
-        revisions=dict(own_ability().revisions),
-    )

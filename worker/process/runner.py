@@ -24,7 +24,7 @@ from graspd.service.model.errors import (
     TaskRefused,
     UnavailableError,
 )
-from graspd.service.model.messages import IngestMessage, Origin, TaskMessage
+from graspd.service.model.messages import IngestMessage, Origin, TaskMessage, message_type
 from graspd.service.model.records import AttemptRecord
 from graspd.service.model.renamed import renamed
 from graspd.service.model.states import Stage
@@ -175,17 +175,13 @@ class Runner:
         log.warning("task failed: %s", error, exc_info=not isinstance(error, InputError))
         # Bad input and a damaged store do not get better by trying again.
         last = isinstance(error, InputError | DamagedError | TaskRefused) or message.attempt >= message.max_attempt
-        attempt = AttemptRecord(
-            task_id=message.task_id,
-            job_id=message.job_id if isinstance(message, TaskMessage) else "",
-            stage=message.stage,
-            number=message.attempt,
+        attempt = AttemptRecord.of(
+            message,
             kind=type(error).__name__,
             reason=_one_line(error),
             trace="".join(traceback.format_exception(error))[-_TRACE_CHARACTERS:],
             worker=self._worker,
             started=started,
-            ended=timestamp(),
             last=last,
         )
         return self._recorded(message, attempt, context)
@@ -226,7 +222,7 @@ def _has_manifest(message: TaskMessage, context: TaskContext) -> bool:
 def parse_message(raw: Mapping[str, Any]) -> Message:
     """The message in a queue entry; TaskRefused if it is none."""
     try:
-        model = IngestMessage if raw.get("stage") == Stage.INGEST else TaskMessage
+        model = message_type(raw)
         # A newer schema may have more fields; what names the task must still be there, so that it can be refused.
         known = {field.alias or name for name, field in model.model_fields.items()}
         return model.model_validate({key: value for key, value in renamed(dict(raw)).items() if key in known})

@@ -54,7 +54,7 @@ def rollout_on(
     on_gpu = run.device.startswith("cuda")
     if not in_scenes:
         return None if on_gpu else hold_rollout(hand, obj, pieces, known=known, level=level)
-    threads = run.apart().cores if on_gpu else 1
+    threads = run.cores if on_gpu else 1
     return lift_rollout(hand, obj, pieces, threads=threads, known=known, level=lift_level(level))
 
 
@@ -175,7 +175,7 @@ def scene_verdicts(
     pieces: ConvexPieces | None,
     known: KnownLifts | None = None,
     run: ExecutionContext,
-) -> tuple[GraspSet, Arrays, dict[str, int]]:
+) -> tuple[GraspSet, Arrays]:
     """Plan the way of grasps in their scenes, and validate those that are clear.
 
     A grasp that does not lift is not lifted at half the friction.
@@ -192,7 +192,7 @@ def scene_verdicts(
 
     Returns:
         The grasps with `approach`, `coming`, `lift` and `wrist`; columns of the base shard, `quality/success` being the
-        verdict of the lift (-1: not clear); how many are clear, lift, and lift_hard.
+        verdict of the lift (-1: not clear).
     """
     assert grasps.scene is not None
     placed = scenes.placed(grasps.scene)
@@ -201,11 +201,10 @@ def scene_verdicts(
     grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift, wrist=wrist)
     count, clear = len(grasps), np.flatnonzero(way.clear)
     columns: Arrays = {"quality/clearance_m": np.minimum(way.least, FARTHEST_M)}
-    counts = {"clear": len(clear), "lift": 0, "lift_hard": 0}
     success = np.where(way.clear, 0, -1).astype(np.int8)
     columns["quality/success"] = success
     if pieces is None:
-        return grasps, columns, counts
+        return grasps, columns
     common: dict[str, Any] = {"pieces": pieces, "run": run}
     lifts = validate_lifts(hand, obj, grasps.take(clear), placed.take(clear), level=level, known=known, **common)
     success[clear] = lifts.success
@@ -217,14 +216,14 @@ def scene_verdicts(
         hard[lifted] = validate_lifts(
             hand, obj, grasps.take(lifted), placed.take(lifted), level=level, hard=True, known=known, **common
         ).success
-    counts |= {"lift": len(lifted), "lift_hard": int((hard == 1).sum())}
-    return (
-        grasps,
-        columns
-        | {
-            "quality/lift_outcome": outcome,
-            "quality/lift_hard": hard,
-            "quality/verdict_margin": margin,
-        },
-        counts,
-    )
+    columns |= {"quality/lift_outcome": outcome, "quality/lift_hard": hard, "quality/verdict_margin": margin}
+    return grasps, columns
+
+
+def outcomes_in_scenes(columns: Arrays) -> dict[str, NDArray[np.bool_]]:
+    """(N,) which grasps are clear, lift, and lift at half the friction, from the columns of `scene_verdicts`."""
+    clear = np.asarray(columns["quality/success"] >= 0)
+    if "quality/lift_outcome" not in columns:
+        return {"clear": clear, "lift": np.zeros_like(clear), "lift_hard": np.zeros_like(clear)}
+    lifts = clear & (columns["quality/lift_outcome"] == LiftOutcome.LIFTED)
+    return {"clear": clear, "lift": lifts, "lift_hard": columns["quality/lift_hard"] == 1}

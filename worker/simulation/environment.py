@@ -228,3 +228,10 @@ def placed_together(parts: Sequence[PlacedGrasps]) -> PlacedGrasps:
     )
     vars(whole)["scenes"] = tuple(scene for part in parts for scene in part.scenes)  # not to be made anew
     return whole
+
+
+def scenes_together(parts: Sequence[Scenes]) -> Scenes:
+    """The scenes of several sets, one after the other; supports and neighbours are the same."""
+    first = parts[0]
+    beside = np.concatenate([part.neighbour_pose for part in parts]) if first.neighbours else first.neighbour_pose
+    return replace(first, object_pose=np.concatenate([part.object_pose for part in parts]), neighbour_pose=beside)

@@ -95,6 +95,7 @@ def validate(
     pieces: ConvexPieces | None = None,
     cache: Path | None = None,
     known: KnownRollouts | None = None,
+    prefilter: PrefilterVerdicts | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Verdicts:
     """Test grasps by the DexGraspBench force-closure protocol; see `worker.validation.protocol` for the levels.
@@ -111,6 +112,7 @@ def validate(
         pieces: convex pieces of the object; by default its CoACD pieces.
         cache: folder of the pieces, see `decompose`.
         known: trials of the CPU on these terms that are not done again; others are added.
+        prefilter: what `prefiltered` says of these grasps on these terms; None: it is asked.
         run: told of grasps done; asked between grasps whether to stop.
 
     Raises:
@@ -122,12 +124,12 @@ def validate(
         raise InputError(f"unknown level {level!r}; choose one of {', '.join(LEVELS)}")
     began = time.perf_counter()
     pieces = pieces or decompose(obj, cache=cache)
-    prefilter = first_terms(hand, level, run)
+    prefilter_terms = first_terms(hand, level, run)
     # What the prefilter leaves over is near a limit: coarse physics would ask the standard level as well.
-    of_the_cpu: Level = "standard" if prefilter else level
+    of_the_cpu: Level = "standard" if prefilter_terms else level
     case = _Case(hand, obj, pieces, of_the_cpu, hard)
-    terms = verdict_key(hand, obj, level, hard, pieces=pieces, prefilter=prefilter)
-    first = screened(case.scene, terms, grasps, level=level, run=run) if prefilter else PrefilterVerdicts({}, {})
+    terms = verdict_key(hand, obj, level, hard, pieces=pieces, prefilter=prefilter_terms)
+    first = prefilter or _screened(case, terms, grasps, level, run if prefilter_terms else None)
     rollouts = dict(first.stands)
     left = [row for row in range(len(grasps)) if row not in rollouts]
     keys = {} if known is None else {row: postures_key(terms, grasps.take(slice(row, row + 1))) for row in left}
@@ -145,6 +147,21 @@ def validate(
     ordered = [rollouts[row] for row in range(len(grasps))]
     found = _verdicts(ordered, case, terms, postures_key(terms, grasps), time.perf_counter() - began)
     return replace(found, level=level, rechecked=len(first.rechecked), contradicted=contradicted)
+
+
+def prefiltered(
+    hand: HandModel, obj: ObjectModel, grasps: GraspSet, *, level: Level, pieces: ConvexPieces, run: ExecutionContext
+) -> PrefilterVerdicts:
+    """What `validate` asks of the GPU prefilter, for whoever has the device before."""
+    prefilter_terms = first_terms(hand, level, run)
+    terms = verdict_key(hand, obj, level, False, pieces=pieces, prefilter=prefilter_terms)
+    return _screened(_Case(hand, obj, pieces, "standard", False), terms, grasps, level, run if prefilter_terms else None)
+
+
+def _screened(
+    case: _Case, terms: str, grasps: GraspSet, level: Level, run: ExecutionContext | None
+) -> PrefilterVerdicts:
+    return PrefilterVerdicts({}, {}) if run is None else screened(case.scene, terms, grasps, level=level, run=run)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@
                          + pictures x seconds per picture
     time of W workers  = the larger of seconds / W and rounds of batches x seconds of a batch
 
-The rates, each with an interval, come from `service.pipeline.rates`; intervals add, as if all were off
+The rates, each with an interval, come from `service.index.queries.rates`; intervals add, as if all were off
 together. A worker is one process of `graspd worker` on a device like those that were measured.
 """
 
@@ -20,6 +20,7 @@ from typing import Final
 
 from graspd.service.index.index import Index
 from graspd.service.index.queries.overview import BatchCost
+from graspd.service.index.queries.rates import Machine, Rate, Rates, StageRate, picture_rate, scene_rate, tries
 from graspd.service.model.domain import BATCH_SIZE, JobOptions, JobRequest
 from graspd.service.model.errors import LimitError
 from graspd.service.model.planning import stages_of
@@ -28,7 +29,6 @@ from graspd.service.model.records import request_of
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline.datasets.estimate import Estimate, RateUsed, WorkersPlan
 from graspd.service.pipeline.datasets.spec import MAX_CELLS, Matrix
-from graspd.service.pipeline.rates import Machine, Rate, Rates, StageRate, picture_rate, scene_rate, tries
 
 WORKERS: Final = (1, 8, 64)
 #: A task in the queue and the events it sends back, both ways (docs/explanation/scaling.md) [bytes].

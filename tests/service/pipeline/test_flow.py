@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from graspd.service.model.clock import timestamp
 from graspd.service.model.states import Priority, Stage, State
 from graspd.service.model.workers import WorkerBeat, own_ability
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.controller import Controller
-from graspd.service.queue.port import Event, EventKind, Report
+from graspd.service.queue.port import Event, EventKind
 from tests.fakes import make_shard, request
 from tests.memory_queue import Delivery, MemoryQueue
 
@@ -76,23 +78,26 @@ def test_many_ends_at_once_are_one_round(services: Services) -> None:
     assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 150)
 
 
-def test_how_far_a_task_is_reaches_the_index_and_goes_with_its_worker(services: Services) -> None:
+def test_how_far_a_task_is_reaches_the_index_until_it_ends(services: Services) -> None:
     clock = Clock()
     controller = Controller(services, clock=clock)
     controller.round()
     job, _ = job_actions.submit(services, request())
     (held,) = taken(services)
-    services.queue.report(held.message.task_id, Report(attempt=1, done=3.0, total=4.0, message="descending"))
+    assert isinstance(services.queue, MemoryQueue)
+    busy = replace(WorkerBeat.of_this_process("w0", "cpu", Stage), task_id=held.message.task_id)
+    services.queue._workers["w0"] = replace(busy, done=3.0, total=4.0, message="descending")
     clock.now += 1.0
     controller.round()
     (task,) = services.index.jobs.tasks(job=job.id).items
     assert (task.done, task.total, task.message) == (3.0, 4.0, "descending")
-    assert isinstance(services.queue, MemoryQueue)
-    services.queue.finish(held)  # it was killed before it said anything more
+    finish(services, held)  # and its worker has not said so yet
+    services.queue._workers["w0"] = replace(busy, done=4.0, total=4.0, message="late")
     for _ in range(2):
         clock.now += 1.0
         controller.round()
-    assert services.queue.reports() == {}
+    (task,) = services.index.jobs.tasks(job=job.id).items
+    assert task.state is State.SUCCEEDED and task.message != "late"
 
 
 def test_a_fleet_larger_than_the_window_finds_work(services: Services) -> None:

@@ -7,8 +7,8 @@ import pytest
 from graspd.service.model.clock import timestamp
 from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.lists import queue_name
-from graspd.service.queue.port import Event, EventKind, Report
-from graspd.service.queue.rq_queue import REPORTS, RqQueue
+from graspd.service.queue.port import Event, EventKind
+from graspd.service.queue.rq_queue import RqQueue
 from tests.fakes import message_for
 from tests.memory_queue import MemoryQueue
 
@@ -48,23 +48,6 @@ def test_tasks_are_added_together_and_none_twice(rq_queue: RqQueue) -> None:
     rq_queue.connection.delete(f"rq:queue:{queue_name(Priority.BULK, Stage.SYNTHESIZE)}")
     assert rq_queue.enqueue(tasks, Priority.BULK) == 0, "what the queue knows is not added again"
     assert rq_queue.enqueue(tasks, Priority.BULK, again=True) == 700
-
-
-def test_a_report_replaces_the_last_one_and_goes_with_the_attempt(queue: MemoryQueue | RqQueue) -> None:
-    queue.report("a", Report(attempt=1, done=1.0, total=4.0, message="descending"))
-    queue.report("b", Report(attempt=1, done=1.0))
-    queue.report("a", Report(attempt=1, done=2.0, total=4.0))
-    assert queue.reports()["a"] == Report(attempt=1, done=2.0, total=4.0)
-    queue.publish(Event(kind=EventKind.FINISHED, at=timestamp(), task_id="a"))
-    assert set(queue.reports()) == {"b"}
-    queue.forget_reports(["b"])
-    assert queue.reports() == {}
-
-
-@pytest.mark.parametrize("data", [b"\xff", b"[]", b'{"done": -1}', b'{"total": 1e400}'])
-def test_a_report_that_cannot_be_read_says_nothing(rq_queue: RqQueue, data: bytes) -> None:
-    rq_queue.connection.hset(REPORTS, "a", data)
-    assert rq_queue.reports() == {"a": Report()}
 
 
 def test_unreadable_events_stay_nobodys_work(rq_queue: RqQueue) -> None:

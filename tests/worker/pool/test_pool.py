@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from graspd.service.model.errors import TaskCancelled
-from graspd.worker.pool.pool import BYTES_PER_PROCESS, KEPT, MEMORY_SHARE, Pool, ProcessLost, processes_at_once
+from graspd.worker.engines.joins import BYTES_PER_PROCESS, PROCESS_SHARE, processes_at_once
+from graspd.worker.pool.pool import KEPT, Pool, ProcessLost
 from tests.waiting import until
 from tests.worker.pool import works
 
@@ -112,7 +113,7 @@ def machine(root: Path, cores: float, memory: int) -> Path:
 def test_how_many_there_are_where_nobody_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: range(64), raising=False)
     monkeypatch.setattr(os, "sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 1 << 26}[name])
-    room = round(BYTES_PER_PROCESS / MEMORY_SHARE)
+    room = round(BYTES_PER_PROCESS / PROCESS_SHARE)
     big = machine(tmp_path / "big", 16, 40 * room)
     assert processes_at_once("cuda:0", 0, root=big) == 15
     assert processes_at_once("cuda:1", 0, root=big, workers=4) == 3, "workers of one machine share its cores"

@@ -50,6 +50,9 @@ def test_what_a_worker_is_at_is_shown_at_once(heart: Heartbeat, rq_queue: RqQueu
     heart.interval_s = 3600.0
     heart.update(state="busy", task_id="a")
     until(lambda: [(beat.state, beat.task_id) for beat in rq_queue.workers()] == [("busy", "a")], "the news")
+    heart.update(done=1.0, total=4.0, message="descending")
+    told = ("a", 1.0, 4.0, "descending")
+    until(lambda: [(b.task_id, b.done, b.total, b.message) for b in rq_queue.workers()] == [told], "how far it is")
 
 
 def test_a_worker_that_leaves_is_not_lost(heart: Heartbeat, rq_queue: RqQueue) -> None:

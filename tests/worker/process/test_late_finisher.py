@@ -75,6 +75,6 @@ def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue: RqQueue, red
         assert run_worker(settings, start=engine_of({Stage.SYNTHESIZE: stage}), burst=True)
     finally:
         refuse(0)
-    assert rq_queue.leases() == []
+    assert rq_queue.leases() == [] and not rq_queue.connection.keys("rq:job:*")
     kinds = [event.kind for _, event in rq_queue.tail("0", limit=10, wait_s=0)]
     assert kinds[:2] == [EventKind.STARTED, EventKind.FINISHED]

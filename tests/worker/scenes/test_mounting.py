@@ -103,7 +103,7 @@ def test_the_wrist_is_bent_no_farther_than_the_table_asks(shadow: HandModel, tab
 def test_valid_grasps_have_their_forearm_above_the_table_at_the_stored_angles(
     shadow: HandModel, block: ObjectModel, table: Scenes, planned: GraspSet
 ) -> None:
-    found, columns, _ = scene_verdicts(shadow, block, planned, table, level="lift", pieces=None, run=DEFAULT_CONTEXT)
+    found, columns = scene_verdicts(shadow, block, planned, table, level="lift", pieces=None, run=DEFAULT_CONTEXT)
     assert found.wrist is not None and found.wrist.shape == (8, 2) and found.approach is not None
     assert shadow.mounting is not None and found.lift is not None and found.scene is not None
     clear = np.flatnonzero(columns["quality/clearance_m"] >= MARGIN_M)
@@ -126,10 +126,10 @@ def test_a_grasp_with_its_mounting_in_the_table_is_not_clear(
     vertices, faces = tessellate("sphere", (1.0,))
     ball = ConvexPiece(2, "sphere", (1.0,), IDENTITY_POSE, vertices, faces, "forearm")
     everywhere = replace(shadow.mounting, pieces=(ball,))
-    _, columns, counts = scene_verdicts(
+    _, columns = scene_verdicts(
         replace(shadow, mounting=everywhere), block, planned, table, level="lift", pieces=None, run=DEFAULT_CONTEXT
     )
-    assert (columns["quality/success"] == -1).all() and counts["clear"] == 0
+    assert (columns["quality/success"] == -1).all()
 
 
 def test_free_grasps_do_not_depend_on_the_mounting(shadow: HandModel, block: ObjectModel) -> None:

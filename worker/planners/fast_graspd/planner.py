@@ -134,7 +134,7 @@ def plan_joined(
     """See `worker.planners.Joined`; `warm` as `Batches` has it."""
     began = time.perf_counter()
     batches = Batches(asked, obj, warm)
-    run = asked[0].run.apart()
+    run = asked[0].run
     try:
         parts = optimise(_pair(hand, obj, asked[0].wanted, run), batches, run, postures=True)
     except Exception:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import pairwise
 from typing import Any, Final, Self
 
 import numpy as np
@@ -61,14 +59,6 @@ class PrefilterOutcomes:
         kinds = (Outcome.LOST_WHILE_CLOSING, Outcome.DISPLACED, Outcome.ROTATED)
         lost = np.isin(self.outcome, kinds).any(axis=1) & np.isfinite(self.margin) & (self.margin > BAND[1])
         return np.asarray((inside | lost) & ~self.overflow)
-
-    def parts(self, sizes: Sequence[int]) -> list[Self]:
-        """The trials of grasps that were joined, set by set."""
-        ends = np.cumsum([0, *sizes])
-        return [
-            replace(self, **{field.name: getattr(self, field.name)[a:b] for field in fields(self)})
-            for a, b in pairwise(ends)
-        ]
 
     @staticmethod
     def terms(engine: str) -> list[Any]:

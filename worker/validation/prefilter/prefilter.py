@@ -14,9 +14,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import logging
-import threading
 from collections import OrderedDict
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
@@ -29,9 +27,9 @@ from numpy.typing import NDArray
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
 from graspd.worker.engines import backend
-from graspd.worker.engines.devices import check_device, is_out_of_memory
+from graspd.worker.engines.devices import check_device, exclusive, is_out_of_memory
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
-from graspd.worker.grasps import GraspSet, Posture, joined
+from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.model import HandModel
 from graspd.worker.validation import protocol
@@ -239,7 +237,6 @@ class WorldPool:
 
 
 _pools: OrderedDict[tuple[str, str, int], WorldPool] = OrderedDict()
-_lock = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -279,7 +276,7 @@ def first_terms(hand: HandModel, level: str, run: ExecutionContext) -> list[Any]
 
 
 def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: ExecutionContext) -> PrefilterVerdicts:
-    """What the prefilter says of grasps in a scene; in one launch with those of the others in `run.meeting`.
+    """What the prefilter says of grasps in a scene.
 
     Args:
         scene: the validator's own.
@@ -292,24 +289,13 @@ def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: Exe
         TaskCancelled: when `run.cancelled()` answers True.
     """
 
-    def work(asked: Sequence[GraspSet]) -> list[PrefilterOutcomes]:
-        with _lock:
-            every = joined(asked)
-            found = _pool(scene, terms, run.device, len(every)).validate(
-                every, run if run.meeting is None else DEFAULT_CONTEXT
-            )
-        check_device(run.device)
-        return found.parts([len(one) for one in asked])
-
     postures = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
     if not len(grasps):
         return PrefilterVerdicts({}, {})
     try:
-        if run.meeting is None:
-            found = work([postures])[0]
-        else:
-            key = ("prefilter", terms, run.device)
-            found = run.meeting.ask(key, postures, work, size=len(grasps), cancelled=run.cancelled)
+        with exclusive:
+            found = _pool(scene, terms, run.device, len(grasps)).validate(postures, run)
+            check_device(run.device)
     except RuntimeError as error:
         if not is_out_of_memory(error):
             raise

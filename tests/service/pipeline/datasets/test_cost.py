@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 
 from graspd.service.index.queries.overview import BatchCost
+from graspd.service.index.queries.rates import ORIGIN, STORED, STORED_METHODS, STORED_MODEL_S, STORED_PLACE, machine_of
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import LimitError, NotFoundError
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.cost import estimate
 from graspd.service.pipeline.datasets.estimate import Estimate
-from graspd.service.pipeline.rates import ORIGIN, STORED, STORED_METHODS, STORED_MODEL_S, STORED_PLACE, machine_of
 from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import finish, jobs_of, wanted
 

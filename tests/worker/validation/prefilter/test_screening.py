@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -17,13 +16,12 @@ from graspd.service.store.columns import SCHEMAS
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.generation import scored
 from graspd.worker.grasps import GraspSet
-from graspd.worker.meeting import Meeting
 from graspd.worker.validation.key import Level
 from graspd.worker.validation.prefilter import phases as rollouts
 from graspd.worker.validation.prefilter import prefilter as screening
 from graspd.worker.validation.prefilter.phases import PrefilterOutcomes
 from graspd.worker.validation.protocol import ValidatedBy
-from graspd.worker.validation.validator import Verdicts, validate
+from graspd.worker.validation.validator import Verdicts, prefiltered, validate
 from tests.worker.validation.prefilter.engine import Stand
 from tests.worker.validation.prefilter.test_worlds import every_kind
 from tests.worker.validation.test_validator import BOX, PADS, WHOLE
@@ -161,22 +159,11 @@ def test_a_shard_tells_of_each_grasp_who_validated_it(mode: Any) -> None:
         assert columns.keys() <= SCHEMAS["base"].keys()
 
 
-def test_members_of_a_meeting_are_validated_in_one_launch() -> None:
-    grasps = every_kind()
-    halves = [grasps.take(np.arange(0, 6)), grasps.take(np.arange(6, len(grasps)))]
-    alone = [verdicts(ON, "fast", half) for half in halves]
-    with Meeting(2, 64) as meeting:
-        run = dataclasses.replace(ON, meeting=meeting)
-
-        def member(half: GraspSet) -> Any:
-            try:
-                return verdicts(run, "fast", half)
-            finally:
-                meeting.leave()
-
-        with ThreadPoolExecutor(2) as pool:
-            together = list(pool.map(member, halves))
-    assert meeting.served == [2]
-    for one, other in zip(alone, together, strict=True):
-        np.testing.assert_array_equal(one.outcome, other.outcome)
-        np.testing.assert_array_equal(one.validated_by, other.validated_by)
+def test_verdicts_of_the_gpu_prefilter_that_were_asked_before_are_those_of_the_judge(stand_in: Stand) -> None:
+    run, made = ON.quiet(), verdicts(ON, "fast")
+    known = prefiltered(PADS, BOX, every_kind(), level="fast", pieces=WHOLE, run=run)
+    launched = stand_in.steps
+    again = validate(PADS, BOX, every_kind(), level="fast", pieces=WHOLE, prefilter=known, run=run)
+    assert stand_in.steps == launched > 0, "it is not asked twice"
+    np.testing.assert_array_equal(again.outcome, made.outcome)
+    np.testing.assert_array_equal(again.validated_by, made.validated_by)

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
+from graspd.commands import doctor
 from graspd.service.run.doctor.checks import Condition
 from graspd.service.settings import Settings
-from graspd.worker.process import doctor
 from graspd.worker.process.selfcheck import EngineError
 
 GIB = 2**30

@@ -15,7 +15,7 @@ from graspd.service.model.states import Stage
 from graspd.service.run.doctor.checks import Check, Finding, bad, good, warning
 from graspd.service.settings import Settings
 
-_MODULE: Final = "graspd.worker.process.doctor"
+_MODULE: Final = "graspd.commands.doctor"
 _GPU_S: Final = 120.0
 #: All kernels compiled from nothing on a slow machine.
 _KERNELS_S: Final = 900.0

@@ -1,0 +1,94 @@
+"""Every series of `/metrics`, and the names under which sums of them are kept.
+
+`docs/reference/metrics.md` has a table of them.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from pydantic_core import from_json
+
+#: Upper bounds of the histogram of stage times [s].
+STAGE_BUCKETS_S: Final = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
+#: Upper bounds of the histogram of answers [s].
+HTTP_BUCKETS_S: Final = (0.002, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0)
+
+
+@dataclass(frozen=True)
+class Series:
+    """One name of Prometheus."""
+
+    name: str
+    kind: Literal["gauge", "counter", "histogram"]
+    labels: tuple[str, ...]
+    meaning: str
+    source: Literal["queue", "index", "probe", "controller", "process"]
+
+
+_ALL: Final = (
+    Series("graspd_queue_depth", "gauge", ("priority", "stage"), "tasks that wait in the queue", "queue"),
+    Series("graspd_queue_oldest_task_seconds", "gauge", ("priority", "stage"), "age of the oldest of them", "queue"),
+    Series("graspd_tasks_running", "gauge", ("priority", "stage"), "tasks in a worker's hands", "queue"),
+    Series(
+        "graspd_workers",
+        "gauge",
+        ("state",),
+        "workers by what they do: checking, idle, busy, stopping, quarantined",
+        "queue",
+    ),
+    Series("graspd_worker_lease_age_seconds", "gauge", ("worker", "device"), "time since its last beat", "queue"),
+    Series("graspd_controller_up", "gauge", (), "1: a controller gave a sign of life lately", "queue"),
+    Series("graspd_jobs_unfinished", "gauge", ("state",), "queued and running jobs, counted up to 10,000", "index"),
+    Series("graspd_job_oldest_seconds", "gauge", ("state",), "age of the oldest queued and running job", "index"),
+    Series("graspd_grasps_per_second", "gauge", ("verdict",), "grasps kept in the last minute: all, valid", "index"),
+    Series("graspd_store_damaged", "gauge", (), "objects of the store known to be damaged or missing", "index"),
+    Series("graspd_part_up", "gauge", ("part",), "1: redis, index or store answers", "probe"),
+    Series("graspd_part_latency_seconds", "gauge", ("part",), "time of a ping, a read, a small write", "probe"),
+    Series(
+        "graspd_grasps_total",
+        "counter",
+        ("verdict",),
+        "grasps kept: all, valid; tried ones: validated",
+        "controller",
+    ),
+    Series("graspd_shards_total", "counter", ("stage",), "shards written", "controller"),
+    Series("graspd_shard_bytes_total", "counter", ("stage",), "bytes of them", "controller"),
+    Series("graspd_stage_seconds", "histogram", ("stage",), "time a worker spent on one task", "controller"),
+    Series(
+        "graspd_task_failures_total", "counter", ("stage", "kind"), "failed attempts by the error's name", "controller"
+    ),
+    Series("graspd_task_handbacks_total", "counter", ("stage", "kind"), "deferred, returned, cancelled", "controller"),
+    Series(
+        "graspd_jobs_ended_total", "counter", ("state",), "jobs that succeeded, failed or were cancelled", "controller"
+    ),
+    Series("graspd_http_requests_total", "counter", ("method", "route", "status"), "requests answered", "process"),
+    Series("graspd_http_request_seconds", "histogram", ("method", "route"), "time to answer", "process"),
+)
+
+SERIES: Final[dict[str, Series]] = {series.name: series for series in _ALL}
+
+
+def series_table() -> str:
+    """Markdown table of all series."""
+    lines = ["| series | type | labels | meaning | from |", "| --- | --- | --- | --- | --- |"]
+    for series in SERIES.values():
+        labels = ", ".join(f"`{label}`" for label in series.labels)
+        lines.append(f"| `{series.name}` | {series.kind} | {labels} | {series.meaning} | {series.source} |")
+    return "\n".join(lines)
+
+
+def field(name: str, *labels: str) -> str:
+    """Name of a sum: the series and the values of its labels."""
+    return json.dumps([name, *labels])
+
+
+def parse_field(text: str) -> tuple[str, tuple[str, ...]] | None:
+    """Series and label values of a sum; None if it is not one of ours."""
+    try:
+        name, *labels = from_json(text)
+    except (ValueError, TypeError):
+        return None
+    return (name, tuple(map(str, labels))) if isinstance(name, str) else None
