@@ -7,7 +7,7 @@ import tomllib
 
 import pytest
 
-from tests.conftest import REPOSITORY
+from tests.conftest import PACKAGES, REPOSITORY
 
 
 def test_every_fault_in_the_table_has_its_test() -> None:
@@ -25,7 +25,7 @@ def rows_of(heading: str) -> list[list[str]]:
 
 
 @pytest.mark.parametrize("package", ["api", "worker", "service"])
-def test_the_floors_are_those_that_the_contracts_keep(package: str) -> None:
+def test_the_layers_are_those_that_the_contracts_keep(package: str) -> None:
     contracts = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
     (kept,) = [c["layers"] for c in contracts if c["type"] == "layers" and c["containers"] == [f"graspd.{package}"]]
     layers = [set(re.findall(r"`(\w+)`", first)) for first, _ in rows_of(f"layer of `{package}/` | what it is")]
@@ -60,3 +60,19 @@ def test_the_task_engine_stays_within_its_budget_of_lines() -> None:
     files = [file for place in places for file in ([place] if place.suffix else sorted(place.glob("*.py")))]
     assert all(place.exists() for place in places) and len(files) >= 22
     assert sum(len(file.read_text().splitlines()) for file in files) <= 3_500
+
+
+def product_modules() -> list[str]:
+    """Texts of all modules of the product."""
+    return [file.read_text() for package in PACKAGES for file in sorted((REPOSITORY / package).rglob("*.py"))]
+
+
+@pytest.mark.parametrize("what, budget", [("modules", 520), ("lines", 93_700), ("lines that the formatter skips", 40)])
+def test_the_product_stays_within_its_budget(what: str, budget: int) -> None:
+    texts = [text for text in product_modules() if text]
+    found = {
+        "modules": len(texts),
+        "lines": sum(len(text.splitlines()) for text in texts),
+        "lines that the formatter skips": sum(text.count("fmt: skip") for text in texts),
+    }
+    assert 0 < found[what] <= budget
