@@ -5,32 +5,23 @@ from __future__ import annotations
 from service.index.rebuild import rebuild
 from service.index.views import UsageDay
 from service.model import names
-from service.model.clock import timestamp
 from service.model.messages import Origin
 from service.model.planning import Turns, message_of, plan
 from service.model.projects import ProjectScope
 from service.model.records import JobRecord
-from service.model.states import AssetKind, Lane
+from service.model.states import Lane
+from service.pipeline import job_actions
 from service.pipeline.backends import Services
 from service.store.records import put_record
-from tests.fakes import make_shard, request
+from tests.fakes import make_shard, make_task, request
 
-_PAIR = ((AssetKind.HAND, "gripper"), (AssetKind.OBJECT, "ball"))
 DAY, NEXT = "2026-11-20", "2026-11-21"
 
 
 def enter(services: Services, project: str, seed: int, *, key: str = "", batches: int = 1, where: int = 0) -> JobRecord:
     """A bulk job of a project, none of it in the queue; `where` is the first digit of its id."""
-    hand, obj = (services.index.assets.get(kind, name).digest for kind, name in _PAIR)
-    record = JobRecord(
-        id=f"{where:x}{seed:031x}",
-        request=request(grasps=32 * batches, seed=seed),
-        hand_digest=hand,
-        object_digest=obj,
-        lane=Lane.BULK,
-        created=timestamp(),
-        origin=Origin(key=key or project),
-        project=project,
+    record = job_actions.prepare(services, request(grasps=32 * batches, seed=seed), lane=Lane.BULK).model_copy(
+        update={"id": f"{where:x}{seed:031x}", "origin": Origin(key=key or project), "project": project}
     )
     put_record(services.store, names.job_record(record.id), record)
     services.index.write.add_job(record)
@@ -47,10 +38,9 @@ def make(
     return sum(manifest.valid or 0 for manifest in made)
 
 
-def usage(project: str, day: str, *, batches: int, valid: int, gpu: float = 0.0, cpu: float = 0.0) -> UsageDay:
-    return UsageDay(
-        project=project, day=day, grasps=32 * batches, valid=valid, tasks=batches, gpu_seconds=gpu, cpu_seconds=cpu
-    )
+def usage(project: str, day: str, *, batches: int, gpu: float = 0.0, cpu: float = 0.0, **more: int) -> UsageDay:
+    made = {"grasps": 32 * batches, "tasks": batches, "gpu_seconds": gpu, "cpu_seconds": cpu, **more}
+    return UsageDay(project=project, day=day, **made)
 
 
 def test_what_was_made_is_summed_for_each_project_and_day(services: Services) -> None:
@@ -74,12 +64,8 @@ def test_gpu_seconds_of_a_day_are_those_of_gpu_workers_for_that_project(services
     make(services, enter(services, "red", 2), device="cpu")
     make(services, enter(services, "red", 3), day=NEXT)
     make(services, enter(services, "blue", 4))
-    assert [services.index.usage.gpu_seconds(*of) for of in (("red", DAY), ("red", NEXT), ("blue", DAY))] == [
-        30,
-        10,
-        10,
-    ]
-    assert services.index.usage.gpu_seconds("green", DAY) == 0
+    for project, day, seconds in (("red", DAY, 30), ("red", NEXT, 10), ("blue", DAY, 10), ("green", DAY, 0)):
+        assert services.index.usage.gpu_seconds(project, day) == seconds
 
 
 def test_a_shard_that_two_projects_asked_for_is_charged_to_the_first(services: Services) -> None:
@@ -107,10 +93,8 @@ def test_what_was_deleted_stays_counted(services: Services) -> None:
 
 def test_usage_is_the_same_after_the_index_was_made_anew(services: Services) -> None:
     for seed, project in enumerate(("red", "blue")):
-        record = enter(services, project, seed)
-        for task in plan(record):
-            manifest = make_shard(services.store, message_of(record, task, attempt=1, max_attempt=3))
-            services.index.write.add_manifest(manifest)
+        for task in plan(record := enter(services, project, seed)):
+            make_task(services, record, task)
     before = services.index.usage.days("2000-01-01", "2999-01-01")
     assert {day.project for day in before} == {"red", "blue"}
     rebuild(services.index, services.store)

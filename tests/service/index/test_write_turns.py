@@ -12,10 +12,10 @@ import pytest
 
 from service.index.rebuild import differences
 from service.model import names
-from service.model.clock import timestamp
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
-from service.model.states import AssetKind, Lane, State
+from service.model.states import Lane, State
+from service.pipeline import job_actions
 from service.pipeline.backends import Services
 from service.settings import Settings
 from service.store.records import put_record
@@ -45,18 +45,8 @@ def processes(index_url: str, tmp_path: Path) -> Iterator[list[Services]]:
 
 def enter(services: Services, place: int, seed: int, *, batches: int = 1) -> JobRecord:
     """A job whose id begins with a digit."""
-    hand, obj = (
-        services.index.assets.get(kind, name).digest
-        for kind, name in ((AssetKind.HAND, "gripper"), (AssetKind.OBJECT, "ball"))
-    )
-    record = JobRecord(
-        id=f"{place:x}{seed:031x}",
-        request=request(grasps=32 * batches, seed=seed),
-        hand_digest=hand,
-        object_digest=obj,
-        lane=Lane.BULK,
-        created=timestamp(),
-    )
+    record = job_actions.prepare(services, request(grasps=32 * batches, seed=seed), lane=Lane.BULK)
+    record = record.model_copy(update={"id": f"{place:x}{seed:031x}"})
     put_record(services.store, names.job_record(record.id), record)
     services.index.write.add_job(record)
     return record

@@ -8,17 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from service.pipeline.controller import Duty
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
-
-    def spend(self, seconds: float) -> None:
-        self.now += seconds
+from tests.waiting import Clock
 
 
 @pytest.mark.parametrize(
@@ -28,15 +18,15 @@ def test_the_pause_follows_from_the_cost(cost_s: float, pause_s: float) -> None:
     clock, done = Clock(), list[float]()
 
     def work() -> None:
-        clock.spend(cost_s)
+        clock.now += cost_s
         done.append(clock.now)
 
     duty = Duty(clock, work, 1.0, share=0.2, longest_s=6.0)
     duty()
-    clock.spend(pause_s - 0.01)
+    clock.now += pause_s - 0.01
     duty()
     assert len(done) == 1
-    clock.spend(0.02)
+    clock.now += 0.02
     duty()
     assert len(done) == 2
 

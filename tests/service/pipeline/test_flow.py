@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
+import pytest
+
 from service.model.clock import timestamp
 from service.model.states import Lane, Stage, State
-from service.model.workers import WorkerBeat, own_ability
+from service.model.workers import own_ability
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
 from service.pipeline.controller import Controller
 from service.queue.port import Event, EventKind, Report
-from tests.fakes import make_shard, request
+from tests.fakes import beat_of, make_shard, request, with_settings
 from tests.memory_queue import Delivery, MemoryQueue
-
-
-class Clock:
-    now = 1000.0
-
-    def __call__(self) -> float:
-        return self.now
+from tests.waiting import Clock
 
 
 def taken(services: Services) -> list[Delivery]:
@@ -45,9 +41,15 @@ def _event(delivery: Delivery, kind: EventKind) -> Event:
     )
 
 
-def test_the_next_stage_is_queued_without_waiting_for_a_sweep(services: Services) -> None:
-    controller = Controller(services, clock=Clock())
-    controller.round()
+@pytest.fixture
+def controller(services: Services) -> Controller:
+    """One that leads, to whom time passes by its clock alone."""
+    made = Controller(services, clock=Clock())
+    made.round()
+    return made
+
+
+def test_the_next_stage_is_queued_without_waiting_for_a_sweep(services: Services, controller: Controller) -> None:
     job_actions.submit(services, request(scenes=2))
     (first,) = taken(services)
     finish(services, first)
@@ -55,71 +57,44 @@ def test_the_next_stage_is_queued_without_waiting_for_a_sweep(services: Services
     assert [delivery.message.stage for delivery in taken(services)] == [Stage.SCENE]
 
 
-def test_a_task_that_runs_is_not_queued_again_between_two_sweeps(services: Services) -> None:
-    controller = Controller(services, clock=Clock())
-    controller.round()
-    job_actions.submit(services, request(grasps=96), lane=Lane.BULK)
+def test_what_runs_is_not_queued_again_and_many_ends_are_one_round(services: Services, controller: Controller) -> None:
+    job, _ = job_actions.submit(services, request(grasps=32 * 150), lane=Lane.BULK)
     held = taken(services)
     finish(services, held[0])
     controller.round()
     assert services.queue.waiting() == set()
-
-
-def test_many_ends_at_once_are_one_round(services: Services) -> None:
-    controller = Controller(services, clock=Clock())
-    controller.round()
-    job, _ = job_actions.submit(services, request(grasps=32 * 150), lane=Lane.BULK)
-    for delivery in taken(services):
+    for delivery in held[1:]:
         finish(services, delivery)
     controller.round()
     done = services.index.jobs.get(job.id)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 150)
 
 
-def test_how_far_a_task_is_reaches_the_index_and_goes_with_its_worker(services: Services) -> None:
-    clock = Clock()
-    controller = Controller(services, clock=clock)
-    controller.round()
+def test_how_far_a_task_is_reaches_the_index_and_goes_with_its_worker(
+    services: Services, controller: Controller
+) -> None:
     job, _ = job_actions.submit(services, request())
     (held,) = taken(services)
     services.queue.report(held.message.task_id, Report(attempt=1, done=3.0, total=4.0, message="descending"))
-    clock.now += 1.0
+    controller._clock.now += 1.0
     controller.round()
     (task,) = services.index.jobs.tasks(job=job.id).items
     assert (task.done, task.total, task.message) == (3.0, 4.0, "descending")
     assert isinstance(services.queue, MemoryQueue)
     services.queue.finish(held)  # it was killed before it said anything more
     for _ in range(2):
-        clock.now += 1.0
+        controller._clock.now += 1.0
         controller.round()
     assert services.queue.reports() == {}
 
 
 def test_a_fleet_larger_than_the_window_finds_work(services: Services) -> None:
-    small = Services(
-        services.settings.model_copy(update={"queue_window": 1}), services.store, services.index, services.queue
-    )
+    small = with_settings(services, queue_window=1)
     assert isinstance(services.queue, MemoryQueue)
-    now, own = timestamp(), own_ability()
-    for name in map(str, range(20)):
-        services.queue._workers[name] = WorkerBeat(
-            name,
-            "h",
-            1,
-            "cpu",
-            "",
-            (Stage.SYNTHESIZE,),
-            "0",
-            "idle",
-            "",
-            now,
-            now,
-            "",
-            own.schemas,
-            dict(own.revisions),
-        )
-    clock = Clock()
-    controller = Controller(small, clock=clock)
+    own = own_ability()
+    can = {"stages": (Stage.SYNTHESIZE,), "schemas": own.schemas, "revisions": dict(own.revisions)}
+    services.queue._workers.update({name: beat_of(name, **can) for name in map(str, range(20))})
+    controller = Controller(small, clock=(clock := Clock()))
     controller.round()
     job_actions.submit(small, request(grasps=32 * 100), lane=Lane.BULK)
     clock.now += 1.0

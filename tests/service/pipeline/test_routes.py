@@ -15,7 +15,7 @@ from service.pipeline.routes import Place, Routes
 from service.queue import entries
 from service.queue.lists import known_lists, queue_name, queue_names
 from service.queue.rq_queue import RqQueue
-from tests.fakes import message_for, request
+from tests.fakes import beat_of, message_for, request
 
 OWN = own_ability()
 REVISION = OWN.revisions["synthesize"]
@@ -25,9 +25,7 @@ NEED = Need(Stage.SYNTHESIZE, OWN.schemas[0], OWN.schemas[1], REVISION)
 def beat(
     *, schemas: tuple[int, int] = OWN.schemas, revision: int = REVISION, stage: Stage = Stage.SYNTHESIZE
 ) -> WorkerBeat:
-    now = "2026-01-01T00:00:00.000Z"
-    revisions = {**OWN.revisions, "synthesize": revision}
-    return WorkerBeat("w", "h", 1, "cpu", "CPU", (stage,), "0", "idle", "", now, now, "", schemas, revisions)
+    return beat_of(stages=(stage,), schemas=schemas, revisions={**OWN.revisions, "synthesize": revision})
 
 
 NEXT = beat(revision=REVISION + 1)

@@ -22,20 +22,9 @@ SLOPE = {"kind": "box", "size": [0.2, 0.2, 0.2], "pose": [0.5, 0, 0, 0.8, 0, 0.6
 
 
 def ball(centre: Any) -> AssetView:
-    return AssetView(
-        kind=AssetKind.OBJECT,
-        name="ball",
-        digest="b" * 32,
-        filename="ball.stl",
-        files=[],
-        size_bytes=1,
-        created="",
-        builtin=False,
-        verdict="accept",
-        message=None,
-        repairs=[],
-        facts={"centre_of_mass_m": centre},
-    )
+    what = {"kind": AssetKind.OBJECT, "name": "ball", "digest": "b" * 32, "filename": "ball.stl", "files": []}
+    found = {"verdict": "accept", "message": None, "repairs": [], "facts": {"centre_of_mass_m": centre}}
+    return AssetView(**what, **found, size_bytes=1, created="", builtin=False)
 
 
 @pytest.mark.parametrize(

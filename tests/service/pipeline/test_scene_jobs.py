@@ -6,42 +6,27 @@ import pytest
 
 from service.index.queries.grasps import GraspFilter, GraspSort
 from service.model import names
-from service.model.clock import timestamp
-from service.model.planning import message_of, plan
-from service.model.records import AttemptRecord, JobRecord
+from service.model.planning import plan
+from service.model.records import JobRecord
 from service.model.states import Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
-from service.store.records import put_record, read_record
-from tests.fakes import make_shard, request
+from service.store.records import read_record
+from tests.fakes import fail_task, make_task, record_of, request
 
 
 def submit(services: Services, **changes: object) -> JobRecord:
-    job, _ = job_actions.submit(services, request(**{"scene": "table", **changes}))
-    return read_record(JobRecord, services.store, names.job_record(job.id))
+    return record_of(services, job_actions.submit(services, request(**{"scene": "table", **changes}))[0].id)
 
 
 def make(services: Services, job: JobRecord, stage: Stage, batch: int = 0) -> None:
-    task = next(task for task in plan(job) if task.stage is stage and task.batch == batch)
-    services.index.write.add_manifest(make_shard(services.store, message_of(job, task, attempt=1, max_attempt=3)))
+    make_task(services, job, next(task for task in plan(job) if task.stage is stage and task.batch == batch))
 
 
 def fail(services: Services, job: JobRecord, batch: int, kind: str, number: int = 1) -> None:
     """The last attempt at a batch's grasps."""
     task = next(task for task in plan(job) if task.stage is Stage.SYNTHESIZE and task.batch == batch)
-    attempt = AttemptRecord(
-        task_id=task.id,
-        job_id=job.id,
-        stage=task.stage,
-        number=number,
-        kind=kind,
-        reason="none of 128 grasps tried is valid in its scene",
-        worker="w",
-        ended=timestamp(),
-        last=True,
-    )
-    put_record(services.store, names.attempt(task.id, number), attempt)
-    services.index.write.add_attempt(attempt)
+    fail_task(services, job.id, task, number, kind=kind, reason="none of 128 grasps tried is valid in its scene")
 
 
 def states(services: Services, job: JobRecord) -> dict[tuple[int, Stage], State]:
@@ -52,11 +37,8 @@ def test_scenes_are_made_before_grasps_and_told_in_that_order(services: Services
     job = submit(services, grasps=64, views=1)
     assert len(services.queue.waiting()) == 2, "the scenes of both batches"
     told = services.index.jobs.get(job.id).stages
-    assert [(stage.stage, stage.tasks) for stage in told] == [
-        (Stage.SCENE, 2),
-        (Stage.SYNTHESIZE, 2),
-        (Stage.RENDER, 2),
-    ]
+    order = (Stage.SCENE, Stage.SYNTHESIZE, Stage.RENDER)
+    assert [(stage.stage, stage.tasks) for stage in told] == [(stage, 2) for stage in order]
     make(services, job, Stage.SCENE)
     ready = [(task.task.batch, task.task.stage) for task in services.index.feed.ready_of_job(job.id, limit=9)]
     assert ready == [(0, Stage.SYNTHESIZE)], "the other batch's scenes are queued already"

@@ -14,10 +14,12 @@ from service.model.states import AssetKind, Lane, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
+from service.pipeline.datasets.cost import estimate
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.store.records import job_events
 from service.store.store import open_store
 from tests.dataset_status import status
+from tests.fakes import with_settings
 from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import add_asset, fail, finish, jobs_of, wanted
 
@@ -26,13 +28,10 @@ def test_a_dataset_has_a_job_for_each_hand_and_object(either: Services) -> None:
     dataset, new = actions.create(either, wanted(scenes=1))
     assert new and (dataset.cells, dataset.asked, dataset.state) == (4, 128, State.QUEUED)
     plan_all(either)
-    pairs = [
-        (either.index.jobs.get(job).request.hand, either.index.jobs.get(job).request.object)
-        for job in jobs_of(either, "grasps")
-    ]
+    jobs = [either.index.jobs.get(job) for job in jobs_of(either, "grasps")]
+    pairs = [(job.request.hand, job.request.object) for job in jobs]
     assert pairs == [("gripper", "ball"), ("gripper", "cube"), ("claw", "ball"), ("claw", "cube")]
-    assert {either.index.jobs.get(job).lane for job in jobs_of(either, "grasps")} == {Lane.BULK}
-    assert {either.index.jobs.get(job).request.scenes for job in jobs_of(either, "grasps")} == {1}
+    assert {(job.lane, job.request.scenes) for job in jobs} == {(Lane.BULK, 1)}
 
 
 def test_the_same_dataset_again_is_the_same_and_repeats_nothing(services: Services) -> None:
@@ -58,18 +57,14 @@ def test_a_planner_that_was_stopped_is_continued(services: Services) -> None:
     assert not DatasetRounds(services).advance(10)
 
 
-def test_two_datasets_share_the_jobs_that_both_want(services: Services) -> None:
+def test_datasets_and_jobs_of_their_own_share_what_all_want(services: Services) -> None:
+    job, _ = job_actions.submit(services, JobRequest(hand="claw", object="ball", grasps=32))
     actions.create(services, wanted("one"))
     actions.create(services, wanted("two", hands=("gripper",), objects=("cube", "cone")))
     plan_all(services)
     assert jobs_of(services, "one")[1] == jobs_of(services, "two")[0]
+    assert jobs_of(services, "one")[2] == job.id
     assert len(services.index.jobs.page().items) == 5
-
-
-def test_a_job_that_was_submitted_by_itself_is_a_cell(services: Services) -> None:
-    job, _ = job_actions.submit(services, JobRequest(hand="claw", object="ball", grasps=32))
-    actions.create(services, wanted())
-    assert jobs_of(services, "grasps")[2] == job.id
 
 
 def test_a_name_stands_for_one_dataset(services: Services) -> None:
@@ -113,8 +108,9 @@ def test_what_cannot_be_used_is_refused_before_anything_is_recorded(services: Se
 
 
 def test_a_matrix_over_the_limit_is_refused(services: Services) -> None:
-    with pytest.raises(LimitError, match="over 100000 cells"):
-        actions.create(services, wanted(hands=("gripper", "claw"), objects=[f"o{i}" for i in range(60_000)]))
+    for refuse in (actions.create, lambda of, asked: estimate(of.index, asked)):
+        with pytest.raises(LimitError, match="over 100000 cells"):
+            refuse(services, wanted(hands=("gripper", "claw"), objects=[f"o{i}" for i in range(60_000)]))
 
 
 def test_status_tells_each_cell(either: Services) -> None:
@@ -190,12 +186,8 @@ def test_a_job_that_another_dataset_waits_for_goes_on(either: Services) -> None:
     plan_all(either)
     actions.cancel(either, "one")
     plan_all(either)
-    assert [cell.state for cell in status(either.index, "one").cells] == [
-        "cancelled",
-        "queued",
-        "cancelled",
-        "cancelled",
-    ]
+    states = [cell.state for cell in status(either.index, "one").cells]
+    assert states == ["cancelled", "queued", "cancelled", "cancelled"]
 
 
 def test_retry_starts_failed_and_cancelled_cells_again_and_repeats_nothing(services: Services) -> None:
@@ -236,8 +228,7 @@ def test_an_event_reaches_a_job_once_however_often_the_planner_runs(services: Se
 
 
 def test_a_large_dataset_leaves_the_queue_to_others(services: Services) -> None:
-    small = services.settings.model_copy(update={"queue_window": 10})
-    services = Services(small, services.store, services.index, services.queue)
+    services = with_settings(services, queue_window=10)
     actions.create(services, wanted(grasps=320))
     plan_all(services)
     assert len(services.queue.waiting()) == 10
