@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -28,39 +30,21 @@ HAND, OBJECT = "a" * 32, "b" * 32
 
 
 def record(wanted: JobRequest) -> JobRecord:
-    return JobRecord(
-        id=job_id(wanted, HAND, OBJECT),
-        request=wanted,
-        hand_digest=HAND,
-        object_digest=OBJECT,
-        lane=Lane.BULK,
-        created=timestamp(),
-    )
+    digests = {"hand_digest": HAND, "object_digest": OBJECT}
+    return JobRecord(id=job_id(wanted, HAND, OBJECT), request=wanted, lane=Lane.BULK, created=timestamp(), **digests)
 
 
 def test_a_job_is_cut_into_batches_of_32_and_the_last_is_smaller() -> None:
-    tasks = list(plan(record(request(grasps=70))))
-    assert [task.count for task in tasks] == [32, 32, 6]
-    assert [task.batch for task in tasks] == [0, 1, 2]
+    assert [(task.batch, task.count) for task in plan(record(request(grasps=70)))] == [(0, 32), (1, 32), (2, 6)]
 
 
-@pytest.mark.parametrize(
-    ("changes", "stages"),
-    [
-        ({}, [Stage.SYNTHESIZE]),
-        ({"scenes": 2}, [Stage.SYNTHESIZE, Stage.SCENE]),
-        ({"scenes": 2, "views": 3}, [Stage.SYNTHESIZE, Stage.SCENE, Stage.RENDER]),
-    ],
-)
-def test_only_what_was_asked_for_is_planned(changes: dict[str, int], stages: list[Stage]) -> None:
-    assert [task.stage for task in plan(record(request(**changes)))] == stages
-
-
-def test_each_stage_reads_what_the_stage_before_writes() -> None:
+def test_only_what_was_asked_for_is_planned_and_reads_what_the_stage_before_writes() -> None:
+    (alone,) = plan(record(request()))
+    assert (alone.stage, alone.inputs) == (Stage.SYNTHESIZE, ())
+    assert [task.stage for task in plan(record(request(scenes=2)))] == [Stage.SYNTHESIZE, Stage.SCENE]
     base, scene, views = plan(record(request(scenes=2, views=3)))
-    assert base.inputs == ()
-    assert scene.inputs == (base.output,)
-    assert views.inputs == (scene.output,)
+    assert [task.stage for task in (base, scene, views)] == [Stage.SYNTHESIZE, Stage.SCENE, Stage.RENDER]
+    assert (base.inputs, scene.inputs, views.inputs) == ((), (base.output,), (scene.output,))
 
 
 def test_more_views_are_other_pictures_of_the_same_grasps_and_scenes() -> None:
@@ -97,42 +81,29 @@ def facts(*stages: Stage, **of_first: object) -> list[TaskFacts]:
 CHAIN = (Stage.SYNTHESIZE, Stage.SCENE, Stage.RENDER)
 
 
-def test_only_the_first_stage_may_start_at_first() -> None:
-    states = batch_states(facts(*CHAIN), job_cancelled=False)
-    assert states == [State.QUEUED] * 3
-    assert batch_ready(states) == [True, False, False]
+DONE, QUEUED, FAILED, GONE = State.SUCCEEDED, State.QUEUED, State.FAILED, State.CANCELLED
+OVER = {"last_attempt": 3, "exhausted": True}
 
 
-def test_a_finished_stage_frees_the_next_one() -> None:
-    states = batch_states(facts(*CHAIN, done=True), job_cancelled=False)
-    assert states == [State.SUCCEEDED, State.QUEUED, State.QUEUED]
-    assert batch_ready(states) == [False, True, False]
-
-
-def test_what_follows_a_failed_task_is_cancelled_not_left_waiting() -> None:
-    states = batch_states(facts(*CHAIN, last_attempt=3, exhausted=True), job_cancelled=False)
-    assert states == [State.FAILED, State.CANCELLED, State.CANCELLED]
-    assert batch_ready(states) == [False] * 3
-
-
-def test_a_retried_task_waits_again_and_so_does_what_follows() -> None:
-    states = batch_states(facts(*CHAIN, last_attempt=3, exhausted=True, retried_upto=3), job_cancelled=False)
-    assert states == [State.QUEUED] * 3
-
-
-def test_a_failure_after_the_retry_counts() -> None:
-    chain = facts(*CHAIN, last_attempt=6, exhausted=True, retried_upto=3)
-    assert batch_states(chain, job_cancelled=False)[0] is State.FAILED
-
-
-def test_a_cancelled_job_keeps_what_is_done() -> None:
-    states = batch_states(facts(*CHAIN, done=True), job_cancelled=True)
-    assert states == [State.SUCCEEDED, State.CANCELLED, State.CANCELLED]
-
-
-def test_a_shard_that_turns_up_after_a_failure_counts_as_success() -> None:
-    states = batch_states(facts(*CHAIN, done=True, last_attempt=3, exhausted=True), job_cancelled=False)
-    assert states[0] is State.SUCCEEDED
+@pytest.mark.parametrize(
+    ("first", "cancelled", "states", "ready"),
+    [
+        ({}, False, [QUEUED] * 3, 0),
+        ({"done": True}, False, [DONE, QUEUED, QUEUED], 1),
+        (OVER, False, [FAILED, GONE, GONE], None),
+        (OVER | {"retried_upto": 3}, False, [QUEUED] * 3, 0),
+        (OVER | {"last_attempt": 6, "retried_upto": 3}, False, [FAILED, GONE, GONE], None),
+        ({"done": True}, True, [DONE, GONE, GONE], None),
+        (OVER | {"done": True}, False, [DONE, QUEUED, QUEUED], 1),
+    ],
+    ids=["new", "done", "failed", "retried", "failed after it", "cancelled", "a shard after a failure"],
+)
+def test_states_of_a_batch_follow_from_facts(
+    first: dict[str, Any], cancelled: bool, states: list[State], ready: int | None
+) -> None:
+    found = batch_states(facts(*CHAIN, **first), job_cancelled=cancelled)
+    assert found == states
+    assert batch_ready(found) == [place == ready for place in range(3)]
 
 
 @pytest.mark.parametrize(

@@ -20,38 +20,17 @@ from worker.planners.registry import PLANNERS, method
 
 HAND, OBJECT = "a" * 32, "b" * 32
 #: A job as it was written before jobs had scenes.
-PLAIN: dict[str, Any] = {
-    "grasps": 32,
-    "method": "fast_graspd",
-    "fidelity": "standard",
-    "seed": 0,
-    "scenes": 0,
-    "views": 0,
-    "stereo": False,
-    "width": 320,
-    "height": 240,
-    "channels": [],
-    "friction": 1.0,
-    "want": "valid",
-    "budget": 4.0,
-    "referee": "certificate",
-    "audits": 8,
-    "robustness": 0,
-    "options": {},
-    "target": "",
-}
+PLAIN: dict[str, Any] = (
+    {"grasps": 32, "method": "fast_graspd", "fidelity": "standard", "seed": 0, "scenes": 0, "views": 0}
+    | {"stereo": False, "width": 320, "height": 240, "channels": [], "friction": 1.0, "want": "valid", "budget": 4.0}
+    | {"referee": "certificate", "audits": 8, "robustness": 0, "options": {}, "target": ""}
+)
 PLANE = {"kind": "half_space"}
 
 
 def record(wanted: JobRequest) -> JobRecord:
-    return JobRecord(
-        id=job_id(wanted, HAND, OBJECT),
-        request=wanted,
-        hand_digest=HAND,
-        object_digest=OBJECT,
-        lane=Lane.BULK,
-        created=timestamp(),
-    )
+    digests = {"hand_digest": HAND, "object_digest": OBJECT}
+    return JobRecord(id=job_id(wanted, HAND, OBJECT), request=wanted, lane=Lane.BULK, created=timestamp(), **digests)
 
 
 def test_a_job_without_a_scene_keeps_its_id_its_record_and_its_message() -> None:
@@ -65,9 +44,8 @@ def test_a_job_without_a_scene_keeps_its_id_its_record_and_its_message() -> None
 
 
 def test_a_dataset_without_a_scene_keeps_its_digest() -> None:
-    made = describe(
-        "d", [Member(name="h", digest=HAND)], [Member(name="o", digest=OBJECT)], JobOptions(), lambda one: (one, None)
-    )
+    hands, objects = [Member(name="h", digest=HAND)], [Member(name="o", digest=OBJECT)]
+    made = describe("d", hands, objects, JobOptions(), lambda one: (one, None))
     options = {name: value for name, value in PLAIN.items() if name not in ("options", "target")}
     assert made.digest == digest_json({"hands": [["h", HAND]], "objects": [["o", OBJECT]], "options": options})
 
@@ -75,16 +53,8 @@ def test_a_dataset_without_a_scene_keeps_its_digest() -> None:
 def test_scenes_after_the_grasps_have_the_address_that_they_had() -> None:
     common = {"hand": HAND, "object": OBJECT, "names": ["gripper", "ball"], "batch": 1, "count": 32, "seed": 0}
     said = {**common, "stage": "scene", "revision": 2, "inputs": ["x"], "scenes": 3}
-    assert digest_json(said) == shard_id(
-        Stage.SCENE,
-        request=request(scenes=3),
-        hand_digest=HAND,
-        object_digest=OBJECT,
-        batch=1,
-        count=32,
-        revision=2,
-        inputs=("x",),
-    )
+    of = {"hand_digest": HAND, "object_digest": OBJECT, "batch": 1, "count": 32, "revision": 2, "inputs": ("x",)}
+    assert digest_json(said) == shard_id(Stage.SCENE, request=request(scenes=3), **of)
 
 
 def test_a_job_in_a_scene_is_another_job_and_makes_its_scenes_first() -> None:
@@ -96,21 +66,15 @@ def test_a_job_in_a_scene_is_another_job_and_makes_its_scenes_first() -> None:
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("name", "value"),
     [
-        {"scene": "bin"},
-        {"scene": {"supports": [PLANE]}},
-        {"scenes": 5},
-        {"faces": "all"},
-        {"seed": 1},
-        {"touch": 2},
-        {"touch": -0.5},
-        {"fidelity": "draft"},
+        *[("scene", "bin"), ("scene", {"supports": [PLANE]}), ("scenes", 5), ("faces", "all"), ("seed", 1)],
+        *[("touch", 2), ("touch", -0.5), ("fidelity", "draft")],
     ],
 )
-def test_whatever_moves_scenes_gives_them_another_address(changes: dict[str, Any]) -> None:
+def test_whatever_moves_scenes_gives_them_another_address(name: str, value: Any) -> None:
     first = next(plan(record(request(scene="table"))))
-    assert next(plan(record(request(**{"scene": "table", **changes})))).output != first.output
+    assert next(plan(record(request(**{"scene": "table", name: value})))).output != first.output
 
 
 def test_where_no_number_of_scenes_is_named_there_are_a_few() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ import pytest
 
 from service.model.errors import DamagedShard, InputError, NotFoundError
 from service.model.names import dataset_snapshot, shard_file
-from service.model.records import JobRecord, Snapshot, SnapshotShard
+from service.model.records import JobRecord, Snapshot
+from service.model.states import Stage
 from service.model.transforms import compose, pose_from_matrix
 from service.pipeline.backends import Services
 from service.readers import Grasps, Pictures, ShardCache, Shards, open_shards
@@ -41,55 +43,47 @@ def folder(services: Services, job: JobRecord, tmp_path: Path) -> Path:
     return out
 
 
+@pytest.fixture
+def shards(services: Services, job: JobRecord, tmp_path: Path) -> Shards:
+    """Of the job, in the store."""
+    return open_shards(services.store, job=job.id, cache=tmp_path / "cache")
+
+
 def bases(services: Services, shards: Shards) -> list[Shard]:
     return [read_shard(services.store.get(file.key), kind="base") for file in shards.of("base")]
 
 
-def test_a_job_in_a_store_is_read_whole(services: Services, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
+def test_a_job_in_a_store_is_read_whole_and_valid_grasps_unless_all_are_wanted(
+    services: Services, shards: Shards
+) -> None:
     assert [file.kind for file in shards] == ["base", "scene", "views"] * 2
     assert len(Grasps(shards, valid=False)) == GRASPS
-
-
-def test_only_valid_grasps_are_read_unless_all_are_wanted(services: Services, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
     valid = sum(int(np.count_nonzero(base["quality/valid"])) for base in bases(services, shards))
     assert 0 < valid < GRASPS
     assert len(Grasps(shards)) == valid
 
 
-def test_a_sample_is_a_row_of_its_shard(services: Services, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
-    sample = Grasps(shards)[-1]
+def test_a_sample_is_a_row_of_its_shard_and_arrays_hold_the_samples_in_order(shards: Shards) -> None:
+    grasps = Grasps(shards)
+    sample = grasps[-1]
     base = read_shard(shards.path(shards.by_id(sample["shard_id"])), kind="base")
     np.testing.assert_array_equal(sample["grasp/hand_pose"], base["grasp/hand_pose"][sample["row"]])
     assert (sample["hand"], sample["object"]) == ("allegro", "mug")
-
-
-def test_arrays_hold_the_samples_in_their_order(services: Services, job: JobRecord, tmp_path: Path) -> None:
-    grasps = Grasps(open_shards(services.store, job=job.id, cache=tmp_path / "cache"))
     arrays = grasps.arrays("quality/epsilon")
     np.testing.assert_array_equal(arrays["quality/epsilon"], [sample["quality/epsilon"] for sample in grasps])
     assert len(arrays["hand"]) == len(grasps)
 
 
-def test_a_condition_keeps_the_grasps_it_holds_for(services: Services, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
+def test_a_condition_keeps_the_grasps_it_holds_for(shards: Shards) -> None:
     good = Grasps(shards, where=lambda columns: columns["quality/penetration_depth_mm"] < 0.5)
     assert 0 < len(good) < len(Grasps(shards))
     assert all(sample["quality/penetration_depth_mm"] < 0.5 for sample in good)
-
-
-def test_a_condition_of_the_wrong_length_is_told(folder: Path) -> None:
     with pytest.raises(InputError, match="mask of shape"):
-        Grasps(open_shards(folder), where=lambda columns: np.ones(3, bool))
+        Grasps(shards, where=lambda columns: np.ones(3, bool))
 
 
-def test_files_in_a_folder_are_the_same_dataset(
-    services: Services, job: JobRecord, folder: Path, tmp_path: Path
-) -> None:
-    stored = Grasps(open_shards(services.store, job=job.id, cache=tmp_path / "cache")).arrays()
-    local = Grasps(open_shards(folder)).arrays()
+def test_files_in_a_folder_are_the_same_dataset(shards: Shards, folder: Path) -> None:
+    stored, local = (Grasps(source).arrays() for source in (shards, open_shards(folder)))
     np.testing.assert_array_equal(local["grasp/joint_positions"], stored["grasp/joint_positions"])
 
 
@@ -109,44 +103,34 @@ def test_a_picture_comes_with_its_scenes_grasps_in_the_camera_frame(folder: Path
     np.testing.assert_array_equal(picture["grasp/base_row"], scene["grasp/base_index"][here])
 
 
-def test_every_picture_is_there_once(folder: Path) -> None:
-    pictures = Pictures(open_shards(folder))
+def test_every_picture_is_there_once_and_a_missing_scene_shard_is_named(folder: Path) -> None:
+    shards = open_shards(folder)
+    pictures = Pictures(shards)
     places = {(sample["shard_id"], sample["row"]) for sample in pictures}
     assert len(places) == len(pictures) == 2 * 2 * 2  # batches, scenes, views
-
-
-def test_a_scene_shard_that_is_missing_is_named(folder: Path) -> None:
-    shards = open_shards(folder)
     with pytest.raises(NotFoundError, match="not among"):
         Pictures(Shards(shards.of("views")))
 
 
-def test_the_newest_snapshot_of_a_dataset_is_read(services: Services, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
+def test_the_newest_snapshot_of_a_dataset_is_read(services: Services, shards: Shards, tmp_path: Path) -> None:
+    with pytest.raises(NotFoundError, match="graspd datasets snapshot kitchen"):
+        open_shards(services.store, dataset="kitchen", cache=tmp_path / "cache")
     for number, some in enumerate((shards.files[:1], shards.files)):
         _put_snapshot(services, "kitchen", Shards(some), created=f"2026-01-0{number + 1}T00:00:00Z")
     assert len(open_shards(services.store, dataset="kitchen", cache=tmp_path / "cache")) == len(shards)
 
 
-def test_a_dataset_without_a_snapshot_says_how_to_take_one(services: Services, tmp_path: Path) -> None:
-    with pytest.raises(NotFoundError, match="graspd datasets snapshot kitchen"):
-        open_shards(services.store, dataset="kitchen", cache=tmp_path / "cache")
-
-
-def test_a_file_that_changed_in_the_store_is_refused(services: Services, job: JobRecord, tmp_path: Path) -> None:
-    shard = open_shards(services.store, job=job.id, cache=tmp_path / "cache").files[0]
-    cache = ShardCache(tmp_path / "other")
+def test_a_file_that_changed_is_refused_in_the_store_and_fetched_again_in_the_cache(
+    services: Services, shards: Shards, tmp_path: Path
+) -> None:
+    shard = shards.files[0]
     with pytest.raises(DamagedShard, match=shard.id):
-        cache.fetch(services.store, shard.key, "0" * 64)
+        ShardCache(tmp_path / "other").fetch(services.store, shard.key, "0" * 64)
     assert not list((tmp_path / "other").iterdir())
-
-
-def test_a_cached_file_that_changed_is_fetched_again(services: Services, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
-    path = shards.path(shards.files[0])
+    path = shards.path(shard)
     data = path.read_bytes()
     path.write_bytes(flipped(data))
-    assert shards.path(shards.files[0]).read_bytes() == data
+    assert shards.path(shard).read_bytes() == data
 
 
 def test_a_wrong_value_in_a_file_is_refused_and_not_handed_out(folder: Path) -> None:
@@ -159,48 +143,23 @@ def test_a_wrong_value_in_a_file_is_refused_and_not_handed_out(folder: Path) -> 
 
 
 def test_a_full_cache_drops_what_was_unused_longest(services: Services, tmp_path: Path) -> None:
-    from service.model.states import Stage
-
-    data = [bytes([number]) * 1000 for number in range(3)]
-    keys = [shard_file(Stage.SYNTHESIZE, f"{number:032x}") for number in range(3)]
-    sums = [hashlib.sha256(blob).hexdigest() for blob in data]
-    for key, blob in zip(keys, data, strict=True):
+    blobs = {shard_file(Stage.SYNTHESIZE, f"{number:032x}"): bytes([number]) * 1000 for number in range(3)}
+    for key, blob in blobs.items():
         services.store.put(key, blob)
     cache = ShardCache(tmp_path / "small", limit_bytes=2500)
-    import os
-
-    for age, (key, digest) in enumerate(zip(keys[:2], sums[:2], strict=True)):
-        os.utime(cache.fetch(services.store, key, digest), (1000 - 100 * age, 1000 - 100 * age))
-    cache.fetch(services.store, keys[2], sums[2])
+    sums = [hashlib.sha256(blob).hexdigest() for blob in blobs.values()]
+    for age, (key, digest) in enumerate(zip(blobs, sums, strict=True)):
+        path = cache.fetch(services.store, key, digest)
+        if age < 2:
+            os.utime(path, (1000 - 100 * age, 1000 - 100 * age))
     assert {path.stem for path in cache.folder.iterdir()} == {sums[0], sums[2]}
 
 
 def _put_snapshot(services: Services, dataset: str, shards: Shards, *, created: str) -> None:
     digest = hashlib.sha256(created.encode()).hexdigest()[:32]
-    listed = tuple(
-        SnapshotShard(
-            id=file.id,
-            kind=file.kind,
-            key=file.key,
-            sha256=file.sha256,
-            size_bytes=1,
-            count=1,
-            valid=1,
-            hand=file.hand,
-            object=file.object,
-            batch=file.batch,
-        )
-        for file in shards
-    )
-    taken = Snapshot(
-        dataset=dataset,
-        dataset_digest="a" * 32,
-        digest=digest,
-        complete=True,
-        grasps=1,
-        valid=1,
-        size_bytes=1,
-        created=created,
-        shards=listed,
-    )
+    same = ("id", "kind", "key", "sha256", "hand", "object", "batch")
+    sums = {"size_bytes": 1, "valid": 1}
+    listed = [{name: getattr(file, name) for name in same} | sums | {"count": 1} for file in shards]
+    of = {"dataset": dataset, "dataset_digest": "a" * 32, "digest": digest, "complete": True, "grasps": 1}
+    taken = Snapshot(**of, **sums, created=created, shards=listed)
     put_record(services.store, dataset_snapshot(dataset, digest), taken)

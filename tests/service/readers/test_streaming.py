@@ -32,6 +32,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
+def shards(folder: Path, tmp_path: Path) -> Shards:
+    return streamed(folder, open_store("memory://"), tmp_path / "cache")
+
+
+@pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[tuple[str, int, int]]]:
     """Every range that a store is asked for."""
     found: list[tuple[str, int, int]] = []
@@ -78,32 +83,22 @@ def test_the_samples_are_those_of_the_files(
     same(remote.clouds(64, noise="stereo", fuse=True), local.clouds(64, noise="stereo", fuse=True))
 
 
-def test_pictures_leave_nothing_on_the_disk(folder: Path, tmp_path: Path) -> None:
-    pictures = Pictures(streamed(folder, open_store("memory://"), tmp_path / "cache"))
-    assert sum(1 for _ in pictures) == VIEWS
+def test_pictures_leave_nothing_on_the_disk(folder: Path, shards: Shards, tmp_path: Path) -> None:
+    assert sum(1 for _ in Pictures(shards)) == VIEWS
     (base,) = (tmp_path / "cache").iterdir()
     assert base.read_bytes() == (folder / "base.h5").read_bytes()
 
 
-def test_a_request_brings_all_that_is_read_in_turn(
-    folder: Path, tmp_path: Path, asked: list[tuple[str, int, int]]
+def test_a_request_brings_all_that_is_read_in_turn_or_the_bytes_of_one_picture(
+    folder: Path, shards: Shards, asked: list[tuple[str, int, int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shards = streamed(folder, open_store("memory://"), tmp_path)
     pictures = Pictures(shards, ["image/rgb", "image/depth"])
     pictures[0]
     asked.clear()
     shards.ranges.forget()
     assert sum(1 for _ in pictures) == VIEWS
     assert [key for key, _, _ in asked] == [VIEWS_KEY]
-
-
-def test_a_picture_drawn_from_a_large_shard_brings_its_own_bytes(
-    folder: Path, tmp_path: Path, asked: list[tuple[str, int, int]], monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setattr(ranges, "GAP_BYTES", 0)
-    shards = streamed(folder, open_store("memory://"), tmp_path)
-    pictures = Pictures(shards, ["image/rgb", "image/depth"])
-    pictures[0]
     shards.ranges.forget()
     asked.clear()
     pictures[4]
@@ -149,10 +144,9 @@ def test_damage_is_told_with_the_row_and_what_is_gone_with_its_name(folder: Path
 
 @pytest.mark.parametrize("largest", [0, 1 << 22], ids=["ranges", "whole"])
 def test_a_store_that_is_away_is_told_and_not_taken_for_damage(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, largest: int
+    shards: Shards, monkeypatch: pytest.MonkeyPatch, largest: int
 ) -> None:
     monkeypatch.setattr(ranges, "AHEAD_BYTES", largest)
-    shards = streamed(folder, open_store("memory://"), tmp_path)
     pictures = Pictures(shards)
 
     def away(*_: object) -> bytes:

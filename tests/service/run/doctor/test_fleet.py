@@ -6,7 +6,7 @@ import json
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,13 @@ import pytest
 from service.model.clock import timestamp
 from service.model.states import Lane, Stage
 from service.model.version import PACKAGE_VERSION
-from service.model.workers import WorkerBeat
 from service.pipeline.leading import PART
 from service.queue.rq_queue import WORKERS, RqQueue, worker_key
 from service.run.address import record_address
 from service.run.doctor.checks import Condition
 from service.run.doctor.fleet import clocks, controller, port, workers
 from service.settings import Settings
+from tests.fakes import beat_of
 from tests.servers import PostgresServer, free_ports
 from tests.service.queue.test_queue import task
 
@@ -34,10 +34,9 @@ def settings(rq_queue: RqQueue, redis_server: str, tmp_path: Path) -> Settings:
 
 def present(queue: RqQueue, name: str = "w", **facts: Any) -> None:
     """A worker that gave a sign of life."""
-    now = timestamp()
-    beat = WorkerBeat(name, "node1", 1, "cpu", "CPU", tuple(Stage), PACKAGE_VERSION, "idle", "", now, now)
+    beat = beat_of(name, **{"host": "node1", "version": PACKAGE_VERSION, **facts})
     queue.connection.sadd(WORKERS, name)
-    queue.connection.set(worker_key(name), json.dumps(asdict(replace(beat, **facts))), ex=60)
+    queue.connection.set(worker_key(name), json.dumps(asdict(beat)), ex=60)
 
 
 def test_a_controller_that_lives_and_one_that_does_not(settings: Settings, rq_queue: RqQueue) -> None:
