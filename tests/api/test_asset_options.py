@@ -1,8 +1,13 @@
-"""What a user says about an upload reaches its check, and goes over what its own asset.json says."""
+"""Uploads: what a user says about one reaches its check, and files go past memory."""
 
 from __future__ import annotations
 
+import io
 import json
+import os
+import tracemalloc
+import zipfile
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,12 +15,14 @@ import trimesh
 from starlette.testclient import TestClient
 
 from api.uploads import files_of_upload
+from service.model.digests import digest_files
+from service.model.errors import InputError
 from service.model.messages import IngestMessage
 from service.model.states import AssetKind
 from service.pipeline.backends import Services
 from service.store.asset_options import hand_options, object_options
-from service.store.assets import builtin_files
-from service.store.library import load_asset, load_asset_files, load_check
+from service.store.assets import builtin_files, pack
+from service.store.library import load_asset, load_asset_files, load_check, publish_asset
 from worker.stages import ingest
 from worker.stages.context import TaskContext
 
@@ -45,7 +52,11 @@ def shell() -> bytes:
 
 #: A brick in millimetres; a ball of 4 cm, as its triangles have it, beside a crumb; and the shell.
 BRICK = stl(trimesh.creation.box((60.0, 40.0, 30.0)))
+
+
 BALL = trimesh.creation.icosphere(subdivisions=3, radius=0.04)
+
+
 TWO = stl(BALL, trimesh.creation.box((0.01, 0.01, 0.01)).apply_translation((0.1, 0, 0)))
 
 
@@ -118,3 +129,48 @@ def test_the_other_keys_stay_as_uploaded(http: TestClient, services: Services) -
     answer = http.post("/v1/objects", files={"file": ("b.stl", b"solid b\nendsolid b")}).json()
     files = load_asset_files(services.store, AssetKind.OBJECT, answer["digest"])
     assert json.loads(files["asset.json"]) == {"file": "b.stl"}
+
+
+MIB = 1 << 20
+
+
+def folder_of(count: int, size: int) -> bytes:
+    """ZIP of a folder with a mesh and textures that do not compress."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("thing/mesh.stl", b"solid x\nendsolid x\n")
+        for number in range(count):
+            archive.writestr(f"thing/texture-{number}.png", os.urandom(size))
+    return buffer.getvalue()
+
+
+def test_a_zip_is_kept_without_ever_being_whole_in_memory(services: Services, tmp_path: Path) -> None:
+    with (tmp_path / "upload.zip").open("w+b") as file:
+        file.write(folder_of(3, 8 * MIB))
+        tracemalloc.start()
+        files = files_of_upload(AssetKind.OBJECT, "thing.zip", file, limit_bytes=32 * MIB)
+        asset = publish_asset(services.store, AssetKind.OBJECT, "thing", files)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    # Two pieces of 1 MiB on their way into the store, of 24 MiB.
+    assert peak < 3 * MIB
+    assert len(load_asset_files(services.store, AssetKind.OBJECT, asset.digest)) == 5
+
+
+def test_a_zip_on_disk_and_its_files_in_memory_are_the_same_asset() -> None:
+    data = folder_of(2, 100_000)
+    streamed = files_of_upload(AssetKind.OBJECT, "thing.zip", data, limit_bytes=MIB)
+    held = dict(streamed)
+    assert digest_files(AssetKind.OBJECT, streamed) == digest_files(AssetKind.OBJECT, held)
+    assert pack(streamed) == pack(held)
+
+
+def test_a_zip_whose_header_understates_its_files_is_refused() -> None:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("mesh.stl", b"0" * 5000)
+    data = buffer.getvalue()
+    true, false = (5000).to_bytes(4, "little"), (10).to_bytes(4, "little")
+    assert data.count(true) == 2
+    with pytest.raises(InputError, match="damaged"):
+        files_of_upload(AssetKind.OBJECT, "thing.zip", data.replace(true, false), limit_bytes=1000)

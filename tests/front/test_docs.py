@@ -1,4 +1,4 @@
-"""docs/reference/python.md, the notebook and what of docs/how-to/hands.md needs a service, run as printed."""
+"""Tutorials, docs/reference/python.md, the notebook and what needs a service, run as printed."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -20,6 +21,7 @@ import graspd
 from service.run.supervisor import Supervisor
 from service.settings import Settings
 from tests.conftest import REPOSITORY
+from tests.docs_commands import run_page
 from tests.waiting import PATIENCE_S, until_a_worker_is_idle
 from tests.worker.hands.my_hand import write_my_hand
 
@@ -116,3 +118,23 @@ def test_a_hand_is_added_corrected_and_used_as_the_page_says(environment: dict[s
         answer = http.post(httpx.URL(url).path, json=body)
         assert answer.status_code == 202, answer.text
         assert http.get("/v1/jobs", params={"hand": "my_hand"}).json()["items"][0]["state"] == "succeeded"
+
+
+TUTORIALS = sorted((REPOSITORY / "docs" / "tutorials").glob("*.md"))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+def test_the_commands_of_a_tutorial_run(page: Path, tmp_path: Path) -> None:
+    assert run_page(page, "", tmp_path) == []
+
+
+def test_the_lines_that_read_the_first_grasps_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    graspd.synthesize("allegro", "mug", count=4, fidelity="draft", seed=1).save("mug.h5")
+    (block,) = re.findall(r"```python\n(.*?)```", (TUTORIALS[0]).read_text(), re.DOTALL)
+    said: dict[str, Any] = {}
+    exec(block, said)
+    best = said["best"]
+    assert (len(best), best.joint_positions.shape) == (3, (3, 16)) and (best.metric("epsilon") > 0).all()

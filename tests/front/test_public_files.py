@@ -1,8 +1,10 @@
-"""Files that a public project keeps beside its sources: valid by their schemas, and true of this repository."""
+"""Files that a public project keeps beside its sources are valid; `import graspd` is light and complete."""
 
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -13,12 +15,17 @@ import yaml
 from click.testing import CliRunner
 from packaging.specifiers import SpecifierSet
 
+import graspd
 from service.model.version import PACKAGE_VERSION
 from tests.conftest import REPOSITORY
 from tests.docs_commands import Line
 
 FORGE = REPOSITORY / ".github"
+
+
 WORKFLOWS = sorted((FORGE / "workflows").glob("*"))
+
+
 #: Name of a schema that check-jsonschema brings, and the files that it describes.
 SCHEMAS = {
     "citation-file-format": [REPOSITORY / "CITATION.cff"],
@@ -26,6 +33,8 @@ SCHEMAS = {
     "github-issue-forms": sorted((FORGE / "ISSUE_TEMPLATE").glob("*")),
     "github-workflows": WORKFLOWS,
 }
+
+
 PROSE = [
     *(REPOSITORY / name for name in ("CONTRIBUTING.md", "SECURITY.md", "CODE_OF_CONDUCT.md")),
     FORGE / "pull_request_template.md",
@@ -102,3 +111,51 @@ def test_a_commit_is_checked_by_the_tools_of_make_check() -> None:
     checked = set(re.findall(r"\$\(BIN\)/([\w-]+)", recipe))
     tools = {hook["entry"].split()[0] for repository in config["repos"] for hook in repository["hooks"]}
     assert tools <= {f".venv/bin/{name}" for name in checked}
+
+
+HEAVY = ("numpy", "pydantic", "warp", "newton", "trimesh", "mujoco", "h5py", "httpx", "service", "worker", "api")
+
+
+#: What imports the others without the garbage collector.
+LIGHT = {"service", "service.model", "service.model.libraries"}
+
+
+def python(code: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=cwd)
+
+
+def test_the_import_loads_nothing_that_takes_time() -> None:
+    done = python("import graspd, sys; print(*sys.modules)", REPOSITORY)
+    loaded = set(done.stdout.split())
+    assert "graspd" in loaded, done.stderr
+    assert {name.partition(".")[0] for name in loaded - LIGHT}.isdisjoint(HEAVY)
+
+
+def test_every_public_name_is_there() -> None:
+    assert [name for name in graspd.__all__ if getattr(graspd, name, None) is None] == []
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = graspd.no_such_name
+
+
+def test_the_errors_are_one_tree() -> None:
+    named = [getattr(graspd, name) for name in graspd.__all__ if name.endswith("Error")]
+    assert all(issubclass(one, graspd.GraspdError) for one in named)
+
+
+@pytest.mark.parametrize("marker", ["__init__.py", None])
+def test_a_folder_that_hides_one_of_graspds_own_is_named_in_one_line(tmp_path: Path, marker: str | None) -> None:
+    hiding = tmp_path / "worker"
+    hiding.mkdir()
+    if marker:
+        (hiding / marker).touch()
+    # What stands first on the path wins, as beside a user's script; graspd itself is behind it.
+    code = f"import sys; sys.path[:0] = [{str(tmp_path)!r}, {str(REPOSITORY)!r}]; import graspd"
+    done = python(code, tmp_path)
+    if marker is None:  # a folder without __init__.py does not hide a package
+        assert done.returncode == 0, done.stderr
+        return
+    said = f"{hiding} hides graspd's own package 'worker'; rename it, or start Python in another folder"
+    assert done.stderr.strip().splitlines()[-1] == f"ImportError: graspd: {said}"

@@ -1,25 +1,39 @@
-"""What a terminal of 80 columns shows: every name, id and time whole, and as it is written."""
+"""Tables of jobs, datasets and their estimates on a terminal."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from rich.console import Console
 from rich.progress import Progress
 from typer.testing import CliRunner
 
-from api.client.reports import JobDisplay
+from api.client.reports import JobDisplay, print_cells, print_dataset, print_estimate
 from graspd.cli import build
 from service.cli import plain_console, plain_table
 from service.model.domain import JobOptions
 from service.model.states import State
+from service.pipeline.backends import Services
+from service.pipeline.datasets import actions
+from service.pipeline.datasets.cost import estimate
+from service.pipeline.datasets.spec import DatasetRequest
+from tests.api.factories import add_job, finish_all
+from tests.planning import plan_all
 
 NAME = "[red]mug[/] :mug: " + "a-very-long-name-of-an-object-that-somebody-gave-to-it"[:46]
+
+
 ID = "0123456789ab"
+
+
 CREATED = "2026-11-26T03:14:11.123456Z"
+
+
 JOB = SimpleNamespace(
     id=ID + "0" * 20,
     state=State.SUCCEEDED,
@@ -32,6 +46,8 @@ JOB = SimpleNamespace(
     standing="valid",
     created=CREATED,
 )
+
+
 DATASET = SimpleNamespace(
     name=NAME,
     state=State.SUCCEEDED,
@@ -43,11 +59,19 @@ DATASET = SimpleNamespace(
     created=CREATED,
     options=JobOptions(),
 )
+
+
 ASSET = SimpleNamespace(
     name=NAME, filename=NAME, size_bytes=10**6, builtin=False, verdict="ok", facts={}, digest=ID + "0" * 52
 )
+
+
 TAG = {"name": NAME, "grasps": 10**6, "changed": CREATED}
+
+
 WEBHOOK = {"id": ID, "url": "https://example.org/" + NAME, "states": ["failed", "succeeded"], "created": CREATED}
+
+
 DELIVERY = {
     "kind": "job",
     "subject": ID,
@@ -133,3 +157,28 @@ def test_progress_shows_messages_as_they_are(monkeypatch: pytest.MonkeyPatch) ->
     with console.capture() as got:
         console.print(progress)
     assert "[red]mug[/] [/nothing]" in got.get()
+
+
+@pytest.mark.parametrize("referee", ["none", "certificate"])
+def test_a_report_names_the_standing_of_what_it_counts(services: Services, referee: str) -> None:
+    given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32, "referee": referee}
+    wanted = DatasetRequest.model_validate(given)
+    actions.create(services, wanted)
+    plan_all(services)
+    finish_all(services, add_job(services, referee=referee))
+    out = io.StringIO()
+    console = Console(file=out, width=200)
+    dataset = services.index.datasets.get("k")
+    print_estimate(estimate(services.index, wanted), console)
+    print_dataset(dataset, console)
+    print_cells(dataset, services.index.datasets.cells("k").items, console)
+    made = 32 if referee == "none" else dataset.valid
+    word, other = ("sound", "valid") if referee == "none" else ("valid", "sound")
+    assert f"grasps: {made} {word} of 32 tried" in out.getvalue()
+    judged = "not judged" if referee == "none" else "at"
+    assert f"per {word} grasp" in out.getvalue() and f"{made}/32 {judged}" in out.getvalue()
+    assert other not in out.getvalue()
+
+
+def test_raw_grasps_that_nobody_judges_are_merely_kept() -> None:
+    assert JobOptions(want="raw", referee="none").standing == "kept"

@@ -1,15 +1,28 @@
-"""Many tasks through one controller: reports, events in bulk, and stages that follow one another between two sweeps."""
+"""Many tasks through one controller: reports, events in bulk, stages between two sweeps, large jobs in pieces."""
 
 from __future__ import annotations
 
-import pytest
+import contextlib
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
+import pytest
+from sqlalchemy import func, select
+
+from service.index.changes.records import RANGES_AT_ONCE
+from service.index.rebuild import differences
+from service.index.tables import tasks
+from service.model import names
 from service.model.clock import timestamp
+from service.model.errors import ConflictError
 from service.model.states import Lane, Stage, State
 from service.model.workers import own_ability
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
-from service.pipeline.controller import Controller
+from service.pipeline.controller import Controller, Duty
+from service.pipeline.deletion import delete_job
 from service.queue.port import Event, EventKind, Report
 from tests.fakes import beat_of, make_shard, request, with_settings
 from tests.memory_queue import Delivery, MemoryQueue
@@ -100,3 +113,133 @@ def test_a_fleet_larger_than_the_window_finds_work(services: Services) -> None:
     clock.now += 1.0
     controller.round()
     assert len(services.queue.waiting()) == 40
+
+
+@pytest.mark.parametrize(
+    ("cost_s", "pause_s"), [(0.0, 1.0), (0.25, 1.0), (1.0, 4.0), (3.0, 6.0)], ids=["free", "cheap", "dear", "bounded"]
+)
+def test_the_pause_follows_from_the_cost(cost_s: float, pause_s: float) -> None:
+    clock, done = Clock(), list[float]()
+
+    def work() -> None:
+        clock.now += cost_s
+        done.append(clock.now)
+
+    duty = Duty(clock, work, 1.0, share=0.2, longest_s=6.0)
+    duty()
+    clock.now += pause_s - 0.01
+    duty()
+    assert len(done) == 1
+    clock.now += 0.02
+    duty()
+    assert len(done) == 2
+
+
+@pytest.mark.parametrize("work", [lambda: 1 / 0, lambda: True], ids=["broke off", "has more to do"])
+def test_what_is_not_done_is_due_at_once(work: Callable[[], object]) -> None:
+    begun: list[int] = []
+    duty = Duty(Clock(), lambda: begun.append(1) or work(), 1.0)  # type: ignore[func-returns-value]
+    for _ in range(2):
+        with contextlib.suppress(ZeroDivisionError):
+            duty()
+    assert len(begun) == 2
+
+
+WorkOff = Callable[[], list[tuple[str, int]]]
+
+
+LARGE = 32 * (2 * RANGES_AT_ONCE + 1)
+
+
+def entered(services: Services) -> int:
+    with services.index.database.reading() as connection:
+        return int(connection.scalar(select(func.count()).select_from(tasks)) or 0)
+
+
+@pytest.fixture
+def now() -> list[float]:
+    """The time that the entering reads."""
+    return [0.0]
+
+
+@pytest.fixture
+def entering(services: Services, now: list[float]) -> Controller:
+    """One that leads already: the index is whole."""
+    made = Controller(services, clock=lambda: now[0])
+    made.round()
+    return made
+
+
+@pytest.fixture
+def work_off(services: Services, entering: Controller, now: list[float]) -> WorkOff:
+    """Enters all that is left, and gives the job and the number of rows of each turn."""
+
+    def enter() -> list[tuple[str, int]]:
+        turns = []
+        while services.index.write.entering():
+            before = entered(services)
+            now[0] += 10.0
+            entering.round()
+            turns.append((entering._entered, entered(services) - before))
+        return turns
+
+    return enter
+
+
+def test_turns_are_short_and_alternate(services: Services, work_off: WorkOff) -> None:
+    jobs = [job_actions.submit(services, request(grasps=LARGE, seed=seed))[0].id for seed in range(2)]
+    assert entered(services) == 2 * RANGES_AT_ONCE
+    turns = work_off()
+    assert [job for job, _ in turns] == 2 * sorted(jobs)
+    assert [rows for _, rows in turns] == [RANGES_AT_ONCE, RANGES_AT_ONCE, 1, 1]
+    assert differences(services.index, services.store) == []
+
+
+def test_a_job_is_told_whole_before_it_is_entered(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=LARGE))
+    assert [(stage.tasks, stage.queued) for stage in job.stages] == [(LARGE // 32, LARGE // 32)]
+
+
+def test_a_job_that_is_being_entered_has_not_ended(services: Services, work_off: WorkOff) -> None:
+    job, _ = job_actions.submit(services, request(grasps=LARGE))
+    assert not job_actions.cancel(services, job.id).state.is_final
+    with pytest.raises(ConflictError):
+        delete_job(services, job.id)
+    work_off()
+    assert services.index.jobs.get(job.id).state is State.CANCELLED
+    assert differences(services.index, services.store) == []
+
+
+def test_the_same_job_again_begins_nothing_anew(services: Services, work_off: WorkOff) -> None:
+    job, _ = job_actions.submit(services, request(grasps=LARGE))
+    work_off()
+    again, new = job_actions.submit(services, request(grasps=LARGE))
+    assert (again.id, new, services.index.write.entering()) == (job.id, False, [])
+
+
+def test_a_job_whose_record_is_gone_is_given_up(services: Services, work_off: WorkOff) -> None:
+    job, _ = job_actions.submit(services, request(grasps=LARGE))
+    services.store.delete(names.job_record(job.id))
+    assert work_off() == [(job.id, 0)]
+
+
+@pytest.mark.slow
+def test_five_jobs_of_a_million_grasps_delay_a_small_one_by_less_than_three_seconds(services: Services) -> None:
+    stop, waits = threading.Event(), list[float]()
+    leading = Controller(services)
+    leading.round()
+    entering = threading.Thread(target=leading.run, args=(stop,))
+    entering.start()
+    with ThreadPoolExecutor(5) as pool:
+        large = [pool.submit(job_actions.submit, services, request(grasps=10**6, seed=seed)) for seed in range(5)]
+        number = 0
+        while not all(one.done() for one in large) or services.index.write.entering():
+            number += 1
+            start = time.monotonic()
+            job_actions.submit(services, request(grasps=1, seed=100 + number))
+            waits.append(time.monotonic() - start)
+    stop.set()
+    entering.join()
+    print(f"{number} small jobs beside five large ones: longest wait {max(waits):.2f} s")
+    assert entered(services) == 5 * 31_250 + number
+    assert max(waits) < 3

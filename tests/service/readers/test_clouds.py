@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +15,14 @@ from service.model.errors import InputError
 from service.readers import Pictures, open_shards
 from service.readers.clouds import Clouds, graspness
 from service.store.shards import read_shard
+from tests.conftest import REPOSITORY
 from tests.service.readers import box_scenes
 from tests.service.readers.box_scenes import EYES, POSES, SCENE_OF_GRASP, SIZE, VALID
 
 #: Pictures keep depth in float32: half a unit in the last place of half a metre is 3e-8, of a point 6e-8 [m].
 DEPTH_M = 1e-7
+
+
 VIEWS = len(EYES)
 
 
@@ -199,3 +204,24 @@ def test_graspness_of_a_cloud_is_that_of_its_true_points(pictures: Pictures) -> 
 def test_what_no_cloud_can_be_is_refused(pictures: Pictures, option: str, value: Any) -> None:
     with pytest.raises(InputError):
         pictures.clouds(**{"fuse": value == "camera", option: value})
+
+
+def test_the_page_runs_as_it_is_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "demo-out").mkdir()
+    box_scenes.write(tmp_path / "demo-out" / "shards")
+    monkeypatch.chdir(tmp_path)
+    page = (REPOSITORY / "docs" / "how-to" / "clouds.md").read_text()
+    said: dict[str, Any] = {}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        if "torch" not in block or find_spec("torch") is not None:
+            exec(block, said)
+    sample = said["sample"]
+    assert sample["cloud/points"].shape == (1024, 3) and sample["cloud/seen"] > 100
+    listed = re.findall(r"^\| (`[^|]*`) \| ", page, re.MULTILINE)
+    keys = {name for cell in listed for name in re.findall(r"`([\w/]+)`", cell) if "/" in name or name == "base_id"}
+    sample = said["views"].clouds(8, hand_surface=lambda _, rows: np.zeros((len(rows), 1, 3)))[0]
+    assert keys <= set(sample), "the table names what is not there"
+    of_clouds = {
+        name for name in sample if name.split("/")[0] in ("cloud", "camera", "table", "object") and "/" in name
+    }
+    assert of_clouds <= keys, "the table leaves something out"

@@ -1,10 +1,13 @@
-"""Reading shards back: from files, jobs and snapshots; what is kept, and how pictures and grasps belong together."""
+"""Reading shards back: from files, jobs, snapshots and S3, ahead of need; how pictures and grasps belong together."""
 
 from __future__ import annotations
 
 import hashlib
 import os
+import threading
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,11 +18,17 @@ from service.model.records import JobRecord, Snapshot
 from service.model.states import Stage
 from service.model.transforms import compose, pose_from_matrix
 from service.pipeline.backends import Services
-from service.readers import Grasps, Pictures, ShardCache, Shards, open_shards
+from service.readers import Grasps, Pictures, ShardCache, Shards, open_shards, prefetched
+from service.settings import Settings
 from service.store.records import put_record
 from service.store.shards import Shard, read_shard
+from service.store.store import open_store
 from tests.api import factories
 from tests.damage import flipped, flipped_values
+from tests.indexes import empty_index
+from tests.memory_queue import MemoryQueue
+from tests.servers import S3Server
+from tests.service.readers import box_scenes
 
 GRASPS = 40
 
@@ -163,3 +172,108 @@ def _put_snapshot(services: Services, dataset: str, shards: Shards, *, created: 
     of = {"dataset": dataset, "dataset_digest": "a" * 32, "digest": digest, "complete": True, "grasps": 1}
     taken = Snapshot(**of, **sums, created=created, shards=listed)
     put_record(services.store, dataset_snapshot(dataset, digest), taken)
+
+
+@pytest.fixture
+def remote(tmp_path: Path, s3_url: str) -> Iterator[Services]:
+    index = empty_index(f"sqlite:///{tmp_path / 'index.sqlite'}")
+    made = Services(Settings(data_dir=tmp_path), open_store(s3_url), index, MemoryQueue())
+    factories.add_builtins(made)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def remote_job(remote: Services) -> JobRecord:
+    record = factories.add_job(remote, grasps=40, scenes=2, views=2, width=24, height=16)
+    factories.finish_all(remote, record)
+    return record
+
+
+@pytest.mark.s3
+def test_what_is_read_from_s3_is_what_was_written(
+    remote: Services, remote_job: JobRecord, s3_url: str, tmp_path: Path
+) -> None:
+    shards = open_shards(s3_url, job=remote_job.id, cache=tmp_path / "cache")
+    written = [remote.store.get(file.key) for file in shards]
+    assert [shards.path(file).read_bytes() for file in shards] == written
+    assert len(Grasps(shards, valid=False)) == 40 and len(Pictures(shards)) == 8
+
+
+@pytest.mark.s3
+def test_what_was_read_once_needs_the_server_no_more(
+    remote: Services, remote_job: JobRecord, s3_url: str, s3_server: S3Server, tmp_path: Path
+) -> None:
+    shards = open_shards(s3_url, job=remote_job.id, cache=tmp_path / "cache")
+    first = Grasps(shards).arrays("grasp/hand_pose")
+    s3_server.kill()
+    try:
+        again = Grasps(shards).arrays("grasp/hand_pose")
+    finally:
+        s3_server.start()
+    np.testing.assert_array_equal(again["grasp/hand_pose"], first["grasp/hand_pose"])
+
+
+@pytest.mark.s3
+def test_a_cache_smaller_than_the_job_still_reads_all_of_it(
+    remote: Services, remote_job: JobRecord, s3_url: str, tmp_path: Path
+) -> None:
+    shards = open_shards(s3_url, job=remote_job.id, cache=tmp_path / "cache", cache_bytes=60_000)
+    largest = max(len(remote.store.get(file.key)) for file in shards)
+    assert sum(1 for _ in Grasps(shards, valid=False)) == 40
+    held = sum(path.stat().st_size for path in (tmp_path / "cache").iterdir())
+    assert held <= max(60_000, largest) < sum(len(remote.store.get(file.key)) for file in shards)
+
+
+class Counted(Sequence[dict[str, Any]]):
+    """Numbers as samples; number `bad` cannot be read."""
+
+    def __init__(self, bad: int = -1) -> None:
+        self.bad, self.asked, self._lock = bad, 0, threading.Lock()
+
+    def __len__(self) -> int:
+        return 30
+
+    def __getitem__(self, index: Any) -> Any:
+        with self._lock:
+            self.asked += 1
+        if index == self.bad:
+            raise InputError("no such number")
+        return {"number": index}
+
+
+def test_samples_come_in_order_and_none_is_left_out() -> None:
+    assert [sample["number"] for sample in prefetched(Counted(), workers=3, ahead=4)] == list(range(30))
+    order = [7, 3, 3, 29]
+    assert [sample["number"] for sample in prefetched(Counted(), order, workers=2, ahead=50)] == order
+
+
+def test_no_more_are_read_than_may_be_held() -> None:
+    source = Counted()
+    found = prefetched(source, workers=2, ahead=5)
+    for _ in range(3):
+        next(found)
+    assert source.asked <= 3 + 5
+    found.close()
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("prefetch")]
+
+
+def test_an_error_comes_when_it_is_its_turn() -> None:
+    found = prefetched(Counted(bad=4), workers=2, ahead=10)
+    assert [next(found)["number"] for _ in range(4)] == [0, 1, 2, 3]
+    with pytest.raises(InputError, match="no such number"):
+        next(found)
+
+
+@pytest.mark.parametrize("options", [{"workers": 0}, {"ahead": 0}])
+def test_numbers_below_one_are_refused_at_once(options: dict[str, int]) -> None:
+    with pytest.raises(InputError, match="at least one"):
+        prefetched(Counted(), **options)
+
+
+def test_pictures_and_clouds_are_the_same_ahead(tmp_path: Path) -> None:
+    pictures = Pictures(open_shards(box_scenes.write(tmp_path / "box")))
+    for source in (pictures, pictures.clouds(64, noise="tof")):
+        for index, sample in enumerate(prefetched(source, workers=3)):
+            for name, value in source[index].items():
+                np.testing.assert_array_equal(sample[name], value)

@@ -1,22 +1,29 @@
-"""Shards that are not what they were: refused by name, wherever they are read."""
+"""Shards that are not what they were, or hold what is not theirs: refused by name, wherever they are read."""
 
 from __future__ import annotations
 
 import hashlib
 import os
+import resource
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
+import numpy as np
 import pytest
 
-from service.model.errors import DamagedShard
+from service.model.errors import DamagedShard, InputError, NotFoundError
 from service.model.states import Stage
+from service.store import validity
 from service.store.integrity import Checked, read_checked
 from service.store.manifests import ShardManifest, load_shard
 from service.store.shards import read_shard
 from service.store.store import Store, open_store
 from tests.damage import cut, flip, flipped, flipped_values, overwrite, remove
 from tests.fakes import make_shard, message_for
+from tests.worker.files.test_curation import shard as base_shard
 
 HARMS = (flip, cut, remove)
 
@@ -129,3 +136,115 @@ def test_a_large_file_is_cut_off_before_what_turned(tmp_path: Path, store: Store
     with pytest.raises(DamagedShard):
         got.extend(checked.stream("large.bin", digest, 0, len(data)))
     assert b"".join(got) == data[: 2 << 20]
+
+
+FLAGS = np.array([1, 1, 0], np.uint8)
+
+
+def test_where_nobody_judged_nothing_is_valid() -> None:
+    columns = {"quality/valid": np.zeros(3, np.uint8), "quality/sound": FLAGS}
+    assert not validity.valid(columns).any()
+    assert validity.chosen(columns, unjudged=True).tolist() == [True, True, False]
+
+
+def test_a_shard_of_graspd_0_1_that_nobody_judged_is_not_taken_for_judged() -> None:
+    assert not validity.valid({"quality/valid": FLAGS}).any()
+    assert validity.chosen({"quality/valid": FLAGS}, unjudged=True).tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize("verdict, valid, unjudged", [(1, [True, True, False], []), (-1, [], [True, True, False])])
+def test_a_verdict_counts_only_where_there_is_one(verdict: int, valid: list[bool], unjudged: list[bool]) -> None:
+    columns = {"quality/valid": FLAGS, "quality/sound": FLAGS, "quality/success": np.full(3, verdict, np.int8)}
+    assert validity.valid(columns).tolist() == (valid or [False] * 3)
+    assert validity.chosen(columns, unjudged=True).tolist() == (unjudged or [False] * 3)
+
+
+def test_a_grasp_that_was_judged_and_dropped_is_neither() -> None:
+    columns = {
+        "quality/valid": np.zeros(1, np.uint8),
+        "quality/sound": np.ones(1, np.uint8),
+        "quality/success": np.zeros(1, np.int8),
+    }
+    assert not validity.chosen(columns).any()
+    assert not validity.chosen(columns, unjudged=True).any()
+
+
+def external_link(file: h5py.File, secret: Path) -> None:
+    file["grasp/hand_pose"] = h5py.ExternalLink(str(secret), "/secret")
+
+
+def soft_link(file: h5py.File, _: Path) -> None:
+    file["grasp/hand_pose"] = h5py.SoftLink("/pregrasp/hand_pose")
+
+
+def external_storage(file: h5py.File, secret: Path) -> None:
+    file.create_dataset("grasp/hand_pose", (4, 7), "f8", external=[(str(secret), 0, 4 * 7 * 8)])
+
+
+def virtual(file: h5py.File, secret: Path) -> None:
+    layout = h5py.VirtualLayout((4, 7), "f8")
+    layout[:] = h5py.VirtualSource(str(secret), "secret", (4, 7))
+    file.create_virtual_dataset("grasp/hand_pose", layout)
+
+
+def made_up(file: h5py.File, _: Path) -> None:
+    file.create_dataset("grasp/hand_pose", (50_000_000, 7), "f8", chunks=(4096, 7), fillvalue=1.0)
+
+
+def deflated_zeros(file: h5py.File, _: Path) -> None:
+    dataset = file.create_dataset("grasp/hand_pose", (50_000_000, 7), "f8", chunks=(1 << 20, 7), compression="gzip")
+    piece = zlib.compress(bytes(dataset.chunks[0] * 7 * 8), 9)
+    for start in range(0, 48 << 20, 1 << 20):
+        dataset.id.write_direct_chunk((start, 0), piece)
+
+
+def one_dataset_under_many_names(file: h5py.File, _: Path) -> None:
+    file["grasp/hand_pose"] = np.zeros((1000, 7))
+    for number in range(500):
+        file[f"name{number}"] = file["grasp/hand_pose"]
+
+
+def many(file: h5py.File, _: Path) -> None:
+    for number in range(1200):
+        file.create_group(f"g{number}")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        external_link,
+        soft_link,
+        external_storage,
+        virtual,
+        made_up,
+        deflated_zeros,
+        one_dataset_under_many_names,
+        many,
+    ],
+)
+@pytest.mark.parametrize("as_bytes", [False, True])
+def test_values_from_elsewhere_are_refused(
+    change: Callable[[h5py.File, Path], None], as_bytes: bool, tmp_path: Path
+) -> None:
+    secret, shard = tmp_path / "secret.h5", tmp_path / "shard.h5"
+    with h5py.File(secret, "w") as file:
+        file["secret"] = np.full((4, 7), 42.0)
+    base_shard(shard, 1)
+    with h5py.File(shard, "r+") as file:
+        if "grasp/hand_pose" in file and change is not many:
+            del file["grasp/hand_pose"]
+        change(file, secret)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match=r"link|another file|claims|more than 1000"):
+        read_shard(shard.read_bytes() if as_bytes else shard)
+    # The file that makes values up claims 2.8 GB; KiB.
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500 * 1024
+
+
+def test_what_is_no_hdf5_is_told_in_our_words(tmp_path: Path) -> None:
+    (tmp_path / "a.h5").write_text("no")
+    with pytest.raises(InputError, match="not a readable HDF5 file; give a shard"):
+        read_shard(tmp_path / "a.h5")
+    for absent in (tmp_path / "absent.h5", tmp_path):
+        with pytest.raises(NotFoundError, match="does not exist, or is no file"):
+            read_shard(absent)
