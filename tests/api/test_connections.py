@@ -118,11 +118,6 @@ def test_half_of_a_request_behind_another_is_given_up_after_its_answer(connect: 
     assert answer.index(b" 200 ") < answer.index(b" 408 ")
 
 
-def test_an_answer_may_take_longer_than_headers(connect: Connect) -> None:
-    connection = connect(_WHOLE)
-    assert b" 200 " in connection.recv(65536)
-
-
 def test_a_request_of_two_lengths_is_refused(connect: Connect, app: FastAPI) -> None:
     lengths = b"Transfer-Encoding: chunked\r\nContent-Length: 5\r\n"
     sent = b"POST /v1/jobs HTTP/1.1\r\nHost: 127.0.0.1\r\n" + lengths + b"\r\n0\r\n\r\nGET /healthz HTTP/1.1\r\n"

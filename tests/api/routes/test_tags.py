@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from api.access.keys import KeyFile, Scope
+from api.access.keys import Scope
 from api.app import create_app
 from service.index.rebuild import differences, rebuild
 from service.model import names
@@ -22,7 +22,7 @@ from service.pipeline.backends import Services
 from service.readers.where import parse
 from service.store.manifests import ShardManifest
 from service.store.shards import Shard, read_shard
-from tests.api.factories import add_job, finish_all
+from tests.api.factories import add_job, finish_all, people_of
 from tests.planning import plan_all
 
 Grasps = list[dict[str, Any]]
@@ -162,17 +162,8 @@ def test_what_is_not_there_or_too_much_gets_no_tag(
 def test_a_project_has_tags_of_its_own_and_a_key_changes_only_what_is_its(
     services: Services, made: ShardManifest
 ) -> None:
-    keys = KeyFile(services.settings.resolved_keys_file)
-    people = {
-        name: {"Authorization": f"Bearer {keys.add(name, scope, project=project)}"}
-        for name, scope, project in [
-            ("old", Scope.SUBMIT, ""),
-            ("new", Scope.SUBMIT, ""),
-            ("eve", Scope.READ, ""),
-            ("root", Scope.ADMIN, ""),
-            ("bob", Scope.SUBMIT, "blue"),
-        ]
-    }
+    submits = {name: (Scope.SUBMIT, project) for name, project in (("old", ""), ("new", ""), ("bob", "blue"))}
+    people = people_of(services.settings, **submits, eve=(Scope.READ, ""), root=(Scope.ADMIN, ""))
     body = {"name": "good", "grasps": named(made.shard_id, 1)}
     with TestClient(create_app(services.settings, services), base_url="https://graspd.example") as http:
 
