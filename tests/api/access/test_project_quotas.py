@@ -20,7 +20,7 @@ from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from service.store.records import read_record
 from tests.api.conftest import TODAY
-from tests.api.factories import finish_all
+from tests.api.factories import finish_all, people_of
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
 Ask = Callable[..., Any]
@@ -39,13 +39,12 @@ def service(
 @pytest.fixture
 def ask(service: TestClient, settings: Settings) -> Ask:
     """Submits a job in the name of a key: two are of `red`, one of `blue`."""
-    keys = KeyFile(settings.resolved_keys_file)
     projects = {"ann": "red", "amy": "red", "bob": "blue"}
-    tokens = {name: keys.add(name, Scope.SUBMIT, project=project) for name, project in projects.items()}
+    people = people_of(settings, **{name: (Scope.SUBMIT, project) for name, project in projects.items()})
 
     def submit(who: str, seed: int, path: str = "/v1/jobs", /, **changes: Any) -> Any:
         body = {**JOB, "seed": seed, **changes} if path == "/v1/jobs" else changes
-        return service.post(path, json=body, headers={"Authorization": f"Bearer {tokens[who]}"})
+        return service.post(path, json=body, headers=people[who])
 
     return submit
 

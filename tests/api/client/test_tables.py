@@ -34,31 +34,13 @@ ID = "0123456789ab"
 CREATED = "2026-11-26T03:14:11.123456Z"
 
 
-JOB = SimpleNamespace(
-    id=ID + "0" * 20,
-    state=State.SUCCEEDED,
-    hand=NAME,
-    object=NAME,
-    progress=1.0,
-    valid=100_000,
-    grasps=100_000,
-    requested=100_000,
-    standing="valid",
-    created=CREATED,
-)
+_DONE = {"state": State.SUCCEEDED, "progress": 1.0, "created": CREATED}
+_JOB = {"id": ID + "0" * 20, "hand": NAME, "object": NAME, "standing": "valid"}
+JOB = SimpleNamespace(**dict.fromkeys(("valid", "grasps", "requested"), 100_000), **_JOB, **_DONE)
 
 
-DATASET = SimpleNamespace(
-    name=NAME,
-    state=State.SUCCEEDED,
-    cells=1000,
-    progress=1.0,
-    counted=10**6,
-    asked=10**6,
-    size_bytes=10**9 + 1,
-    created=CREATED,
-    options=JobOptions(),
-)
+_DATASET = {"name": NAME, "cells": 1000, "counted": 10**6, "asked": 10**6, "size_bytes": 10**9 + 1}
+DATASET = SimpleNamespace(**_DATASET, **_DONE, options=JobOptions())
 
 
 ASSET = SimpleNamespace(
@@ -72,15 +54,8 @@ TAG = {"name": NAME, "grasps": 10**6, "changed": CREATED}
 WEBHOOK = {"id": ID, "url": "https://example.org/" + NAME, "states": ["failed", "succeeded"], "created": CREATED}
 
 
-DELIVERY = {
-    "kind": "job",
-    "subject": ID,
-    "ended": "succeeded",
-    "state": "delivered",
-    "attempts": 3,
-    "tried": CREATED,
-    "detail": NAME,
-}
+_ENDED = {"kind": "job", "subject": ID, "ended": "succeeded", "state": "delivered"}
+DELIVERY = _ENDED | {"attempts": 3, "tried": CREATED, "detail": NAME}
 
 
 class Service:

@@ -93,11 +93,6 @@ def test_a_file_larger_than_any_network_is_not_read(monkeypatch: pytest.MonkeyPa
     assert file.tell() == 0
 
 
-def test_a_network_has_no_model_to_show(http: TestClient) -> None:
-    upload(http, of_hand(http))
-    assert http.get("/v1/networks/net/model").status_code == 404
-
-
 def test_a_job_names_a_network_and_keeps_its_digest(http: TestClient, services: Services) -> None:
     digest = upload(http, of_hand(http)).json()["digest"]
     answer = http.post("/v1/jobs", json=JOB)
@@ -125,32 +120,21 @@ def test_a_job_that_the_network_does_not_fit_is_refused_in_a_line(
     http: TestClient, changes: dict[str, Any], status: int, words: str
 ) -> None:
     upload(http, of_hand(http))
-    for path, body in (
-        ("/v1/jobs", JOB | changes),
-        (
-            "/v1/datasets",
-            {
-                **{k: v for k, v in (JOB | changes).items() if k not in ("hand", "object")},
-                "name": "d",
-                "hands": [(JOB | changes)["hand"]],
-                "objects": ["mug"],
-            },
-        ),
-    ):
+    job = JOB | changes
+    options = {name: value for name, value in job.items() if name not in ("hand", "object")}
+    dataset = {"name": "d", "hands": [job["hand"]], "objects": [job["object"]], **options}
+    for path, body in (("/v1/jobs", job), ("/v1/datasets", dataset)):
         answer = http.post(path, json=body)
         assert answer.status_code == status, answer.text
         assert words in json.dumps(answer.json(), ensure_ascii=False) and "\n" not in answer.json()["detail"]
 
 
-def test_a_network_that_nothing_needs_is_deleted(http: TestClient) -> None:
-    upload(http, of_hand(http))
-    assert http.delete("/v1/networks/net").status_code == 204
-    assert http.get("/v1/networks/net").status_code == 404
-
-
-def test_the_page_of_hands_shows_networks_once_there_are_any(http: TestClient) -> None:
+def test_the_page_of_hands_shows_networks_while_there_are_any(http: TestClient) -> None:
     assert "Networks" not in http.get("/hands").text
     digest = upload(http, of_hand(http)).json()["digest"]
     page = http.get("/hands").text
     barrett = http.get("/v1/hands/barrett").json()["digest"]
     assert digest[:12] in page and f"barrett ({barrett[:12]})" in page and "drawn by chance" in page
+    assert http.get("/v1/networks/net/model").status_code == 404
+    assert http.delete("/v1/networks/net").status_code == 204
+    assert http.get("/v1/networks/net").status_code == 404
