@@ -50,21 +50,19 @@ def test_gpu_workers_see_every_gpu_and_share_the_folder_that_tells_them_apart() 
 
 
 @pytest.mark.parametrize("name", sorted(SERVICES))
-def test_every_image_has_a_version(name: str) -> None:
-    _, _, tag = SERVICES[name]["image"].partition(":")
-    assert re.match(r"v?\d", tag), f"{SERVICES[name]['image']} floats"
+def test_every_service_has_a_version_limits_a_restart_policy_and_bounded_logs(name: str) -> None:
+    service = SERVICES[name]
+    assert re.match(r"v?\d", service["image"].partition(":")[2]), f"{service['image']} floats"
+    assert "memory" in service["deploy"]["resources"]["limits"]
+    assert service["restart"] == "unless-stopped"
+    assert {"max-size", "max-file"} <= service["logging"]["options"].keys()
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_the_environment_is_made_of_settings(name: str) -> None:
+def test_the_environment_is_made_of_settings_that_can_be_read(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     environment = SERVICES[name]["environment"]
-    unknown = {key for key in environment if key not in SETTINGS and not key.startswith(PREFIXES)}
-    assert not unknown
-
-
-@pytest.mark.parametrize("name", OURS)
-def test_the_defaults_are_settings_that_can_be_read(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    for key, value in SERVICES[name]["environment"].items():
+    assert not {key for key in environment if key not in SETTINGS and not key.startswith(PREFIXES)}
+    for key, value in environment.items():
         monkeypatch.setenv(key, value)
     settings = Settings()
     assert settings.redis_url is not None
@@ -72,24 +70,11 @@ def test_the_defaults_are_settings_that_can_be_read(name: str, monkeypatch: pyte
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_docker_waits_longer_than_a_process_may_take_to_stop(name: str) -> None:
+def test_docker_waits_for_our_containers_and_they_have_no_rights_to_lose(name: str) -> None:
     service = SERVICES[name]
     wait = composition.seconds(service["stop_grace_period"])
     assert wait > float(service["environment"]["GRASPD_STOP_GRACE_S"])
     assert wait > float(composition.example()["GRASPD_STOP_GRACE_S"])
-
-
-@pytest.mark.parametrize("name", sorted(SERVICES))
-def test_every_service_has_limits_a_restart_policy_and_bounded_logs(name: str) -> None:
-    service = SERVICES[name]
-    assert "memory" in service["deploy"]["resources"]["limits"]
-    assert service["restart"] == "unless-stopped"
-    assert {"max-size", "max-file"} <= service["logging"]["options"].keys()
-
-
-@pytest.mark.parametrize("name", OURS)
-def test_our_containers_have_no_rights_to_lose(name: str) -> None:
-    service = SERVICES[name]
     assert service["read_only"] is True
     assert service["cap_drop"] == ["ALL"]
     assert "no-new-privileges:true" in service["security_opt"]

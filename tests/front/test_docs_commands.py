@@ -118,15 +118,8 @@ def test_a_page_that_ended_well_waits_for_a_change(tmp_path: Path, monkeypatch: 
     assert len(ran) == 4
 
 
-LINKING = sorted(
-    page
-    for page in (
-        *REPOSITORY.glob("*.md"),
-        *(REPOSITORY / "docs").rglob("*.md"),
-        *(REPOSITORY / "examples").rglob("*.md"),
-    )
-    if page.is_file()
-)
+_FOLDERS = (REPOSITORY.glob("*.md"), *((REPOSITORY / name).rglob("*.md") for name in ("docs", "examples")))
+LINKING = sorted(page for pages in _FOLDERS for page in pages if page.is_file())
 
 
 #: Sources whose comments, messages and help name pages.
@@ -172,11 +165,8 @@ def test_links_of_a_page_lead_somewhere(page: Path) -> None:
 
 @pytest.mark.parametrize("room", SOURCES)
 def test_pages_that_sources_name_exist(room: str) -> None:
-    files = [
-        file
-        for file in (REPOSITORY / room).rglob("*")
-        if file.suffix in {".py", ".sh", ".toml", ".yaml", ".yml", ".sbatch", ".html", ".ipynb"}
-    ]
+    suffixes = {".py", ".sh", ".toml", ".yaml", ".yml", ".sbatch", ".html", ".ipynb"}
+    files = [file for file in (REPOSITORY / room).rglob("*") if file.suffix in suffixes]
     assert files
     named = {(str(file.relative_to(REPOSITORY)), page) for file in files for page in _LINKED.findall(file.read_text())}
     assert {(file, page) for file, page in named if not (REPOSITORY / page).is_file()} == set()

@@ -88,50 +88,28 @@ def test_a_fault_of_graspd_keeps_its_trace() -> None:
 
 
 #: Words of the libraries that read files, and of pydantic and click.
-FOREIGN = (
-    "Errno",
-    "pydantic",
-    "nable to open",
-    "nput should",
-    "Traceback",
-    "Error:",
-    "<unicode string>",
-    "errors.pydantic",
-)
+FOREIGN = ("Errno", "pydantic", "nable to open", "nput should", "Traceback", "Error:", "<unicode string>")
 
 
 #: FILE stands for what is not there, or is of no kind; the suffix is what a user would give.
+_TYPED = """
+    synth --hand FILE.urdf --object mug -o OUT.h5
+    synth --hand allegro --object FILE.stl -o OUT.h5
+    synth --hand allegro --object mug --scene FILE.yaml -o OUT.h5
+    synth --hand allegro --object mug --scene FILE.json -o OUT.h5
+    synth --hand allegro --object mug --scene table --with FILE.stl -o OUT.h5
+    synth --hand allegro --object mug --scene table --method learned --option network=FILE.npz -o OUT.h5
+    evaluate FILE.h5; evaluate FILE.json; scene FILE.h5; render FILE.h5; view FILE.h5; pictures FILE.h5
+    clouds FILE.h5 -o OUT; grasps where lift --from FILE.h5 -o OUT
+    datasets balance FILE.h5 -o OUT; datasets card FILE.h5/ -o OUT; datasets diff FILE.h5 FILE.h5
+    datasets create x --spec FILE.toml; datasets estimate --spec FILE.json
+    hands check FILE.urdf; hands check FILE.zip; objects check FILE.zip; objects check FILE.stl
+    bench --hand FILE.urdf; admin bench-render --object FILE.stl; admin gallery --hand FILE.urdf -o OUT
+    chart --from FILE.json; chart --scene FILE.json --quick; stability --from FILE.json
+    submit --hand allegro --object mug --scene FILE.json
+"""
 COMMANDS = (
-    "synth --hand FILE.urdf --object mug -o OUT.h5",
-    "synth --hand allegro --object FILE.stl -o OUT.h5",
-    "synth --hand allegro --object mug --scene FILE.yaml -o OUT.h5",
-    "synth --hand allegro --object mug --scene FILE.json -o OUT.h5",
-    "synth --hand allegro --object mug --scene table --with FILE.stl -o OUT.h5",
-    "synth --hand allegro --object mug --scene table --method learned --option network=FILE.npz -o OUT.h5",
-    "evaluate FILE.h5",
-    "evaluate FILE.json",
-    "scene FILE.h5",
-    "render FILE.h5",
-    "view FILE.h5",
-    "pictures FILE.h5",
-    "clouds FILE.h5 -o OUT",
-    "grasps where lift --from FILE.h5 -o OUT",
-    "datasets balance FILE.h5 -o OUT",
-    "datasets card FILE.h5/ -o OUT",
-    "datasets diff FILE.h5 FILE.h5",
-    "datasets create x --spec FILE.toml",
-    "datasets estimate --spec FILE.json",
-    "hands check FILE.urdf",
-    "hands check FILE.zip",
-    "objects check FILE.zip",
-    "objects check FILE.stl",
-    "bench --hand FILE.urdf",
-    "admin bench-render --object FILE.stl",
-    "chart --from FILE.json",
-    "chart --scene FILE.json --quick",
-    "stability --from FILE.json",
-    "admin gallery --hand FILE.urdf -o OUT",
-    "submit --hand allegro --object mug --scene FILE.json",
+    *(command.strip() for line in _TYPED.split("\n") for command in line.split(";") if command.strip()),
     *(f"export FILE.h5 --format {name} -o OUT" for name in EXPORTS),
     *(
         f"import FILE.{'json' if name == 'reference' else 'npy'} --format {name} --licence x --source y --hand allegro "

@@ -70,14 +70,8 @@ def test_a_picture_that_would_show_steps_keeps_its_colours(tmp_path: Path) -> No
 
 
 def test_raw_results_stand_beside_the_pages_and_not_in_the_manifest(tmp_path: Path) -> None:
-    raw = Study(
-        "add",
-        "a sum",
-        ("results/sum.json",),
-        (*ADD.run, ADD.run[0].replace("total.txt", "sum.json")),
-        prints=ADD.prints,
-    )
-    runner(tmp_path).run(raw)
+    run = (*ADD.run, ADD.run[0].replace("total.txt", "sum.json"))
+    runner(tmp_path).run(Study("add", "a sum", ("results/sum.json",), run, prints=ADD.prints))
     assert (tmp_path / "docs/results/sum.json").is_file()
     assert set(load(tmp_path / "docs")["add"]["files"]) == {"results/sum.md"}
 
@@ -89,14 +83,10 @@ def test_each_file_belongs_to_one_study() -> None:
 
 
 @pytest.mark.parametrize("path", page.PAGES, ids=lambda path: path.name)
-def test_what_a_page_cites_is_held(path: Path) -> None:
+def test_what_a_page_cites_is_held_and_its_tables_are_those_of_the_figures(path: Path) -> None:
     held = {name for record in load(DOCS).values() for name in record["files"]} | {INDEX, manifest.MANIFEST}
     folders = {str(parent) for name in held for parent in Path(name).parents}
     assert set(page.cited(path)) <= held | folders
-
-
-@pytest.mark.parametrize("path", page.PAGES, ids=lambda path: path.name)
-def test_tables_of_a_page_are_those_of_the_figures(path: Path) -> None:
     text = path.read_text()
     assert page.renewed(text, DOCS) == text, "run: make docs"
 
@@ -180,16 +170,10 @@ def test_what_a_study_lacks_is_said(tmp_path: Path) -> None:
 
 def test_folders_of_this_machine_are_not_in_the_figures(tmp_path: Path) -> None:
     tells = "import sys, json; json.dump(sys.argv[1:], open(sys.argv[2], 'w'))"
-    says = Study(
-        "add",
-        "a sum",
-        ("results/where.json",),
-        (f'python -c "{tells}" DATA/hands OUT/results/where.json',),
-        prints="results/where.md",
-    )
+    line = f'python -c "{tells}" DATA/hands OUT/results/where.json'
     made = runner(tmp_path)
     made.places["DATA"] = tmp_path / "data"
-    made.run(says)
+    made.run(Study("add", "a sum", ("results/where.json",), (line,), prints="results/where.md"))
     assert json.loads((tmp_path / "docs/results/where.json").read_text()) == ["DATA/hands", "docs/results/where.json"]
 
 

@@ -29,16 +29,16 @@ def share(http: TestClient, job: str) -> float:
     return sum(row["valid"] for row in rows) / len(rows)
 
 
-def test_the_service_counts_as_tries_only_what_was_judged(http: TestClient, jobs: dict[str, str]) -> None:
+def test_service_and_job_count_as_tries_only_what_was_judged(http: TestClient, jobs: dict[str, str]) -> None:
     stats = http.get("/v1/stats").json()
     assert (stats["tried"], stats["judged"]) == (352, 32)
-    assert stats["valid_yield"] == share(http, jobs["judged"])
-
-
-def test_a_job_tells_its_yield_or_that_nobody_judged(http: TestClient, jobs: dict[str, str]) -> None:
     told = {name: http.get(f"/v1/jobs/{job}").json() for name, job in jobs.items()}
-    assert told["judged"]["valid_yield"] == share(http, jobs["judged"])
+    assert stats["valid_yield"] == told["judged"]["valid_yield"] == share(http, jobs["judged"])
     assert (told["unjudged"]["judged"], told["unjudged"]["valid_yield"]) == (0, None)
+    words = f"{int(100 * share(http, jobs['judged']) + 1e-9)} %"
+    home = http.get("/").text
+    assert words in home and "320 more are not judged" in home
+    assert words in http.get("/datasets").text
 
 
 def test_a_dataset_of_unjudged_grasps_has_no_yield(http: TestClient, services: Services) -> None:
@@ -52,13 +52,6 @@ def test_a_dataset_of_unjudged_grasps_has_no_yield(http: TestClient, services: S
     assert http.get("/v1/datasets/d").json()["valid_yield"] is None
     for page in ("/datasets/d", "/datasets", "/compare?one=d&other=d", f"/jobs/{job.id}", "/"):
         assert "not judged" in http.get(page).text, page
-
-
-def test_pages_show_the_share_of_the_judged(http: TestClient, jobs: dict[str, str]) -> None:
-    words = f"{int(100 * share(http, jobs['judged']) + 1e-9)} %"
-    home = http.get("/").text
-    assert words in home and "320 more are not judged" in home
-    assert words in http.get("/datasets").text
 
 
 def test_grasps_that_nobody_judged_are_found_as_such_and_not_among_the_rejected(
