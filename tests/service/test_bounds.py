@@ -46,17 +46,8 @@ def test_a_waiting_task_takes_a_few_kilobytes_of_redis_and_gives_them_back(rq_qu
 
 
 def test_the_stream_of_events_takes_a_bounded_part_of_redis(rq_queue: RqQueue) -> None:
-    event = Event(
-        kind=EventKind.FINISHED,
-        at=timestamp(),
-        task_id="0" * 32,
-        job_id="1" * 32,
-        attempt=1,
-        worker="host-12345-abcdef",
-        seconds=12.5,
-        output="2" * 32,
-        message="was there already",
-    )
+    ids = {"task_id": "0" * 32, "job_id": "1" * 32, "output": "2" * 32, "worker": "host-12345-abcdef"}
+    event = Event(kind=EventKind.FINISHED, at=timestamp(), attempt=1, seconds=12.5, message="was there already", **ids)
     for _ in range(1000):
         rq_queue.publish(event)
     size = rq_queue.connection.memory_usage(EVENTS, samples=0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -36,11 +37,10 @@ def v1(root: Path, folder: str, quota: int) -> None:
     (place / "cpu.cfs_period_us").write_text("100000\n")
 
 
-def test_without_control_groups_the_affinity_counts_not_the_machine(tmp_path: Path) -> None:
+def test_without_control_groups_the_affinity_counts_not_the_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert available_cores(tmp_path) == MACHINE
-
-
-def test_a_system_without_affinity_gives_its_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "sched_getaffinity")
     assert available_cores(tmp_path) == 2 * MACHINE
 
@@ -58,18 +58,14 @@ def test_the_least_quota_on_the_way_up_counts(tmp_path: Path) -> None:
     assert available_cores(root) == 3
 
 
-@pytest.mark.parametrize("folder", ["cpu", "cpu,cpuacct"])
-def test_the_quota_of_version_1_counts(tmp_path: Path, folder: str) -> None:
+@pytest.mark.parametrize(
+    ("folder", "quota", "cores"), [("cpu", 400_000, 4), ("cpu,cpuacct", 400_000, 4), ("cpu", -1, MACHINE)]
+)
+def test_the_quota_of_version_1_counts(tmp_path: Path, folder: str, quota: int, cores: int) -> None:
     # In a container the path is the host's, and only the controller's root is there.
     root = system(tmp_path, "4:memory:/docker/x\n3:cpu,cpuacct:/docker/x\n0::/")
-    v1(root, folder, 400_000)
-    assert available_cores(root) == 4
-
-
-def test_no_quota_of_version_1_is_no_limit(tmp_path: Path) -> None:
-    root = system(tmp_path, "3:cpu,cpuacct:/")
-    v1(root, "cpu", -1)
-    assert available_cores(root) == MACHINE
+    v1(root, folder, quota)
+    assert available_cores(root) == cores
 
 
 @pytest.mark.parametrize("text", ["", "what", "1 2 3", "100000 0"])
@@ -81,12 +77,10 @@ def test_no_other_count_of_cores_is_asked_for() -> None:
     here = Path(__file__).parents[3]
     packages = ("api", "service", "worker", "benchmarks", "examples")
     files = [file for package in packages for file in (here / package).rglob("*.py")] + list(here.glob("*.py"))
-    asking = [
-        str(file.relative_to(here))
-        for file in files
-        if any(word in file.read_text() for word in ("cpu_count(", "sched_getaffinity("))
+    words = re.compile(r"cpu_count\(|sched_getaffinity\(")
+    assert [str(file.relative_to(here)) for file in files if words.search(file.read_text())] == [
+        "service/model/cores.py"
     ]
-    assert asking == ["service/model/cores.py"]
 
 
 def test_the_files_are_read_once_in_a_moment_and_a_changed_quota_is_heard_of(

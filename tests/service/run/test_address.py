@@ -44,21 +44,18 @@ def asked() -> str:
         return client.url
 
 
-def test_the_client_asks_the_service_of_its_data_folder(folder: Path) -> None:
+def test_the_client_asks_the_service_of_its_data_folder_unless_a_url_was_given(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert asked() == "http://127.0.0.1:8000", "without a record the usual address"
     record_address(folder, URL)
+    assert stat.S_IMODE((folder / "api.json").stat().st_mode) == 0o600
+    assert [file.name for file in folder.iterdir()] == ["api.json"]
     assert asked() == URL
-
-
-def test_a_url_that_was_given_goes_before(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    record_address(folder, URL)
     monkeypatch.setenv("GRASPD_API_URL", "http://127.0.0.1:1234")
     assert asked() == "http://127.0.0.1:1234"
     with open_client("http://127.0.0.1:99") as client:
         assert client.url == "http://127.0.0.1:99"
-
-
-def test_without_a_record_the_client_asks_the_usual_address(folder: Path) -> None:
-    assert asked() == "http://127.0.0.1:8000"
 
 
 def test_the_record_of_a_service_that_is_gone_is_not_believed(folder: Path) -> None:
@@ -69,28 +66,13 @@ def test_the_record_of_a_service_that_is_gone_is_not_believed(folder: Path) -> N
     assert asked() == "http://127.0.0.1:8000"
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "{",
-        "[]",
-        "3",
-        '{"api_url": 5, "pid": 1}',
-        '{"api_url": "file:///x", "pid": 1}',
-        '{"api_url": "http://x", "pid": "1"}',
-        '{"api_url": "http://x", "pid": ' + "9" * 40 + "}",
-    ],
-)
+_NO_RECORDS = '|{|[]|3|{"api_url": 5, "pid": 1}|{"api_url": "file:///x", "pid": 1}|{"api_url": "http://x", "pid": "1"}'
+
+
+@pytest.mark.parametrize("text", [*_NO_RECORDS.split("|"), f'{{"api_url": "http://x", "pid": {"9" * 40}}}'])
 def test_a_record_that_makes_no_sense_is_no_record(folder: Path, text: str) -> None:
     (folder / "api.json").write_text(text)
     assert recorded_address(folder) is None
-
-
-def test_the_record_is_for_its_user_alone_and_leaves_no_scraps(folder: Path) -> None:
-    record_address(folder, URL)
-    assert stat.S_IMODE((folder / "api.json").stat().st_mode) == 0o600
-    assert [file.name for file in folder.iterdir()] == ["api.json"]
 
 
 def test_only_the_process_that_wrote_the_record_takes_it_away(folder: Path) -> None:

@@ -67,11 +67,8 @@ def test_a_command_of_a_second_service_on_a_store_is_refused(
     command: list[str], first: Services, beside: str, tmp_path: Path
 ) -> None:
     done = run(command, tmp_path / "second", GRASPD_STORE_URL=first.store.url, GRASPD_REDIS_URL=beside)
-    said = done.stderr.splitlines()[-1]
-    assert (done.returncode, said.partition(" graspd service")[0]) == (
-        1,
-        f"graspd: the store {first.store.url} belongs to another",
-    )
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith(f"graspd: the store {first.store.url} belongs to another graspd")
 
 
 def test_the_doctor_says_so(first: Services, redis_server: str, tmp_path: Path) -> None:
@@ -91,25 +88,10 @@ def test_another_number_of_database_is_another_redis(first: Services, beside: st
     second.close()
 
 
-NAMES = [
-    "100%",
-    "a%20b",
-    "a#b",
-    "what?",
-    "a b",
-    "größe ÅΩ",
-    "a\nb",
-    "q'u\"o\\te",
-    "a&b=c;d",
-    "[1]",
-    "a:b@c",
-    "{x}",
-    "~",
-    "$HOME",
-]
+NAMES = "100% a%20b a#b what? größe q'u\"o\\te a&b=c;d [1] a:b@c {x} ~ $HOME"
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES.split(), "a b", "a\nb"])
 def test_store_and_index_lie_in_the_folder_and_nothing_beside_it(name: str, tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path / name)
     store = open_store(settings.resolved_store_url)

@@ -209,19 +209,19 @@ def many(file: h5py.File, _: Path) -> None:
         file.create_group(f"g{number}")
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        external_link,
-        soft_link,
-        external_storage,
-        virtual,
-        made_up,
-        deflated_zeros,
-        one_dataset_under_many_names,
-        many,
-    ],
+CHANGES = (
+    external_link,
+    soft_link,
+    external_storage,
+    virtual,
+    made_up,
+    deflated_zeros,
+    one_dataset_under_many_names,
+    many,
 )
+
+
+@pytest.mark.parametrize("change", CHANGES)
 @pytest.mark.parametrize("as_bytes", [False, True])
 def test_values_from_elsewhere_are_refused(
     change: Callable[[h5py.File, Path], None], as_bytes: bool, tmp_path: Path

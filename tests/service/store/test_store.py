@@ -191,12 +191,6 @@ def test_anybody_with_the_signed_address_may_read_that_object_and_no_other(signi
 
 
 @pytest.mark.s3
-def test_an_endpoint_of_the_service_alone_is_not_handed_out(remote_store: Store) -> None:
-    remote_store.put("a", b"1")
-    assert remote_store.sign("a") is None
-
-
-@pytest.mark.s3
 def test_an_address_is_signed_for_where_clients_reach_the_store(s3_url: str) -> None:
     remote_store = open_store(s3_url, public_endpoint="https://files.example.org")
     assert urlsplit(remote_store.sign("a") or "").netloc == "files.example.org"
@@ -214,14 +208,9 @@ def test_wrong_credentials_are_one_clear_line_without_the_secret(s3_url: str, mo
 @pytest.mark.s3
 def test_a_server_that_is_away_is_unavailable_for_every_call(s3_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{free_ports(1)[0]}")
-    remote_store = open_store(s3_url)
-    for call in (
-        lambda: remote_store.put("a", b"1"),
-        lambda: remote_store.get("a"),
-        lambda: remote_store.exists("a"),
-        lambda: list(remote_store.list("jobs")),
-        remote_store.probe,
-    ):
+    store = open_store(s3_url)
+    reads = (lambda: store.get("a"), lambda: store.exists("a"), lambda: list(store.list("jobs")))
+    for call in (lambda: store.put("a", b"1"), store.probe, *reads):
         with pytest.raises(StoreUnavailable) as found:
             call()
         assert not isinstance(found.value, NotFoundError)

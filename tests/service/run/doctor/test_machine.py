@@ -46,20 +46,16 @@ def test_a_data_folder_that_others_can_read_is_told(tmp_path: Path) -> None:
 
 def test_a_data_folder_on_a_network_is_told_where_locks_are_needed(tmp_path: Path) -> None:
     mounts = tmp_path / "mounts"
-    mounts.write_text(
-        f"/dev/sda / ext4 rw 0 0\nserver:/home {tmp_path} nfs4 rw 0 0\ntmpfs {tmp_path}/tmp tmpfs rw 0 0\n"
-    )
+    kinds = f"/dev/sda / ext4 rw 0 0\nserver:/home {tmp_path} nfs4 rw 0 0\ntmpfs {tmp_path}/tmp tmpfs rw 0 0\n"
+    mounts.write_text(kinds)
     folder = tmp_path / "data"
     found = data_folder(Settings(data_dir=folder), mounts=mounts)
     assert found.condition is Condition.WARNING
     assert "nfs4" in found.message
     elsewhere = Settings(data_dir=folder, redis_url="redis://other", index_url="postgresql+psycopg://other/graspd")
     assert data_folder(elsewhere, mounts=mounts).condition is Condition.GOOD
-    assert [filesystem(path, mounts) for path in (folder, tmp_path / "tmp" / "x", Path("/etc"))] == [
-        "nfs4",
-        "tmpfs",
-        "ext4",
-    ]
+    for path, kind in ((folder, "nfs4"), (tmp_path / "tmp" / "x", "tmpfs"), (Path("/etc"), "ext4")):
+        assert filesystem(path, mounts) == kind
     assert not folder.exists()
 
 
