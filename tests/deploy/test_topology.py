@@ -25,6 +25,7 @@ from tests.conftest import REPOSITORY
 from tests.deploy import composition
 from tests.servers import PostgresServer, S3Server, free_ports
 from tests.service.conftest import wait_for_redis
+from tests.shell import completed
 from tests.waiting import until
 
 _READY_S = 120.0
@@ -55,13 +56,8 @@ class Topology:
             )
 
     def graspd(self, service: str, *arguments: str, **more: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "graspd", *arguments],
-            env=self.environment(service) | more,
-            cwd=REPOSITORY,
-            capture_output=True,
-            text=True,
-            check=False,
+        return completed(
+            [sys.executable, "-m", "graspd", *arguments], env=self.environment(service) | more, cwd=REPOSITORY
         )
 
     def until_ready(self) -> None:

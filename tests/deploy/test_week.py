@@ -8,15 +8,8 @@ import pytest
 
 from benchmarks.week import CONTROLLER_TASKS_PER_S, HARSH, Rates, Told, Week, table, task_seconds
 
-NOTHING = Rates(
-    reclaimed_per_day=0,
-    killed_per_day=0,
-    cut_off_per_day=0,
-    zone_per_week=0,
-    controller_killed_per_day=0,
-    redis_restarts_per_week=0,
-    store_outages_per_week=0,
-)
+_EVENTS = ("reclaimed_per_day", "killed_per_day", "cut_off_per_day", "zone_per_week", "controller_killed_per_day")
+NOTHING = Rates(**dict.fromkeys((*_EVENTS, "redis_restarts_per_week", "store_outages_per_week"), 0))
 DAY_S = 86_400.0
 
 

@@ -8,7 +8,6 @@ import json
 import os
 import re
 import shlex
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,6 +21,7 @@ from service.run.supervisor import Supervisor
 from service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.docs_commands import run_page
+from tests.shell import completed
 from tests.waiting import PATIENCE_S, until_a_worker_is_idle
 from tests.worker.hands.my_hand import write_my_hand
 
@@ -37,9 +37,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, 
 
 
 def run(code: str, environment: dict[str, str], folder: Path) -> str:
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment, cwd=folder
-    )
+    done = completed([sys.executable, "-c", code], env=environment, cwd=folder)
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout
 
@@ -102,14 +100,7 @@ def test_a_hand_is_added_corrected_and_used_as_the_page_says(environment: dict[s
         program, *arguments = shlex.split(line, comments=True) or ["", ""]
         if program != "graspd" or arguments[:2] == ["hands", "check"]:
             continue
-        done = subprocess.run(
-            [sys.executable, "-m", "graspd", *arguments],
-            capture_output=True,
-            text=True,
-            check=False,
-            env=environment,
-            cwd=tmp_path,
-        )
+        done = completed([sys.executable, "-m", "graspd", *arguments], env=environment, cwd=tmp_path)
         assert done.returncode == 0, done.stderr[-2000:]
     (curl,) = [shlex.split(line) for line in lines if line.startswith("curl ")]
     url = next(part for part in curl if part.startswith("http"))

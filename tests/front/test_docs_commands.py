@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import subprocess
 import sys
 from collections import Counter
 from functools import cache
@@ -18,6 +17,7 @@ import yaml
 from tests import docs_commands
 from tests.conftest import REPOSITORY
 from tests.docs_commands import NOT_RUN, PAGES, Line, lines_of
+from tests.shell import completed
 
 #: `graspd jobs`, <pre>graspd jobs</pre>, epilog="graspd jobs".
 _NAMED = re.compile(r'(?:`|>|epilog=")(graspd\s+[a-z](?:(?!\.\.\.)[^"`{}<…,;])*)')
@@ -228,11 +228,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if not (find_spec("material") and find_spec("mkdocstrings")):
         pytest.skip("needs pip install '.[docs]'; make docs-site brings it")
     folder = tmp_path_factory.mktemp("site")
-    done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", folder],
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
+    done = completed(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", folder], cwd=REPOSITORY
     )
     assert done.returncode == 0, done.stderr
     return folder

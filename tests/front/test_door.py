@@ -12,13 +12,14 @@ from typer.testing import CliRunner
 
 from graspd.cli import build
 from service.cli import at_the_door
+from tests.shell import completed
 from worker.commands.exchange import EXPORTS, IMPORTS
 
 GRASPD = f"'{sys.executable}' -m graspd"
 
 
 def run(line: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=False)
+    return completed(["bash", "-c", line])
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")

@@ -19,6 +19,7 @@ import graspd
 from service.model.version import PACKAGE_VERSION
 from tests.conftest import REPOSITORY
 from tests.docs_commands import Line
+from tests.shell import completed
 
 FORGE = REPOSITORY / ".github"
 
@@ -121,7 +122,7 @@ LIGHT = {"service", "service.model", "service.model.libraries"}
 
 
 def python(code: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=cwd)
+    return completed([sys.executable, "-c", code], cwd=cwd)
 
 
 def test_the_import_loads_nothing_that_takes_time() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import subprocess
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from benchmarks.results.studies import BY_NAME, STUDIES, Study, is_raw
 from service.model.version import STAGE_REVISIONS
 from tests.conftest import REPOSITORY
 from tests.docs_commands import Line
+from tests.shell import completed
 
 MOST_BYTES, MOST_LINES = 8_000_000, 6_000
 ADD = Study(
@@ -40,7 +40,7 @@ def test_the_manifest_holds_every_figure_and_picture_as_it_is() -> None:
 
 
 def test_git_keeps_what_readers_see_and_no_raw_results() -> None:
-    listed = subprocess.run(["git", "ls-files", "docs"], cwd=REPOSITORY, capture_output=True, text=True)
+    listed = completed(["git", "ls-files", "docs"], cwd=REPOSITORY)
     if listed.returncode:
         pytest.skip("no checkout of git")
     files = [REPOSITORY / name for name in listed.stdout.split() if (REPOSITORY / name).is_file()]

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 import graspd.cli
 from graspd.cli import build
+from tests.shell import completed
 
 NOBODY = {"GRASPD_API_URL": "http://127.0.0.1:9"}
 
@@ -64,9 +65,7 @@ def test_a_group_without_a_command_shows_its_help() -> None:
 
 def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
     start = f"import sys; sys.argv[0] = 'graspd'; from graspd.cli import main\n{code}"
-    return subprocess.run(
-        [sys.executable, "-c", start], env=os.environ | environment, capture_output=True, text=True, check=False
-    )
+    return completed([sys.executable, "-c", start], env=os.environ | environment)
 
 
 @pytest.mark.parametrize(

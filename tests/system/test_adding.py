@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from service.index.rebuild import differences
 from service.run.supervisor import Supervisor
 from service.settings import Settings
 from service.store.store import open_store
+from tests.shell import completed
 from tests.waiting import PATIENCE_S, until_a_worker_is_idle
 
 GRIPPER = """\
@@ -54,9 +54,7 @@ class Shell:
     def __call__(self, *arguments: str) -> tuple[int, dict[str, Any], str]:
         """Exit code, the JSON object on the last line, standard error."""
         command = [sys.executable, "-m", "graspd", *arguments, "--json"]
-        done = subprocess.run(
-            command, capture_output=True, text=True, env=self.environment, cwd=self.folder, timeout=280, check=False
-        )
+        done = completed(command, env=self.environment, cwd=self.folder, timeout=280)
         lines = done.stdout.strip().splitlines()
         return done.returncode, json.loads(lines[-1]) if lines else {}, done.stderr
 

@@ -30,6 +30,7 @@ from service.store.records import publish
 from service.store.store import open_store
 from tests.networks import random_network
 from tests.service.pipeline.test_fidelity_choice import scene_chart
+from tests.shell import completed
 from tests.waiting import PATIENCE_S
 
 STL = b"solid box\nendsolid box\n"
@@ -49,9 +50,7 @@ class Shell:
     def __call__(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "graspd", *arguments]
         if not self.in_process:
-            return subprocess.run(
-                command, capture_output=True, text=True, env=self.environment, timeout=60, check=False
-            )
+            return completed(command, env=self.environment, timeout=60)
         ours = {name: None for name in os.environ if name.startswith("GRASPD_")}
         done = CliRunner().invoke(build(), arguments, env={**ours, **self.environment})
         return subprocess.CompletedProcess(command, done.exit_code, done.stdout, done.stderr)
@@ -157,9 +156,7 @@ def test_at_a_terminal_the_question_is_answered(graspd: Shell, answer: str, code
     ours, theirs = os.openpty()
     os.write(ours, f"{answer}\n".encode())
     command = [sys.executable, "-m", "graspd", "datasets", "delete", name]
-    done = subprocess.run(
-        command, stdin=theirs, capture_output=True, text=True, env=graspd.environment, timeout=60, check=False
-    )
+    done = completed(command, stdin=theirs, env=graspd.environment, timeout=60)
     for end in (ours, theirs):
         os.close(end)
     assert done.returncode == code, done.stderr

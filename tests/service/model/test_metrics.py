@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from typing import Any
 
@@ -16,6 +15,7 @@ from service.store.columns import SCHEMAS
 from service.store.store import open_store
 from tests.conftest import REPOSITORY
 from tests.one_more_metric import MEANING, NAME, TITLE
+from tests.shell import completed
 
 Found = dict[str, Any]
 
@@ -30,7 +30,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
     index.close()
     command = [sys.executable, "-m", "tests.one_more_metric", str(folder / "new"), older]
     (folder / "new").mkdir()
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    done = completed(command, cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 

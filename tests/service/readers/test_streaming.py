@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 import pickle
-import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -25,6 +24,7 @@ from service.store.store import Store, open_store
 from tests.conftest import REPOSITORY
 from tests.service.readers import box_scenes
 from tests.service.readers.box_scenes import VIEWS
+from tests.shell import completed
 
 VIEWS_KEY = f"shards/views/{'c' * 32}.h5"
 
@@ -176,7 +176,7 @@ except InputError as error:
     kept = error
     print(kept)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=REPOSITORY)
+    done = completed([sys.executable, "-c", code], cwd=REPOSITORY)
     assert (done.returncode, "not a readable HDF5 file" in done.stdout) == (0, True), done.stderr[-1000:]
 
 

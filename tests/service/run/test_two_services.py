@@ -21,6 +21,7 @@ from service.run.supervisor import Supervisor
 from service.settings import Settings
 from service.store.store import open_store
 from tests.indexes import empty_index
+from tests.shell import completed
 from tests.waiting import PATIENCE_S
 
 COMMANDS = [["up", "--workers", "0", "--port", "0"], ["api", "--port", "0"], ["controller"], ["worker"]]
@@ -47,9 +48,7 @@ def beside(redis_server: str) -> str:
 
 def run(command: list[str], folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     variables = {**os.environ, "GRASPD_DATA_DIR": str(folder), "GRASPD_LOG_LEVEL": "ERROR", **environment}
-    return subprocess.run(
-        [sys.executable, "-m", "graspd", *command], env=variables, capture_output=True, text=True, check=False
-    )
+    return completed([sys.executable, "-m", "graspd", *command], env=variables)
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
